@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.calibration._robust_weights import rms
 from jointfit_daemon.center_of_rotation import refusal
 from jointfit_daemon.center_of_rotation.spatial import (
     SphereLimits,
@@ -131,6 +132,4 @@ def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> Cen
 
 def carried_center_gap(parent: ClusterTrack, child: ClusterTrack, center: Array) -> float:
     """Return the RMS distance between the centers carried by the two body parts, m."""
-    gap = np.linalg.norm(parent.carry(center) - child.carry(center), axis=-1)
-    gap = gap[np.isfinite(gap)]
-    return float(np.sqrt((gap**2).mean())) if gap.size else float("inf")
+    return rms(np.linalg.norm(parent.carry(center) - child.carry(center), axis=-1), np.inf)

@@ -52,6 +52,8 @@ class LiveClusters:
     def __init__(self, clusters: Mapping[str, MarkerCluster]) -> None:
         self.names = tuple(clusters)
         self._clusters = tuple(clusters.values())
+
+        # Templates of all parts in one array; smaller parts have unused rows.
         sizes = [len(cluster.template) for cluster in self._clusters]
         shape = (len(sizes), max(sizes, default=0))
         self.sizes = tuple(sizes)
@@ -62,16 +64,22 @@ class LiveClusters:
             self._wanted[i, : sizes[i]] = True
         self.origins = np.array([c.origin for c in self._clusters]).reshape(-1, 3)
         self._bodies = [i for i, c in enumerate(self._clusters) if c.body is not None]
+
+        # Counts of frames with a pose, of misfits, and of the most deviating marker in these.
         self._frames = 0
         self._good = np.zeros(shape[0], dtype=np.int64)
         self._bad = np.zeros(shape[0], dtype=np.int64)
         self._blamed = np.zeros(shape, dtype=np.int64)
         self._known = np.zeros(shape, dtype=np.bool_)
         self._usable: dict[bytes, Mask] = {}
+
+        # Columns of the markers and rigid bodies in the current layout.
         self._layout: MocapLayout | None = None
         self._columns = np.zeros(shape, dtype=np.intp)
         self._missing = ~self._wanted
         self._body_columns: dict[int, int] = {}
+
+        # The last frame.
         self.points = np.full((*shape, 3), np.nan)
         """Markers in the last frame, optical world, m, shape (parts, k, 3); NaN if not visible, or
         if the markers of the part do not fit it."""
@@ -129,6 +137,7 @@ class LiveClusters:
         bodies = {name: i for i, name in enumerate(layout.bodies)}
         self._columns[:], self._missing[:] = 0, True
         self._body_columns = {}
+
         for i, cluster in enumerate(self._clusters):
             if cluster.body is not None and cluster.body in bodies:
                 self._body_columns[i] = bodies[cluster.body]
@@ -156,6 +165,7 @@ class LiveClusters:
         key = seen.tobytes()
         known = self._usable.get(key)
         if known is None:
+            # A movement has few patterns; the cache is bounded against flickering markers.
             if len(self._usable) >= _PATTERNS:
                 self._usable.clear()
             known = np.array(
@@ -174,10 +184,13 @@ class LiveClusters:
         weight = w[:, None, :]
         a_mean, y_mean = weight @ self._template / total, weight @ y / total
         a = (self._template - a_mean) * w[..., None]
+
+        # Rotation without reflection from the singular vectors of the cross moment.
         U, _, Vt = np.linalg.svd(np.swapaxes(a, 1, 2) @ y)
         mirrored = np.linalg.det(U @ Vt) < 0.0
         Vt[mirrored, 2] *= -1.0
         R = np.swapaxes(U @ Vt, 1, 2)
+
         t = y_mean - a_mean @ np.swapaxes(R, 1, 2)
         gap = self._template @ np.swapaxes(R, 1, 2) + t - y
         self.R, self.p = R, t[:, 0]
@@ -190,6 +203,7 @@ class LiveClusters:
         for i, (name, cluster) in enumerate(zip(self.names, self._clusters, strict=True)):
             labels = cluster.markers or (cluster.body or name,) * self.sizes[i]
             worst = labels[int(self._blamed[i, : self.sizes[i]].argmax())]
+
             unknown = ~self._known[i] & (self._frames > 0)
             absent = tuple(dict.fromkeys(label for k, label in enumerate(labels) if unknown[k]))
             found[name] = ClusterVisibility(

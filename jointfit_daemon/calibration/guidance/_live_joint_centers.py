@@ -117,10 +117,13 @@ class LiveJointCenters:
         parts.feed(frame)
         if not self.joints:
             return
+
+        # Markers of the distal parts in static-world coordinates of the proximal ones.
         above = self._parents
         v = (parts.points[self._children] - parts.p[above][:, None]) @ parts.R[above]
         v[~parts.placed[above]] = np.nan
         v += self._home
+
         some = np.asarray(np.isfinite(v[..., 0]).any(axis=1))
         self._frames += some
         for k, sphere in enumerate(self._spheres):

@@ -150,6 +150,7 @@ class MovementGuide:
         source = "unknown" if beside == [None] * len(beside) else "configured"
         if 0 < i < count:
             source = "sensors"
+
         return {
             "source": source,
             "predicted_error_mm": _mm(error),
@@ -202,6 +203,7 @@ def _missing_movement(one: LiveJointCenter, target: float) -> str | None:
         return f"movement too small: {words.bend}"
     if one.unseen == 1 and not words.hinge:
         return f"no circumduction, movement about one axis only: {words.sideways}"
+
     noise = _noise(one)
     if noise <= target:
         return one.refused

@@ -81,6 +81,7 @@ class MovementProgress:
             b = next((sensor for sensor in below if sensor in latest), None)
             if a is None or b is None:
                 continue
+
             reach = self._seen.get((joint, a, b))
             if reach is None:
                 zero = self.standing if {a, b} <= self.standing.keys() else latest

@@ -21,21 +21,21 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 DEPTH = 4
+"""Number of iterations in the history."""
 _RANK = 1e-8
 
 
 class Anderson:
     """The last few iterates and their images."""
 
-    def __init__(self, depth: int = DEPTH) -> None:
-        self._depth = depth
+    def __init__(self) -> None:
         self._images: list[Array] = []
         self._changes: list[Array] = []
 
     def propose(self, at: Array, image: Array) -> Array | None:
         """Return the next point to try after g(at) = image; None without a history."""
-        self._images = [*self._images[-self._depth :], image]
-        self._changes = [*self._changes[-self._depth :], image - at]
+        self._images = [*self._images[-DEPTH:], image]
+        self._changes = [*self._changes[-DEPTH:], image - at]
         if len(self._images) == 1:
             return None
         dG = np.diff(np.array(self._images), axis=0).T

@@ -56,9 +56,7 @@ def solve_in_turns(
     follow: Callable[[Array, Array], Carriers],
     on_step: Callable[[AlternatingStep], bool] | None = None,
     *,
-    start: Array | None = None,
     tolerance: float = _TOLERANCE,
-    most_iterations: int = _MOST_ITERATIONS,
 ) -> list[AlternatingStep]:
     """Refine by turns of inverse kinematics and weighted means.
 
@@ -68,8 +66,6 @@ def solve_in_turns(
         Given positions, m, shape (M, 3), and weights of squared errors, shape (T, M): the poses.
     on_step
         Called with every accepted iterate; True ends the iteration.
-    start
-        Positions to begin with, m, shape (M, 3); the nominal ones if None.
     tolerance
         Relative decrease of F in one turn at which it is done.
 
@@ -79,8 +75,8 @@ def solve_in_turns(
         Start and every accepted place; F falls along it.
     """
     turns = _AlternatingSolver(problem, follow)
-    path, anderson = [turns.first(start)], Anderson()
-    while len(path) <= most_iterations:
+    path, anderson = [turns.first()], Anderson()
+    while len(path) <= _MOST_ITERATIONS:
         last = path[-1]
         plain = turns.means(last)
         guess = anderson.propose(last.positions[problem.free], plain[problem.free])
@@ -109,8 +105,8 @@ class _AlternatingSolver:
         self._problem = problem
         self._follow = follow
 
-    def first(self, start: Array | None) -> AlternatingStep:
-        begin = self._problem.model.positions if start is None else start
+    def first(self) -> AlternatingStep:
+        begin = self._problem.model.positions
         return self._at(begin, self._follow(begin, self._problem.weights))
 
     def follow(self, positions: Array, last: AlternatingStep) -> AlternatingStep:

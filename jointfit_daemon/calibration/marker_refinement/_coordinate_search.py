@@ -109,6 +109,7 @@ class _Walk:
                 error = self._measure(trial)
                 if not error < self.errors[-1] - least_gain:
                     break
+
                 self.positions = trial
                 self.errors.append(error)
             if len(self.errors) > accepted:

@@ -59,6 +59,7 @@ def judge_trial(
     ones = np.ones(len(before.markers))
     old = solve_frames(before, trial.targets, ones, options=options)
     new = solve_frames(after, trial.targets, ones, start=old.state, options=options)
+
     return TrialOutcome(
         trial.name,
         trained,

@@ -143,9 +143,12 @@ def _movable(
     for trial in trials:
         seen |= np.isfinite(trial.targets).all(axis=-1).any(axis=0)
     seen &= model.weights > 0.0
+
+    # The only marker of a segment cannot be told from its pose.
     counted = np.bincount(model.marker_segments[seen], minlength=len(model.segments))
     alone = seen & (counted[model.marker_segments] == 1)
     free = ~model.locked & (seen & ~alone)[:, None]
+
     notes = []
     absent = [m.name for m, there in zip(model.markers, seen, strict=True) if not there]
     if absent:
@@ -164,6 +167,7 @@ def _gaps(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
         [np.isfinite(t.targets).all(axis=-1).any(axis=0) for t in trials]
     )
     partly = np.any(present, axis=0) & ~np.all(present, axis=0)
+
     return [
         f"{trial.name}: {', '.join(missing)} missing throughout"
         for trial, there in zip(trials, present, strict=True)

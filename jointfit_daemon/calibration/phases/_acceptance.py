@@ -66,6 +66,7 @@ def _worse_angles(new: Calibration, old: Calibration) -> list[str]:
             was, now = before[name].get(old.method), after.get(name, {}).get(new.method)
             if not (isinstance(was, int | float) and isinstance(now, int | float)):
                 continue
+
             if now > SLACK * was + SLACK_RAD:
                 quantity = "orientation" if kind == "segments" else "flexion"
                 found.append(

@@ -146,22 +146,21 @@ def fit_offline(
     training = _training(chain, trials, mounts)
     _refuse_few(chain, training, "the training data")
     models = fit_models(chain, training, method)
+
+    # Sensors and reference are in one world, so worlds and static poses are the identity.
+    identity = as_quaternion(rotation.IDENTITY.tolist())
     return Calibration(
         method=method,
         joints=chain.joints,
         segments=chain.segments,
         chain_sensors=chain.sensors,
         sensor={
-            name: SensorCalibration(
-                as_quaternion(rotation.IDENTITY.tolist()), as_quaternion(mounts[name].tolist())
-            )
+            name: SensorCalibration(identity, as_quaternion(mounts[name].tolist()))
             for group in chain.sensors
             for name in group
         },
         segment={
-            segment: SegmentCalibration(
-                as_quaternion(rotation.IDENTITY.tolist()), None, None, models[segment]
-            )
+            segment: SegmentCalibration(identity, None, None, models[segment])
             for segment in chain.segments
         },
         joint={name: JointCalibration(None, None, "unknown") for name in chain.joints},
@@ -284,25 +283,11 @@ class _Fold:
 
     def method(self, method: Method) -> MethodScore:
         """Evaluate one method with all sensors available, like the daemon."""
-        return self._judged(
-            method,
-            {
-                segment: predict_all_sensors(
-                    self.chain,
-                    i,
-                    fit_all_sensors(self.chain, i, method, self.training),
-                    self.aligned,
-                )
-                for i, segment in enumerate(self.chain.segments)
-            },
-        )
-
-    @property
-    def frames(self) -> int:
-        known = [
-            visible(q) for q in (*self.aligned.sensors.values(), *self.test.reference.values())
-        ]
-        return int(np.count_nonzero(np.all(known, axis=0)))
+        estimates = {}
+        for i, segment in enumerate(self.chain.segments):
+            model = fit_all_sensors(self.chain, i, method, self.training)
+            estimates[segment] = predict_all_sensors(self.chain, i, model, self.aligned)
+        return self._score(method, estimates)
 
     def singles(self) -> list[MethodScore]:
         """Evaluate the first sensor of each segment alone, then the second, and so on."""
@@ -310,23 +295,24 @@ class _Fold:
         found = []
         for k in range(max(map(len, chain.sensors))):
             names = [group[min(k, len(group) - 1)] for group in chain.sensors]
-            estimates = dict(
-                zip(chain.segments, (self.aligned.sensors[n] for n in names), strict=True)
-            )
-            found.append(self._judged(f"single {'+'.join(names)}", estimates))
+            sensors = [self.aligned.sensors[name] for name in names]
+            estimates = dict(zip(chain.segments, sensors, strict=True))
+            found.append(self._score(f"single {'+'.join(names)}", estimates))
         return found
 
-    def _judged(self, method: str, estimates: Mapping[str, Array]) -> MethodScore:
+    def _score(self, method: str, estimates: Mapping[str, Array]) -> MethodScore:
         chain, reference = self.chain, self.test.reference
         flexion = {
             joint: _flexion(estimates[above], estimates[below], self.axes[joint])
             for joint, above, below in _inner(chain)
         }
         off = {j: flexion[j] - self.truth[j] for j in flexion}
+
+        known = [visible(q) for q in (*self.aligned.sensors.values(), *reference.values())]
         return MethodScore(
             self.test.name,
             method,
-            self.frames,
+            int(np.count_nonzero(np.all(known, axis=0))),
             {s: rms(rotation.angle_between(estimates[s], reference[s])) for s in chain.segments},
             {j: rms(np.arctan2(np.sin(angle), np.cos(angle))) for j, angle in off.items()},
             flexion,

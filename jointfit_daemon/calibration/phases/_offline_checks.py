@@ -75,6 +75,7 @@ def _far_sensors(
             apart = float(np.median(off)) if off.size else 0.0
             if apart <= FAR:
                 continue
+
             yield (
                 f"{trial.name}: {sensor} is {np.rad2deg(apart):.0f}° from the reference of "
                 f"{segment}; check that quaternions are scalar first (w, x, y, z), --up, and that "

@@ -152,8 +152,9 @@ def _reference(calibration: Calibration, frames: OnlineFrames, chain: Chain) -> 
         if cluster.body is not None:
             turn = rotation.multiply(frames.bodies[name], rotation.conjugate(cluster.q_body))
         else:
-            turn, _, rms = rigid_fit(cluster.template, frames.markers[name])
-            turn[~(rms <= MARKERS_RMS_M)] = np.nan
+            turn, _, rms_m = rigid_fit(cluster.template, frames.markers[name])
+            turn[~(rms_m <= MARKERS_RMS_M)] = np.nan
+
         good = float(np.isfinite(turn[:, 0]).mean()) if len(turn) else 0.0
         if good < 1.0 - MOST_LEFT_OUT:
             raise CalibrationError(
@@ -162,6 +163,7 @@ def _reference(calibration: Calibration, frames: OnlineFrames, chain: Chain) -> 
             )
         q_static = np.array(calibration.segment[name].q_static)
         reference[name] = rotation.multiply(turn, q_static)
+
     whole = np.all([np.isfinite(q).all(axis=1) for q in reference.values()], axis=0)
     if np.count_nonzero(whole) < FEWEST:
         raise CalibrationError(f"{np.count_nonzero(whole)} complete frames, {FEWEST} are needed")

@@ -180,6 +180,7 @@ def plate_track(
             "align: no plate configured; name its rigid body (plate = …) or its markers"
             " (markers.plate = […])"
         )
+
     if (seen := int(np.count_nonzero(visible(q)))) < MIN_FRAMES:
         raise CalibrationError(
             f"plate: visible in {seen} frames, at least {MIN_FRAMES} are needed; hold it in view"

@@ -60,6 +60,7 @@ def anatomy_quality(anatomy: Anatomy, joints: Mapping[str, JointCalibration]) ->
             arc_rad=None if fit is None else fit.arc,
             unseen_directions=0 if fit is None else len(fit.unseen),
         )
+
     return AnatomyQuality(
         centers,
         {name: length for name, (length, _) in anatomy.lengths.items()},

@@ -231,6 +231,7 @@ def _turned(old: StoredCluster | None, new: MarkerCluster | None) -> NDArray[np.
         return None
     if old.body is not None:
         return rotation.multiply(new.q_body, rotation.conjugate(old.q_body))
+
     q, _, rms = rigid_fit(np.array(old.template), (new.template + new.origin)[None])
     if rms[0] > MAX_TEMPLATE_RMS_M:
         raise CalibrationError(

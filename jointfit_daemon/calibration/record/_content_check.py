@@ -48,11 +48,13 @@ def content_faults(calibration: Calibration) -> list[str]:
 def _faults(c: Calibration) -> Iterator[str]:
     if c.method not in get_args(Method):
         yield f"method {c.method!r}, expected one of {', '.join(get_args(Method))}"
+
     texts = (*c.flags, *c.notes, c.digest, c.software, c.created_utc, c.memory)
     if not all(isinstance(text, str) for text in texts):
         yield "flags, notes, digest, software, created_utc and memory must be text"
     if len(b64decode(c.memory, validate=True)) % 2:
         yield "memory: truncated"
+
     sensors = [name for group in c.chain_sensors for name in group]
     yield from _names("joints", c.joints)
     yield from _names("segments", c.segments)
@@ -60,6 +62,8 @@ def _faults(c: Calibration) -> Iterator[str]:
     yield from _same("sensor", c.sensor, sensors)
     yield from _same("segment", c.segment, c.segments)
     yield from _same("joint", c.joint, c.joints)
+
+    # Content of each record; names are correct here.
     yield from _sensors(c)
     for name, segment in c.segment.items():
         yield from _segment(name, segment)
@@ -151,6 +155,7 @@ def _quality(quality: Mapping[str, Any]) -> Iterator[str]:
         if not (section is None or isinstance(section, dict)):
             yield f"quality.{key}: expected a table"
             return
+
     for key in ("segments", "flexion"):
         for name, figures in (quality.get("holdout", {}).get(key) or {}).items():
             if not isinstance(figures, dict):

@@ -159,6 +159,8 @@ class CalibrationStore:
         if not path.exists():
             known = ", ".join(map(str, self.versions())) or "none"
             raise CalibrationFileError(f"{path}: no such version; stored: {known}")
+
+        # A file that cannot be read may be readable later; one with unusable content never is.
         try:
             data = read_bounded(path, MOST_BYTES)
         except MalformedFileError as error:

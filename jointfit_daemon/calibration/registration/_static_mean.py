@@ -125,6 +125,7 @@ def static_problems(
             f"static pose of {still_s:.1f} s, {limits.still_s:.1f} s are needed: "
             "stand still for longer"
         )
+
     found += [
         f"{sensor}: orientation scatters by {np.rad2deg(mean.spread):.1f} deg in the static "
         f"pose, at most {np.rad2deg(limits.spread):.1f} deg are accepted: "

@@ -7,7 +7,6 @@ influence.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
 from math import radians
 from typing import TYPE_CHECKING
 
@@ -16,19 +15,15 @@ from jointfit_daemon.kinematics.rotation_scalar import angle_between_one, normal
 if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
-_NS = 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class StillnessLimits:
-    """Thresholds of rest. For a noisier sensor use three times its values on a table."""
-
-    window_s: float = 1.0
-    """Length of the window that must be at rest, s."""
-    turn: float = radians(1.0)
-    """Largest rotation from the first step of a window to any later step, rad."""
-    step_s: float = 0.05
-    """Averaging interval of the orientations, s."""
+WINDOW_NS = 1_000_000_000
+"""Length of the window that must be at rest, ns."""
+STEP_NS = 50_000_000
+"""Averaging interval of the orientations, ns."""
+LONGEST_PAUSE_NS = WINDOW_NS // 4
+"""Longest pause in the data within a window, ns."""
+MAX_ROTATION = radians(1.0)
+"""Largest rotation from the first step of a window to any later step, rad: three times the noise of
+a sensor on a table."""
 
 
 class StillnessMonitor:
@@ -40,12 +35,7 @@ class StillnessMonitor:
     pause in the data or time running backwards starts a new window.
     """
 
-    def __init__(self, limits: StillnessLimits | None = None) -> None:
-        limits = limits or StillnessLimits()
-        self._turn = limits.turn
-        self._window_ns = round(limits.window_s * _NS)
-        self._step_ns = round(limits.step_s * _NS)
-        self._longest_pause_ns = self._window_ns // 4
+    def __init__(self) -> None:
         self._steps: deque[tuple[int, Quaternion]] = deque()  # at most window / step + 2
         self._began_ns = self._last_ns = 0
         self._sum: Quaternion | None = None
@@ -55,29 +45,26 @@ class StillnessMonitor:
         """Process one orientation at `t_ns`; return True while the last window was at rest."""
         pause = t_ns - self._last_ns
         self._last_ns = t_ns
-        if self._sum is None or not 0 <= pause <= self._longest_pause_ns:
+        if self._sum is None or not 0 <= pause <= LONGEST_PAUSE_NS:
             self._steps.clear()
-            self._begin(t_ns, q)
-            self._calm = False
-        elif t_ns - self._began_ns >= self._step_ns:
+            self._began_ns, self._sum, self._calm = t_ns, q, False
+        elif t_ns - self._began_ns >= STEP_NS:
             self._steps.append((t_ns, normalize_one(self._sum)))
-            self._begin(t_ns, q)
-            self._calm = self._judge(t_ns)
+            self._began_ns, self._sum = t_ns, q
+            self._calm = self._is_at_rest(t_ns)
         else:
+            # The sum of a step, with equal signs of all quaternions.
             w, x, y, z = self._sum
             sign = -1.0 if w * q[0] + x * q[1] + y * q[2] + z * q[3] < 0.0 else 1.0
             self._sum = (w + sign * q[0], x + sign * q[1], y + sign * q[2], z + sign * q[3])
         return self._calm
 
-    def _begin(self, t_ns: int, q: Quaternion) -> None:
-        self._began_ns, self._sum = t_ns, q
-
-    def _judge(self, t_ns: int) -> bool:
+    def _is_at_rest(self, t_ns: int) -> bool:
         steps = self._steps
-        while len(steps) > 1 and t_ns - steps[1][0] >= self._window_ns:
+        while len(steps) > 1 and t_ns - steps[1][0] >= WINDOW_NS:
             steps.popleft()
         began, start = steps[0]
         # With irregular time stamps the steps are up to one step shorter than the window.
-        if t_ns - began < self._window_ns - self._step_ns:
+        if t_ns - began < WINDOW_NS - STEP_NS:
             return False
-        return all(angle_between_one(start, q) < self._turn for _, q in steps)
+        return all(angle_between_one(start, q) < MAX_ROTATION for _, q in steps)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from jointfit_daemon.calibration.registration import fit_sensor_alignment
 from jointfit_daemon.calibration.soft_tissue._mean_fit import fusion_weights
 from jointfit_daemon.calibration.soft_tissue._segment_training import (
@@ -14,11 +12,6 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.limb_model import AlignedModel
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from jointfit_daemon.arrays import Array
-
 
 def fit_aligned(training: SegmentTraining) -> AlignedModel:
     """Return the mean of aligned sensors, weighted by their residual errors.
@@ -26,15 +19,12 @@ def fit_aligned(training: SegmentTraining) -> AlignedModel:
     Robot-world and hand-eye calibration with known verticals (`fit_sensor_alignment`) for each
     sensor, then the eigenvector mean of Markley et al. 2007.
     """
-
-    def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
-        model = _aligned(part, 0.0)
-        return lambda test: model.predict(test.sensors)
-
-    return _aligned(training, held_out_sd(training, fit))
+    sd = held_out_sd(training, lambda part, test: _aligned(part, 0.0).predict(test.sensors))
+    return _aligned(training, sd)
 
 
 def _aligned(training: SegmentTraining, sd: float) -> AlignedModel:
+    # World and mount of each sensor, then weights from the errors of the aligned sensors.
     found = [fit_sensor_alignment("heading", q, training.q_reference) for q in training.sensors]
     turned = [
         rotation.multiply(rotation.multiply(one.q_world, q), one.q_mount)

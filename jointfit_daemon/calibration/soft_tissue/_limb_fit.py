@@ -80,6 +80,7 @@ def fit_models(
             x = [training.sensors[s] for s in alive]
             alone = fit_segment(method, x, None, reference, training.trials)
             models[model_key(alive, None)] = alone
+
             for near in sensor_sets(neighbor(chain, i)):
                 models[model_key(alive, "+".join(near))] = (
                     fit_segment(method, x, mean_of(training, near), reference, training.trials)

@@ -14,7 +14,7 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import MeanModel, equal_weights, fuse
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from jointfit_daemon.arrays import Array
 
@@ -56,21 +56,17 @@ def best_single(training: SegmentTraining) -> MeanModel:
         errors = [rotation.angle_between(q, part.q_reference) for q in part.sensors]
         return int(np.argmin([np.mean(error**2) for error in errors]))
 
-    def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
-        chosen = best(part)
-        return lambda test: test.sensors[chosen]
-
     chosen = best(training)
     weights = tuple(float(k == chosen) for k in range(len(training.sensors)))
-    return MeanModel(weights, held_out_sd(training, fit))
+    sd = held_out_sd(training, lambda part, test: test.sensors[best(part)])
+    return MeanModel(weights, sd)
 
 
 def fit_mean(training: SegmentTraining) -> MeanModel:
     """Return the mean weighted by the error of each sensor relative to the reference."""
 
-    def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
-        weights = tuple(fusion_weights(part.sensors, part.q_reference).tolist())
-        return lambda test: fuse(test.sensors, weights)
+    def weights(part: SegmentTraining) -> tuple[float, ...]:
+        return tuple(fusion_weights(part.sensors, part.q_reference).tolist())
 
-    weights = tuple(fusion_weights(training.sensors, training.q_reference).tolist())
-    return MeanModel(weights, held_out_sd(training, fit))
+    sd = held_out_sd(training, lambda part, test: fuse(test.sensors, weights(part)))
+    return MeanModel(weights(training), sd)

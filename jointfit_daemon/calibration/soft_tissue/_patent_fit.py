@@ -15,8 +15,6 @@ from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.limb_model import PatentModel, PatentReading
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from jointfit_daemon.arrays import Array
 
 
@@ -26,12 +24,10 @@ def fit_patent(reading: PatentReading, training: SegmentTraining) -> PatentModel
     Least squares by orthogonal decomposition: normal equations would square condition numbers close
     to a thousand.
     """
-
-    def fit(part: SegmentTraining) -> Callable[[SegmentTraining], Array]:
-        model = _regressed(reading, part, 0.0)
-        return lambda test: model.predict(test.sensors)
-
-    return _regressed(reading, training, held_out_sd(training, fit))
+    sd = held_out_sd(
+        training, lambda part, test: _regressed(reading, part, 0.0).predict(test.sensors)
+    )
+    return _regressed(reading, training, sd)
 
 
 def _regressed(reading: PatentReading, training: SegmentTraining, sd: float) -> PatentModel:

@@ -96,18 +96,18 @@ class SegmentTraining:
 
 
 def held_out_sd(
-    training: SegmentTraining, fit: Callable[[SegmentTraining], Callable[[SegmentTraining], Array]]
+    training: SegmentTraining, predict: Callable[[SegmentTraining, SegmentTraining], Array]
 ) -> float:
     """Return the RMS error per axis over all held-out blocks of `training`, rad.
 
     Parameters
     ----------
-    fit : callable
-        Fits training frames and returns a function from frames to orientations (n, 4).
+    predict : callable
+        Fits the first frames and returns the orientation of the second, shape (n, 4).
     """
     squares = []
     for held in training.folds():
         test = training.part(held)
-        estimate = fit(training.part(~held))(test)
+        estimate = predict(training.part(~held), test)
         squares.append(rotation.angle_between(estimate, test.q_reference) ** 2)
     return float(np.sqrt(np.mean(np.concatenate(squares)) / 3.0))

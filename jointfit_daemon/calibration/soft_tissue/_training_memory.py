@@ -49,6 +49,7 @@ def unpack(chain: Chain, text: str) -> LimbTraining | None:
     table = np.frombuffer(b64decode(text), dtype="<i2")
     if table.size == 0 or table.size % width:
         return None
+
     rows = table.reshape(-1, width).astype(np.float64)
     columns = [rotation.normalize(rows[:, i : i + 4]) for i in range(0, width - 1, 4)]
     count = len(sensors)

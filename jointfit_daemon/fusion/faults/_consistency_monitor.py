@@ -110,6 +110,9 @@ class ConsistencyMonitor:
 
         drifts = any(name in drifting for group in chain.sensors for name in group)
         self._common = HeadingDriftFilter(0.0) if drifts else None
+        self._drifts = [*self._pair_drifts.values(), *(joint.drift for joint in self._joints)]
+        if self._common is not None:
+            self._drifts.append(self._common)
         self._sensor_drift: dict[str, float] = dict.fromkeys(calibration.sensor, 0.0)
         """Heading drift that is removed from each sensor, rad."""
         self._segment_drift = [0.0] * len(chain.segments)
@@ -174,13 +177,15 @@ class ConsistencyMonitor:
         for i in range(len(self._joints)):
             differences += self._compare_joint(t_ns, i, inputs, verticals)
         changed = self._disturbances.update(t_ns, differences)
-        self._report_pairs()
+        for segment, pairs in zip(self._chain.segments, self._pairs, strict=True):
+            for pair in pairs:
+                if pair.changed:
+                    pair.changed = False
+                    outlier = self._disturbances.outlier(pair.link.a, pair.link.b)
+                    disturbed = None if pair.tilted else outlier
+                    self._reports.append(slip_report(pair, segment, disturbed))
 
-        # Every filter is stepped; all are renewed in the same frame.
-        filters = [*self._pair_drifts.values(), *(joint.drift for joint in self._joints)]
-        if self._common is not None:
-            filters.append(self._common)
-        if any([drift.step(t_ns) for drift in filters]):  # noqa: C419 - no short circuit
+        if any([drift.step(t_ns) for drift in self._drifts]):  # noqa: C419 - every filter is stepped
             self._distribute_drifts()
             self._report_drifts()
             changed = True
@@ -294,16 +299,6 @@ class ConsistencyMonitor:
             if not consistent
             for pair in pairs
         )
-
-    def _report_pairs(self) -> None:
-        for segment, pairs in zip(self._chain.segments, self._pairs, strict=True):
-            for pair in pairs:
-                if pair.changed:
-                    outlier = self._disturbances.outlier(pair.link.a, pair.link.b)
-                    self._reports.append(
-                        slip_report(pair, segment, None if pair.tilted else outlier)
-                    )
-                    pair.changed = False
 
     # --- heading drift, once a second --------------------------------------------------------
 

@@ -149,7 +149,7 @@ class StuckSensorDetector:
 
         if self._window is None or t_ns - self._window[0] >= WINDOW_NS:
             if self._window is not None:
-                self._compare_window(self._window[1], orientations)
+                self._update_lagging(self._window[1], orientations)
             self._window = (t_ns, orientations)
         return [name for name, sensor in self._items if sensor.repeating or sensor.lagging]
 
@@ -185,7 +185,7 @@ class StuckSensorDetector:
             for name in (*sensor.partners, *sensor.others)
         )
 
-    def _compare_window(self, start: Orientations, end: Orientations) -> None:
+    def _update_lagging(self, start: Orientations, end: Orientations) -> None:
         """Mark sensors that hardly moved in two windows in which a partner turned far."""
         for name, sensor in self._items:
             if any(_turned(other, start, end, WINDOW_ROTATION) for other in sensor.partners):
