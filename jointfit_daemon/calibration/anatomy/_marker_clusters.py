@@ -30,7 +30,7 @@ from jointfit_daemon.limb_model import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -84,14 +84,18 @@ def columns(track: OpticalTrack, name: str, settings: CalibrationSettings) -> li
         are fewer than three.
     """
     wanted = settings.markers[name]
-    index = {marker: i for i, marker in enumerate(track.markers)}
-    if missing := [unknown_name("marker", m, track.markers) for m in wanted if m not in index]:
-        raise CalibrationError(*(f"markers.{name}: {text}" for text in missing))
-
+    found = _marker_columns(track, name, wanted)
     if len(set(wanted)) < MIN_MARKERS:
         raise CalibrationError(
             f"markers.{name}: {len(set(wanted))} markers, at least {MIN_MARKERS} are needed"
         )
+    return found
+
+
+def _marker_columns(track: OpticalTrack, name: str, wanted: Sequence[str]) -> list[int]:
+    index = {marker: i for i, marker in enumerate(track.markers)}
+    if missing := [unknown_name("marker", m, track.markers) for m in wanted if m not in index]:
+        raise CalibrationError(*(f"markers.{name}: {text}" for text in missing))
     return [index[m] for m in wanted]
 
 
@@ -175,12 +179,7 @@ def track_cluster(track: OpticalTrack, cluster: MarkerCluster) -> ClusterTrack:
         points = rotation.rotate(q[:, None], cluster.template) + p[:, None]
         return ClusterTrack(track.t_ns, q, p, points, np.zeros(len(q)), cluster.origin)
 
-    if missing := [
-        unknown_name("marker", m, track.markers) for m in cluster.markers if m not in track.markers
-    ]:
-        raise CalibrationError(*(f"markers.{cluster.name}: {text}" for text in missing))
-
-    points = track.positions[:, [track.markers.index(m) for m in cluster.markers]]
+    points = track.positions[:, _marker_columns(track, cluster.name, cluster.markers)]
     q, p, rms = steady_fit(cluster.template, points)
 
     # A larger residual means swapped or mislabeled markers: no pose.

@@ -80,10 +80,15 @@ def solve_in_turns(
         last = path[-1]
         plain = turns.means(last)
         guess = anderson.propose(last.positions[problem.free], plain[problem.free])
-        new = None if guess is None else turns.follow(turns.filled(guess), last)
-        if new is None or new.cost >= last.cost:
-            if guess is not None:
+        new = None
+        if guess is not None:
+            positions = problem.model.positions.copy()
+            positions[problem.free] = guess
+            new = turns.follow(positions, last)
+            if new.cost >= last.cost:
                 anderson.forget()
+                new = None
+        if new is None:
             new = turns.follow(plain, last)
 
         if new.cost >= last.cost:  # both halves are at their best, up to rounding
@@ -125,12 +130,6 @@ class _AlternatingSolver:
         means = last.positions.copy()
         means[problem.free] = (pulled / np.where(total > 0.0, total, 1.0))[problem.free]
         return means
-
-    def filled(self, free: Array) -> Array:
-        """Return all positions from the free coordinates."""
-        positions = self._problem.model.positions.copy()
-        positions[self._problem.free] = free
-        return positions
 
     def _at(self, positions: Array, carriers: Carriers) -> AlternatingStep:
         distances = np.linalg.norm(self._errors(positions, carriers), axis=-1)

@@ -89,9 +89,7 @@ def _sensors(c: Calibration) -> Iterator[str]:
 
 def _segment(name: str, segment: SegmentCalibration) -> Iterator[str]:
     yield from _unit(f"segment.{name}.q_static", segment.q_static)
-    for key in ("length", "length_sd"):
-        if not _number_or_none(getattr(segment, key), 0.0, _LONGEST_M):
-            yield f"segment.{name}.{key}: {getattr(segment, key)!r}"
+    yield from _bounded(f"segment.{name}", segment, ("length", "length_sd"), _LONGEST_M)
     for key, model in segment.models.items():
         sensors, bar, other = key.partition("|")
         if not bar:
@@ -174,9 +172,7 @@ def _joints(c: Calibration) -> Iterator[str]:
             yield from _finite(f"joint.{name}.center", joint.center, (3,))
         if not _is_text(joint.source):
             yield f"joint.{name}.source: {joint.source!r}"
-        for key in ("sd", "residual_rms", "gap_rms"):
-            if not _number_or_none(getattr(joint, key), 0.0, _LARGEST_SD):
-                yield f"joint.{name}.{key}: {getattr(joint, key)!r}"
+        yield from _bounded(f"joint.{name}", joint, ("sd", "residual_rms", "gap_rms"), _LARGEST_SD)
 
 
 def _clusters(c: Calibration) -> Iterator[str]:
@@ -218,6 +214,13 @@ def _names(key: str, names: Sequence[Any]) -> Iterator[str]:
 def _same(key: str, found: Mapping[str, Any], names: Sequence[str]) -> Iterator[str]:
     if set(found) != set(names):
         yield f"{key}: expected {', '.join(names)}, found {', '.join(found) or 'none'}"
+
+
+def _bounded(key: str, record: object, names: Sequence[str], largest: float) -> Iterator[str]:
+    """Yield the fields that are neither None nor a number from 0 to `largest`."""
+    for name in names:
+        if not _number_or_none(value := getattr(record, name), 0.0, largest):
+            yield f"{key}.{name}: {value!r}"
 
 
 def _finite(key: str, values: Any, shape: tuple[int, ...]) -> Iterator[str]:

@@ -14,6 +14,7 @@ of a neighbor that was not on the plate. Lags that are too uncertain are absent.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import hypot, radians
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -37,14 +38,7 @@ PLATE = LagSettings(
     min_valid=0.5,
 )
 """Limits of the lag estimate for a rigid plate: only noise and occlusion disturb it."""
-SKIN = LagSettings(
-    max_sigma_ns=5e6,
-    min_r2=0.7,
-    min_rate=radians(10),
-    min_acceleration=radians(60),
-    min_weight=0.5,
-    min_valid=0.5,
-)
+SKIN = replace(PLATE, max_sigma_ns=5e6, min_r2=0.7, min_weight=0.5)
 """Limits of the lag estimate on skin: R² is lower; 5 ms at 3 rad/s is still below 1°."""
 
 SENSOR_TISSUE_SD_NS = 2e6

@@ -85,18 +85,16 @@ class ConsistencyMonitor:
     ) -> None:
         self._chain = chain
         links = {(link.a, link.b): link for link in calibration.links}
+        couples = [[*combinations(group, 2)] for group in chain.sensors]
         self._pairs = [
-            [
-                SlipDetector(links.get((a, b)) or untrained_link(a, b))
-                for a, b in combinations(group, 2)
-            ]
-            for group in chain.sensors
+            [SlipDetector(links.get(pair) or untrained_link(*pair)) for pair in pairs]
+            for pairs in couples
         ]
         self._pair_drifts = {
-            (pair.link.a, pair.link.b): HeadingDriftFilter(pair.link.spread)
-            for pairs in self._pairs
+            pair: HeadingDriftFilter(links[pair].spread)
+            for pairs in couples
             for pair in pairs
-            if (pair.link.a, pair.link.b) in links
+            if pair in links
         }
         poses = [calibration.segment[name].q_static for name in chain.segments]
         self._joints = [
@@ -120,9 +118,7 @@ class ConsistencyMonitor:
         self._half_turns: dict[str, tuple[float, float]] = {}
         """cos and sin of half the heading correction, for corrected sensors."""
         self._disturbances = MagneticDisturbanceDetector(chain.sensors)
-        self._preceding = {
-            name: group[:k] for group in chain.sensors for k, name in enumerate(group)
-        }
+        self._preceding = {n: group[:k] for group in chain.sensors for k, n in enumerate(group)}
         """Sensors of the same segment listed before each sensor."""
         self._corrections: dict[str, Quaternion] = {}
         """Rotations in segment axes that reduce the differences of pairs."""
@@ -177,13 +173,7 @@ class ConsistencyMonitor:
         for i in range(len(self._joints)):
             differences += self._compare_joint(t_ns, i, inputs, verticals)
         changed = self._disturbances.update(t_ns, differences)
-        for segment, pairs in zip(self._chain.segments, self._pairs, strict=True):
-            for pair in pairs:
-                if pair.changed:
-                    pair.changed = False
-                    outlier = self._disturbances.outlier(pair.link.a, pair.link.b)
-                    disturbed = None if pair.tilted else outlier
-                    self._reports.append(slip_report(pair, segment, disturbed))
+        self._report_pairs()
 
         if any([drift.step(t_ns) for drift in self._drifts]):  # noqa: C419 - every filter is stepped
             self._distribute_drifts()
@@ -299,6 +289,15 @@ class ConsistencyMonitor:
             if not consistent
             for pair in pairs
         )
+
+    def _report_pairs(self) -> None:
+        for segment, pairs in zip(self._chain.segments, self._pairs, strict=True):
+            for pair in pairs:
+                if pair.changed:
+                    pair.changed = False
+                    outlier = self._disturbances.outlier(pair.link.a, pair.link.b)
+                    disturbed = None if pair.tilted else outlier
+                    self._reports.append(slip_report(pair, segment, disturbed))
 
     # --- heading drift, once a second --------------------------------------------------------
 
