@@ -25,7 +25,7 @@ SEARCH = os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
 _KEPT_DAYS = 21
 
 
-class CannotMake(Exception):  # noqa: N818 - named for what happened
+class RootBuildError(Exception):
     """The root cannot be made here, and why."""
 
 
@@ -53,7 +53,7 @@ def kept(
 
     Raises
     ------
-    CannotMake
+    RootBuildError
         Tools are missing, or Debian cannot be reached.
     """
     stem, _, ending = name.partition(".")
@@ -70,7 +70,7 @@ def kept(
 
     absent = [deb for tool, deb in tools.items() if shutil.which(tool, path=SEARCH) is None]
     if absent:
-        raise CannotMake(f"apt install {' '.join(absent)}")
+        raise RootBuildError(f"apt install {' '.join(absent)}")
     with tempfile.TemporaryDirectory(prefix=f"{stem}-", dir=cache) as scratch:
         make(Path(scratch)).replace(path)
     return path
@@ -88,10 +88,10 @@ def bootstrap(packages: Sequence[str], hooks: Sequence[str], work: Path) -> Path
 
 
 def run(words: list[str], work: Path) -> None:
-    """Run a command in `work`; raise `CannotMake` with the end of its errors if it fails."""
+    """Run a command in `work`; raise `RootBuildError` with the end of its errors if it fails."""
     done = subprocess.run(  # noqa: S603 - fixed commands
         words, cwd=work, env=os.environ | {"PATH": SEARCH}, text=True, capture_output=True,
         check=False, stdin=subprocess.DEVNULL,
     )  # fmt: skip
     if done.returncode:
-        raise CannotMake(f"{words[0]} ended with {done.returncode}:\n{done.stderr[-2000:]}")
+        raise RootBuildError(f"{words[0]} ended with {done.returncode}:\n{done.stderr[-2000:]}")

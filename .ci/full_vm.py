@@ -61,7 +61,7 @@ def main() -> int:
         work = Path(scratch)
         try:
             disk = given.image or vm_image.image()
-        except debian_root.CannotMake as error:
+        except debian_root.RootBuildError as error:
             say(str(error))
             return uml.CANNOT_START
         share = (given.out or work / "share").resolve()

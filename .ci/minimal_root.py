@@ -23,7 +23,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from debian_root import CACHE, SEARCH, CannotMake, bootstrap, kept, run
+from debian_root import CACHE, SEARCH, RootBuildError, bootstrap, kept, run
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGES = ("python3", "python3-venv", "make", "git", "ca-certificates")
@@ -116,7 +116,7 @@ def main() -> int:
             )  # fmt: skip
         finally:
             run([*root, "rm", "-rf", "--one-file-system", str(work)], CACHE)
-    except CannotMake as error:
+    except RootBuildError as error:
         print(f"minimal_root: {error}", file=sys.stderr)
         return 2
     return ended.returncode

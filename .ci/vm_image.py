@@ -9,7 +9,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from debian_root import CACHE, CannotMake, bootstrap, kept, run
+from debian_root import CACHE, RootBuildError, bootstrap, kept, run
 
 SIZE = "2G"  # sparse; the package and what tests write must fit
 PACKAGES = (
@@ -37,7 +37,7 @@ def main() -> int:
     parser.add_argument("--cache", type=Path, default=CACHE, metavar="DIR")
     try:
         print(image(parser.parse_args().cache))
-    except CannotMake as error:
+    except RootBuildError as error:
         print(f"vm_image: {error}", file=sys.stderr)
         return 2
     return 0
@@ -48,7 +48,7 @@ def image(cache: Path = CACHE) -> Path:
 
     Raises
     ------
-    CannotMake
+    RootBuildError
         Tools are missing, or Debian cannot be reached.
     """
     return kept("vm.ext4", Path(__file__).read_text(encoding="utf-8"), TOOLS, _make, cache)
