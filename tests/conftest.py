@@ -22,12 +22,12 @@ if TYPE_CHECKING:
 
     from tests.broker_fixture import Broker
 
-settings.register_profile("home", deadline=None)  # a loaded machine is no fault of the code
-settings.register_profile("ci", deadline=None, derandomize=True)
+# The suite draws the same inputs in every run, so that it passes on all machines or on none; new
+# ones are searched with HYPOTHESIS_PROFILE=search and `make fuzz`. No deadline: load may be high.
+settings.register_profile("suite", deadline=None, derandomize=True, max_examples=50)
 settings.register_profile("few", deadline=None, derandomize=True, max_examples=20)
-settings.load_profile(
-    os.environ.get("HYPOTHESIS_PROFILE") or ("ci" if os.environ.get("CI") else "home")
-)
+settings.register_profile("search", deadline=None, max_examples=500)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "suite"))
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the unit has it: read when numpy loads
 

@@ -195,7 +195,13 @@ class XbusContinuity:
         moduli = (WRAP_DAY, WRAP_32_BIT) if self.modulus is None else (self.modulus,)
         for modulus in moduli:
             true = step + modulus
-            if 0 < true <= _PLAUSIBLE_GAP and (counts is None or self._agree(true, counts)):
+            off_ns = point.arrival_ns - last.arrival_ns - true * TICK_NS
+            paced = abs(off_ns) <= _PACE_NS or true <= _DISTINCT * self._period
+            if (
+                0 < true <= _PLAUSIBLE_GAP
+                and paced
+                and (counts is None or self._agree(true, counts))
+            ):
                 self.modulus = modulus
                 return true
         return step
