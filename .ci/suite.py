@@ -53,7 +53,7 @@ def main(arguments: list[str]) -> int:
     if parallel == TESTS_FAILED and not experiments:
         disturbed = _repeat_system_tests(reports)
         parallel = 0 if disturbed else parallel
-    alone = _run(parts[1], reports, arguments)
+    alone = _run(parts[1], reports, arguments or _files_of_tests_alone())
 
     duration_s = time.monotonic() - began
     for test in disturbed:
@@ -71,6 +71,12 @@ def _run(part: str, reports: Path, arguments: list[str], report: str = "") -> in
     path = reports / f"{report or part}.xml"
     command = [sys.executable, "-m", "pytest", "--part", part, f"--junitxml={path}", *arguments]
     return subprocess.run(command, check=False).returncode  # noqa: S603 - our own command
+
+
+def _files_of_tests_alone() -> list[str]:
+    """Return the test files with the marker `alone`: to collect all others takes ten seconds."""
+    files = sorted((BUILD.parent / "tests").rglob("test_*.py"))
+    return [str(path) for path in files if "mark.alone" in path.read_text(encoding="utf-8")]
 
 
 def _repeat_system_tests(reports: Path) -> list[str]:

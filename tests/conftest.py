@@ -47,7 +47,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect the tests of the other parts."""
+    """Deselect the tests of the other parts; start the longest test first."""
+    items.sort(key=lambda item: item.get_closest_marker("first") is None)
     part = config.getoption("part")
     if part is None:
         return
