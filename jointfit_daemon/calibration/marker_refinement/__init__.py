@@ -1,7 +1,7 @@
 """Marker positions on their segments, refined on movements."""
 
 from jointfit_daemon.calibration.marker_refinement._block_descent import Carriers
-from jointfit_daemon.calibration.marker_refinement._coordinate_search import search
+from jointfit_daemon.calibration.marker_refinement._coordinate_search import SearchSettings, search
 from jointfit_daemon.calibration.marker_refinement._motion_trial import (
     MotionTrial,
     RefinementError,
@@ -24,6 +24,7 @@ __all__ = [
     "RefinementError",
     "RefinementMethod",
     "RefinementSettings",
+    "SearchSettings",
     "TrackingStatistics",
     "TrialOutcome",
     "refine_markers",

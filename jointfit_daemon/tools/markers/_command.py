@@ -58,6 +58,13 @@ Holdout = Annotated[
 Frames = Annotated[
     int, typer.Option("--frames", min=10, help="Largest number of frames per trial, evenly spaced.")
 ]
+FirstStep = Annotated[
+    float, typer.Option("--first-step", help="First step of the search, mm.", min=0.01, max=100.0)
+]
+Threshold = Annotated[
+    float,
+    typer.Option("--threshold", help="Step at which the search ends, mm.", min=0.001, max=100.0),
+]
 Up = Annotated[
     str | None, typer.Option("--up", help="Vertical axis, if the files do not define it.")
 ]
@@ -82,6 +89,8 @@ def markers(
     evenness: Evenness = 0.0,
     holdout: Holdout = 0.0,
     frames: Frames = 150,
+    first_step: FirstStep = 8.0,
+    threshold: Threshold = 2.0,
     up: Up = None,
     out: Out = None,
     json: Json = False,
@@ -95,12 +104,15 @@ def markers(
         RefinementError,
         RefinementMethod,
         RefinementSettings,
+        SearchSettings,
     )
     from jointfit_daemon.tools.markers._output import ENDINGS
     from jointfit_daemon.tools.markers._trials import ModelRequest
 
     check_choice("--method", method, get_args(RefinementMethod))
     check_choice("--up", up, "xyz")
+    if threshold > first_step:
+        raise ValueError(f"--threshold is {threshold:g} mm, expected --first-step or less")
     for path in out or ():
         check_output("--out", path, ENDINGS)
     check_plot(plot)
@@ -109,7 +121,12 @@ def markers(
     asked = ModelRequest(model, *names, up or None)
     chosen = cast("RefinementMethod", method)
     settings = RefinementSettings(
-        chosen, prior, frames=frames, evenness=evenness, holdout_share=holdout
+        chosen,
+        prior,
+        frames=frames,
+        evenness=evenness,
+        holdout_share=holdout,
+        search=SearchSettings(1e-3 * first_step, 1e-3 * threshold),
     )
     try:
         chain, remarks, found = _refined(asked, (trials, validate or []), settings)

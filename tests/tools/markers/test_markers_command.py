@@ -90,6 +90,16 @@ def test_coordinate_search_reports_its_inverse_kinematics_runs(folder: Path) -> 
     assert found["trials"][0]["after"]["rms_m"] < found["trials"][0]["before"]["rms_m"]
 
 
+def test_steps_of_the_coordinate_search_are_options(folder: Path) -> None:
+    coarse, fine = (
+        answer(folder, "--method", "search", "--frames", "10", "--threshold", threshold)
+        for threshold in ("4", "1")
+    )
+    assert fine["runs"] > coarse["runs"]
+    after = [found["trials"][0]["after"]["rms_m"] for found in (coarse, fine)]
+    assert after[1] < after[0]
+
+
 def test_text_report_contains_markers_trials_and_gauge(folder: Path) -> None:
     result = run(app, asked(folder, "--lock", "P0", "--lock", "T3.x.z"))
     assert result.exit_code == 0, result.stderr
@@ -148,6 +158,7 @@ def test_opensim_reads_the_marker_set(folder: Path) -> None:
         (["--method", "magic"], 2, ["joint, block or search"]),
         (["--out", "new.osim"], 2, [".toml, .json, .xml or .trc"]),
         (["--up", "w"], 2, ["x, y or z"]),
+        (["--threshold", "9"], 2, ["--threshold is 9 mm", "--first-step or less"]),
         (["--lock", "*"], 1, ["all coordinates are locked"]),
         (["--validate", "nowhere.trc"], 2, ["nowhere.trc"]),
     ],
