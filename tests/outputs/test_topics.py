@@ -31,8 +31,10 @@ def test_flags_of_frames_equal_the_table_of_the_documentation() -> None:
 
 def test_every_kind_of_event_is_documented() -> None:
     page = PAGE.read_text(encoding="utf-8")
-    paragraph = page.partition("`bridge/event`: ")[2].partition("\n\n")[0]
-    assert [kind for kind in NoticeKind if f"`{kind}`" not in paragraph] == []
+    table = page.partition("| `kind` | reported |\n|---|---|\n")[2].partition("\n\n")[0]
+    cells = [line.split(" | ")[0] for line in table.splitlines()]
+    documented = [kind for cell in cells for kind in re.findall(r"`(\w+)`", cell)]
+    assert sorted(documented) == sorted(NoticeKind)
 
 
 def test_topic_name_replaces_the_placeholder() -> None:
