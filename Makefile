@@ -42,7 +42,7 @@ $(VENV)/.fuzz: $(STAMP)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --group fuzz
 	@touch $@
 
-fuzz: $(VENV)/.fuzz  ## coverage-guided fuzzing of every entrance, 10^7 cases (an hour); ARGS="xbus-bytes --seconds 60"
+fuzz: $(VENV)/.fuzz  ## coverage-guided fuzzing of every input, 10^7 cases (an hour); ARGS="xbus-bytes --seconds 60"
 	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.fuzz $(ARGS)
 
 lint: $(STAMP)  ## ruff: rules and format
