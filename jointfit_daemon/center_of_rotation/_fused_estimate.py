@@ -1,8 +1,8 @@
 """Robust fusion of several estimates of one center.
 
 Each estimate is weighted by its information matrix, so that the weak direction of one marker is
-covered by the others. An estimate that contradicts the others by more than its covariance allows
-loses weight and is named in a flag.
+covered by the others. An estimate that differs from the others by more than its covariance allows
+has a reduced weight and is named in a flag.
 """
 
 from __future__ import annotations
@@ -21,32 +21,33 @@ if TYPE_CHECKING:
 
 
 TOLERATED = 2.5
-"""Mahalanobis distance per root of the dimension from which an estimate loses weight (Huber)."""
+"""Mahalanobis distance over the root of the dimension above which an estimate has less weight
+(Huber)."""
 _PASSES = 50
 
 
 def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) -> CenterEstimate:
-    r"""Fuse estimates of one center, as of several markers.
+    r"""Fuse several estimates of one center, for example one for each marker.
 
     .. math:: I_k = C_k^{-1}, \qquad C = \Big(\sum_k w_k I_k\Big)^{-1}, \qquad
               c = C \sum_k w_k I_k c_k
 
-    with w_k = min(1, κ/D_k), D_k the Mahalanobis distance to the center fused from the others. An
-    unseen direction has no information. The covariance is widened by how much the estimates
-    disagree beyond their own covariances.
+    with w_k = min(1, κ/D_k), D_k the Mahalanobis distance to the center fused from the others. The
+    information is zero along unobserved directions. The covariance is widened by how much the
+    estimates disagree beyond their own covariances.
 
     Parameters
     ----------
     estimates : sequence of CenterEstimate
-        Of one dimension, one parent, with independent errors (of the parent's own noise, which they
-        share, `RunningSphere` knows more).
+        Estimates of equal dimension in one parent frame, with independent errors. Noise of the
+        parent's markers is common to all markers; `RunningSphere` models it.
     robust : bool
         Reduce the weight of estimates that contradict the others.
 
     Returns
     -------
     CenterEstimate
-        Refused ones are left out as long as others remain.
+        Refused estimates are ignored unless all are refused.
 
     Raises
     ------
@@ -76,7 +77,7 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
 
 
 def _information(estimate: CenterEstimate) -> Array:
-    """Return the inverse covariance, zero along unseen directions."""
+    """Return the inverse covariance, zero along unobserved directions."""
     d = len(estimate.center)
     across = (
         np.linalg.svd(estimate.unseen)[2][len(estimate.unseen) :]
@@ -88,7 +89,7 @@ def _information(estimate: CenterEstimate) -> Array:
 
 
 def _seen(total: Array) -> Array:
-    """Return the directions that information shows, the columns."""
+    """Return the directions with information, as columns."""
     if total.size == 0:
         return total
     known, axes = np.linalg.eigh(total)
@@ -109,7 +110,7 @@ def _weight(i: int, w: Array, knowledge: Array, centers: Array) -> float:
     spread = np.linalg.inv(P.T @ knowledge[i] @ P) + P.T @ B @ np.linalg.inv(shown) @ B.T @ P
     gap = P.T @ (centers[i] - m)
     square = float(gap @ np.linalg.solve(spread, gap)) / len(gap)
-    distance = sqrt(max(square, 0.0))  # a nearly singular spread may round below zero
+    distance = sqrt(max(square, 0.0))  # rounding may make a nearly singular covariance negative
 
     return min(1.0, TOLERATED / max(distance, 1e-12)) ** 2
 

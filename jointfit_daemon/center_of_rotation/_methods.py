@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 _ASK_EVERY = 50
-"""Frames between two estimates of a stream, which update its outlier weights."""
+"""Number of frames between two estimates of a stream; each estimate updates the outlier weights."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +69,12 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     Returns
     -------
     CenterEstimate
-        With `refused` set, naming cause and remedy, where the movement does not show a center.
+        If the movement does not determine a center, `refused` is set to the cause and the remedy.
 
     Raises
     ------
     ValueError
-        Unknown method, or the movement lacks a required field. Bad data never raise.
+        Unknown method, or the movement lacks a required field. Unusable data are refused instead.
     """
     if not isinstance(movement, Movement):
         movement = Movement(np.asarray(movement, dtype=np.float64))
@@ -106,11 +106,11 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
 
 
 def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimate:
-    """Refuse a turn that the noise of the parent's own frame may be: the child need not move."""
+    """Refuse a rotation that is no larger than the noise of the parent's frame."""
     if parent is None or found.refused is not None or len(found.center) < 3:
         return found
     turn = sqrt(NOISE_FACTOR) * turn_noise(parent, found.noise)
-    # directions spread evenly over an arc are a quarter of it away from their mean
+    # for directions spread evenly over an arc, the mean angle to their mean is a quarter of the arc
     if found.arc / 4.0 > turn:
         return found
     why = (

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 PARENT_TURN_RAD = radians(0.8)
-"""A frame fitted to markers 10 cm from its middle, 1 mm noisy, turns by half of it, and its turns
-look like the joint's own."""
+"""Noise of 1 mm of markers 10 cm from their mean rotates the fitted frame by half of this value.
+Such rotations cannot be distinguished from joint rotations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,14 +27,14 @@ class BodyPoses:
     q: Array
     """q_world_body, scalar first, shape (n, 4); NaN where not known."""
     t: Array
-    """Position of its origin, m, shape (n, 3)."""
+    """Position of the body's origin in the world, m, shape (n, 3)."""
 
     def to_world(self, x: Array) -> Array:
-        """Take one point of the body, m, shape (3,), to the world, shape (n, 3)."""
+        """Transform one point of the body, m, shape (3,), to the world, shape (n, 3)."""
         return rotation.rotate(self.q, x) + self.t
 
     def to_body(self, points: Array) -> Array:
-        """Take points seen in the world, m, shape (n, k, 3), to the body's coordinates."""
+        """Transform points in the world, m, shape (n, k, 3), to the body's coordinates."""
         return rotation.rotate(rotation.conjugate(self.q)[:, None], points - self.t[:, None])
 
 
@@ -48,20 +48,20 @@ class Movement:
     parent: BodyPoses | None = None
     child: BodyPoses | None = None
     parent_markers: Array | None = None
-    """The parent's own markers in its coordinates, m, shape (m, 3): the effect of their noise on
-    the points is then separated from their own."""
+    """The parent's own markers in its coordinates, m, shape (m, 3). If given, the effect of their
+    noise on `points` is separated from the noise of the child's markers."""
     angles: Array | None = None
     """Angle of the child about the joint's axis relative to the parent, rad, shape (n,), from
     inertial sensors: for ``oriented``."""
     axis: Array | None = None
-    """Normal of the plane for planar methods on points in space, shape (3,); found if None."""
+    """Normal of the plane for planar methods on points in space, shape (3,); estimated if None."""
     near: Array | None = None
-    """Where to begin and to stay along unseen directions, m, shape (d,); the markers' mean if
-    None."""
+    """Initial center, and its value along unobserved directions, m, shape (d,); the markers' mean
+    if None."""
     interval: float = 0.01
-    """From frame to frame, s."""
+    """Time between frames, s."""
 
     @property
     def least_turn(self) -> float:
-        """Return the turning, rad, that may be noise of a moving parent's own frame."""
+        """Return the rotation, rad, that noise of a moving parent's frame may cause."""
         return PARENT_TURN_RAD if self.parent is not None else 0.0

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def lag_one_correlation(e: Array, seen: NDArray[np.bool_]) -> float:
-    """Return the lag-one correlation of residuals, shape (n, k), 0 to 0.99; chance is 0."""
+    """Return the lag-one correlation of residuals, (n, k), 0 to 0.99; 0 if not significant."""
     both = seen[1:] & seen[:-1]
     count = int(np.count_nonzero(seen))
     power = float((e[seen] ** 2).sum()) / max(count, 1)
@@ -25,9 +25,9 @@ def lag_one_correlation(e: Array, seen: NDArray[np.bool_]) -> float:
 
 
 def variance_inflation(rho: float) -> float:
-    r"""Return :math:`(1+\rho)/(1-\rho)`: by how much residuals that are alike widen a variance.
+    r"""Return :math:`(1+\rho)/(1-\rho)`: the factor on the variance for correlated residuals.
 
-    With a lag-one correlation ρ below 1, n frames are worth n over this.
+    With a lag-one correlation ρ below 1, n frames count as n divided by this factor.
     """
     return (1.0 + rho) / (1.0 - rho)
 
@@ -42,7 +42,7 @@ def radial_residuals(v: Array, m: Array, w: Array) -> tuple[Array, Array]:
     m : ndarray, shape (d,)
         Center, m.
     w : ndarray, shape (n, k)
-        Weights of the mean distance; zero where a point was not seen.
+        Weights of the mean distance; zero where a point is missing.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def radial_residuals(v: Array, m: Array, w: Array) -> tuple[Array, Array]:
 
 
 def arc_of_spread(spread: float) -> float:
-    r"""Return the evenly covered arc, rad, whose points have this variance over R².
+    r"""Return the evenly covered arc, rad, on which the points have variance `spread` R².
 
     .. math:: 1 - \left( \frac{\sin(\varphi/2)}{\varphi/2} \right)^2 = \text{spread}
     """
@@ -76,5 +76,5 @@ def arc_of_spread(spread: float) -> float:
 
 
 def arc_of(resultant: float) -> float:
-    """Return the arc that directions spread evenly over have this mean resultant, rad."""
+    """Return the arc, rad, on which evenly spread directions have this mean resultant."""
     return arc_of_spread(1.0 - min(max(resultant, 0.0), 1.0) ** 2)

@@ -2,7 +2,7 @@
 
 Points in space are projected along the joint axis, which is given or estimated from the paths. A
 movement about more than one axis is refused. The position of the center along the axis is reported
-as unseen.
+as unobserved.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ OFF_AXIS = (
     "or score, or give the axis"
 )
 LIMITS = CircleLimits(sd=inf)
-"""No limit on the error: a user who chose a method gets its result with its uncertainty."""
+"""No limit on the error: if the user chose the method, the result is returned with its
+uncertainty."""
 _GRID_STEP_M = 0.005
 
 
@@ -53,7 +54,7 @@ def circle(method: CircleMethod) -> MarkerFit:
 
 
 def running(p: Array, _: Movement) -> CenterEstimate:
-    """Feed one marker to a stream."""
+    """Estimate the center with `RunningCircle`, fed with one marker frame by frame."""
     stream = RunningCircle(limits=LIMITS)
     for x, y in p.tolist():
         stream.feed(x, y)
@@ -61,13 +62,13 @@ def running(p: Array, _: Movement) -> CenterEstimate:
 
 
 def oriented(p: Array, movement: Movement) -> CenterEstimate:
-    """Fit one marker and the child's angle."""
+    """Fit the path of one marker together with the child's angle."""
     angles = cast("Array", movement.angles)  # the method needs them
     return oriented_estimate(p, angles, movement.interval, limits=LIMITS)
 
 
 def grid(p: Array, _: Movement) -> CenterEstimate:
-    """Search grid nodes around the circle fit of one marker: a baseline."""
+    """Search the grid nodes around the circle fit of one marker; a baseline method."""
     about = replace(circle_estimate(p, limits=LIMITS), method="grid")
     if about.refused is not None:
         return about
@@ -79,7 +80,7 @@ def grid(p: Array, _: Movement) -> CenterEstimate:
 
 
 def three_frames(p: Array, _: Movement) -> CenterEstimate:
-    """Use the first, middle and last frame of one marker, with the noise that all frames show."""
+    """Use the first, middle and last frame of one marker, with noise estimated from all frames."""
     whole = circle_estimate(p, limits=LIMITS)
     if whole.refused is not None:
         return replace(whole, method="three_frames")
@@ -93,13 +94,13 @@ def three_frames(p: Array, _: Movement) -> CenterEstimate:
 
 
 def geometric(points: Array, movement: Movement) -> CenterEstimate:
-    """Fit the circles of all markers at once, by distance."""
+    """Fit the circles of all markers at once by radial distance."""
     start = movement.near if movement.near is not None and len(movement.near) == 2 else None
     return geometric_estimate(points, start=start, limits=LIMITS)
 
 
 def each(fit: MarkerFit) -> MarkerFit:
-    """Return a fit of every marker alone, with the centers fused."""
+    """Fit each marker alone and return the fused center."""
 
     def fit_all(points: Array, movement: Movement) -> CenterEstimate:
         found = [fit(points[:, j], movement) for j in range(points.shape[1])]

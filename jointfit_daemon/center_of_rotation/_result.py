@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class CenterEstimate:
     """Estimated point that is fixed in both the parent and the child segment.
 
-    This is the only result type of centers of rotation. An anatomical `JointCenter` of the
-    calibration contains one, and is placed with the other joints of the chain by priors.
+    This is the only result type of centers of rotation. A `JointCenter` of the calibration contains
+    one; priors combine it with the other joints of the chain.
     """
 
     method: str
@@ -31,7 +31,7 @@ class CenterEstimate:
     covariance: Array
     """m², shape (d, d); zero along the directions in `unseen`."""
     noise: float
-    """Standard deviation of a point per coordinate, estimated from the residuals, m."""
+    """Standard deviation of each coordinate of a point, estimated from the residuals, m."""
     residual: float
     """RMS residual, m (radial; for SCoRE the distance between the two sides)."""
     radii: Array
@@ -40,30 +40,30 @@ class CenterEstimate:
     """Angle covered by the markers about the center, rad."""
     bound: float
     """Cramér-Rao bound of the RMS error for `noise` that is independent from frame to frame, m; inf
-    where a direction is unseen. It depends on the movement, not on the method."""
+    if a direction is unobserved. It depends on the movement, not on the method."""
     conditioning: float
-    """T, the curvature over its standard error; below 6 a circle is not usable."""
+    """T, the curvature divided by its standard error; below 6 a circle is not usable."""
     frames: int
     effective_frames: float
-    """`frames` after forgetting weights and correlation from frame to frame."""
+    """Effective number of frames, after forgetting and correlation from frame to frame."""
     unseen: Array = field(default_factory=lambda: np.zeros((0, 3)))
     """Unit directions in which nothing was observed, shape (u, d)."""
     axis: Array | None = None
-    """Unit axis of a hinge in the parent's coordinates, shape (3,), where one was found."""
+    """Unit axis of a hinge in the parent's coordinates, shape (3,); None if there is no hinge."""
     leverage: Array | None = None
     """Covariance of the center per m² of radial soft-tissue artefact, shape (d, d); None if not
     computed. The artefact repeats with posture, so more frames do not reduce it."""
     flags: tuple[str, ...] = ()
     """Findings about the data, e.g. ``orientation_inconsistent``."""
     within95: float | None = None
-    """Squared Mahalanobis distance eᵀC⁻¹e that 95 % of the centers published by this method stay
-    within: the published ellipse. None: the quantile of chi-square is the best that is known."""
+    """Squared Mahalanobis distance eᵀC⁻¹e of the 95 % error ellipse of this method; None: use the
+    quantile of chi-square."""
     refused: str | None = None
     """Cause and remedy if the center must not be used; None if it may."""
 
     @property
     def sd(self) -> float:
-        """Return the predicted RMS error √tr(covariance), m; inf where a direction is unseen."""
+        """Return the predicted RMS error √tr(covariance), m; inf if a direction is unobserved."""
         if len(self.unseen) > 0:
             return inf
         return sqrt(max(float(np.trace(self.covariance)), 0.0))

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 STILL_M = 0.001
-"""RMS distance from their mean below which points are one place seen again and again."""
+"""RMS distance from the mean, m, below which all points count as one position."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class CircleLimits:
     reach: tuple[float, float] = (0.02, 1.0)
     """Distance of a marker from the center, m."""
     arc: float = radians(10.0)
-    """Least angle gone through, rad."""
+    """Smallest arc of the movement, rad."""
     sd: float = 0.02
     """Largest predicted RMS error, m."""
 
@@ -59,12 +59,12 @@ def circle_estimate(
     method: CircleMethod = "hyper",
     limits: CircleLimits | None = None,
 ) -> CenterEstimate:
-    """Estimate the center one marker turns about from all its frames at once.
+    """Estimate the center of rotation of one marker from all frames at once.
 
     Parameters
     ----------
     points : array_like, shape (n, 2)
-        In the parent's coordinates, in order of time, m; NaN where not seen.
+        Positions in the parent's coordinates, in order of time, m; NaN where missing.
     weights : array_like, shape (n,), optional
         Not negative.
     method : str
@@ -75,7 +75,7 @@ def circle_estimate(
     Returns
     -------
     CenterEstimate
-        The same, to rounding, as a `RunningCircle` fed with these points gives.
+        Equals, except for rounding, the estimate of a `RunningCircle` fed with these points.
     """
     p = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     seen = seen_places(p)
@@ -108,14 +108,14 @@ def publish(
     Parameters
     ----------
     m : CircleMoments
-        Of the points.
+        Moments of the points.
     lagged : callable
         Mean product of the radial residuals of neighbours in time, m², about the center (a, b) from
         the centroid and for R²; the source of the correlation.
     method : str
-        Of the circle.
+        Name of the circle fit.
     frames : int
-        Points seen.
+        Number of available points.
     limits : CircleLimits
         Acceptance limits.
     """
@@ -127,7 +127,7 @@ def publish(
         reason = "noise hides the curvature: increase the range of motion or bring cameras closer"
         return refused_circle(method, (m.x, m.y), frames, reason)
 
-    # the noise of neighbours that is alike makes their frames worth less
+    # correlated noise of neighbouring frames reduces their effective number
     judged = circle_statistics(m, *circle)
     alike = lagged(*circle) / judged.residual if judged.residual > 0.0 else 0.0
     wider = variance_inflation(min(max(alike, 0.0), 0.99) if isfinite(alike) else 0.0)
@@ -184,7 +184,7 @@ def objection(radius: float, arc: float, T: float, sd: float, limits: CircleLimi
 
 
 def refused_circle(method: str, at: ArrayLike, frames: int, reason: str) -> CenterEstimate:
-    """Return a refused estimate at a point, shape (2,), in which every direction is unseen."""
+    """Return a refused estimate at a point, shape (2,), with every direction unobserved."""
     middle = np.asarray(at, dtype=np.float64)
     return replace(
         refusal(method, 2, frames, reason),
@@ -216,5 +216,5 @@ def arc_about(points: Array, center: Array) -> float:
     turn = np.sort(np.arctan2(seen[:, 1], seen[:, 0]))
     gaps = np.diff(turn, append=turn[0] + 2.0 * pi)
     widest = float(gaps.max())
-    # a full circle leaves gaps no wider than its frames are apart
+    # on a full circle, no gap is wider than the distance between frames
     return 2.0 * pi - widest if widest > 4.0 * pi / len(seen) else 2.0 * pi

@@ -31,7 +31,7 @@ _STEPS = 20
 
 
 class Circles(NamedTuple):
-    """Circles fitted to sets of points, shape (...) each."""
+    """Circles fitted to sets of points; all fields have the leading shape (...)."""
 
     center: Array
     """m, shape (..., 2); NaN where `valid` is False."""
@@ -40,11 +40,11 @@ class Circles(NamedTuple):
     covariance: Array
     """Covariance of the center, m², shape (..., 2, 2)."""
     noise: Array
-    """Standard deviation of a point per coordinate, m."""
+    """Standard deviation of each coordinate of a point, m."""
     conditioning: Array
     """T, the radius over the center's largest standard error."""
     valid: NDArray[np.bool_]
-    """True where a circle exists and the noise does not hide its arc."""
+    """True where a circle exists and its arc exceeds the noise."""
 
 
 def polynomial(m: CircleMoments[Number], method: str) -> tuple[Number, Number, Number, float]:
@@ -69,7 +69,7 @@ def polynomial(m: CircleMoments[Number], method: str) -> tuple[Number, Number, N
 
 
 def smallest_root(m: CircleMoments[float], method: str = "hyper") -> float:
-    """Return η by Newton from zero, 5 or 6 steps: where the polynomial no longer falls."""
+    """Return η by 5 or 6 Newton steps from zero, until the polynomial no longer decreases."""
     if method == "kasa":
         return 0.0
     A0, A1, A2, A4 = polynomial(m, method)
@@ -122,7 +122,7 @@ def circle_from_root(
         R^2 &= a^2 + b^2 + M_z + \{0, 2\eta, 0, -2\eta\}
     """
     z = m.xx + m.yy
-    # η² - ηMz + C as a product and a rest: on short arcs the plain sum has no digits
+    # η² - ηMz + C as a product and a remainder: on short arcs the plain sum cancels
     twice = 2.0 * ((m.xx - eta) * (m.yy - eta) - m.xy * m.xy)
     a = (m.xz * (m.yy - eta) - m.yz * m.xy) / twice
     b = (m.yz * (m.xx - eta) - m.xz * m.xy) / twice
@@ -132,7 +132,7 @@ def circle_from_root(
 
 
 def circle_of(m: CircleMoments[float], method: str = "hyper") -> tuple[float, float, float] | None:
-    """Return `circle_from_root` of one circle; None where the moments have none."""
+    """Return `circle_from_root` of one circle; None if the moments determine no circle."""
     eta = smallest_root(m, method)
     if (m.xx - eta) * (m.yy - eta) == m.xy * m.xy:
         return None
@@ -147,12 +147,12 @@ def temper(
 
     .. math:: S = (I + C/R^2)^{-1}, \qquad d' = S d, \qquad C' = S C S
 
-    for the center d from the centroid with covariance C. On a short arc the data show the
-    curvature κ with an error s that is nearly normal, and the center is its inverse: 1/κ has a mean
-    square error that is ruled by the few cases near κ = 0, and is too far on average. There this is
-    κ/(κ² + s²), Zellner's minimum expected loss estimator of an inverse (1978): the bias to second
-    order and the tail are gone, and the error is the bound's times 1 + 1/T² instead of 1 + 4.5/T².
-    On long arcs S is the identity.
+    for the vector d from the centroid to the center, with covariance C. On a short arc the
+    estimated curvature κ has a nearly normal error s, and the distance of the center is 1/κ. The
+    mean square error of 1/κ is dominated by the few cases near κ = 0, and 1/κ is too large on
+    average. It is therefore replaced by κ/(κ² + s²), Zellner's minimum expected loss estimator of
+    an inverse (1978). This removes the bias to second order and the tail; the error is 1 + 1/T²
+    times the bound, not 1 + 4.5/T². On long arcs S is the identity.
     """
     xx, xy, yy = cov
     p, q, r = 1.0 + xx / square, xy / square, 1.0 + yy / square
@@ -183,14 +183,14 @@ def fit_circles(
     tempered : bool
         Shrink centers with `temper`; False gives the textbook center.
     correlated : bool
-        Points follow one another in time: widen the covariance by what their residuals' correlation
-        from one to the next asks for.
+        The points are in order of time: increase the covariance for the correlation between
+        successive residuals.
 
     Returns
     -------
     Circles
         `valid` is False, and center and radius NaN, for fewer than four points, points on a line,
-        points at one place, and arcs that noise hides.
+        points at one position, and arcs within the noise.
     """
     m = moments_of(points)
     with np.errstate(all="ignore"):  # sets without a circle are masked below
@@ -224,19 +224,19 @@ def fit_circles(
 
 
 def fit_circle(points: ArrayLike, *, method: CircleMethod = "hyper") -> tuple[float, float, float]:
-    """Return center and radius, m, of one plain circle, unjudged, as fast as can be.
+    """Return center and radius, m, of one circle, without shrinkage and without acceptance limits.
 
     Parameters
     ----------
     points : array_like, shape (n, 2)
-        m; all of them seen.
+        m; no NaN.
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
 
     Raises
     ------
     ValueError
-        Fewer than three points, points on a line or at one place, or points that show no arc.
+        Fewer than three points, points on a line or at one position, or points without curvature.
     """
     p = np.asarray(points, dtype=np.float64)
     m = moments_of_one(p) if len(p) > 2 else None
@@ -261,6 +261,6 @@ def _lagged(points: ArrayLike, m: CircleMoments[Array], a: Array, b: Array, squa
 
 
 def persistence(correlation: Array) -> Array:
-    r"""Return :math:`(1+\rho)/(1-\rho)`, ρ held to 0 … 0.99: how much correlation widens."""
+    r"""Return :math:`(1+\rho)/(1-\rho)`, the factor on the variance, with ρ limited to 0 … 0.99."""
     rho = np.clip(np.nan_to_num(correlation), 0.0, 0.99)
     return np.asarray((1.0 + rho) / (1.0 - rho))

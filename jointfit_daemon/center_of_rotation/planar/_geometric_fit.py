@@ -44,23 +44,24 @@ def geometric_estimate(
     start: ArrayLike | None = None,
     limits: CircleLimits | None = None,
 ) -> CenterEstimate:
-    r"""Estimate the center that one marker or several turn about, by Levenberg-Marquardt.
+    r"""Estimate the center of rotation of one or several markers by Levenberg-Marquardt.
 
     .. math:: \min_c \sum_{tk} \rho\left( |x_{tk} - c| - R_k \right)
 
-    with R_k the mean distance of marker k. Several markers share the center; they gain
-    much more than √k where they sit at different angles round the joint, because each one's weak
-    direction points elsewhere. Residuals of neighboring frames that are alike (correlation r at one
-    frame) widen the covariance by (1 + r)/(1 - r), as of the other circles.
+    with R_k the mean distance of marker k. Several markers have one common center. Markers at
+    different angles about the joint reduce the error by much more than √k, because their weak
+    directions differ. Correlated residuals of neighboring frames (lag-one correlation r) increase
+    the covariance by (1 + r)/(1 - r), as in the other circle fits.
 
     Parameters
     ----------
     points : array_like, shape (n, 2) or (n, k, 2)
-        In the parent's coordinates, m; NaN where not seen.
+        Positions in the parent's coordinates, m; NaN where missing.
     robust : bool
-        Huber's loss at 1.5 standard deviations, taken from the median residual.
+        Use Huber's loss with a bound of 1.5 standard deviations, estimated from the median
+        residual.
     start : array_like, shape (2,), optional
-        Where to begin, m; Hyper of the marker that shows most if None.
+        Initial center, m; the Hyper fit of the best conditioned marker if None.
     limits : CircleLimits, optional
         Acceptance limits.
     """
@@ -126,7 +127,7 @@ def _accept_estimate(
     count = int(seen.sum())
     free = 2 + x.shape[1]
 
-    # Huber's variance: mean of squared pull over squared share of points that pull freely
+    # Huber's variance: mean squared influence over the squared share of points within the bound
     pull = float((w**2 * e**2)[seen].sum()) / max(count - free, 1)
     variance = pull / max(float((w[seen] >= 1.0).mean()), 0.1) ** 2
     information = np.einsum("tk,tka,tkb->ab", seen.astype(np.float64), J, J)

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
 
 
 _AT_ONCE = 400_000
-"""Distances held at a time: they stay in the cache."""
+"""Number of distances computed at a time, so that they fit in the processor cache."""
 
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A square of nodes about a middle, which is a node itself."""
+    """A square grid of nodes; its middle is a node."""
 
     middle: tuple[float, float] = (0.0, 0.0)
     """m."""
@@ -33,7 +33,7 @@ class Grid:
     """m."""
 
     def nodes(self) -> Array:
-        """Return the nodes row by row, x running fastest, m, shape (g, 2)."""
+        """Return the nodes row by row, x varying fastest, m, shape (g, 2)."""
         k = int(np.floor(self.half_width / self.step + 1e-9))
         ticks = self.step * np.arange(-k, k + 1)
         y, x = np.meshgrid(self.middle[1] + ticks, self.middle[0] + ticks, indexing="ij")
@@ -52,7 +52,7 @@ def grid_center(points: ArrayLike, grid: Grid) -> Array:
     points : array_like, shape (..., N, 2)
         One marker over N frames, m; no NaN.
     grid : Grid
-        Where to look.
+        Nodes of the search.
 
     Returns
     -------

@@ -19,12 +19,12 @@ if TYPE_CHECKING:
 Number = TypeVar("Number", float, Array)
 
 GATE = 6.0
-"""T from which on a center is published: its error is within 15 % of the bound there."""
+"""Smallest T of a published center; there the error is within 15 % of the bound."""
 LOG_20 = log(20.0)
 FARTHEST_M = 1e4
 """Coordinates beyond this, m, are treated as missing, like NaN."""
 ROUNDING = 1e-13
-"""Share of the points' own variance below which a difference of moments is rounding."""
+"""Share of the points' variance below which a difference of moments is attributed to rounding."""
 
 
 class CircleMoments(NamedTuple, Generic[Number]):
@@ -33,7 +33,7 @@ class CircleMoments(NamedTuple, Generic[Number]):
     weight: Number
     """Sum of the weights."""
     effective: Number
-    """(Σw)²/Σw²: how many points of equal weight know as much."""
+    """(Σw)²/Σw²: the equivalent number of points of equal weight."""
     x: Number
     """Centroid, m."""
     y: Number
@@ -47,10 +47,10 @@ class CircleMoments(NamedTuple, Generic[Number]):
 
 
 class CircleStatistics(NamedTuple, Generic[Number]):
-    """Statistics of a circle about the centroid plus (a, b)."""
+    """Statistics of a circle whose center is at (a, b) from the centroid."""
 
     noise: Number
-    """Variance of a point per coordinate, m²."""
+    """Variance of each coordinate of a point, m²."""
     residual: Number
     """Mean square of the radial residuals, m²."""
     bound: Number
@@ -64,7 +64,7 @@ class CircleStatistics(NamedTuple, Generic[Number]):
 
 
 def seen_places(points: Array) -> NDArray[np.bool_]:
-    """Return which points, shape (..., 2), are measurements, shape (...)."""
+    """Return a mask, shape (...), of the points, shape (..., 2), that are valid measurements."""
     return np.asarray((np.abs(points) < FARTHEST_M).all(axis=-1))
 
 
@@ -81,7 +81,7 @@ def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMom
     Returns
     -------
     CircleMoments
-        Arrays of shape (...); zeros where nothing was seen.
+        Arrays of shape (...); zeros where all points are missing.
     """
     p = np.asarray(points, dtype=np.float64)
     seen = seen_places(p)
@@ -99,14 +99,14 @@ def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMom
     pairs = ((x, x), (x, y), (y, y), (x, z), (y, z))
     means = [np.einsum("...n,...n,...n->...", share, u, v) for u, v in pairs]
 
-    # about its mean z has only its variance left: Mzz = var z + (Mxx + Myy)², exact to rounding
+    # Mzz = var z + (Mxx + Myy)²: z about its mean avoids cancellation
     zz = np.einsum("...n,...n,...n->...", share, z, z) + (means[0] + means[2]) ** 2
     xx, xy, yy, xz, yz = means
     return CircleMoments(total, effective, middle[..., 0], middle[..., 1], xx, xy, yy, xz, yz, zz)
 
 
 def moments_of_one(points: Array, weights: Array | None = None) -> CircleMoments[float]:
-    """Return `moments_of` one set of points, shape (n, 2), all of them seen; several times faster.
+    """Return `moments_of` one set of points, shape (n, 2), without NaN; several times faster.
 
     Weights, shape (n,), are not negative and not all zero.
     """
@@ -141,12 +141,12 @@ def sum_of_squares(m: CircleMoments[Number], a: Number, b: Number, square: Numbe
 def noise_of(
     m: CircleMoments[Number], a: Number, b: Number, square: Number
 ) -> tuple[Number, Number]:
-    """Return the noise of a coordinate and the mean square of the radial residuals, m².
+    """Return the noise variance of a coordinate and the mean square of the radial residuals, m².
 
     Parameters are those of `circle_statistics`.
     """
     u = sum_of_squares(m, a, b, square)
-    u = (u + abs(u)) * 0.5  # rounding may take a perfect fit below zero
+    u = (u + abs(u)) * 0.5  # with a perfect fit, rounding may make this negative
     residual = u / (4.0 * square)
     return residual * m.effective / (m.effective - 3.0), residual
 
@@ -154,7 +154,7 @@ def noise_of(
 def arc_shows(m: CircleMoments[Number], noise: Number) -> Any:
     """Return whether the covariance of the points is positive definite without their noise.
 
-    Where it is not, noise hides the arc, and variances of `circle_statistics` may be negative.
+    Otherwise the arc is within the noise, and variances of `circle_statistics` may be negative.
     """
     sxx, syy = m.xx - noise, m.yy - noise
     trace = sxx + syy
@@ -173,16 +173,17 @@ def circle_statistics(
         \mathrm{Cov} &= \frac{\hat\sigma^2 R^2}{n} S^{-1} \left( 1 + \left(5 -
             \tfrac52 \sqrt{\lambda_2/\lambda_1}\right) \hat\sigma^2/\lambda_1 \right)
 
-    with n the effective number. The noise is taken off the moments because it thickens the arc,
-    which would pass for curvature: without it the claim on 20° is half the truth. The bracket is
-    noise along the arc, which blurs the reference of the curvature: 5 is exact for a parabola
-    (noise on t adds 5σ²/var t to the variance of t² over evenly spread t), half of it is found by
-    simulation for the whole circle. It matters from σ = R/30 on.
+    with n the effective number of points. The noise variance is subtracted from the moments because
+    noise widens the arc and would count as curvature. Without the subtraction, the predicted error
+    on an arc of 20° is half the true error. The bracket accounts for noise along the arc, which
+    disturbs the reference of the curvature. The factor 5 is exact for a parabola: noise on t adds
+    5σ²/var t to the variance of t² over evenly spread t. Half of it, for the whole circle, was
+    found by simulation. The bracket matters for σ above R/30.
 
     Parameters
     ----------
     m : CircleMoments
-        Of at least four effective points, of which `arc_shows` is true.
+        Moments of at least four effective points for which `arc_shows` is true.
     a, b : float or ndarray
         Center from the centroid, m.
     square : float or ndarray
@@ -208,16 +209,16 @@ def ellipse_scale(effective: float, conditioning: float) -> float:
 
     .. math:: e^T C^{-1} e \le g^2(T)\, \nu \left( 0.05^{-2/\nu} - 1 \right), \qquad \nu = n - 3
 
-    The second factor is twice the quantile of F with 2 and ν degrees of freedom: the noise is
-    estimated, too. The first is for having been published. A center is published when its T, which
-    is nearly T₀ + N(0, 1), passes `GATE`; close to the gate most of those that pass are lucky, and
-    lucky means a curvature found too large, a center too near. The factor
+    The second factor is twice the quantile of F with 2 and ν degrees of freedom, because the noise
+    is estimated, too. The first factor corrects the selection of published centers. A center is
+    published if its T, which is nearly T₀ + N(0, 1), exceeds `GATE`. Close to the gate, most
+    published centers have a curvature that is too large, and are therefore too near. The factor
 
     .. math:: g(T) = 1 + 12.6\, e^{-(T-6)/0.455} + 0.172\, (6/T)^{2.25}
 
-    was solved such that, of the runs that pass, 94.9 to 95.1 % are covered whatever the true T₀,
-    down to movements of which 3 % pass (see the test that integrates it). The last term is what the
-    curvature of the error's distribution asks for far from the gate.
+    was fitted so that 94.9 to 95.1 % of the published centers are covered for any true T₀, down to
+    movements of which 3 % are published (a test integrates it). The last term accounts for the
+    curvature of the error distribution far from the gate.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 METHOD = "oriented"
 MAX_FRAMES = 300
 INCONSISTENT = 13.8
-"""Squared distance of the two answers, in their own covariance, that one in a thousand passes."""
+"""Squared Mahalanobis distance of the two estimates that chance exceeds once in a thousand."""
 _LEAST_NOISE_M = 1e-4
 _PASSES = 40
 _FAR_M = 1.0
@@ -40,7 +40,7 @@ _FAR_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class AngleNoise:
-    """Error model of the child's angle; rad unless stated otherwise."""
+    """Error model of the child's angle; values are in rad unless stated otherwise."""
 
     slow: float = radians(1.5)
     """Standard deviation of the slow part: soft-tissue artefact and heading drift."""
@@ -49,10 +49,10 @@ class AngleNoise:
     white: float = radians(1.0)
     """Standard deviation of the white part."""
     gain: float = 0.02
-    """Standard deviation of the scale, rad/rad."""
+    """Standard deviation of the scale error, rad/rad."""
 
     def covariance(self, times: Array, angles: Array) -> Array:
-        """Return Σ of these angles, without their own noise, at these times, rad², shape (n, n)."""
+        """Return the covariance Σ of slow and scale errors at these times, rad², shape (n, n)."""
         slow = self.slow**2 * np.exp(-np.abs(times[:, None] - times) / self.time)
         turned = angles - angles.mean()
         return np.asarray(
@@ -68,7 +68,7 @@ def oriented_estimate(
     noise: AngleNoise | None = None,
     limits: CircleLimits | None = None,
 ) -> CenterEstimate:
-    r"""Estimate the center of one marker whose segment's angle is measured, too.
+    r"""Estimate the center from the path of one marker and the measured angle of its segment.
 
     .. math::
         x_t &= c + \rho\, u(\theta_t + \beta + \delta_t) + \varepsilon_t \\
@@ -80,22 +80,23 @@ def oriented_estimate(
     contribution of marker noise to aᵀMa, which decreases with distance and would bias c outward.
 
     The guard is a limited translation (Efron and Morris 1971). With Δ = aided - circle, E its
-    covariance if the angles are as good as stated, and s² = ΔᵀE⁻¹Δ, the answer is
+    covariance if the angles are as good as stated, and s² = ΔᵀE⁻¹Δ, the result is
 
     .. math:: c = c_{circle} + \Delta \min(1, \lambda/s), \qquad
               \lambda = 0.7 \left( 1 + (6/T)^2/2 \right)
 
-    so that an angle error of any size adds no more than λ²E to the mean square error. λ grows where
-    the circle's own error has a heavier tail than its covariance.
+    so that an angle error of any size adds no more than λ²E to the mean square error. λ increases
+    where the error of the circle fit has a heavier tail than its covariance.
 
     Parameters
     ----------
     points : array_like, shape (n, 2)
-        Marker in the parent's coordinates, m; NaN where not seen. Over 300 frames are averaged.
+        Marker in the parent's coordinates, m; NaN where missing. More than 300 frames are averaged.
     angles : array_like, shape (n,)
-        Of the child about the joint's axis relative to the parent, rad, from any zero; NaN unknown.
+        Angle of the child about the joint's axis relative to the parent, rad, from any zero; NaN if
+        unknown.
     interval : float
-        From frame to frame, s.
+        Time between frames, s.
     noise : AngleNoise, optional
         Error model of the angles.
     limits : CircleLimits, optional
@@ -104,7 +105,7 @@ def oriented_estimate(
     Returns
     -------
     CenterEstimate
-        Flagged ``orientation_inconsistent`` where path and angles contradict each other.
+        Has the flag ``orientation_inconsistent`` if path and angles are inconsistent.
     """
     x, theta, times = _thin(points, angles, interval)
     allowed = limits or CircleLimits()
@@ -124,8 +125,8 @@ def oriented_estimate(
         return replace(alone, method=METHOD)
     sigma = max(_path_noise(x), _LEAST_NOISE_M)
 
-    # The scale's covariance is that of the angles as the path explains them, to second order. It
-    # must not hold their noise, which is correlated with the residuals and would pull the center.
+    # The covariance of the scale uses the angles predicted from the path, to second order. It must
+    # not contain the angle noise, which is correlated with the residuals and would bias the center.
     d = (x - x.mean(axis=0)) / max(float(x.std()), 1e-9)
     one, u, v = np.ones(len(x)), d[:, 0], d[:, 1]
     terms = np.column_stack((one, u, v, u * u, u * v, v * v))
@@ -170,12 +171,12 @@ def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, flo
     Returns
     -------
     center, covariance, s2 : ndarray, ndarray, float
-        The covariance includes the remaining part of a contradiction.
+        The covariance includes the part of the difference that the limit removed.
     """
     if not bool(circle.valid):
         return center, C, 0.0
     spread, axes = np.linalg.eigh(circle.covariance)
-    # E may come out thin or negative: then a quarter of the circle's own variance
+    # E may be nearly singular or negative; its lower bound is a quarter of the circle's variance
     apart = np.einsum("ai,ab,bi->i", axes, circle.covariance - C, axes)
     apart = np.maximum(apart, 0.25 * np.maximum(spread, 1e-18))
     delta = center - circle.center
@@ -210,7 +211,7 @@ def _path_noise(x: Array) -> float:
     circle = fit_circles(x)
     if bool(circle.valid):
         return float(circle.noise)
-    # no arc to speak of: across the straight line that the path then is, or a flat parabola
+    # nearly no arc: use the direction across the straight path, or a flat parabola
     d = x - x.mean(axis=0)
     along, across = (d @ np.linalg.svd(d, full_matrices=False)[2].T).T
     terms = np.column_stack((np.ones(len(x)), along, along**2))
@@ -272,7 +273,7 @@ def _normal(
     H = Je.T @ Je / sigma**2 + Ja.T @ MJ
     g = Je.T @ e / sigma**2 + MJ.T @ a
 
-    # capped from below: the compensation has no bound as a point comes to the center
+    # bounded from below: the compensation diverges for a point close to the center
     counted = np.where(q > rho0 / 2, np.diag(M) / q**4, 0.0)
     g[:2] -= sigma**2 * counted @ d
     return H, g
@@ -281,7 +282,7 @@ def _normal(
 def _accept_estimate(
     x: Array, held: tuple[Array, Array, float], alone: CenterEstimate, limits: CircleLimits
 ) -> CenterEstimate:
-    """Return the estimate of the path `alone` with the guarded center and its acceptance."""
+    """Return the estimate `alone` of the path with the guarded center and its acceptance."""
     center, C, s2 = held
     radius = float(np.linalg.norm(x - center, axis=1).mean())
     largest = float(np.linalg.eigvalsh(C)[-1])

@@ -28,7 +28,7 @@ def plane_of(axis: ArrayLike) -> Array:
     if not length > 0.0:
         raise ValueError("an axis needs a length: (0, 0, 0) has no plane across it")
     n = n / length
-    # y is farthest from the axis a hinge of ours has; z stands in where the axis is y
+    # y is farthest from typical flexion axes; z is used if the axis is y
     guide = np.eye(3)[1 if abs(n[1]) < 0.9 else 2]
     first = guide - n * (n @ guide)
     first /= np.linalg.norm(first)

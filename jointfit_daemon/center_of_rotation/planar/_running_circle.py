@@ -1,7 +1,7 @@
 """Circle fit of a stream of points at constant cost per frame.
 
-Invariant: the result equals the batch fit of all frames with the same weights. Ten sums hold the
-circle, its covariance and the lag-one correlation of the residuals. The sums are plain floats
+Invariant: the result equals the batch fit of all frames with the same weights. Ten sums determine
+the circle, its covariance and the lag-one correlation of the residuals. The sums are plain floats
 because arrays of nine numbers cost more than the arithmetic.
 """
 
@@ -44,13 +44,13 @@ class RunningCircle:
     forgetting : float
         Remaining share of a frame's weight one frame later, in (0, 1]; exp(-Δt/τ) forgets over τ.
     window : int, optional
-        Only the last so many seen frames count. Not together with forgetting.
+        Number of most recent valid frames that count. Not together with forgetting.
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
     robust : bool
-        Weigh a frame that leaves the circle found so far by Huber's 1.5 standard deviations.
+        Apply Huber weights with a bound of 1.5 standard deviations about the current circle.
     limits : CircleLimits, optional
-        When `estimate` refuses.
+        Acceptance limits of `estimate`.
 
     Raises
     ------
@@ -90,9 +90,9 @@ class RunningCircle:
         self.frames = 0
 
     def feed(self, x: float, y: float, weight: float = 1.0) -> None:
-        """Take one frame in the parent's coordinates, m; NaN is "not seen", and a gap in time.
+        """Process one frame in the parent's coordinates, m.
 
-        So is a weight that is not above zero.
+        NaN means missing and is a gap in time, as is a weight that is not above zero.
         """
         if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and 0.0 < weight < inf):
             self._pass()
@@ -143,10 +143,10 @@ class RunningCircle:
             self._squares *= mu * mu
         self._before = (0.0, 0.0, 0.0)
         if self._window is not None and self._kept and self._kept[-1][2] > 0.0:
-            self._kept.append((0.0, 0.0, 0.0))  # weighs nothing, and parts its neighbours
+            self._kept.append((0.0, 0.0, 0.0))  # has no weight, and separates its neighbours
 
     def _slide(self, frame: Kept) -> None:
-        """Remove the oldest frame; sums are recomputed every `_RESUM_FRAMES` against rounding."""
+        """Remove the oldest frame; recompute sums every `_RESUM_FRAMES` to limit rounding."""
         kept = self._kept
         kept.append(frame)
         if self.frames <= (self._window or 0):
@@ -170,7 +170,7 @@ class RunningCircle:
             self._add(x, y, w)
 
     def _recenter(self, x: float, y: float) -> tuple[float, float]:
-        """Move the origin to the mean where that is far: fourth powers lose digits there."""
+        """Move the origin to the mean if that is far, because fourth powers lose digits there."""
         weight = self._sums[9]
         if weight <= 0.0 or self._origin is None:
             return x, y
@@ -214,7 +214,7 @@ class RunningCircle:
         )
 
     def circle(self) -> tuple[float, float, float] | None:
-        """Return center and radius of the plain circle, m, unjudged; None if there is none."""
+        """Return center and radius, m, without shrinkage or limits; None if there is no circle."""
         m = self.moments()
         z = m.xx + m.yy
         if m.effective <= 3.0 or m.xx * m.yy - m.xy * m.xy <= ROUNDING * z * z:
@@ -228,7 +228,8 @@ class RunningCircle:
     def estimate(self) -> CenterEstimate:
         """Return center, covariance, predicted error and acceptance from all frames.
 
-        Never raises; refused, with cause and remedy, where there is no center to be had.
+        This method never raises. Without a usable center, the estimate is refused with cause and
+        remedy.
         """
         return publish(
             self.moments(),
@@ -280,7 +281,7 @@ def _scaled(sums: Sums, factor: float) -> Sums:
 
 
 def _paired(sums: Sums, mu: float, now: Kept, before: Kept) -> Sums:
-    """Return the sums of products of each frame with the one before it, both ways averaged."""
+    """Return the sums of products of each frame with the one before it, symmetrized."""
     x, y, w = now
     u, v, weight = before
     a, b, c, d, e, f, g, h, i, j = sums

@@ -57,9 +57,9 @@ def three_frame_center(points: ArrayLike) -> Array:
 
 
 def _sides(p: Array) -> tuple[Array, Array, Array]:
-    """Return the sides from the first point over the largest of them, and that, m.
+    """Return the sides from the first point, divided by the largest side, and that side, m.
 
-    Squares of sides as they are would vanish or overflow for coordinates that are mistakes.
+    Without the division, squares of implausible coordinates would underflow or overflow.
     """
     u, v = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
     size = np.maximum(np.abs(u).max(axis=-1), np.abs(v).max(axis=-1))
@@ -68,7 +68,7 @@ def _sides(p: Array) -> tuple[Array, Array, Array]:
 
 
 def _offset(u: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the center from the first point, in the sides' unit, and where there is none."""
+    """Return the center from the first point, in the sides' unit, and a mask of missing centers."""
     D = u[..., 0] * v[..., 1] - v[..., 0] * u[..., 1]
     s2, s3 = (u**2).sum(axis=-1), (v**2).sum(axis=-1)
     longest = np.maximum(np.maximum(s2, s3), ((u - v) ** 2).sum(axis=-1))
@@ -80,20 +80,20 @@ def _offset(u: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
-    """Estimate a center from three points, with the error that noise of this size gives it.
+    """Estimate a center from three points, with the error predicted from the given noise.
 
     Parameters
     ----------
     points : array_like, shape (3, 2)
         One marker in three frames, m.
     noise : float
-        Standard deviation of each coordinate, m: three points cannot show it themselves.
+        Standard deviation of each coordinate, m; three points do not determine it.
 
     Returns
     -------
     CenterEstimate
-        The covariance is first-order noise through the closed form; refused where the points are
-        on a line, not seen, or closer to a line than the noise.
+        The covariance is first-order noise through the closed form; refused if points are missing,
+        on a line, or closer to a line than the noise.
     """
     p = np.asarray(points, dtype=np.float64)
     if not seen_places(p).all():
@@ -114,7 +114,7 @@ def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
     error = sqrt(float(np.trace(covariance)))
     radius = float(size * np.hypot(*offset))
 
-    # beyond it the smallest turn of the center is lost in noise and the error has no mean square
+    # beyond it noise dominates and the mean square error is not finite
     lost = f"noise of {1000 * noise:.1f} mm hides the arc: choose frames further apart"
     turned = np.unwrap(np.arctan2(spokes[:, 1], spokes[:, 0]))
     return CenterEstimate(
@@ -139,8 +139,8 @@ def equal_step_error(step: ArrayLike, noise: ArrayLike) -> Array:
     .. math:: E^2 = \sigma^2 \frac{2 + \cos\alpha}{(1 - \cos\alpha)^2 (1 + \cos\alpha)}
 
     Source: Akbarifar et al. 2021, equation 15, first order in the noise: the Cramér-Rao bound of
-    three points. Holds while noise/radius is below (1 - cos α)/6;
-    beyond it the error has no finite mean square. Least at 120°: 1.155 σ.
+    three points. The prediction holds while noise/radius is below (1 - cos α)/6;
+    beyond it the error has no finite mean square. Its minimum is 1.155 σ at 120°.
 
     Parameters
     ----------

@@ -1,13 +1,13 @@
 r"""One center for the spheres (in a plane: circles) of several markers, from their sums.
 
-The algebraic residual of marker j about its mean, F = |x|² - 2 a·x - mean|x|², is 2 R_j times
-the radial one, so that
+The algebraic residual of marker j about its mean, F = |x|² - 2 a·x - mean|x|², is 2 R_j times the
+radial residual. Therefore
 
 .. math:: \min_a \sum_j \frac{n_j}{R_j^2 s_j} \left( \mathrm{var} F_j - \eta\, E_j(a) \right)
           = 0 \text{ at the smallest } \eta
 
-weighs all markers as a geometric fit does, and E_j, the contribution of unit noise to var F_j,
-removes the bias of short arcs: for one marker in a plane the center is that of the hyper fit
+weights all markers as a geometric fit does. E_j, the contribution of unit noise to var F_j, removes
+the bias of short arcs. For one marker in a plane the center equals that of the hyper fit
 (Al-Sharadqah and Chernov 2009; Kanatani and Rangarajan 2011; for spheres, Halvorsen 2003 solved
 instead of iterated).
 """
@@ -81,20 +81,20 @@ class ConcentricSpheres:
     center: Array
     """m, shape (r,)."""
     noise2: float
-    """Variance of a coordinate of a marker whose relative noise is one, m², unbiased."""
+    """Unbiased variance of a coordinate of a marker whose relative noise is one, m²."""
     relative: Array
-    """Variance of each marker's noise over it, shape (k,)."""
+    """Noise variance of each marker divided by the common variance, shape (k,)."""
     radii2: Array
     """m², shape (k,)."""
     information: Array
-    """Mean-square change of direction summed over frames and markers, noise taken out, each
-    weighted by the common noise over its own: shape (r, r)."""
+    """Squared change of direction, summed over frames and markers, without noise; each marker is
+    weighted by the common noise variance over its own. Shape (r, r)."""
     floor: Array
-    """Contribution of the noise alone, shape (r, r)."""
+    """Contribution of noise alone to the same sum, shape (r, r)."""
 
 
 def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
-    """Fit one center, each marker weighted by its own noise; None if the paths do not bend."""
+    """Fit one center, each marker weighted by its noise; None if the paths have no curvature."""
     k = len(paths.n)
     relative = np.ones(k)
     found = _smallest_root(paths, relative)
@@ -116,7 +116,7 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
     noise2 = max(eta, _NOTHING_M2) * total / max(total - k - len(m), 1.0)
     w = paths.n / (R2 * relative)
 
-    # of n frames, the path about its own mean holds 1 - 1/n of the noise
+    # the path about its own mean contains 1 - 1/n of the noise of n frames
     left = (1.0 - 1.0 / np.maximum(paths.n, 1.0)) * noise2 * relative
     floor = np.einsum("j,jab->ab", w * left, paths.S)
     information = np.einsum("j,jab->ab", w, paths.C) - floor
@@ -124,7 +124,7 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
 
 
 def _shrunk(ratio: Array, n: Array) -> Array:
-    """Return how noisy markers are relative to each other, as far as chance does not explain it."""
+    """Return the relative noise variance of each marker; differences within chance are removed."""
     ratio = ratio / np.median(ratio) if np.median(ratio) > 0 else np.ones_like(ratio)
     ratio = np.clip(ratio, 0.0, 1e6)
     chance = 4.0 * 2.0 / np.maximum(n, 1.0)
@@ -136,8 +136,9 @@ def _shrunk(ratio: Array, n: Array) -> Array:
 def _smallest_root(paths: MarkerPaths, relative: Array) -> tuple[Array, float, Array, Array] | None:
     """Return center, eta, each marker's radial variance and its squared radius.
 
-    Newton on G(η) det B(η), which has no other root below and reaches it from zero without passing
-    it; G alone is concave and would be overshot on short arcs, where B is nearly singular.
+    Newton's method on G(η) det B(η), which has no smaller root, converges from zero without
+    overshoot. On G alone, which is concave, it would overshoot on short arcs, where B is nearly
+    singular.
     """
     g = np.average(paths.mean, axis=0, weights=paths.n)
     h = paths.mean - g

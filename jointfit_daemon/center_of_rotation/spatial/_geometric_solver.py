@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 HUBER = 1.5
 NOISE_FACTOR = 6.0
-"""A direction is seen from this many times the turning that noise alone gives."""
+"""A direction is observed if the rotation exceeds the rotation caused by noise by this factor."""
 _PASSES = 30
 _ROUNDED = 1e-9
 _LONGEST_STEP_M = 0.2
@@ -39,16 +39,16 @@ class SphereOptions:
     """Settings of a geometric sphere fit."""
 
     huber: float = HUBER
-    """Residuals above so many scales lose weight; inf: plain least squares."""
+    """Residuals above this number of scales have reduced weight; inf: plain least squares."""
     smallest_scale: float = _ROUNDED
     """Smallest residual scale, m; 0.1 mm with soft-tissue artefact, so that a few good
     frames do not dominate."""
     start: Array | None = None
-    """Start, and position along unseen directions, m, shape (3,)."""
+    """Initial center, and its value along unobserved directions, m, shape (3,)."""
     hold: float = 0.0
     """Noise, m, that must not move the initial estimate away from `start`."""
     min_direction: float = 0.0
-    """RMS turning, rad, below which a direction is not seen whatever the noise."""
+    """RMS rotation, rad, below which a direction is unobserved for any noise."""
     keep_one: bool = False
     """Fit the best direction even if it is not observable."""
 
@@ -60,12 +60,12 @@ class SphereFit:
     center: Array
     """m, shape (3,)."""
     basis: Array
-    """Directions that were seen, the columns, shape (3, r)."""
+    """Observed directions, the columns, shape (3, r)."""
     residuals: Array
-    """Radial, m, shape (n, k); zero where not seen."""
+    """Radial residuals, m, shape (n, k); zero where missing."""
     seen: Mask
     weights: Array
-    """Huber's, zero where not seen, shape (n, k)."""
+    """Huber weights, shape (n, k); zero where missing."""
     turning: Array
     """Derivatives of the residuals by the center, shape (n, k, 3)."""
     radii: Array
@@ -75,26 +75,26 @@ class SphereFit:
 
     @property
     def information(self) -> Array:
-        """Return JᵀWJ in the seen directions, shape (r, r)."""
+        """Return JᵀWJ in the observed directions, shape (r, r)."""
         J = self.turning @ self.basis
         return np.asarray(np.einsum("tj,tja,tjb->ab", self.weights, J, J))
 
     @property
     def unseen(self) -> Array:
-        """Return the other directions, the rows, shape (3 - r, 3)."""
+        """Return the unobserved directions, the rows, shape (3 - r, 3)."""
         return np.asarray(np.linalg.svd(self.basis)[0][:, self.basis.shape[1] :].T)
 
 
 def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
-    """Fit spheres about one center by Gauss-Newton with Huber weights, radii profiled out.
+    """Fit spheres about one center by Gauss-Newton with Huber weights; radii are eliminated.
 
-    Directions that the movement does not show are left at the start: noise would pull the center
-    to the markers' own plane with false confidence. Halvorsen 2003; Chang and Pollard 2007.
+    Unobserved directions keep the start value: noise would move the center to the plane of the
+    markers with a covariance that is too small. Halvorsen 2003; Chang and Pollard 2007.
 
     Parameters
     ----------
     points : ndarray, shape (n, k, 3)
-        m; NaN where not seen; every marker seen at least twice.
+        m; NaN where missing; every marker is visible at least twice.
     options : SphereOptions
         Start, robustness.
     """
@@ -117,7 +117,7 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
             break
         Jb = J @ basis
         H = np.einsum("tj,tja,tjb->ab", w, Jb, Jb)
-        if not np.trace(H) > 0.0:  # nothing moved at all
+        if not np.trace(H) > 0.0:  # no marker moved
             basis = np.zeros((3, 0))
             break
 
@@ -146,7 +146,7 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
 
 
 def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
-    """Return Gamage and Lasenby's center, held to `start` where `hold` of noise would rule."""
+    """Return Gamage and Lasenby's center, at `start` in directions where noise `hold` dominates."""
     total = np.maximum(w.sum(axis=0), 1e-12)
     d = v - start
     d = d - (w[..., None] * d).sum(axis=0) / total[:, None]
@@ -155,16 +155,16 @@ def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
     A = 2.0 * np.einsum("tj,tja,tjb->ab", w / total, d, d)
     b = np.einsum("tj,tja,tj->a", w / total, d, square)
 
-    # a millionth of the path keeps a plane from being singular
+    # a millionth of the path avoids a singular matrix for motion in a plane
     least = max(options.hold**2, 1e-6 * float(np.trace(A)) / len(total))
     return np.asarray(start + np.linalg.solve(A + 2.0 * len(total) * least * np.eye(3), b))
 
 
 def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions) -> Array:
-    """Return an orthonormal basis (3, r) of the directions the movement shows.
+    """Return an orthonormal basis (3, r) of the observed directions.
 
-    Noise turns a marker's direction across its own line of sight only, so the threshold of each
-    direction b is scaled by the mean of 1 - (b·u)².
+    Noise changes the direction of a marker only across its line to the center, so the threshold of
+    each direction b is scaled by the mean of 1 - (b·u)².
     """
     _, J = radial_residuals(v, m, w)
     total = w.sum()
@@ -196,9 +196,9 @@ def judge_sphere(
     .. math:: C = \frac{\sum ψ^2 / (N - k - r)}{p^2} \Big(\sum J J^T - \text{noise's part}
               \Big)^{-1} \frac{1+\rho}{1-\rho}
 
-    ψ the residuals cut off at Huber's bound, p the share that is not cut, ρ the correlation of
-    the residuals from one frame to the next (Huber 1964; of a smooth disturbance it is all that
-    separates many frames from much knowledge).
+    ψ with ψ the residuals limited to Huber's bound, p the share that is not limited, and ρ the
+    correlation of the residuals from one frame to the next (Huber 1964). With a smooth disturbance
+    only ρ prevents an underestimate of the covariance at a high frame rate.
     """
     n, k = int(fit.seen.sum()), fit.seen.shape[1]
     rank = fit.basis.shape[1]
@@ -224,7 +224,7 @@ def judge_sphere(
     conditioning = radius / float(np.sqrt(np.linalg.norm(shown, 2)))
     unseen = fit.unseen
 
-    # obliquely seen markers turn less: the one that turned most knows the arc
+    # the marker that rotated most determines the arc, since oblique ones rotate less
     inside = np.linalg.norm(fit.resultant @ fit.basis, axis=1)
     off = np.linalg.norm(fit.resultant @ unseen.T, axis=1) if len(unseen) else 0.0 * inside
     arc = arc_of(float((inside / np.sqrt(np.maximum(1.0 - off**2, 1e-12))).min()))
@@ -248,7 +248,7 @@ def judge_sphere(
 
 
 def kept_by_huber(k: float) -> float:
-    """Return the variance that is left of a standard normal residual cut off at k."""
+    """Return the variance of a standard normal residual limited to ±k."""
     if not np.isfinite(k):
         return 1.0
     inside = erf(k / sqrt(2.0))

@@ -1,9 +1,9 @@
 """Observable directions of a center, and its covariance along them.
 
-A direction is observable if the movement turned the markers along it by more than the noise does,
-and if the center is known there to a sixth of the radius. The covariance is widened for residuals
-that persist between frames and for noise shared between markers. Soft-tissue artefact repeats with
-posture, so all frames together count as one observation of it.
+A direction is observable if the markers rotated along it by more than the noise, and if the
+standard deviation of the center along it is below a sixth of the radius. The covariance is
+increased for residuals that persist between frames and for noise shared between markers.
+Soft-tissue artefact repeats with posture, so all frames together count as one observation of it.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ if TYPE_CHECKING:
 
 
 MIN_CONDITIONING = 6.0
-"""T: radius over the center's standard deviation, below which a direction is not seen."""
+"""T, the radius over the standard deviation of the center, below which a direction is
+unobserved."""
 MIN_SIGNIFICANCE = 7.0
-"""Standard deviations by which the turning along a third direction must exceed the turning by
-noise: many frames of noise along a hinge's axis would pass for a well-conditioned center."""
+"""Standard deviations by which the rotation along a third direction must exceed that of noise.
+Otherwise many frames of noise along a hinge's axis would appear as a well-conditioned center."""
 FADED = 0.5 ** LAGS[1]
 """Correlation over `LAGS[1]` frames of noise that halves itself each frame; longer correlation is
 soft-tissue artefact."""
 FILLED = 0.1
-"""Share of the movement's variance from which residuals are no noise about an arc."""
+"""Share of the movement's variance above which residuals are not noise about an arc."""
 _STILL_M = 1e-6
 _PERSISTENT = 0.99
 _CHI2 = (3.841, 5.991, 7.815)  # 95 % of one, two, three squares
@@ -46,9 +47,9 @@ class SphereLimits:
     """Acceptance limits of a center in space."""
 
     min_direction: float = 0.0
-    """RMS turning of the markers along the third direction, rad, below which the joint is taken for
-    a hinge whatever the noise: 3° with soft-tissue artefact; more than the turns that noise gives
-    the parent's frame, which look like the joint's own."""
+    """RMS rotation of the markers along the third direction, rad, below which the joint counts as a
+    hinge for any noise: 3° with soft-tissue artefact. It must exceed the rotation that noise causes
+    in the parent's frame, which cannot be distinguished from joint rotation."""
     min_arc: float = radians(8.0)
     reach: tuple[float, float] = (0.02, 1.0)
     """Least and largest distance of the markers from the center, m."""
@@ -63,9 +64,9 @@ class ResidualStatistics:
     together: Array
     """Covariance from marker to marker, m², shape (k, k)."""
     persistence: float
-    """Correlation from one frame to the next, 0 to 0.99; chance is 0."""
+    """Correlation from one frame to the next, 0 to 0.99; 0 if not significant."""
     posture: float
-    """Share of their variance that goes with posture."""
+    """Share of the residual variance that repeats with posture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,21 +79,22 @@ class ObservedCenter:
     """Directions observable despite soft-tissue artefact, along the basis, the columns, shape
     (r, s)."""
     paths: MarkerPaths
-    """Along them."""
+    """Center along the basis, m."""
     found: ConcentricSpheres
     spread: Array
     """Covariance along the basis, m², shape (r, r)."""
     tilt: Array
-    """How much of a squared lever along the unseen direction joins it, shape (r, r)."""
+    """Part of a squared lever arm along the unobserved direction that adds to `spread`, shape (r,
+    r)."""
     bound2: float
     """Trace of the Cramér-Rao bound, m²."""
     left: ResidualStatistics
     within95: float
-    """Squared Mahalanobis distance that holds the center 95 times in a hundred."""
+    """Squared Mahalanobis distance with 95 % coverage of the center."""
 
 
 def moving_directions(paths: MarkerPaths) -> Array:
-    """Return the directions in which anything moved at all, shape (d, r)."""
+    """Return the directions in which any marker moved, shape (d, r)."""
     spread, axes = np.linalg.eigh(np.einsum("j,jab->ab", paths.n / paths.n.sum(), paths.C))
     return np.asarray(axes[:, spread > max(_STILL_M**2, 1e-12 * float(spread[-1]))])
 
@@ -103,7 +105,7 @@ def observe(
     """Fit, dropping the least observable direction until all others are observable.
 
     Directions hidden by noise are left out of the fit. Directions that only soft-tissue artefact
-    shows stay in the fit, since the residuals would grow without them, but not in the result.
+    excites remain in the fit, since the residuals would grow without them, but not in the result.
     """
     while basis.shape[1] >= 2:
         flat = paths.seen_along(basis)
@@ -112,7 +114,7 @@ def observe(
             basis = basis @ np.linalg.eigh(np.einsum("j,jab->ab", flat.n, flat.C))[1][:, 1:]
             continue
 
-        # the information, in squared radians, that noise may bring along the least seen direction
+        # information, rad², that noise may contribute along the least observed direction
         spread, axes = np.linalg.eigh(found.information)
         radius2 = float(np.median(found.radii2))
         noise = max(MIN_CONDITIONING**2 * found.noise2 / radius2, 0.0)
@@ -123,8 +125,8 @@ def observe(
             noise = max(noise, chance, limits.min_direction**2 * total)
 
         if spread[0] > noise:
-            # Paths that fill an area as wide as it is long are a small movement seen face on. Its
-            # center lies before or behind it, too far for the bend to show; a circle is chance.
+            # Paths that fill an area as wide as it is long are a small movement on a sphere, viewed
+            # along its radius. The curvature is not measurable; a fitted circle is chance.
             wide = np.linalg.eigvalsh(np.einsum("j,jab->ab", flat.n / flat.n.sum(), flat.C))[-1]
             if found.noise2 * float(np.median(found.relative)) > FILLED * wide:
                 return None
@@ -133,7 +135,7 @@ def observe(
             skin2 = found.noise2 + soft_tissue_variance(left, flat, found)
             shown = spread > MIN_CONDITIONING**2 * skin2 / radius2
 
-            # one direction alone gives no center: the error then shows it
+            # one direction alone determines no center; the predicted error is then large
             shown = shown if shown.sum() >= 2 else np.ones_like(shown)
             return _spread(sums, basis, flat, found, left=left, shown=axes[:, shown])
 
@@ -150,9 +152,9 @@ def soft_tissue_variance(
     .. math:: \mathrm{Cov}_{posture} = p^2 \left[ \overline{u u^T} - \bar u \bar u^T \right]^{-1}
 
     p² is the persistent variance of the residuals. The part of the artefact that is linear in the
-    directions u moves the center and leaves no residual; it is taken to be as large as the rest,
-    which does. It repeats with every cycle: no number of frames and no number of markers, which
-    share their parent's soft tissue, reduces it.
+    directions u moves the center and leaves no residual. It is assumed to be as large as the part
+    that leaves residuals. It repeats with every cycle: no number of frames and no number of
+    markers, which share their parent's soft tissue, reduces it.
     """
     return left.posture * found.noise2 * float((paths.n / found.relative).sum())
 
@@ -160,20 +162,20 @@ def soft_tissue_variance(
 def posture_share(lasting: float, frames: float) -> float:
     """Return the share of the residual variance that repeats with posture.
 
-    It is their correlation over `LAGS[1]` frames, if that is more than noise that has faded leaves
-    by chance three times in a thousand.
+    It is the correlation of the residuals over `LAGS[1]` frames, if it exceeds the 99.7 % quantile
+    of decayed noise.
     """
-    # of a correlation ρ per frame, frames are worth (1 + ρ²)/(1 - ρ²) times less
+    # a correlation ρ per frame divides the effective frames by (1 + ρ²)/(1 - ρ²)
     chance = FADED + 3.0 * float(np.sqrt((5.0 / 3.0) / max(frames, 1.0)))
     return min(lasting, 1.0) if lasting > chance else 0.0
 
 
 def within95(rank: int, freedom: float) -> float:
-    r"""Return the squared Mahalanobis distance that holds a center 95 times in a hundred.
+    r"""Return the squared Mahalanobis distance with 95 % coverage of a center.
 
     .. math:: r F_{0.95}(r, \nu) \approx \chi^2 \left( 1 + \frac{\chi^2 - r + 2}{2 \nu} \right)
 
-    for r directions and a noise estimated with ν degrees of freedom.
+    for r directions and noise estimated with ν degrees of freedom.
     """
     chi2 = _CHI2[rank - 1]
     return chi2 * (1.0 + (chi2 - rank + 2.0) / (2.0 * max(freedom, 2.0)))
@@ -194,7 +196,7 @@ def _spread(
               \overline{u_j u_l^T}}{s_j s_l} \Big] B^{-1} \cdot \frac{1+\rho\rho_u}{1-\rho\rho_u}
 
     e the radial residuals, u the directions, s the relative noise, ρ and ρ_u their
-    lag-one correlations (noise that lasts hurts only where the movement lasts, too); plus
+    lag-one correlations (persistent noise matters only if the movement persists, too); plus
     `soft_tissue_variance` over the information.
     """
     k, rank = paths.mean.shape
@@ -213,7 +215,7 @@ def _spread(
     bread = np.linalg.inv(found.information)
     dof = max(total * (1.0 - rho) / (1.0 + rho) - k - rank, 2.0)
 
-    # a fit takes more out of noise that lasts
+    # a fit absorbs more of persistent noise
     own = total * (1.0 - both) / (1.0 + both)
     widened = total / max(own - k - rank, 1.0)
     bound2 = found.noise2 * float(np.trace(bread))
@@ -230,7 +232,7 @@ def _spread(
 def _no_better(spread: Array, white: Array) -> Array:
     """Return `spread` no smaller in any direction than a quarter of the covariance for white noise.
 
-    Few frames may show correlations between markers that are chance and would cancel all noise.
+    In few frames, chance correlations between markers could cancel all noise.
     """
     L = np.linalg.cholesky((white + white.T) / 2.0)
     inner = np.linalg.solve(L, np.linalg.solve(L, spread).T)

@@ -1,8 +1,8 @@
 r"""Effect of the parent's marker noise on a point in the parent's coordinates.
 
-The parent's frame is itself a fit to noisy markers; a point a lever arm away is moved by the
-fit's turn. Close parent markers and long levers amplify noise, and all markers of the child share
-it.
+The parent's frame is itself a fit to noisy markers. A rotation error of this fit moves a point in
+proportion to its lever arm. Close parent markers and long lever arms amplify noise, which is common
+to all markers of the child.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
     Parameters
     ----------
     points : ndarray, shape (..., 3)
-        In the parent, m.
+        Points in the parent's coordinates, m.
     parent : ndarray, shape (m, 3)
         The parent's markers in its own coordinates, m.
     noise : float
@@ -43,7 +43,7 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
     Raises
     ------
     ValueError
-        Fewer than three markers, or all on a line: they fix no frame.
+        Fewer than three markers, or all on a line: the frame is undetermined.
     """
     middle = parent.mean(axis=0)
     d = parent - middle
@@ -58,7 +58,7 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
 
 
 def turn_noise(parent: Array, noise: float) -> float:
-    r"""Return how far a frame fitted to noisy markers turns about its loosest axis, RMS, rad.
+    r"""Return the RMS rotation error, rad, of a frame fitted to noisy markers about its worst axis.
 
     .. math:: σ_φ^2 = σ^2\, λ_{max}(G^{-1})
 
@@ -75,27 +75,28 @@ def turn_noise(parent: Array, noise: float) -> float:
 
 
 def relative(points: Array, parent: Array, center: Array) -> Array:
-    r"""Return the shape of each marker's noise for `RunningSphere`: its radial part is one.
+    r"""Return each marker's relative noise covariance for `RunningSphere`; its radial part is 1.
 
     .. math:: S_j = Σ_c / \overline{\hat r_j^T Σ_c \hat r_j}, \qquad
               Σ_c = \left(1 + \tfrac1m\right) I + [λ_c]_× G^{-1} [λ_c]_×^T
 
-    with the lever arm of the center, not of the marker: a turn of the parent's frame carries
-    markers and center alike, and the distance between them feels only how the center is moved.
+    with the lever arm of the center, not of the marker: a rotation of the parent's frame moves
+    markers and center alike, so that only the displacement of the center changes the distance
+    between them.
 
     Parameters
     ----------
     points : ndarray, shape (n, k, 3)
-        Markers in the parent, m; NaN where not seen.
+        Markers in the parent's coordinates, m; NaN where missing.
     parent : ndarray, shape (m, 3)
         The parent's markers, m.
     center : ndarray, shape (3,)
-        About where the center is, m.
+        Approximate position of the center, m.
 
     Returns
     -------
     ndarray, shape (k, 3, 3)
-        The common shape for a marker never seen.
+        A marker that is never visible has the common covariance.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1), dtype=np.float64)
     S = spatial_noise(center, parent, 1.0)

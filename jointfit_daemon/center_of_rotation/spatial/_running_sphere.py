@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 
 
 OUTLIER = 3.0
-"""Residuals above so many standard deviations lose weight. Not Huber's 1.5: a frame is weighted
-once and for good, and the noise must not shrink by it."""
+"""Residuals above this number of standard deviations have reduced weight. It is larger than Huber's
+1.5 because a frame is weighted only once, and the noise estimate must not shrink."""
 OFF = 8.0
-"""Standard deviations, and at least `OFF_M`, from which a marker is not where it belongs."""
+"""Residual in standard deviations, and at least `OFF_M`, above which a marker is off its sphere."""
 OFF_M = 0.01
 STAYED_OFF = 25
 """Consecutive frames off its sphere after which a marker is restarted at its new position."""
 _FAR_M = 2.0
-"""Fourth powers lose their digits farther from the fixed point."""
+"""Largest distance from the fixed point, m; beyond it fourth powers lose digits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,19 +60,19 @@ class RunningSphere:
     Parameters
     ----------
     markers : int
-        How many markers a frame has, k.
+        Number of markers k in a frame.
     forgetting : float
         Remaining share of a frame's weight one frame later, in (0, 1]; 1 keeps all.
     dimension : int
         3, or 2 for points in a plane.
     near : ndarray, shape (dimension,), optional
-        Where to stay along directions the movement does not show, m.
+        Position along unobserved directions, m.
     robust : bool
         Reduce the weight of markers that leave their sphere (soft tissue, exchanged labels), and
         restart a marker that stays away. Uses the last `estimate`.
     limits : SphereLimits, optional
         Acceptance limits. If None, persistent residuals are not counted as soft-tissue
-        artefact: live, the caller adds its variance (give ``SphereLimits()`` to have it counted).
+        artefact: in live use the caller adds its variance (pass ``SphereLimits()`` to count it).
     shape : ndarray, shape (k, d, d), optional
         Covariance of each marker's noise relative to the common variance, see ``relative``.
 
@@ -117,7 +117,7 @@ class RunningSphere:
         self._restarted: set[int] = set()
 
     def feed(self, points: Array, weights: Array | None = None) -> None:
-        """Take one frame, m, shape (k, d), in the parent's coordinates; NaN where not seen.
+        """Process one frame, m, shape (k, d), in the parent's coordinates; NaN where missing.
 
         Parameters
         ----------
@@ -158,7 +158,7 @@ class RunningSphere:
     def estimate(self) -> CenterEstimate:
         """Return center, covariance and predicted error of all frames so far; never raises.
 
-        Costs more than `feed`: ask when it is to be published, not every frame.
+        It costs more than `feed`; call it when a result is published, not for every frame.
         """
         sums = self.sums()
         found, spheres = center_of(sums, near=self._near, shape=self._shape, limits=self._limits)
@@ -178,7 +178,7 @@ class RunningSphere:
     def _weights(self, given: Array | None) -> Array | None:
         """Return the weights of the frame in `_phi`; None if all are one."""
         phi, expected = self._phi, self._expected
-        near = phi[:, 0] < _FAR_M**2  # not for NaN, either
+        near = phi[:, 0] < _FAR_M**2  # also False for NaN
         if expected is None:
             if given is None and near.all():
                 return None
@@ -194,7 +194,7 @@ class RunningSphere:
         w = np.where(near, 1.0 if given is None else given, 0.0)
         if fine.all():
             return self._restart(w, np.isfinite(phi[:, 0]) & ~near)
-        # the center's own uncertainty excuses a marker that goes where it never was
+        # the uncertainty of the center increases the tolerance at new positions of a marker
         way = np.where(near[:, None], phi[:, 1:-1] - expected.mean, 0.0)
         excused = np.einsum("ja,jab,jb->j", way, expected.unsure, way)
         scale = np.sqrt(expected.noise**2 + np.maximum(excused, 0.0))
@@ -205,7 +205,7 @@ class RunningSphere:
         return self._restart(w, off | (np.isfinite(phi[:, 0]) & ~near))
 
     def _restart(self, w: Array, off: NDArray[np.bool_]) -> Array:
-        """Restart markers that stayed off: they have slipped or been relabelled."""
+        """Restart markers that remained off their sphere: they slipped or were relabelled."""
         self._off = np.where(off, self._off + 1, np.where(w > 0.0, 0, self._off))
         k, e = self._phi.shape
         for j in np.flatnonzero(self._off >= STAYED_OFF):
@@ -266,9 +266,9 @@ def fit_running(
     points : ndarray, shape (n, k, d)
         m; NaN where not seen.
     weights : ndarray, shape (n, k), optional
-        Non-negative, as a forgetting stream would weigh them in the end; one if None.
+        Non-negative; for forgetting, the final weights of the frames. One if None.
     near, limits, shape
-        As for `RunningSphere`.
+        See `RunningSphere`.
     """
     limits = limits or SphereLimits(posture=False)
     return center_of(sum_up(points, weights), near=near, shape=shape, limits=limits)[0]

@@ -34,16 +34,16 @@ def fit_axis(
     parent, child : BodyPoses
         In one world.
     near : ndarray, shape (3,), optional
-        Where to come to along the axis, in the parent, m; None: nearest the parent's origin.
+        Position along the axis, in the parent's coordinates, m; None: nearest the parent's origin.
     toward : ndarray, shape (3,), optional
-        The axis is turned to have a positive component along it, as to the subject's right.
+        Direction along which the axis has a positive component, such as the subject's right.
     robust : bool
         Huber weights on the gap between the two sides.
 
     Returns
     -------
     CenterEstimate
-        `axis` in the parent; refused where the movement went about more than one axis.
+        `axis` is in the parent's coordinates; refused if the movement was about more than one axis.
     """
     estimate = two_sided_estimate("sara", parent, child, near, hinge=True, robust=robust)
     axis = estimate.axis

@@ -38,7 +38,7 @@ SEVERAL_AXES = (
 )
 NO_TURN = "the child did not rotate against the parent: move the joint, at least 30° each way"
 MIN_TURN_RAD = 0.02
-"""RMS turning about the second axis of the movement below which nothing was turned."""
+"""RMS rotation, rad, about the second axis of the movement below which there was no rotation."""
 LEVER_M = 0.24
 """Replaces the radius in T, m, since poses carry no marker positions: the center must be known to
 40 mm."""
@@ -50,7 +50,7 @@ _LEAST_M = 1e-9
 def fit_score(
     parent: BodyPoses, child: BodyPoses, *, near: Array | None = None, robust: bool = True
 ) -> CenterEstimate:
-    """Estimate a center by SCoRE; where only an axis was observed the answer is a hinge's.
+    """Estimate a center by SCoRE; if only an axis was observed, return the estimate of a hinge.
 
     Ehrig et al. 2006. Parameters as in `two_sided_estimate`.
     """
@@ -71,12 +71,13 @@ def two_sided_estimate(
     parent, child : BodyPoses
         In one world; frames with NaN are left out.
     near : ndarray, shape (3,), or None
-        Position along a hinge's axis, in the parent, m; None: nearest the parent's origin.
+        Position along a hinge's axis, in the parent's coordinates, m; None: nearest the parent's
+        origin.
     hinge : bool
         Solve for an axis, without the sixth singular value. False: only if the ratio of the last
         two is below `HINGE_RATIO`.
     robust : bool
-        Huber weights on the gap, by which marker swaps lose their weight.
+        Huber weights on the gap, which reduce the influence of marker swaps.
 
     Returns
     -------
@@ -105,7 +106,7 @@ def two_sided_estimate(
     inverse = (Vt[:rank].T / np.maximum(s[:rank], 1e-12) ** 2) @ Vt[:rank]
     white, C, rho = _covariances(gaps, w, inverse, rank)
 
-    # along an axis nothing was observed
+    # the direction along the axis is unobserved
     axis = Vt[5, :3] / np.linalg.norm(Vt[5, :3]) if rank == 5 else None
     center = c[:3]
     if axis is not None:
@@ -138,8 +139,8 @@ def two_sided_estimate(
 def _covariances(gaps: Array, w: Array, inverse: Array, rank: int) -> tuple[Array, Array, float]:
     """Return the covariance of the parent's point for white noise and in total, m², shape (3, 3).
 
-    Third is the correlation of the gaps from one frame to the next. Persistent noise reduces the
-    effective frames; soft-tissue artefact leaves one.
+    The third value is the correlation of the gaps from one frame to the next. Persistent noise
+    reduces the effective frames; with soft-tissue artefact a single one remains.
     """
     n = len(gaps)
     noise2 = max(float((w[:, None] * gaps**2).sum()) / max(3.0 * n - rank, 1.0), _LEAST_M**2)
@@ -153,10 +154,10 @@ def _covariances(gaps: Array, w: Array, inverse: Array, rank: int) -> tuple[Arra
 
 
 def _arc(parent: BodyPoses, child: BodyPoses) -> float:
-    """Return the arc of the direction that turned most, rad."""
+    """Return the arc of the direction that rotated most, rad."""
     q = rotation.multiply(rotation.conjugate(parent.q), child.q)
     R = rotation.to_matrix(q[np.isfinite(q).all(axis=1)])
-    # the mean rotation shortens that direction to its resultant
+    # the length of the mean of that direction is its resultant
     return arc_of(float(np.linalg.svd(R.mean(axis=0))[1][2]))
 
 

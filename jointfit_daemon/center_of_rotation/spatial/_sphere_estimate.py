@@ -1,7 +1,8 @@
-"""Center estimates from sums over sphere paths: covariance, hinge axis and acceptance.
+"""Center estimates from sums of marker positions: covariance, hinge axis and acceptance.
 
-A hinge shows two directions of the center and its axis. A straight path or a marker at rest is
-refused with a remedy. Along an unseen direction the caller chooses the position.
+A hinge movement determines the center in two directions, and the hinge axis. A straight path or a
+marker at rest is refused with a remedy. Along an unobserved direction the caller chooses the
+position.
 """
 
 from __future__ import annotations
@@ -34,11 +35,12 @@ if TYPE_CHECKING:
 
 
 MIN_FRAMES = 15
-"""Effective frames a marker must be seen in."""
+"""Least effective number of frames in which a marker is visible."""
 LOUD = 9.0
-"""Variance of a marker over that of the others from which it is named."""
+"""Ratio of a marker's variance to the median variance above which the marker is flagged as
+noisy."""
 PERSISTENT = 0.5
-"""Correlation of residuals from frame to frame from which it is flagged."""
+"""Lag-one autocorrelation of the residuals above which ``residuals_persist`` is set."""
 STRAIGHT = "the marker paths have no curvature: move the joint by at least 30° in each direction"
 FURTHER = ": increase the range of motion of this joint"
 SOFT_TISSUE = (
@@ -56,16 +58,16 @@ def center_of(
     shape: Array | None = None,
     limits: SphereLimits | None = None,
 ) -> tuple[CenterEstimate, ConcentricSpheres | None]:
-    """Judge the center that sums over frames show.
+    """Estimate the center from sums over frames, and decide whether it may be used.
 
     Parameters
     ----------
     sums : SphereSums
-        Of any number of frames, about any fixed points.
+        Sums over any number of frames; the reference point of each marker is arbitrary.
     method : str
-        Name to sign with.
+        Method name stored in the result.
     near : ndarray, shape (d,), optional
-        Position along unseen directions, m; None: at the markers' mean.
+        Position along unobserved directions, m; None: at the markers' mean.
     shape : ndarray, shape (k, d, d), optional
         Covariance of each marker's noise relative to the common variance, as
         ``relative`` gives it for a moving parent; None: isotropic.
@@ -75,10 +77,10 @@ def center_of(
     Returns
     -------
     estimate : CenterEstimate
-        NaN only in the center of a refusal that has none, and in the radii of markers that were
-        not seen often enough to be used.
+        The center is NaN if it was refused before one was found. The radius is NaN for markers
+        visible in too few frames.
     spheres : ConcentricSpheres or None
-        The markers' spheres; None where they are about no such center.
+        The markers' spheres; None unless the center is observable in all directions.
     """
     limits = limits or SphereLimits()
     d = sums.origin.shape[1]
@@ -116,7 +118,7 @@ def _answer(
     stay = middle if near is None else np.asarray(near, dtype=np.float64)
     center, spread = shrink_center(seen, middle @ seen.basis)
     fitted = seen.basis @ center
-    hidden = unseen @ seen.basis @ seen.basis.T  # in the fit, but not in the answer
+    hidden = unseen @ seen.basis @ seen.basis.T  # in the fit, but not in the result
     lean = float(((unseen @ stay - hidden @ fitted - (unseen - hidden) @ middle) ** 2).sum())
     spread = seen.shown.T @ spread @ seen.shown
     C = basis @ (spread + lean * (seen.shown.T @ seen.tilt @ seen.shown)) @ basis.T
@@ -158,13 +160,14 @@ def _answer(
 
 
 def shrink_center(seen: ObservedCenter, middle: Array) -> tuple[Array, Array]:
-    r"""Return the center shrunk by the outward bias of its uncertainty, and its covariance.
+    r"""Return the center, shrunk towards the markers' mean, and its covariance.
 
     .. math:: S = (I + C/R^2)^{-1}, \qquad d' = S d, \qquad C' = S C S
 
-    for the center d from the markers' mean. The data show a curvature whose error is nearly normal;
-    its inverse is too far on average. This is Zellner's minimum expected loss estimator of an
-    inverse (1978), as in the plane. On long arcs S is the identity.
+    for the vector d from the markers' mean to the center. The error of the estimated curvature is
+    nearly normal; its inverse, the distance, is therefore too large on average. The shrinkage
+    removes this outward bias. It is Zellner's minimum expected loss estimator of an inverse (1978),
+    as in the plane. On long arcs S is the identity.
     """
     R2 = float(np.median(seen.found.radii2))
     S = np.linalg.inv(np.eye(len(middle)) + seen.spread / R2)

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 OUTLIER = 3.0
-"""Residuals above so many standard deviations lose weight in the estimate. Noise rarely
-exceeds it, so that its variance is not underestimated."""
+"""Residuals above this number of standard deviations have reduced weight. Noise rarely exceeds it,
+so that the noise variance is not underestimated."""
 STILL_M = 1e-6
 _HALVORSEN_STEPS = 20
 FLAT = (
@@ -37,25 +37,26 @@ FLAT = (
 
 
 def gamage_lasenby(points: Array, min_direction: float = 0.0) -> CenterEstimate:
-    r"""Solve for the center in which the spread of squared distances is least.
+    r"""Solve for the center with the smallest variance of squared distances.
 
     .. math:: 2 \sum_j \left(\overline{vv^T} - \bar v \bar v^T\right) m
               = \sum_j \left(\overline{v|v|^2} - \bar v\, \overline{|v|^2}\right)
 
-    Biased towards the markers on short arcs, as Kåsa's circle is. Gamage and Lasenby 2002.
+    The center is biased towards the markers on short arcs, as in Kåsa's circle fit. Gamage and
+    Lasenby 2002.
 
     Parameters
     ----------
     points : ndarray, shape (n, k, 3)
         Markers of the child in the parent's coordinates, m; NaN where not seen.
     min_direction : float
-        RMS turning, rad, below which a direction is not seen: then refused.
+        RMS rotation, rad, below which a direction is unobserved and the estimate refused.
     """
     return _linear(points, "gamage_lasenby", 0, min_direction)
 
 
 def halvorsen(points: Array, min_direction: float = 0.0) -> CenterEstimate:
-    r"""Take the bias out of `gamage_lasenby` by the noise found, twenty times over.
+    r"""Correct the bias of `gamage_lasenby` for the estimated noise in twenty iterations.
 
     .. math:: A m = b - 2 σ^2 \sum_j (\bar v_j - m), \qquad
               σ^2 = \frac{\sum (u - \bar u_j)^2}{nk - k - 3}, \quad u = |v - m|
@@ -96,12 +97,12 @@ def fit_sphere(
     limits: SphereLimits | None = None,
     parent: Array | None = None,
 ) -> CenterEstimate:
-    r"""Fit the point that each marker keeps its own distance from.
+    r"""Fit the point at a constant distance from each marker.
 
     .. math:: \min_m \sum_{tj} \rho\left(|v_{tj} - m| - \bar u_j\right),
               \qquad \bar u_j = \mathrm{mean}_t |v_{tj} - m|
 
-    finds outliers; the center and its error are those of the other frames' sums.
+    determines the outliers; center and covariance are computed from the sums of the other frames.
 
     Parameters
     ----------
@@ -112,14 +113,14 @@ def fit_sphere(
     limits : SphereLimits, optional
         Acceptance limits.
     parent : ndarray, shape (m, 3), optional
-        The parent's own markers in its coordinates, m: their noise, which all markers of the child
-        share, is separated from their own.
+        The parent's own markers in its coordinates, m. Their noise, common to all markers of the
+        child, is separated from the noise of the child's markers.
 
     Returns
     -------
     CenterEstimate
-        `unseen` holds the directions the movement does not show (a hinge's axis); the center stays
-        there where `options.start` is, or beside the markers' mean.
+        `unseen` contains the unobserved directions (a hinge's axis). Along them the center is at
+        `options.start`, or at the markers' mean.
     """
     options = options or SphereOptions()
     weights = _weights(points, options)
@@ -132,7 +133,7 @@ def fit_sphere(
 
 
 def _weights(points: Array, options: SphereOptions) -> Array | None:
-    """Return the weight of each marker in each frame, shape (n, k); None where all are one."""
+    """Return the weight of each marker in each frame, shape (n, k); None if all are one."""
     seen = np.asarray(np.isfinite(points).all(axis=-1))
     enough = seen.sum(axis=0) >= MIN_FRAMES
     still = not enough.any() or float(np.nanstd(points[:, enough], axis=0).max()) < STILL_M

@@ -1,14 +1,14 @@
 r"""Sums of fixed size over any number of frames, sufficient for a fit of spheres.
 
-For every marker, φ = (|p|², p, 1), p its place from a fixed point near it. All estimates of
-spheres about one center are functions of
+For every marker, φ = (|p|², p, 1) with p its position relative to a fixed point near it. All
+estimates of spheres about one center are functions of
 
 .. math:: M_{jl} = \sum_t \sqrt{w_{tj} w_{tl}}\, φ_{tj} φ_{tl}^T, \qquad
           L_{gj} = \sum_t \sqrt{w_{tj} w_{t-g,j}}\, φ_{tj} φ_{t-g,j}^T, \quad g \in \{1, 4\}
 
-M holds the variances of the residuals and their covariance between markers (noise of the parent's
-frame), L their correlation in time. Forgetting multiplies both. A marker that is not visible adds
-nothing.
+M determines the variances of the residuals and their covariance between markers (noise of the
+parent's frame), L their correlation in time. Forgetting scales both. A marker that is not visible
+adds nothing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 LAGS = (1, 4)
-"""Frames apart: neighbours, and far enough for noise that halves itself each frame to be gone."""
+"""Lags in frames: neighbours, and a lag after which noise that halves each frame has decayed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +36,11 @@ class SphereSums:
     M: Array
     """Shape (k, e, k, e)."""
     L: Array
-    """One for each of `LAGS`, shape (2, k, e, e)."""
+    """Lagged sums for each of `LAGS`, shape (2, k, e, e)."""
     squares: Array
     """Σ w², shape (k,)."""
     frames: int
-    """Frames that showed any marker."""
+    """Number of frames with any visible marker."""
 
     @property
     def weights(self) -> Array:
@@ -50,7 +50,7 @@ class SphereSums:
 
     @property
     def counts(self) -> Array:
-        """Return how many frames the weights are worth, (Σw)²/Σw² per marker, shape (k,)."""
+        """Return the effective number of frames, (Σw)²/Σw² per marker, shape (k,)."""
         return np.asarray(self.weights**2 / np.maximum(self.squares, 1e-300))
 
     def only(self, markers: NDArray[np.bool_]) -> SphereSums:
@@ -87,9 +87,9 @@ def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
 
 
 def centered(sums: SphereSums) -> SphereSums:
-    r"""Return the sums about each marker's mean; markers never seen stay where they are.
+    r"""Return the sums about each marker's mean; those of markers never visible are unchanged.
 
-    About a point moved by b, :math:`\varphi' = T \varphi`, so that :math:`M' = T M T^T` and
+    For a reference point moved by b, :math:`\varphi' = T \varphi`, so that :math:`M' = T M T^T` and
     :math:`L' = T L T^T`.
     """
     k, d = sums.origin.shape

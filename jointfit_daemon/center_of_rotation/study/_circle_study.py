@@ -3,9 +3,9 @@ r"""Monte Carlo study of the circle fits: maps of the error over arc, noise and 
 Invariant: one seeded generator supplies all random numbers. All runs of a cell are computed
 at once.
 
-A marker at distance r from the center stands at the angles 0, α and 2α; each coordinate carries
-independent noise of standard deviation σ. Two of (r, σ, α) vary over a map, the third is fixed. On
-every cell are the RMS errors of the methods over many runs, the error predicted for three frames
+A marker at distance r from the center is at the angles 0, α and 2α; each coordinate has independent
+noise of standard deviation σ. Two of (r, σ, α) vary over a map, the third is fixed. Every cell
+contains the RMS errors of the methods over many runs, the error predicted for three frames
 
 .. math:: F = \sigma \sqrt{\frac{2 + \cos\alpha}{(1 - \cos\alpha)^2 (1 + \cos\alpha)}}
 
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 
 
 CLIPS_M = (None, 0.05, 0.15, 0.3, 0.5)
-"""Both maps of a correlation are cut off there, m; None: as they are."""
+"""Upper limit of the values of both maps of a correlation, m; None: no limit."""
 PRINTED = {"α–σ": (0.99, 0.78), "r–σ": (0.99, 0.98), "r–α": (0.99, 0.94)}
-"""The source's table 1 as its digits are read: analytic against prediction, against grid."""
+"""Correlations of table 1 of the source: analytic solution with prediction, and with grid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,24 +50,25 @@ class StudySetup:
     radii: Array = field(default_factory=lambda: np.linspace(0.1, 0.6, 11))
     noises: Array = field(default_factory=lambda: 0.0005 * np.arange(11.0))
     steps: Array = field(default_factory=lambda: np.arange(5.0, 176.0, 5.0) * (np.pi / 180.0))
-    """α, the angle from one of the three frames to the next; its poles 0 and π are left out."""
+    """α, the angle between successive frames; the poles 0 and π are excluded."""
     radius: float = 0.6
-    """r of the map that does not vary it."""
+    """r in the map in which r is fixed."""
     noise: float = 0.001
     step: float = np.pi / 3.0
     repeats: int = 1000
-    """Runs a cell of the three-frame solution."""
+    """Number of runs of the three-frame solution in each cell."""
     grid_repeats: int = 150
-    """... of the grid searches, the first of the same runs."""
+    """Number of runs of the grid searches, the first of the same runs."""
     box: float = 0.05
-    """The grid spans ± this about the true center, m."""
+    """Half width of the grid about the true center, m."""
     node: float = 0.005
-    """From node to node, m."""
+    """Distance between nodes, m."""
     frames: int = 100
-    """Evenly over the same arc, for the estimators that use all frames."""
+    """Number of frames, evenly over the same arc, for the estimators that use all frames."""
     frames_repeats: int = 30
     orientation_noise: float = float(np.deg2rad(1.0))
-    """White error of the angle that the orientation-aided estimator is given, rad."""
+    """Standard deviation of the white error of the angle for the orientation-aided estimator,
+    rad."""
     seed: int = 1
 
 
@@ -88,7 +89,7 @@ class PairMaps:
 
 
 def correlation(a: Array, b: Array, clip: float | None = None) -> float:
-    """Return Pearson's correlation of two maps, both cut off at `clip`; 0 if one is constant."""
+    """Return Pearson's correlation of two maps, both limited to `clip`; 0 if one is constant."""
     x, y = (np.minimum(m, np.inf if clip is None else clip).ravel() for m in (a, b))
     x, y = x - x.mean(), y - y.mean()
     scale = float(np.sqrt((x @ x) * (y @ y)))
@@ -155,14 +156,14 @@ def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool
     noise : float
         Standard deviation of each coordinate, m.
     known_radius : bool
-        The radius need not be found.
+        The radius is known and not estimated.
     """
     s = float(np.sinc(arc / (2.0 * np.pi)))
     c = float(np.sinc(arc / np.pi))
     along = 1.0 + c - (0.0 if known_radius else 2.0 * s**2)
     if not known_radius and arc < 0.05:
-        along = arc**4 / 360.0  # its series: the difference has no digits there
-    if c >= 1.0 or along <= 0.0 or frames <= 0:  # no arc, or one that is lost in rounding
+        along = arc**4 / 360.0  # series expansion, because the difference cancels there
+    if c >= 1.0 or along <= 0.0 or frames <= 0:  # no arc, or an arc within rounding
         return float("inf")
     return float(noise * np.sqrt((2.0 / (1.0 - c) + 2.0 / along) / frames))
 
@@ -170,7 +171,7 @@ def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool
 def _line(
     setup: StudySetup, rng: np.random.Generator, radius: Array, noise: Array, step: Array
 ) -> dict[str, Array]:
-    """Return all figures of one row of cells, each of shape (cells,)."""
+    """Return all results of one row of cells, each of shape (cells,)."""
     three = _noisy(rng, radius, noise, step[:, None] * np.arange(3.0), setup.repeats)
     few = three[:, : setup.grid_repeats]
     line = {
@@ -217,7 +218,7 @@ def _noisy(
 
 
 def _rms(centers: Array) -> Array:
-    """Return the RMS distance from the origin over the answered runs, (cells,); NaN if none."""
+    """Return the RMS distance from the origin over runs with a result, (cells,); NaN if none."""
     squares = (centers**2).sum(axis=-1)
     answered = np.isfinite(squares)
     total = np.where(answered, squares, 0.0).sum(axis=-1)

@@ -23,11 +23,11 @@ _TOLD = AngleNoise()
 _STEPS = 12
 _LEAST_NOISE_M = 1e-6
 _STUCK = 1e3
-"""Damping at which a run is at its end."""
+"""Damping above which a run ends."""
 
 
 class _Weights(NamedTuple):
-    """M = U diag(d) Uᵀ - h hᵀ of every run, M being the inverse covariance of the angles."""
+    """Inverse covariance M = U diag(d) Uᵀ - h hᵀ of the angles of every run."""
 
     U: Array
     """Shape (n, n)."""
@@ -37,7 +37,7 @@ class _Weights(NamedTuple):
     """Shape (runs, n)."""
 
     def times(self, a: Array) -> Array:
-        """Return M a of every run, shape (runs, n) or, for k vectors a run, (runs, k, n)."""
+        """Return M a of every run, shape (runs, n), or (runs, k, n) for k vectors in each run."""
         d, h = (self.d, self.h) if a.ndim == 2 else (self.d[:, None], self.h[:, None])
         plain = ((a @ self.U) * d) @ self.U.T
         return np.asarray(plain - (h * a).sum(axis=-1, keepdims=True) * h)
@@ -56,7 +56,7 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     angles : ndarray, shape (..., n)
         Measured angle of the child relative to the parent, rad.
     interval : float
-        From frame to frame, s.
+        Time between frames, s.
     """
     shape, n = points.shape[:-2], points.shape[-2]
     z: Complex = (points[..., 0] + 1j * points[..., 1]).reshape(-1, n)
@@ -76,7 +76,7 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     noise = np.maximum(noise, _LEAST_NOISE_M)
     found, H = start, np.zeros((len(z), 4, 4))
 
-    for _ in range(2):  # the angular noise is frozen at a radius: twice settles it
+    for _ in range(2):  # the angular noise is computed at a fixed radius; two passes suffice
         radius = np.maximum(found[:, 2], 0.01)
         weights = _weights(theta, noise / radius, interval)
         found, H = _descend(_Runs(z, theta, noise, weights, weights.diagonal(), radius), found)
@@ -86,7 +86,7 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
 
 @cache
 def _wandering(n: int, interval: float) -> tuple[Array, Array]:
-    """Return eigenvalues and -vectors of the angles' covariance, the scale's part left out."""
+    """Return eigenvalues and eigenvectors of the angles' covariance without the scale part."""
     apart = interval * np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     slow = _TOLD.slow**2 * np.exp(-apart / _TOLD.time)
     values, U = np.linalg.eigh(slow + _TOLD.white**2 * np.eye(n))
@@ -97,7 +97,7 @@ def _weights(theta: Array, relative_noise: Array, interval: float) -> _Weights:
     n = theta.shape[-1]
     values, U = _wandering(n, interval)
     d = 1.0 / (values + relative_noise[:, None] ** 2)
-    # the scale's part without the noise of the angles: here they grow evenly from frame to frame
+    # the scale part without angle noise; the angles grow evenly from frame to frame
     even = np.arange(n) - 0.5 * (n - 1)
     g = _TOLD.gain * np.outer(theta @ even, even) / (even @ even)
     h = ((g @ U) * d) @ U.T
@@ -114,17 +114,17 @@ class _Runs(NamedTuple):
     diagonal: Array
     """Diagonal of M, shape (runs, n)."""
     rho0: Array
-    """The radius at which M is frozen, shape (runs,)."""
+    """Radius at which M is computed, shape (runs,)."""
 
     def only(self, i: NDArray[np.intp]) -> _Runs:
-        """Return some of the runs."""
+        """Return selected runs."""
         U, d, h = self.weights
         kept = _Weights(U, d[i], h[i])
         return _Runs(self.z[i], self.theta[i], self.noise[i], kept, self.diagonal[i], self.rho0[i])
 
 
 def _descend(runs: _Runs, start: Array) -> tuple[Array, Array]:
-    """Levenberg-Marquardt of every run from (x, y, ρ, β); return them and their H."""
+    """Run Levenberg-Marquardt on every run from (x, y, ρ, β); return the parameters and their H."""
     at, mu = start.copy(), np.full(len(start), 1e-3)
     cost, g, H = _cost(runs, at)
     moving = np.arange(len(start))
@@ -148,7 +148,7 @@ def _descend(runs: _Runs, start: Array) -> tuple[Array, Array]:
 
 
 def _cost(runs: _Runs, at: Array) -> tuple[Array, Array, Array]:
-    """Return the score, its half gradient (runs, 4) and Gauss-Newton matrix (runs, 4, 4)."""
+    """Return the cost, half its gradient (runs, 4) and the Gauss-Newton matrix (runs, 4, 4)."""
     z, theta, noise, weights, diagonal, rho0 = runs
     d = z - (at[:, 0] + 1j * at[:, 1])[:, None]
     q = np.maximum(np.abs(d), 1e-9)
@@ -171,7 +171,7 @@ def _cost(runs: _Runs, at: Array) -> tuple[Array, Array, Array]:
 
 
 def _guarded(center: Array, H: Array, circles: Circles) -> Array:
-    """Limit the distance of aided centers from the circle fits, as `guarded` does for one run."""
+    """Limit the distance of aided centers from the circle fits; the batch form of `guarded`."""
     C = np.linalg.inv(H + 1e-9 * H * np.eye(4))[:, :2, :2]
     held = circles.valid & (circles.noise > _LEAST_NOISE_M)
     of_circle = np.where(held[:, None, None], circles.covariance, np.eye(2))
