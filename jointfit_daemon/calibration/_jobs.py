@@ -1,7 +1,7 @@
 """Jobs of the worker process and their result.
 
-A job is pickled, and its result is sent back and recorded as JSON. This module imports no fit, so
-that the daemon can create jobs without loading scipy.
+A job is pickled, and its result is sent back and recorded as JSON. This module imports no fitting
+code, so that the daemon can create jobs without loading scipy.
 """
 
 from __future__ import annotations
@@ -24,7 +24,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class AlignJob:
-    """Fit the worlds of all sensors on the calibration plate."""
+    """Estimate the rotation between each sensor's world and the optical world.
+
+    All sensors are on the calibration plate.
+    """
 
     name: ClassVar[str] = "align"
 
@@ -98,12 +101,13 @@ class FitResult:
     kept: str | None = None
     """Reason why a refit does not replace the models in force."""
     notes: tuple[str, ...] | None = None
-    """How sensors were re-donned; None without a calibration to compare with."""
+    """Sensors that appear re-donned since the calibration in force; None without such a
+    calibration."""
     refused: str | None = None
     """Reason why there is no result; the other fields are then unused."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form: a refusal alone, otherwise the fields that are not None."""
+        """Return the JSON form: only `refused` if there is no result, else all non-None fields."""
         if self.refused is not None:
             return {"refused": self.refused}
         table = {

@@ -89,7 +89,7 @@ class OnlineFrames:
     """New complete frames of sensors and markers, in order of time."""
 
     sensors: Mapping[str, Array]
-    """q_optical_segment of each sensor through its mount, shape (n, 4)."""
+    """q_optical_segment of each sensor, computed with its mount, shape (n, 4)."""
     markers: Mapping[str, Array]
     """Markers of the cluster of each segment, optical world, m, shape (n, k, 3); absent for rigid
     bodies."""

@@ -131,5 +131,5 @@ def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> Cen
 
 
 def carried_center_gap(parent: ClusterTrack, child: ClusterTrack, center: Array) -> float:
-    """Return the RMS distance between the centers carried by the two body parts, m."""
+    """Return the RMS distance between the centers fixed in the two body parts, m."""
     return rms(np.linalg.norm(parent.carry(center) - child.carry(center), axis=-1), np.inf)

@@ -56,7 +56,7 @@ _STANDING = rotation.IDENTITY
 
 @dataclass(frozen=True, slots=True)
 class JointCenter:
-    """Anatomical joint center in the static world, placed with all other joints of the chain."""
+    """Joint center in the static world, estimated together with the other centers of the chain."""
 
     center: Array
     """m, shape (3,)."""
@@ -67,7 +67,8 @@ class JointCenter:
     fit: CenterEstimate | None
     """Center of rotation from the movement; None for ``length``."""
     gap_rms: float | None
-    """RMS distance between the centers carried by the two body parts, m."""
+    """RMS distance during the movement between the center fixed in the proximal body part and the
+    center fixed in the distal body part, m."""
 
     @property
     def source_text(self) -> str:
@@ -99,7 +100,7 @@ class Anatomy:
 
     joints: Mapping[str, JointCenter | None]
     q_static: Mapping[str, Array]
-    """q_static-world_segment of each segment, shape (4,)."""
+    """Orientation of each segment in the static world, q_world_segment, shape (4,)."""
     lengths: Mapping[str, tuple[float | None, float | None]]
     """Length and its standard deviation for each segment, m."""
     length_sources: Mapping[str, str]
@@ -148,7 +149,7 @@ def find_anatomy(chain: Chain, tracks: Mapping[str, ClusterTrack]) -> Anatomy:
                 f"{segment}: no adjacent joint flexed enough to determine its flexion axis; "
                 "flex and extend it (squats)"
             )
-        if x is None:  # a single segment: its heading is not observable
+        if x is None:  # the heading of a single segment is not observable
             flags.append(FrameFlag.FACING_UNKNOWN)
             x = np.array([1.0, 0.0, 0.0])
         q_static[segment] = _STANDING.copy() if chain.static_axes else _frame(segment, x, z[i])
@@ -202,7 +203,7 @@ def _fit_centers(
 def place_unobserved(
     chain: Chain, found: Mapping[str, CenterEstimate]
 ) -> dict[str, CenterEstimate]:
-    """Move centers along their unobserved directions above or below their neighbors.
+    """Move centers along unobserved directions until vertically above or below their neighbors.
 
     The leg is straight in the static pose, so neighboring joints are above each other. Centers next
     to fully observed ones are moved first.
@@ -229,7 +230,8 @@ def on_skin(fit: CenterEstimate) -> Array:
 
     .. math:: C + \sigma_u^2\, U^T U + \sigma_r^2 L
 
-    with the unseen directions U and the leverage L: the posture-dependent soft-tissue artefact.
+    with the unobserved directions U (rows) and L = ``fit.leverage``, the covariance per m² of
+    radial soft-tissue artefact.
     """
     whole = fit.covariance + UNSEEN_SD_M**2 * fit.unseen.T @ fit.unseen
     return whole if fit.leverage is None else whole + RADIAL_ARTEFACT_SD_M**2 * fit.leverage

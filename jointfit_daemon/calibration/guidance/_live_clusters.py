@@ -155,7 +155,7 @@ class LiveClusters:
         q_body = np.asarray(frame.body_orientations[column], dtype=np.float64)
         q = rotation.multiply(q_body, rotation.conjugate(self._clusters[i].q_body))
         norm = float(np.sqrt(q @ q))
-        if not norm > 0.0:  # NaN too
+        if not norm > 0.0:  # also True for NaN
             return np.full((self.sizes[i], 3), np.nan)
         R = rotation.to_matrix(q / norm)
         return np.asarray(self._clusters[i].template @ R.T + frame.body_positions[column])

@@ -117,7 +117,7 @@ class MovementGuide:
         if elapsed_s > PATIENCE_S:
             missing += [text for name, part in figures.items() if (text := _fault(name, part))]
 
-        # Conditions on each joint: center from markers, then flexion seen by sensors.
+        # Conditions on each joint: center from markers, then flexion measured by sensors.
         joints: dict[str, Mapping[str, object]] = {}
         inner = self._chain.joints[1:-1]
         for joint in self._chain.joints:

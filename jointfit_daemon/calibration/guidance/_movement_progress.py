@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, Quaternion
 
 SKIN_NOISE_M = 0.005
-"""RMS soft-tissue artefact of a skin marker, m: the limit of a functional joint center."""
+"""RMS soft-tissue artefact of a skin marker, m; it limits the accuracy of a functional joint
+center."""
 
 CORRELATION_S = 0.5
 """Correlation time of the soft-tissue artefact, s: one second has two independent samples."""
@@ -70,7 +71,8 @@ class MovementProgress:
     """Orientation of each sensor in the static pose, the zero of flexion; for other sensors the
     first orientation."""
     _seen: dict[tuple[str, str, str], _RotationRange] = field(default_factory=dict)
-    """By joint and pair of sensors: each pair has its own mounts, and therefore its own zero."""
+    """Range for each joint and pair of sensors; each pair has its own sensor-to-segment alignments,
+    and therefore its own zero."""
 
     def update(self, latest: Mapping[str, Quaternion]) -> None:
         """Process the newest orientation of each available sensor."""

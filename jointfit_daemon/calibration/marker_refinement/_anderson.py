@@ -1,6 +1,7 @@
-r"""Anderson acceleration of a fixed-point iteration, to be taken only where it helps.
+r"""Anderson acceleration of a fixed-point iteration, with acceptance by the caller.
 
-This proposes, the caller disposes. Without a safeguard it was seen to raise tracking errors.
+The caller must accept a proposal only if it lowers the objective. Without this safeguard the
+acceleration increased tracking errors.
 
 .. math::
 

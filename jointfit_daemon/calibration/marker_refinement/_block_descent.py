@@ -1,15 +1,15 @@
-r"""Markers and poses in turns: block-coordinate descent, accelerated only where that helps.
+r"""Block-coordinate descent: marker positions and poses are optimized in turns.
 
-It asks of a model nothing but to follow given markers, so it runs on any inverse kinematics.
-Poses fixed, the best positions are a weighted mean of the measured ones in segment axes and of
-the nominal ones,
+The only requirement on the model is inverse kinematics for given markers. With fixed poses, the
+best positions are a weighted mean of the measured positions in segment axes and the nominal
+positions,
 
 .. math::
 
     p_m = \frac{\sum_t w_{tm} R^T (y_{tm} - t) + \lambda n_m p^0_m}{\sum_t w_{tm} + \lambda n_m}
 
 With Huber's loss the weights are those at the last errors. Both halves lower F; an accelerated
-guess is kept only if it lowers F, too.
+proposal is accepted only if it lowers F, too.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ _MOST_ITERATIONS = 30
 
 
 class Carriers(NamedTuple):
-    """Where the segment of every marker is; frames first."""
+    """Pose of the segment of every marker in every frame."""
 
     rotations: Array
     """R_world_segment of each marker's segment, shape (T, M, 3, 3)."""
     origins: Array
     """m, shape (T, M, 3)."""
     overturning: float = 0.0
-    """Part of F from hinges beyond their limits."""
+    """Part of F caused by hinges beyond their limits."""
 
 
 @dataclass(frozen=True, slots=True)
 class AlternatingStep:
-    """One accepted iterate: positions and the poses that follow them."""
+    """One accepted iterate: marker positions and the poses fitted to them."""
 
     positions: Array
     carriers: Carriers
@@ -63,16 +63,17 @@ def solve_in_turns(
     Parameters
     ----------
     follow
-        Given positions, m, shape (M, 3), and weights of squared errors, shape (T, M): the poses.
+        Returns the poses for positions, m, shape (M, 3), and weights of squared errors, shape (T,
+        M).
     on_step
         Called with every accepted iterate; True ends the iteration.
     tolerance
-        Relative decrease of F in one turn at which it is done.
+        Relative decrease of F in one turn below which the iteration ends.
 
     Returns
     -------
     list of Turn
-        Start and every accepted place; F falls along it.
+        The start and every accepted iterate; F decreases.
     """
     turns = _AlternatingSolver(problem, follow)
     path, anderson = [turns.first()], Anderson()
@@ -91,7 +92,7 @@ def solve_in_turns(
         if new is None:
             new = turns.follow(plain, last)
 
-        if new.cost >= last.cost:  # both halves are at their best, up to rounding
+        if new.cost >= last.cost:  # both halves are at their minimum, except for rounding
             break
         path.append(new)
         done = last.cost - new.cost < tolerance * last.cost
@@ -102,7 +103,7 @@ def solve_in_turns(
 
 
 class _AlternatingSolver:
-    """The two halves of a turn."""
+    """The two steps of one turn: poses and positions."""
 
     def __init__(
         self, problem: RefinementProblem, follow: Callable[[Array, Array], Carriers]
@@ -115,7 +116,7 @@ class _AlternatingSolver:
         return self._at(begin, self._follow(begin, self._problem.weights))
 
     def follow(self, positions: Array, last: AlternatingStep) -> AlternatingStep:
-        """Return the poses for new positions, robust weights as at the last poses."""
+        """Return the poses for new positions, with the robust weights of the last poses."""
         distances = np.linalg.norm(self._errors(positions, last.carriers), axis=-1)
         return self._at(positions, self._follow(positions, self._problem.robust(distances)))
 

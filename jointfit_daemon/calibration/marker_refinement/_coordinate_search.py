@@ -1,16 +1,16 @@
 r"""Published coordinate search: one marker coordinate at a time, scored by inverse kinematics.
 
 The search needs only the tracking error of a set of marker positions, so it runs on any model,
-also that of another program. Every unlocked coordinate has a step of its own::
+including a model in another program. Every unlocked coordinate has a step of its own::
 
     while any step is at or above the threshold:
         for every marker, for x, y, z whose step is:
             go on in + while the error falls; if it never did, go on in - while it falls
             if neither way helped: halve the step
 
-Source: Price, LaPrè, Johnson, Umberger and Sup, Int J Numer Method Biomed Eng 36 (2020) e3283,
-doi 10.1002/cnm.3283. The paper does not state the first step, the threshold, the order, nor the
-least decrease; they are settings here.
+Source: Price, LaPrè, Johnson, Umberger and Sup, Int J Numer Method Biomed Eng 36 (2020) e3283, doi
+10.1002/cnm.3283. The paper does not state the first step, the threshold, the order or the least
+decrease; they are settings here.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class SearchSettings:
 
 @dataclass(frozen=True, slots=True)
 class SearchResult:
-    """Where the search ended."""
+    """Result of the search."""
 
     positions: Array
-    """On their segments, m, shape (M, 3)."""
+    """Marker positions on their segments, m, shape (M, 3)."""
     errors: tuple[float, ...]
     """RMS tracking error at the start and after every accepted step, m."""
     runs: int
-    """Times inverse kinematics was run."""
+    """Number of runs of inverse kinematics."""
 
 
 def search(
@@ -64,8 +64,8 @@ def search(
     Parameters
     ----------
     tracking_error
-        RMS distance between measured and model markers after inverse kinematics, m; it may keep the
-        last pose of the frames to start from.
+        RMS distance between measured and model markers after inverse kinematics, m; it may start
+        from the poses of the last call.
     start
         Positions on their segments, m, shape (M, 3).
     free
@@ -100,7 +100,7 @@ class _Walk:
         return self._tracking_error(positions)
 
     def along(self, marker: int, axis: int, step: float, least_gain: float) -> bool:
-        """Go in one direction while that helps, else in the other; return whether either did."""
+        """Step in one direction while the error falls, else the other way; return whether it fell."""
         accepted = len(self.errors)
         for signed in (step, -step):
             while True:

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def tracking_statistics(residuals: Array) -> TrackingStatistics:
-    """Return the figures of residuals, m, shape (T, M, 3), NaN where missing."""
+    """Return the statistics of residuals, m, shape (T, M, 3), NaN where missing."""
     square = np.einsum("tmi,tmi->tm", residuals, residuals)
     seen = np.isfinite(square)
     square = np.where(seen, square, 0.0)
@@ -72,7 +72,7 @@ def judge_trial(
 
 
 def turned(model: ChainModel, old: IkResult, new: IkResult) -> dict[str, tuple[float, float]]:
-    """Return RMS and greatest turn of every joint between two solutions, rad, by segment."""
+    """Return RMS and greatest rotation of every joint between two solutions, rad, by segment."""
     well = ~(old.underdetermined | new.underdetermined)
     if not well.any():
         return {}
@@ -92,7 +92,7 @@ def marker_outcomes(
     free: NDArray[np.bool_],
     trials: Sequence[TrialOutcome],
 ) -> tuple[MarkerOutcome, ...]:
-    """Return every marker's own line."""
+    """Return the result of every marker."""
     old = _pooled([t.before for t in trials], [t.frames for t in trials])
     new = _pooled([t.after for t in trials], [t.frames for t in trials])
     moved = after.positions - before.positions

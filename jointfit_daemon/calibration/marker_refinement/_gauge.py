@@ -1,12 +1,12 @@
 r"""Gauge freedom: directions in which markers may move without changing the tracking error.
 
-A segment on a ball joint may be turned about the joint together with all its markers, and
-inverse kinematics turns it back: the error stays, the joint angle is another. Such directions are
-the null space of the reduced normal matrix without a prior,
+All markers of a segment on a ball joint may be rotated about the joint together. Inverse kinematics
+rotates the segment back, so that the error is equal but the joint angle differs. Such directions
+are the null space of the reduced normal matrix without a prior,
 
 .. math:: S = \sum_t C_t - B_t^T A_t^{-1} B_t
 
-divided by the frames. Locks and priors fix them; otherwise `fixed_by` is "nothing".
+divided by the number of frames. Locks and priors fix them; otherwise `fixed_by` is "nothing".
 """
 
 from __future__ import annotations
@@ -22,43 +22,43 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _ZERO = 1e-6
-"""Eigenvalues of S/T are squared metres per squared metre, 1 for a marker nothing else depends on:
-values below this are rounding."""
+"""Eigenvalues of S/T are squared metres per squared metre, 1 for a marker that is independent of
+all others. Values below this are attributed to rounding."""
 _WEAK = 0.01
-"""Below this a movement of 10 mm costs less than 1 mm of error."""
+"""Eigenvalue below which a displacement of 10 mm increases the error by less than 1 mm."""
 _NAMED = 0.1
-"""Share of a direction's square that a marker must have to be named."""
+"""Smallest share of the square of a direction for which a marker is listed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """Freedom of the markers that the data of these trials leave open."""
+    """Directions of marker displacement that the data of the trials do not determine."""
 
     eigenvalues: Array
     """Eigenvalues of S/T over the unlocked coordinates, ascending; 1 is a fully observed marker."""
     free: int
-    """How many are zero: moves that no tracking error shows."""
+    """Number of zero eigenvalues: displacements without effect on the tracking error."""
     weak: int
-    """How many are not zero and still below 0.01."""
+    """Number of non-zero eigenvalues below 0.01."""
     involved: tuple[str, ...]
-    """Markers that the free moves carry, the most moved first."""
+    """Markers that move along the free directions, the most displaced first."""
     fixed_by: str
     """What fixes the free directions: "locks", "prior" or "nothing"."""
 
 
 def gauge_of(S: Array, frames: int, coordinates: Sequence[str], *, prior: float) -> Gauge:
-    """Return the freedom that S shows.
+    """Return the gauge freedom according to S.
 
     Parameters
     ----------
     S
         Reduced normal matrix without prior and without damping, shape (n, n).
     frames
-        Frames it was summed over.
+        Number of frames in the sum.
     coordinates
         Marker of every row, length n.
     prior
-        Weight of the nominal positions; 0 holds nothing.
+        Weight of the nominal positions; 0 for no prior.
     """
     if not len(S):
         return Gauge(np.empty(0), 0, 0, (), "locks")

@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 
 _LEAST_FRAMES = 10
 _UNIT_FACTOR = 100.0
-"""Size ratio from which the length unit must be wrong."""
+"""Size ratio above which the length unit must be wrong."""
 _MOST_STRETCH = 1.3
 _TOLD_STRETCH = 1.1
 _APART_M = 0.04
-"""Distances between markers of one segment are compared from here on."""
+"""Smallest distance between markers of one segment that is compared, m."""
 _MOST_RMS_M = 0.08
 _SWAP_GAIN = 0.2
-"""Share of the squared error left after exchanging two labels back, below which they were
+"""Share of the squared error that remains after exchanging two labels; below it they were
 exchanged."""
 _SWAP_LEAST_M = 0.05
 _SWAPPED_TRIAL = 0.5
-"""Share of the frames from which a whole trial counts as labelled wrongly."""
+"""Share of the frames above which a whole trial counts as labelled wrongly."""
 _ROBUST = IkOptions(huber_m=0.02, reweightings=4)
 
 
@@ -113,7 +113,7 @@ def _wrong_size(model: ChainModel, trial: MotionTrial) -> list[str]:
 
 
 def _stretch(model: ChainModel, trial: MotionTrial) -> float:
-    """Return measured over nominal distance of markers on one segment, the median pair."""
+    """Return the median ratio of measured to nominal distances of markers on one segment."""
     p, y, s = model.positions, trial.targets, model.marker_segments
     ratios = []
     for i, j in combinations(range(len(p)), 2):
@@ -138,13 +138,13 @@ def _stretches(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
 def _movable(
     model: ChainModel, trials: Sequence[MotionTrial]
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """Return the coordinates that trials speak of, and why others are held."""
+    """Return the coordinates that the trials determine, and why others are locked."""
     seen = np.zeros(len(model.markers), dtype=np.bool_)
     for trial in trials:
         seen |= np.isfinite(trial.targets).all(axis=-1).any(axis=0)
     seen &= model.weights > 0.0
 
-    # The only marker of a segment cannot be told from its pose.
+    # The position of the only marker of a segment and the segment's pose are indistinguishable.
     counted = np.bincount(model.marker_segments[seen], minlength=len(model.segments))
     alone = seen & (counted[model.marker_segments] == 1)
     free = ~model.locked & (seen & ~alone)[:, None]
@@ -162,7 +162,7 @@ def _movable(
 
 
 def _gaps(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
-    """Name markers that are in some trials only."""
+    """List markers that are only in some of the trials."""
     present: NDArray[np.bool_] = np.array(
         [np.isfinite(t.targets).all(axis=-1).any(axis=0) for t in trials]
     )
@@ -205,7 +205,7 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
 
 def _exchanged(residuals: Array, targets: Array) -> list[tuple[int, int, NDArray[np.bool_]]]:
     """Return pairs of markers that fit far better with each other's label, and when."""
-    places = targets + residuals  # where the model has them
+    places = targets + residuals  # positions in the model
     own = np.einsum("tmi,tmi->tm", residuals, residuals)
     found = []
 

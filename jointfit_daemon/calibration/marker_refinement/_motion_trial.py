@@ -30,12 +30,12 @@ class MotionTrial:
     rate_hz: float
 
     def thinned(self, most: int) -> MotionTrial:
-        """Return at most so many frames, evenly over the whole trial."""
+        """Return at most `most` frames, evenly over the whole trial."""
         every = max(1, -(-len(self.targets) // most))
         return MotionTrial(self.name, self.targets[::every], self.rate_hz / every)
 
     def split(self, last_share: float) -> tuple[MotionTrial, MotionTrial]:
-        """Return the first part and the last, each of frames that follow each other."""
+        """Return the first and the last part, each with consecutive frames."""
         cut = len(self.targets) - round(last_share * len(self.targets))
         first = MotionTrial(self.name, self.targets[:cut], self.rate_hz)
         return first, MotionTrial(self.name, self.targets[cut:], self.rate_hz)
@@ -43,21 +43,24 @@ class MotionTrial:
 
 @dataclass(frozen=True, slots=True)
 class RefinementSettings:
-    """How to refine."""
+    """Settings of a refinement."""
 
     method: RefinementMethod = "joint"
     prior: float = 0.05
-    """λ: cost of one metre from the nominal position relative to one metre of error."""
+    """λ: cost of a displacement of 1 m from the nominal position relative to an error of 1 m."""
     huber_m: float | None = 0.02
-    """Errors beyond count by their length, not its square, m; None: all squares."""
+    """Error above which the loss is linear instead of quadratic, m; None: quadratic for all
+    errors."""
     frames: int = 150
-    """Frames of every trial at most: long trials are thinned, so that none outweighs the others."""
+    """Largest number of frames of a trial; longer trials are decimated, so that none dominates."""
     evenness: float = 0.0
-    """Trials weigh as the power of their own error: more makes them more alike."""
+    """Exponent of a trial's error in its weight; a larger one makes the errors of trials more
+    equal."""
     limit_m2: float = 1.0
     """Weight, m^2/rad^2, of a hinge's excess over its limits, where the model has limits."""
     holdout_share: float = 0.0
-    """Last share of every training trial that only decides when to stop; 0: all is learned from."""
+    """Last share of every training trial that only decides when to stop; 0: all frames are
+    fitted."""
     tolerance: float | None = None
-    """Relative decrease of F that ends it; None: the method's own."""
+    """Relative decrease of F that ends the iteration; None: the default of the method."""
     search: SearchSettings = field(default_factory=SearchSettings)

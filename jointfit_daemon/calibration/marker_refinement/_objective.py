@@ -8,10 +8,11 @@ With the markers' errors :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and weigh
               + \tfrac12 \lambda \sum_m n_m\, |p_m - p^0_m|^2
               + \tfrac12 \kappa \sum_{tk} x_{tk}^2, \qquad n_m = \sum_t w_{tm}
 
-where :math:`\rho(r) = r^2/2`, beyond c Huber's :math:`c (r - c/2)`. The prior grows with the frames
-in which a marker was seen, so thinning frames does not change its meaning. Poses q are free in
-every frame, positions p are the same in all of them; x is how far hinges are beyond their limits,
-rad. A program that clamps its joints would else be given markers that it cannot follow.
+where :math:`\rho(r) = r^2/2`, beyond c Huber's :math:`c (r - c/2)`. The prior grows with the number
+of frames in which a marker is visible, so decimating frames does not change its meaning. Poses q
+are free in every frame, positions p are the same in all of them; x is the excess of hinge angles
+over their limits, rad. Without this term, a program with joint limits could not follow the refined
+markers.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class RefinementProblem:
     huber_m: float | None
     """c, m; None: plain squares."""
     limit_m2: float = 0.0
-    """kappa; 0: hinges turn as far as they like."""
+    """kappa; 0: hinge angles are not limited."""
 
     @cached_property
     def seen(self) -> Array:
@@ -71,17 +72,17 @@ class RefinementProblem:
 
     @cached_property
     def limits(self) -> tuple[Band, ...]:
-        """Limits of hinges that are looked at."""
+        """Limits of hinges in the objective."""
         return limits_of(self.model, self.limit_m2)
 
     def excess(self, state: ChainState) -> Array | None:
-        """Return how far hinges are beyond their limits, rad, shape (T, nq); None: no limits."""
+        """Return the excess of hinge angles over their limits, rad, (T, nq); None: no limits."""
         for band in self.limits:
             return np.where(band.weights > 0.0, band.excess(layout_of(self.model), state), 0.0)
         return None
 
     def overturning(self, state: ChainState) -> float:
-        """Return the part of F that is of hinges beyond their limits."""
+        """Return the part of F caused by hinges beyond their limits."""
         excess = self.excess(state)
         return 0.0 if excess is None else float(0.5 * self.limit_m2 * (excess**2).sum())
 

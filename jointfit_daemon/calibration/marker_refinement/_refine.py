@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _FINE = 1e-9
 _RISES = 2
-"""The hold-out's error may rise this often in a row."""
+"""Number of consecutive increases of the hold-out error that are accepted."""
 
 
 def refine_markers(
@@ -52,7 +52,7 @@ def refine_markers(
     validation: Sequence[MotionTrial] = (),
     progress: Progress | None = None,
 ) -> Refinement:
-    """Refine where markers are on their segments.
+    """Refine the positions of markers on their segments.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def refine_markers(
     trials
         Training trials.
     validation
-        Evaluated, not fitted.
+        Trials that are evaluated, not fitted.
 
     Raises
     ------
@@ -135,7 +135,7 @@ def _task(
     options = IkOptions(huber_m=settings.huber_m, limit_m2=settings.limit_m2)
     first = solve_frames(model, targets, weights, options=options)
     if settings.evenness > 0.0:
-        # A weight for every frame: the error of its trial to a power, one on average.
+        # The weight of a frame is the error of its trial to a power, with mean 1.
         lengths = [len(part.targets) for part, _ in parts]
         each = np.split(first.residuals, np.cumsum(lengths)[:-1])
         errors = np.array([tracking_error(part) for part in each])
@@ -230,14 +230,14 @@ _METHODS = {"joint": _jointly, "block": _in_turns, "search": _searching}
 
 
 class ChainFollower:
-    """Inverse kinematics of the chain as `solve_in_turns` asks for it, warm from run to run."""
+    """Inverse kinematics of the chain for `solve_in_turns`; each run starts from the last poses."""
 
     def __init__(self, problem: RefinementProblem, first: IkResult) -> None:
         self._problem, self._state = problem, first.state
         self.runs = 0
 
     def __call__(self, positions: Array, weights: Array) -> Carriers:
-        """Return the poses that follow the markers at these positions."""
+        """Return the poses fitted to the markers at these positions."""
         model = self._problem.model.with_markers(positions)
         fine = IkOptions(tolerance=_FINE, limit_m2=self._problem.limit_m2)
         found = solve_frames(model, self._problem.targets, weights, start=self._state, options=fine)

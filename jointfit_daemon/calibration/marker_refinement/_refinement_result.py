@@ -1,7 +1,7 @@
 """Result of a refinement: marker displacements, tracking errors and changes of joint angles.
 
-All values are SI. Errors have unit weights, whatever weights the fit used. Variances have divisor
-N: over the frames of one trial, and over trials.
+All values are SI. Errors have unit weights, independent of the weights of the fit. Variances over
+frames and over trials have the divisor N.
 """
 
 from __future__ import annotations
@@ -25,45 +25,45 @@ class TrackingStatistics:
     """Tracking error of one model on one trial."""
 
     rms: float
-    """Over all markers and frames, m."""
+    """RMS over all markers and frames, m."""
     variance: float
-    """Over time, of every frame's RMS over its markers, m²."""
+    """Variance over time of the RMS over the markers of each frame, m²."""
     by_marker: Array
-    """RMS of every marker, m, shape (M,); NaN where it is never seen."""
+    """RMS of every marker, m, shape (M,); NaN if it is never visible."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrialOutcome:
-    """One trial before and after."""
+    """One trial before and after the refinement."""
 
     name: str
     trained: bool
-    """False: the refinement never saw it."""
+    """False: the trial was not used in the refinement."""
     frames: int
     rate_hz: float
     before: TrackingStatistics
     after: TrackingStatistics
     angles: dict[str, tuple[float, float]]
-    """Change of each joint's turn, RMS and greatest, rad, by segment; the root left out."""
+    """RMS and greatest change of each joint rotation, rad, by segment, without the root."""
 
 
 @dataclass(frozen=True, slots=True)
 class MarkerOutcome:
-    """One marker before and after."""
+    """One marker before and after the refinement."""
 
     name: str
     segment: str
     moved: tuple[float, float, float]
     """In segment axes, m."""
     held: tuple[bool, bool, bool]
-    """Coordinates that were locked, or that nothing in the trials speaks of."""
+    """Coordinates that were locked, or that the trials do not determine."""
     rms_before: float
-    """Over all trials, m; NaN if never seen."""
+    """RMS over all trials, m; NaN if never visible."""
     rms_after: float
 
     @property
     def distance(self) -> float:
-        """How far it moved, m."""
+        """Displacement of the marker, m."""
         return float(np.linalg.norm(self.moved))
 
 
@@ -79,7 +79,7 @@ class Refinement:
     costs: tuple[float, ...]
     """Cost at the start and after every step; it never rises."""
     runs: int
-    """Times inverse kinematics was run over all frames (`search`, `block`)."""
+    """Number of runs of inverse kinematics over all frames (`search`, `block`)."""
     stopped: str
     gauge: Gauge
     notes: tuple[str, ...] = ()
@@ -91,7 +91,7 @@ class Refinement:
         return _variance([t.before.rms for t in some]), _variance([t.after.rms for t in some])
 
     def angle_change(self) -> tuple[float, float]:
-        """Return RMS and greatest change of any joint's turn in any trial, rad."""
+        """Return RMS and greatest change of any joint rotation in any trial, rad."""
         pairs = [pair for t in self.trials for pair in t.angles.values()]
         if not pairs:
             return float("nan"), float("nan")

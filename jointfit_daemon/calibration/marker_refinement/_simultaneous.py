@@ -1,7 +1,7 @@
-r"""Markers and poses of all frames at once, the poses eliminated: Gauss, Newton and Schur.
+r"""Bundle adjustment of markers and poses: Gauss-Newton with Schur elimination of the poses.
 
-Frames touch each other only through the markers, so the normal equations fall into one small
-block a frame. With :math:`J_{tm} = \partial e/\partial q`, errors taken in segment axes,
+Frames are coupled only through the markers, so the normal equations have one small block for each
+frame. With :math:`J_{tm} = \partial e/\partial q`, errors taken in segment axes,
 
 .. math::
 
@@ -48,7 +48,7 @@ class RefinementStep:
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """The pieces of one linearization; f unlocked coordinates, nq degrees of freedom."""
+    """Blocks of one linearization, for f unlocked coordinates and nq degrees of freedom."""
 
     A: Array
     """Shape (T, nq, nq)."""
@@ -68,7 +68,7 @@ class NormalEquations:
         return dp, -(solved[..., -1] + solved[..., :-1] @ dp)
 
     def reduced(self) -> Array:
-        """Return S as it is, without damping, shape (f, f)."""
+        """Return S without damping, shape (f, f)."""
         return self._reduced(0.0)[1]
 
     def _reduced(self, damping: float) -> tuple[Array, Array, Array]:
@@ -92,7 +92,7 @@ def errors(problem: RefinementProblem, positions: Array, state: ChainState) -> A
 
 
 def linearize(problem: RefinementProblem, positions: Array, state: ChainState) -> NormalEquations:
-    """Return the normal equations at a place."""
+    """Return the normal equations at an iterate."""
     model = problem.model.with_markers(positions)
     e = errors(problem, positions, state)
     root = np.sqrt(problem.robust(np.linalg.norm(e, axis=-1)))
@@ -129,7 +129,7 @@ def solve_jointly(
     on_step: Callable[[RefinementStep], bool] | None = None,
     tolerance: float = _TOLERANCE,
 ) -> list[RefinementStep]:
-    """Refine by Gauss-Newton steps that F never rises on.
+    """Refine by Gauss-Newton steps that never increase F.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def solve_jointly(
     Returns
     -------
     list of Step
-        Start and every accepted place.
+        The start and every accepted iterate.
     """
     steps, damping = [start], _FIRST_DAMPING
     while len(steps) <= _MOST_ITERATIONS:

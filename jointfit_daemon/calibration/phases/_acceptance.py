@@ -27,12 +27,12 @@ class CalibrationComparison(NamedTuple):
 
 
 def compare_calibrations(new: Calibration, old: Calibration | None) -> CalibrationComparison:
-    """Compare a new calibration with the one in force.
+    """Compare a new calibration with the calibration in force.
 
     The criteria are checked in this order, and the first difference decides: the chain, use of
     cameras, alignment of the worlds, the hold-out error of each segment and of the flexion of each
-    inner joint (factor 1.15 plus 0.3°), and the gap between the centers carried by the two body
-    parts (5 mm).
+    inner joint (factor 1.15 plus 0.3°), and the gap between the centers fixed in the two body parts
+    (5 mm).
     """
     if old is None:
         return CalibrationComparison(True, "there was no calibration")

@@ -1,7 +1,7 @@
 r"""Refinement of marker positions on body parts from the functional movement.
 
-The static pose shows markers in one state of the soft tissue; the movement shows them thousands of
-times, and reveals a displaced marker. The markers of each part are refined by `marker_refinement`
+The static pose contains markers in one state of the soft tissue. The movement contains thousands of
+states, and reveals a displaced marker. The markers of each part are refined by `marker_refinement`
 without joints between the parts: joint centers from skin markers have errors of a centimeter and
 would distort the shapes. A rotation of a whole part is unobservable, so the refined shape
 :math:`p'` is fitted back to the pose :math:`p`,

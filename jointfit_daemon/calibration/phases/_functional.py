@@ -77,10 +77,10 @@ if TYPE_CHECKING:
 MIN_SEEN = 0.5
 """Smallest share of frames in which a body part is visible."""
 PLATE_SD_NS = 500_000.0
-"""Standard deviation of a lag from the align phase without its own, ns."""
+"""Standard deviation of a lag from the align phase that has none of its own, ns."""
 STORED_SD_NS = 3e6
-"""Standard deviation of a lag of the calibration in force, ns; it may have been estimated on
-skin."""
+"""Standard deviation of a lag of the calibration in force, ns; it may contain soft-tissue
+artefact."""
 
 
 def fit_calibration(
@@ -116,7 +116,8 @@ def fit_calibration(
     Raises
     ------
     CalibrationError
-        No optical system or markers, too little visible or moved, or sensors missing.
+        No optical system or markers, too few visible frames, too little movement, or missing
+        sensors.
     """
     pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
 

@@ -57,7 +57,7 @@ def run_job(job: CalibrationJob) -> FitResult:
 def _align(job: AlignJob) -> FitResult:
     sensors = [sensor for group in job.chain.sensors for sensor in group]
     missing = [sensor for sensor in sensors if sensor not in job.trial.sensors]
-    if missing:  # later phases would have to refuse what this one let pass
+    if missing:  # otherwise only later phases would refuse it
         raise CalibrationError(
             *(f"{name}: no data while the plate was turned; switch it on" for name in missing)
         )
@@ -129,7 +129,7 @@ def _alignment(job: StaticJob | FunctionalJob) -> PlateAlignment | None:
     previous = _previous(job)
     if previous is None or FrameFlag.HEADINGS_FROM_STATIC in previous.flags:
         return None
-    # The worlds do not depend on how the sensors are worn: they outlive a calibration.
+    # Alignments of sensor worlds do not depend on the sensor mounts, so they remain valid.
     return PlateAlignment(
         {
             name: AlignedSensor(

@@ -39,7 +39,7 @@ def unmoved_joint(chain: Chain, trials: Sequence[OfflineTrial]) -> str | None:
     movements = {
         joint: joint_rotation(reference[above], reference[below]) for joint, above, below in inner
     }
-    for name, q in (movements or reference).items():  # a single segment has no inner joint
+    for name, q in (movements or reference).items():  # single segment without inner joint
         known = q[np.isfinite(q).all(axis=1)]
         turned = rotation.angle_between(robust_mean(known).q, known)
         most = float(np.quantile(turned, 0.95))

@@ -167,7 +167,7 @@ def plate_track(
     Raises
     ------
     CalibrationError
-        rig.toml names no plate, or the stream does not have it or hardly shows it.
+        rig.toml names no plate, or it is not in the stream or hardly visible.
     """
     if settings.plate is not None:
         column = body_column(optical, "plate", settings.plate)

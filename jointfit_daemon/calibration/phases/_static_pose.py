@@ -193,7 +193,7 @@ def with_new_static(
             *(f"{name}: no data in the new static pose; switch it on" for name in missing)
         )
 
-    # Current orientation of every segment, as seen by cameras or as before.
+    # Current orientation of every segment, from cameras or as before.
     q_now: dict[str, Quaternion] = {}
     assumed = False
     for name, segment in calibration.segment.items():

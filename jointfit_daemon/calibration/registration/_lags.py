@@ -1,6 +1,6 @@
 r"""Lag of each sensor relative to the optical clock, estimated from rotation.
 
-On skin, sensor and markers move with different soft tissue, and their relative motion biases the
+Sensors and markers on skin move with different soft tissue, and their relative motion biases the
 lag. The standard deviation of the fit does not contain this bias. The measured lags of the sensors
 of one segment are therefore modeled as
 

@@ -74,8 +74,8 @@ def fit_observable_alignment(
     q_world_sensor : array_like, shape (n, 4)
         Sensor orientations in the world of the sensor.
     q_optical_body : array_like, shape (n, 4)
-        Orientations of the body that carries the sensor, at the same instants. Rows with NaN in
-        either are ignored.
+        Orientations of the body to which the sensor is attached, at the same instants. Rows with
+        NaN in either are ignored.
 
     Raises
     ------

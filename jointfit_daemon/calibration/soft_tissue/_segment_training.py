@@ -82,9 +82,9 @@ class SegmentTraining:
     def folds(self, of_one: int = 5) -> Iterator[NDArray[np.bool_]]:
         """Yield masks of held-out blocks, contiguous in time.
 
-        `of_one` blocks of a single trial, three of each of several. Random frames are unsuitable:
-        neighboring frames are almost identical, so a fit would have seen the frames of its
-        evaluation.
+        A single trial has `of_one` blocks; each of several trials has three. Random frames are
+        unsuitable: neighboring frames are almost identical, so the evaluation would use frames of
+        the fit.
         """
         labels = np.unique(self.trials)
         blocks = of_one if len(labels) == 1 else 3
