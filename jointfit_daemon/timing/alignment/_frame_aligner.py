@@ -4,7 +4,7 @@ Time advances with samples and with ``advance``; memory is bounded. Frames are e
 each once. Every sample has exactly one outcome.
 
 Frame k has the instant ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid does not depend on
-the start time. It is emitted when every living stream has a sample at or after t_k, or at its
+the start time. It is emitted when every active stream has a sample at or after t_k, or at its
 deadline: the next sample of each stream is expected at its usual delay, plus at most 1.5 of its
 periods. Missing samples are extrapolated by up to 2.5 periods; after that the stream is missing
 from the frame.
@@ -94,15 +94,15 @@ class FrameAligner:
         self._fast = mode == "fast"
         self._next = None if begin_ns is None else -(-begin_ns // period_ns)
         """Number of the next frame; None until a stream begins."""
-        self._served: int | None = None  # number of a frame some stream is known to serve
+        self._served: int | None = None  # number of a frame that some stream can serve
         self._serves_ns: int | None = None  # first instant a stream can serve, if not the next
         self._completed_ns = 0
         self._synced = False
         """Whether the clocks behind the last frame had settled."""
         self._deadline_ns: int | None = None
-        self._changed = True  # since `_deadline_ns` was worked out
+        self._changed = True  # change since the last computation of `_deadline_ns`
         self._dues: dict[str, int] = {}
-        """When each stream is ready for the next frame; empty until that is asked."""
+        """Time at which each stream is ready for the next frame; empty until first requested."""
         self.skipped_frames = 0
         """Number of skipped frames, see ``OWED_NS``."""
 
@@ -209,7 +209,7 @@ class FrameAligner:
         return True
 
     def _find_servers(self) -> None:
-        """Determine whether a stream serves the next frame, or else from when on.
+        """Determine whether a stream serves the next frame, or else its first served instant.
 
         Streams that have ended are reset.
         """
@@ -241,7 +241,7 @@ class FrameAligner:
             return None
         if self._served != self._next:
             return max([t_k, *[stream.given_up_ns(t_k) for _, stream in self._items]])
-        if not self._dues:  # else each sample updates the due time of its own stream only
+        if not self._dues:  # otherwise each sample updates only the due time of its own stream
             self._dues = {name: self._due_of(stream) for name, stream in self._items}
         latest = max(self._dues.values())
         return max(t_k, latest) if self._fast else latest
@@ -270,7 +270,7 @@ class FrameAligner:
             if stream.extrapolated:
                 extrapolated.append(name)
 
-        # unchanged while no stream has ended: a pause does not unsettle clocks
+        # unchanged while no stream has ended, because clocks remain settled during a pause
         if not orientations:
             synced = self._synced and any(stream.waited_for for _, stream in self._items)
 

@@ -1,8 +1,8 @@
 """One stream of the frame aligner: its pending samples, its usual delay, its counters.
 
-Bounded memory, independent of the other streams. A sample stays while a frame may still need it; at
-most three at or before the last frame stay for extrapolation. Its outcome is counted when it
-leaves.
+Bounded memory, independent of the other streams. A sample is stored while a frame may still need
+it; at most three at or before the last frame are stored for extrapolation. The outcome of a sample
+is counted when it is removed.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ REACH = 2.5
 GAP = 4.0
 """Largest interval between two samples for interpolation, periods."""
 CROWDED = 0.5
-"""Least interval between two samples for a rate, periods: timestamps may crowd while a clock
-settles.
+"""Least interval between two samples for a rate, periods: timestamps may be close together while a
+clock settles.
 """
 LOST_PERIODS = 3
 """Silence after which a stream counts as lost, periods."""
@@ -107,7 +107,7 @@ class Stream:
         self._counts = dict.fromkeys(SampleOutcome, 0)
         self.newest_ns = self.newest_arrival_ns = 0
         self.extrapolated = self.synced = False
-        """What the last ``at`` did, and whether the clock behind it had settled."""
+        """Outcome of the last ``at``, and whether its clock had settled."""
 
     # --- samples -----------------------------------------------------------------------------
 
@@ -190,7 +190,7 @@ class Stream:
     def due(self, t_ns: int) -> int:
         """Return the arrival of the first sample at or after `t_ns`, or its deadline, ns."""
         if not self.waited_for:
-            return t_ns  # a frame is not published before its instant
+            return t_ns  # no frame is published before its instant
         newest = self.newest_ns
         if newest < t_ns:
             period = self.period_ns

@@ -62,7 +62,7 @@ _SKEW_CHECK_SAMPLES = 256
 
 
 class DeviceClock:
-    """Clock of one device, from sync edges, echoes, ticks, a counter, or arrivals.
+    """Clock of one device, estimated from sync edges, echoes, ticks, a counter, or arrivals.
 
     Parameters
     ----------
@@ -107,7 +107,8 @@ class DeviceClock:
         self._direct: DirectTime | None = None
         self._refused = self._state_direct = self._synced = False
         self._away_since_ns: int | None = None
-        """Last arrival before the port was closed, ns, until a sample shows a restart or none."""
+        """Last arrival before the port was closed, ns, until a sample determines whether the device
+        restarted."""
         self._line.last_u = None
         self._doubts = PlausibilityMonitor()
 
@@ -201,7 +202,7 @@ class DeviceClock:
         self._forget()
 
     def feed_unix_offset(self, offset_ns: int) -> None:
-        """Set UNIX time minus CLOCK_MONOTONIC, ns, for clocks declared to show UNIX time."""
+        """Set UNIX time minus CLOCK_MONOTONIC, ns, for clocks declared to be UNIX time."""
         if offset_ns != self._unix_offset_ns:
             self._unix_offset_ns = offset_ns
             if self._tick_clock is not None and self._tick_clock.scale == "unix":
@@ -365,7 +366,7 @@ class DeviceClock:
         if envelope.settled:
             return doubts.feed(excess, envelope.sigma_ns(u), arrival_ns)
         if excess < 0.0:
-            # The samples before were stale bytes, late by up to seconds: discard the fit.
+            # Earlier samples were stale bytes, late by up to seconds: discard the fit.
             self._envelope = MinimumDelayFilter(NOMINAL_RATE if self._kind != _TICKS else CRYSTAL)
         return None
 
@@ -441,6 +442,6 @@ class DeviceClock:
             self.news.append(warning)
 
     def _by_arrival(self, arrival_ns: int) -> Stamp:
-        """Return the timestamp of a sample without the device time its neighbours have."""
+        """Return the timestamp of a sample without device time among samples with device time."""
         t = arrival_ns - self.latency_ns - round(self.jitter_ns or 0.0)
         return Stamp(self._line.forward(t), float(self._period_ns), synced=False, epoch=self.epoch)

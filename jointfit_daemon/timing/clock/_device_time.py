@@ -23,7 +23,7 @@ NS = 1_000_000_000
 FALL_NS = 500_000_000
 """Decrease of device time that indicates a restart instead of a reordered sample, ns."""
 BACKWARD_LIMIT = 4
-"""Consecutive samples from the past that indicate a restart, however small the decrease."""
+"""Consecutive samples with decreased time that indicate a restart, for any size of the decrease."""
 COUNTER_WIDTHS = (1 << 8, 1 << 16, 1 << 32)
 """Moduli of sample counters."""
 
@@ -218,7 +218,7 @@ class ArrivalTime:
 
     @property
     def turn_ns(self) -> int | None:
-        """None: arrivals do not show the device's own time."""
+        """None: arrivals do not contain the device's own time."""
         return None
 
     def feed(

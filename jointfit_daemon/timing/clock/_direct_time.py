@@ -3,7 +3,7 @@
 Direct time takes precedence over estimates from arrivals. If an estimate contradicts it, a
 ``clock`` event is published.
 
-A sync edge is one instant with two timestamps: u on the device's clock, v on the reference's. The
+A sync edge is one instant with two timestamps: u on the device clock, v on the reference clock. The
 line ``v(u)`` through the edges of the last minute relates the two clocks to microseconds. The
 mapping of v to host time then applies to u. Its uncertainty is common to both and cancels in
 differences between them, including the minimum delay.

@@ -71,7 +71,7 @@ def rates_from_orientations(
     t_ns : ndarray, shape (n,)
         Strictly increasing.
     q : ndarray, shape (n, 4)
-        q_world_body; rows with NaN are poses not seen.
+        q_world_body; rows with NaN are missing poses.
     origin_ns : int
         Instant that becomes 0 s.
     bridge_s : float
@@ -80,7 +80,7 @@ def rates_from_orientations(
     Returns
     -------
     Rates
-        Empty if fewer than three poses were seen.
+        Empty if fewer than three poses are available.
     """
     seen = np.isfinite(q).all(axis=1)
     t = 1e-9 * np.asarray(np.asarray(t_ns)[seen] - origin_ns, dtype=np.float64)

@@ -144,7 +144,7 @@ def estimate_lag(
     Returns
     -------
     LagEstimate
-        With a reason in ``refused`` where the data do not determine the lag.
+        ``refused`` contains the reason if the data do not determine the lag.
     """
     settings = settings or LagSettings()
     if min(np.size(imu_t_ns), np.size(ref_t_ns)) == 0:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 HUBERS = (1.5, 2.4, np.inf)
 """Huber thresholds tried, in standard deviations of the norm of three components (median 1.538). A
-low one suits bursts of optical errors; a high one suits errors that grow with the motion, where
-the largest residuals carry the most information.
+low one suits bursts of optical errors; a high one suits errors that grow with the motion, where the
+largest residuals contain the most information.
 """
 CHOICES = 6
 """Iterations in which the threshold of the least lag variance is chosen; then it is fixed."""
@@ -168,7 +168,7 @@ def _scale(norm: Floats) -> float:
 
 
 def _clipped(norm: Floats, clip: float) -> Floats:
-    """Return Huber's weights."""
+    """Return the Huber weights."""
     return np.minimum(1.0, clip / np.maximum(norm, _TINY))
 
 

@@ -6,8 +6,8 @@ variance is therefore estimated in several ways, and the largest is used:
 
 * the delete-a-block jackknife (Tukey; Künsch 1989): the lag without each block of the window, with
 at most 20 blocks, none shorter than the filter, then with half as many blocks repeatedly while five
-remain. It needs no model of the residuals, and it reveals a block that alone determines the result;
-* Newey and West (1987), with residuals correlated over the shortest of these blocks.
+remain. It needs no model of the residuals, and it detects a single block that determines the
+result; * Newey and West (1987), with residuals correlated over the shortest of these blocks.
 
 A variance from few blocks is uncertain itself. :math:`\nu + 1 = (\sum h)^2/\sum h^2` is the
 effective number of blocks that carry the information h about the lag. The finest scale is widened
@@ -50,12 +50,12 @@ class LinearizedLag(NamedTuple):
     jacobian: Floats
     """Derivatives by rotation, bias and, last, the lag: shape (n, 3, 7)."""
     residual: Floats
-    """rad/s, shape (n, 3)."""
+    """Residuals, rad/s, shape (n, 3)."""
     weight: Floats
-    """Huber's, shape (n,)."""
+    """Huber weights, shape (n,)."""
     give: Floats
     """``-d log(weight) / d log |residual|``, shape (n,): 0 where the weight stays 1, 1 where Huber
-    clips. A clipped residual no longer holds the lag along itself, only across."""
+    clips. A clipped residual constrains the lag only across its own direction."""
     rate: Floats
     """Rate of the slower track, rad/s, shape (n, 3)."""
     t_s: Floats
@@ -63,14 +63,14 @@ class LinearizedLag(NamedTuple):
 
 
 def lag_sigma(solved: LinearizedLag, memory_s: float) -> float:
-    """Return the standard deviation of the lag, s; infinite where too little carries it.
+    """Return the standard deviation of the lag, s; infinite if too few rows determine it.
 
     Parameters
     ----------
     solved : LinearizedLag
-        At the solution.
+        Linearization at the solution.
     memory_s : float
-        How long the filter makes residuals remember, s.
+        Time over which the filter correlates residuals, s.
     """
     normal, gradient = _curvature(solved)
     whole = normal.sum(axis=0)
