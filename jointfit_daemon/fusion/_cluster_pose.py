@@ -90,7 +90,7 @@ class ClusterPose:
         With the singular values s of the cross moment and the sign d of the third axis, the sum of
         squared residuals is :math:`\sum |a|^2 + \sum |y|^2 - 2 (s_1 + s_2 + d s_3)`.
         """
-        visible = np.isfinite(seen).all(axis=1).tobytes()  # one byte a marker
+        visible = np.isfinite(seen).all(axis=1).tobytes()  # one byte for each marker
         if visible not in self._subsets:
             self._subsets[visible] = self._subset(visible)
         subset = self._subsets[visible]

@@ -1,8 +1,8 @@
 """Forward kinematics of one frame: joint positions and angles with standard deviations.
 
 Orientation errors are taken as isotropic and independent between segments, except for flexion (see
-`joint_angle_estimate`). Of a position covariance only the trace is propagated, since a LimbState
-carries no more.
+`joint_angle_estimate`). Only the trace of a position covariance is propagated, since a LimbState
+contains no more.
 """
 
 from __future__ import annotations

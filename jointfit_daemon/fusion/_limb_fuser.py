@@ -130,8 +130,8 @@ class LimbFuser:
         Notes
         -----
         Flags, in this order: ``uncalibrated``, ``other_chain``, those of the calibration,
-        ``extrapolating`` (a sample is extrapolated in time), ``origin_fixed`` (mocap runs but does
-        not see O1, so the configured origin is used), ``stuck:SENSOR``, ``slipped:SENSOR`` or
+        ``extrapolating`` (a sample is extrapolated in time), ``origin_fixed`` (mocap runs but O1 is
+        not visible, so the configured origin is used), ``stuck:SENSOR``, ``slipped:SENSOR`` or
         ``pair_disagrees:SEGMENT``, ``heading_disagrees:JOINT``, ``heading_unseen``, and per segment
         ``one_sensor:``, ``untrained:`` (outside the training range), ``held:``, ``lost:``;
         ``gimbal`` is last.

@@ -27,9 +27,9 @@ class OpticalReading(NamedTuple):
     segments: list[Quaternion | None]
     """q_optical_segment."""
     positions: list[Vector | None]
-    """Joint centers, m: mean of those carried by the two adjacent body parts."""
+    """Joint centers, m: mean of the two centers fixed in the adjacent body parts."""
     gaps: list[float | None]
-    """Distances between the two carried centers, m."""
+    """Distances between these two centers, m."""
     joints: list[JointReading | None]
     """Angles of the joints between two segments; None at the ends of the chain."""
 
@@ -38,9 +38,9 @@ class OpticalLimb:
     r"""Computes the optical reference from the marker clusters of a calibration.
 
     With the rigid motion (R, t) of a body part since the static pose, its segment has the
-    orientation :math:`R\,R_{static}` and carries the joint center c to :math:`R c + t`. The centers
-    carried by the two parts of a joint differ by the gap, which soft-tissue artefact and errors of
-    the center cause.
+    orientation :math:`R\,R_{static}`, and the joint center c fixed in it moves to :math:`R c + t`.
+    The centers fixed in the two parts of a joint differ by the gap, which soft-tissue artefact and
+    errors of the center cause.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class OpticalLimb:
     def __init__(self, chain: Chain, calibration: Calibration) -> None:
         self._chain = chain
         self._parts: list[tuple[MarkerCluster, list[int]] | None] = []
-        """Per body part, from proximal to distal: its cluster, and the joints that it carries."""
+        """Cluster of each body part, from proximal to distal, with the joints fixed in it."""
         self._static = [calibration.segment[name].q_static for name in chain.segments]
         self._signs = [flexion_sign(joint) for joint in chain.joints]
         self._layout: MocapLayout | None = None

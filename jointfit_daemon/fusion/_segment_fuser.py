@@ -39,8 +39,8 @@ MIN_SD = 0.0005
 """Smallest standard deviation of an orientation, rad: the resolution of common sensors."""
 HEADING_SD = radians(2.0)
 """Standard deviation of the heading of a sensor's world just after calibration, rad. The error is
-common to the sensors of a segment, so the training data cannot show it (measured on simulated
-subjects one minute after calibration). It hardly affects flexion."""
+common to the sensors of a segment, so it is not observable in the training data (measured on
+simulated subjects one minute after calibration). It hardly affects flexion."""
 HEADING_WALK = radians(0.3)
 """Random walk of that heading, rad per square root of a minute: doubled after an hour."""
 _HEADING_VAR, _WALK_VAR = HEADING_SD * HEADING_SD, HEADING_WALK * HEADING_WALK
@@ -49,10 +49,10 @@ FADE_NS = 250_000_000
 MODEL_FADE_NS = 1_000_000_000
 """Fade time after a change of the models by online learning, ns."""
 OUTLIER = radians(3.0)
-"""Change of the difference between two sets of sensors within three frames from which on the last
-frame counts as wrong, rad: skin reaches a third of it."""
+"""Change of the difference between two sets of sensors within three frames above which the last
+frame counts as wrong, rad. Soft-tissue artefact reaches a third of it."""
 _HISTORY = 5
-"""Frames kept for that: with two wrong ones the median still stands."""
+"""Number of stored frames; with two wrong frames the median is still correct."""
 HOLD_NS = 200_000_000
 """Time for which the last orientation is held if no sensor has data, ns."""
 MINUTE_NS = 60_000_000_000
@@ -81,7 +81,7 @@ class FusedSegment(NamedTuple):
 
 
 class _Blend(NamedTuple):
-    """A set of sensors that is being left since one came back."""
+    """A set of sensors that is being faded out after a sensor returned."""
 
     start_ns: int
     alive: Names
@@ -114,7 +114,8 @@ class SegmentFuser:
         self._fading: tuple[int, int, Vector] | None = None
         """Start and length of the current fade, ns, and its initial rotation vector, rad."""
         self._blends: list[_Blend] = []
-        """Sets of sensors that are being left, the oldest first; `_fading` belongs to that one."""
+        """Sets of sensors that are being faded out, the oldest first; `_fading` belongs to the
+        oldest."""
         self._history: deque[tuple[Inputs, Quaternion]] = deque(maxlen=_HISTORY)
         """Inputs and output of the last frames."""
 
@@ -250,7 +251,8 @@ class SegmentFuser:
     def _offset_before(self, alive: Names, near: Names) -> Vector:
         """Return the rotation from a set of sensors to the output, in the frames before its use.
 
-        Of the last frame, unless that contradicts the median of the last frames.
+        The rotation is that of the last frame, unless it differs too much from the median of the
+        last frames.
         """
         offsets = [
             difference_one(self._predict(alive, near, inputs).q, q)
@@ -266,7 +268,7 @@ class SegmentFuser:
         self._history.clear()
 
     def _blended(self, t_ns: int, inputs: Inputs, target: Quaternion) -> Quaternion:
-        """Return the output: from the sets of sensors that are being left to `target`."""
+        """Return the output, blended from the sets of sensors that are faded out to `target`."""
         done = [k for k, one in enumerate(self._blends, 1) if t_ns - one.start_ns >= FADE_NS]
         if done:
             del self._blends[: done[-1]]

@@ -70,7 +70,7 @@ class JointCalibration:
     residual_rms: float | None = None
     """RMS residual of the distances between the markers and the center, m."""
     gap_rms: float | None = None
-    """RMS distance between the centers carried by the two adjacent body parts, m."""
+    """RMS distance between the centers fixed in the two adjacent body parts, m."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,8 +37,9 @@ TILTS = 3
 def relative_rotations(sensors: Sequence[Array], mean: Array, q_other: Array) -> Array:
     r"""Return :math:`[k, d_2 \dots d_m]`, rad, shape (n, 3 m) for m sensors.
 
-    :math:`k = \log(\bar q^* \otimes o)` is the joint rotation seen by the mean of the segment's
-    sensors and :math:`d_j = \log(x^* \otimes y_j)` the disagreement of the first with each other.
+    :math:`k = \log(\bar q^* \otimes o)` is the joint rotation relative to the mean of the segment's
+    sensors, and :math:`d_j = \log(x^* \otimes y_j)` the disagreement of the first sensor with each
+    other sensor.
 
     Parameters
     ----------

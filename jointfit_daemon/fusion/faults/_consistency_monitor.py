@@ -76,8 +76,9 @@ class ConsistencyMonitor:
     calibration : Calibration
         Its links predict the relations between sensors.
     drifting : collection of str
-        Sensors without heading reference. Where no hinge shows their headings, the standard
-        deviation grows without limit; for other sensors the drift is assumed to be bounded.
+        Sensors without heading reference. Where no hinge makes their headings observable, the
+        standard deviation grows without limit; for other sensors the drift is assumed to be
+        bounded.
     """
 
     def __init__(
@@ -340,7 +341,7 @@ class ConsistencyMonitor:
     def _evaluate(self, inputs: Inputs) -> ConsistencyResult:
         spread, slipped, flags = self._evaluate_pairs(inputs)
         for i, joint in enumerate(self._joints):
-            variance = joint.extra_variance / 3.0  # one axis of three
+            variance = joint.extra_variance / 3.0  # heading is one axis of three
             if variance:
                 for k in (i, i + 1):
                     spread[k] = sqrt(spread[k] * spread[k] + variance)

@@ -44,7 +44,7 @@ class JointHeadingMonitor:
         Heading of the distal flexion axis against the proximal one in the static pose, rad.
     drifts : bool
         Whether a sensor of the joint has no heading reference, so that its heading drifts even
-        where no hinge shows it.
+        where no hinge makes it observable.
     """
 
     def __init__(self, links: Sequence[SensorLink], standing: float, *, drifts: bool) -> None:

@@ -1,9 +1,9 @@
 r"""Detection and correction of magnetic disturbances: headings that change within seconds.
 
 Ferromagnetic objects turn the heading of a sensor with magnetometer within seconds and release it
-later. Pairs on one segment and pairs across a hinge show the differences. From these, each sensor
-gets a heading :math:`h_i` against the first, and its deviation from the weighted median is
-corrected; every segment has the same weight:
+later. The differences are measured by pairs on one segment and pairs across a hinge. From these,
+each sensor gets a heading :math:`h_i` against the first, and its deviation from the weighted median
+is corrected; every segment has the same weight:
 
 .. math:: o_i = h_i - \mathrm{median}(h), \qquad
           \text{correction: } o_i \cdot \mathrm{clip}\bigl((|o_i| - s_0) / (s_1 - s_0), 0, 1\bigr)
@@ -33,7 +33,7 @@ STALE_NS = 500_000_000
 CORRECTION_START = 1.6
 """Deviation from the median at which the correction starts, in standard deviations."""
 CORRECTION_FULL = 3.2
-"""Deviation from which on it is corrected fully, in standard deviations."""
+"""Deviation above which the correction is complete, in standard deviations."""
 NEGLIGIBLE = 0.002
 """Correction below which a disturbance that ended is dropped, rad."""
 MIN_SD = 0.026
@@ -161,7 +161,8 @@ class MagneticDisturbanceDetector:
                 correction = _ramp(heading - middle, sd)
                 if correction:
                     targets[name] = correction
-                    # The same source may disturb the others by as much as stays unobserved.
+                    # The same source may disturb the other sensors by an amount that remains
+                    # unobserved.
                     ambiguity = max(ambiguity, min(abs(correction), sd))
             ambiguity = max(ambiguity, _ramp(0.5 * (high - low), sd))
         return targets, ambiguity

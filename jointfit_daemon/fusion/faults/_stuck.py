@@ -64,9 +64,9 @@ class _SensorHistory:
         self.since_ns: int | None = None
         """Start of the current repetition; None while the sensor is silent."""
         self.q: Quaternion = (1.0, 0.0, 0.0, 0.0)
-        """Orientation at that instant."""
+        """Orientation at the start of the repetition."""
         self.orientations: Orientations = {}
-        """Orientations of all sensors at that instant."""
+        """Orientations of all sensors at the start of the repetition."""
         self.first_ns: int | None = None
         self.natural_ns = 0
         self.repeating = self.lagging = self.still = False
@@ -177,7 +177,7 @@ class StuckSensorDetector:
         ):
             return True
 
-        # The limb is at rest: the noise of other sensors shows that orientations should vary.
+        # The limb is at rest: the noise of other sensors indicates that orientations should vary.
         if length_ns < REPEAT_AT_REST_NS or since_ns - first_ns < OBSERVATION_NS:
             return False
         return any(
