@@ -41,7 +41,7 @@ class NatNetMocap:
         ------
         DeviceLostError
             The host is unknown, does not answer, has no listening server, sends no frame for
-            ``silence_s``, or another server has taken its place; worth another attempt.
+            ``silence_s``, or another server has taken its place. A retry may succeed.
         DeviceMisconfiguredError
             The host is no NatNet server, its bitstream is not supported, or the network card is
             unknown.

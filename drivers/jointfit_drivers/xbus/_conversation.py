@@ -1,7 +1,8 @@
 """Requests to an Xbus device and its replies, while all its bytes are passed on to the daemon.
 
-Bytes before the first acknowledgement are old or foreign and are discarded. From it on, every byte
-is emitted once, so that the decoder also receives the device's replies.
+Bytes before the first acknowledgement are old or foreign and are discarded. From the
+acknowledgement on, every byte is emitted once, so that the decoder also receives the device's
+replies.
 
 Source: MT0101P rev. 2020.A, state diagram; the 500 ms are its time-outs.
 """
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 REPLY_S = 0.5
 """Longest wait for a reply, s."""
 OUTSTANDING_S = 2.0
-"""Longest wait for the answer to one GoToConfig of a device that sends data, s. Some devices take
+"""Longest wait for a reply to one GoToConfig while the device is sending data, s. Some devices take
 1.5 s, and further requests would queue behind the first.
 """
 _MOST_REPLY_S = 8.0
@@ -34,7 +35,8 @@ _KNOWN = frozenset(map(int, XbusMessageId))
 _OTHER_ADDRESS = 0x01
 """Bus address that a stand-alone device also uses in replies."""
 _KEPT = 8192
-"""Stored bytes before the acknowledgement: more than a message that may contain it by mistake."""
+"""Bytes stored before the acknowledgement; more than one message of greatest length, whose data may
+contain the same bytes by chance."""
 
 
 class XbusConversation:

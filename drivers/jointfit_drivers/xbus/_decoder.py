@@ -204,7 +204,7 @@ class XbusDecoder:
         return self._continue(step, orientation)
 
     def _continue(self, step: XbusStep, orientation: _Orientation) -> list[Decoded]:
-        """Return `orientation` after the orientation that was held for it, if confirmed."""
+        """Return the samples of the held orientation, if confirmed, then those of `orientation`."""
         held = self._held
         out = [] if step.confirmed else self._drop_held()
         self._held = orientation if step.held else None
