@@ -102,15 +102,14 @@ def _start_logging(level: str, rig: str) -> None:
     from jointfit_daemon.outputs.log import PrintableRecord
 
     logging.setLogRecordFactory(PrintableRecord)
-    faulthandler.enable()  # the watchdog's SIGABRT leaves a traceback
+    faulthandler.enable()  # log a traceback on the watchdog's SIGABRT
     logging.basicConfig(level=level.upper(), handlers=[_log_handler(rig, limited=level != "debug")])
-    logging.getLogger("mqtt").setLevel(
-        logging.ERROR
-    )  # of aiomqtt; the daemon logs its faults itself
+    # aiomqtt's logger: the daemon reports connection faults itself
+    logging.getLogger("mqtt").setLevel(logging.ERROR)
 
 
 def _log_handler(rig: str, *, limited: bool) -> logging.Handler:
-    """Return the handler for the journal, for a service without it, or for a terminal."""
+    """Return the log handler: for the systemd journal, a service without journal, or a terminal."""
     from jointfit_daemon.outputs.log import (
         JournalHandler,
         LevelFormatter,
