@@ -189,5 +189,8 @@ def objection(
         return f"the markers would be {radius:.2f} m from the center: check marker names"
     if conditioning < MIN_CONDITIONING:
         remedy = SOFT_TISSUE if soft_tissue else FURTHER
-        return f"uncertain to {1000 * radius / conditioning:.0f} mm{remedy}"
+        return (
+            f"the standard deviation of the center is {1000 * radius / conditioning:.0f} mm"
+            f"{remedy}"
+        )
     return None
