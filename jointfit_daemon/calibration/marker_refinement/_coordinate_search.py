@@ -100,7 +100,7 @@ class _Walk:
         return self._tracking_error(positions)
 
     def along(self, marker: int, axis: int, step: float, least_gain: float) -> bool:
-        """Step in one direction while the error falls, else the other way; return whether it fell."""
+        """Step in one direction while the error falls, else back; return whether it fell."""
         accepted = len(self.errors)
         for signed in (step, -step):
             while True:
