@@ -86,8 +86,8 @@ def read_joint(
               \phi = \mathrm{atan2}(-R_{12}, R_{22}),\; \theta = \arcsin R_{02},\;
               \psi = \mathrm{atan2}(-R_{01}, R_{00})
 
-    Source: Grood and Suntay 1983, doi 10.1115/1.3138397, in our axes. The inner angle does not
-    depend on the choice of the flexion axis.
+    Source: Grood and Suntay 1983, doi 10.1115/1.3138397, in the axes of CONVENTIONS.md. The inner
+    angle does not depend on the choice of the flexion axis.
 
     Parameters
     ----------
@@ -138,7 +138,8 @@ def read_patent(q_proximal: Quaternion, q_distal: Quaternion) -> PatentReading:
               \beta = \arcsin 2(q_0 q_2 - q_3 q_1),\;
               \gamma = \mathrm{atan2}(2(q_0 q_3 + q_1 q_2), 1 - 2(q_2^2 + q_3^2))
 
-    Its joint angle is pi - abs(alpha), which equals the inner angle only for pure flexion about x.
+    The joint angle of the patent is pi - abs(alpha), which equals the inner angle only for pure
+    flexion about x.
     """
     w, x, y, z = between_one(q_proximal, q_distal)
     sine = 2.0 * (w * y - z * x)

@@ -23,7 +23,7 @@ IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
 IDENTITY.setflags(write=False)
 
 _CONJUGATE: Array = np.array([1.0, -1.0, -1.0, -1.0])
-_SMALL_ANGLE = 1e-6  # rad; below it sin(x/2)/x is its series to rounding
+_SMALL_ANGLE = 1e-6  # rad; below it the series of sin(x/2)/x is exact to rounding
 _SMALL_SINE = 1e-9
 
 

@@ -152,7 +152,8 @@ def as_quaternion(q: Iterable[float]) -> Quaternion:
 def from_matrix_one(rows: Sequence[Sequence[float]]) -> Quaternion:
     """Return the unit quaternion with w >= 0 of a rotation matrix (Shepperd 1978)."""
     (a, b, c), (d, e, f), (g, h, i) = rows
-    # Each column of 4 q q^T gives q up to its length; the longest one loses no digits.
+    # Each column of 4 q q^T gives q up to its length; the longest one has the smallest rounding
+    # error.
     q: Quaternion = (1.0 + a + e + i, h - f, c - g, d - b)
     if a + e + i < 0.0:
         if a >= e and a >= i:

@@ -51,7 +51,8 @@ class CoupledCurve:
         rows = np.array(path, dtype=np.float64)
         q = rows[:, 1:5]
         flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))
-        rows[1:, 1:5] *= flips[:, None]  # q and -q are one rotation; a spline needs one of them
+        # q and -q are the same rotation; the spline requires continuous signs
+        rows[1:, 1:5] *= flips[:, None]
         pieces = np.asarray(CubicSpline(rows[:, 0], rows[:, 1:]).c)
         return cls(rows[:, 0], pieces, rows[:, 0].tolist(), pieces.transpose(1, 2, 0).tolist())
 
@@ -66,7 +67,7 @@ class CoupledCurve:
         Parameters
         ----------
         amounts
-            The coordinate, rad, shape (T,).
+            Coordinates, rad, shape (T,).
         """
         if len(amounts) == 1:
             return self._at_one(float(amounts[0]))

@@ -71,7 +71,8 @@ def layout_of(model: ChainModel) -> ChainLayout:
     kept = model.__dict__.get("_layout")
     if not isinstance(kept, ChainLayout):
         kept = _layout(model)
-        model.__dict__["_layout"] = kept  # like its cached properties; the model is immutable
+        # cached like the properties, because the model is immutable
+        model.__dict__["_layout"] = kept
     return kept
 
 

@@ -1,4 +1,4 @@
-"""Inverse kinematics: the poses of a chain model that best marker_fit measured markers."""
+"""Inverse kinematics: the poses of a chain model that best fit measured markers."""
 
 from jointfit_daemon.kinematics.inverse_kinematics._levenberg_marquardt import Band, limits_of
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (

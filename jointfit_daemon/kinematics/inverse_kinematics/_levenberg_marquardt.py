@@ -6,8 +6,8 @@ instants are excluded. In addition to the marker errors the cost contains bands,
 .. math:: \sum_k w_k \left(v_k - clip(v_k, low_k, high_k)\right)^2, \qquad
           v = \log(A_{ref}^T A)
 
-which hold undetermined joints at the instant before (a band of zero width) or joints within their
-limits.
+which restrict undetermined joints to the pose at the instant before (a band of zero width), or
+joints to their limits.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Band:
 
     @classmethod
     def holding(cls, model: ChainModel, reference: ChainState, weights: Array) -> Band:
-        """Return a band that holds all joints but free ones to `reference`; weights (T,)."""
+        """Return a band that restricts all joints except free ones to `reference`; weights (T,)."""
         layout = layout_of(model)
         joint = np.array([s.joint.kind != "free" for s in model.segments])[layout.segment_of]
         zero = np.zeros(layout.nq)
@@ -183,7 +183,7 @@ def find_poses(problem: PoseProblem, start: ChainState) -> PoseSolution:
     if problem.huber_m is None:
         return found
 
-    # errors above Huber's threshold lose weight, and the minimum moves a little
+    # errors above Huber's threshold have reduced weight, which moves the minimum slightly
     iterations = found.iterations
     for _ in range(problem.reweightings):
         errors = problem.at(found.state)[0].errors
