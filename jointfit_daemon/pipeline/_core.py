@@ -100,7 +100,8 @@ class Core:
 
     def feed(self, event: Event) -> list[Output]:
         """Process one event and return its outputs, in order."""
-        if isinstance(event, ChunkArrived):  # first: thousands of these to one other event
+        # checked first: thousands of chunks arrive per other event
+        if isinstance(event, ChunkArrived):
             self._now_ns = max(self._now_ns, event.chunk.t_ns)
             return self._add_chunk(event)
         self._now_ns = max(self._now_ns, event.t_ns)
@@ -177,7 +178,7 @@ class Core:
         return [*outputs, session.status(event.t_ns, text)]
 
     def _reload_sources(self, rig: Rig) -> None:
-        """Create the states of new and changed sources; unchanged ones go on."""
+        """Create the states of new and changed sources; those of unchanged sources continue."""
         unchanged = {
             source.id: state
             for source in rig.sources
@@ -269,7 +270,7 @@ class Core:
                 outputs += self._report(source, state, item)
                 continue
 
-            if state.open and not state.online:  # not by the rest of a closed decoder
+            if state.open and not state.online:  # not for the remaining output of a closed decoder
                 state.online = True
                 outputs.append(DeviceStatus(source, online=True))
                 outputs.append(Notice(self._now_ns, NoticeKind.DEVICE, source, "streaming"))

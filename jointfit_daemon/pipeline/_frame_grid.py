@@ -2,7 +2,7 @@
 
 Invariant: frames are due from the first configuration on, with or without samples, and their
 instants increase across reloads. A reload starts a new grid only if it changes rates, sensors or
-the alignment mode. Samples that wait are then counted, and the counts of remaining sensors go on.
+the alignment mode. Pending samples are then counted, and the counts of remaining sensors continue.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
 A condition is reported when it begins, with its totals once a minute while it lasts, and when a
 minute passed without it.
 
-Invariant: the totals of all notices equal the totals of all events; the limit loses nothing.
+Invariant: the totals of all notices equal the totals of all events; no event is left out of the
+totals.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ class _Condition:
     amount: int = 0
     """Lost samples or discarded bytes."""
     lasting: bool = False
-    """Whether it was reported more than once, so that its end is worth a notice."""
+    """Whether the condition was reported more than once, so that its end is reported, too."""
     text: str = ""
     data: Mapping[str, object] = field(default_factory=dict)
 

@@ -1,4 +1,4 @@
-"""Comparison of the limb from the IMUs with the limb that the cameras see, frame by frame.
+"""Comparison of the limb from the IMUs with the limb from the cameras, frame by frame.
 
 Invariant: every compared pair refers to one instant; limb states are interpolated to the exposure
 of the mocap frame.
@@ -34,9 +34,9 @@ RMS_TIME_S = 10.0
 MAX_GAP_NS = 50_000_000
 """Greatest distance of two limb states to interpolate between, ns: five frames at 100 Hz."""
 _WAITING = 64
-"""Mocap frames that wait for the limb state after them: 0.25 s at 240 Hz."""
+"""Largest number of mocap frames that wait for the next limb state: 0.25 s at 240 Hz."""
 _STATES = 64
-"""Limb states kept for mocap frames that arrive late: 0.6 s at 100 Hz."""
+"""Number of limb states stored for mocap frames that arrive late: 0.6 s at 100 Hz."""
 
 
 class RunningRms:
@@ -180,7 +180,7 @@ class OpticalComparison:
 
 
 def _segments_at(t_ns: int, before: LimbState, after: LimbState) -> list[Quaternion | None]:
-    """Return the segments between two states; None where no sensor measured both."""
+    """Return the segments between two states; None if one of them has no sensor data."""
     share = _share(t_ns, before, after)
     return [
         interpolate_one(a.q_world_segment, b.q_world_segment, share)

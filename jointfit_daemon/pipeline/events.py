@@ -275,7 +275,7 @@ class CalibrationReady:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """The reply to a request: exactly one each."""
+    """The reply to a request; every request has exactly one."""
 
     command: str
     transaction: str

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class WireCounts:
-    """Counts since the daemon started; they go on when a reconnect replaces the decoder."""
+    """Counts since the daemon started; they continue when a reconnect replaces the decoder."""
 
     received: int = 0
     """Samples decoded."""
@@ -31,8 +31,8 @@ class WireCounts:
     lost: int = 0
     """Samples that the device counted but that did not arrive."""
     restarts: int = 0
-    """Restarts of the device, reported by it or seen in its clock. A device that was away counts as
-    restarted unless its clock shows otherwise."""
+    """Restarts of the device, reported by it or seen in its clock. A device that was disconnected
+    counts as restarted unless its clock continued."""
     opened: int = 0
     """Times the source was opened; all but the first are reconnects."""
 
@@ -133,9 +133,9 @@ class FrameCounts:
 
     sent: int = 0
     empty: int = 0
-    """Without any sensor."""
+    """Frames without any sensor."""
     skipped: int = 0
-    """Omitted after a stall of the process."""
+    """Frames omitted after a stall of the process."""
 
 
 @dataclass(frozen=True, slots=True)

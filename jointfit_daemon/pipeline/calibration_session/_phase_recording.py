@@ -37,7 +37,7 @@ class PhaseRecording:
     ----------
     phase : CalibrationPhase
         ``static`` ends after `wanted_s` of stillness, ``align`` after `wanted_s`, ``functional``
-        when the guide misses nothing any more, after `wanted_s` at the latest.
+        when all conditions of the guide hold, after `wanted_s` at the latest.
     chain : Chain
         Sensors that take part.
     start_ns : int
@@ -119,7 +119,7 @@ class PhaseRecording:
     def _guided_progress(
         self, guide: MovementGuide, elapsed_s: float, silent: list[str]
     ) -> tuple[float, str, dict[str, object]]:
-        """Return the progress of a movement: 1 once nothing is missing."""
+        """Return the progress of a movement: 1 when all conditions hold."""
         latest = {name: q for name, q in self._latest.items() if name not in silent}
         look = self._look = guide.look(latest, elapsed_s)
         data: dict[str, object] = {
@@ -151,7 +151,7 @@ class PhaseRecording:
         return self._recorder.overflowed
 
     def trial(self, now_ns: int) -> CalibrationTrial:
-        """Return the recording; of a static phase only the stillness at its end."""
+        """Return the recording; for a static phase only the stillness at its end."""
         if self._gate is None:
             return self._recorder.trial()
         return self._recorder.trial(self._gate.still_since_ns, now_ns)

@@ -1,7 +1,7 @@
 """Stillness of all sensors of a rig during a static pose.
 
 Every sensor has a causal stillness monitor (:mod:`jointfit_daemon.calibration.stillness`). The pose
-is still while every sensor is; a sensor without data is not.
+is still while every sensor is still; a sensor without data is not still.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
     positions = np.full((n, len(markers), 3), np.nan)
     body_positions = np.full((n, len(bodies), 3), np.nan)
     body_orientations = np.full((n, len(bodies), 4), np.nan)
-    for layout in layouts:  # one copy a layout: a copy a frame would block the core
+    for layout in layouts:  # one copy per layout; one copy per frame would block the core
         rows = np.array([row for row, (_, frame) in enumerate(frames) if frame.layout == layout])
         seen = [frame for _, frame in frames if frame.layout == layout]
         to_marker = np.array([markers.index(name) for name in layout.markers], dtype=np.intp)

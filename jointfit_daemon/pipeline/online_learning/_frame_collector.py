@@ -53,9 +53,9 @@ _RECENT, _WAITING = 64, 16
 
 class _TrainingFrame(NamedTuple):
     sensors: list[Quaternion]
-    """q_optical_segment by each sensor, in the order of the chain."""
+    """q_optical_segment from each sensor, in the order of the chain."""
     mocap: list[Array]
-    """Per segment its markers, shape (k, 3), or its rigid body's orientation, shape (4,)."""
+    """Markers, shape (k, 3), or orientation of the rigid body, shape (4,), of each segment."""
 
 
 class OnlineFrameCollector:
@@ -66,8 +66,8 @@ class OnlineFrameCollector:
     chain : Chain
         The limb.
     calibration : Calibration or None
-        The calibration in force. Nothing is collected without one, or if it holds no movement data
-        or no marker clusters of some segment.
+        The calibration in force. No frame is collected without a calibration, or if it contains no
+        movement data or lacks the marker clusters of a segment.
     wanted : bool
         ``learn_online`` of rig.toml.
     """

@@ -1,7 +1,7 @@
 """Prior knowledge of the smallest delay from a sample to its arrival.
 
-Arrival times cannot show a constant delay. The mean of the prior is therefore subtracted from the
-stamps, and its standard deviation is published with them.
+A constant delay is not observable from arrival times. The mean of the prior is therefore subtracted
+from the stamps, and its standard deviation is published with them.
 """
 
 from __future__ import annotations

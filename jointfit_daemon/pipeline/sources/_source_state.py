@@ -1,7 +1,7 @@
 """State of one source in the core: decoder, clock and counters.
 
-Converts chunks to stamped samples and counts losses and errors. It knows nothing of frames,
-calibration or other sources.
+Converts chunks to stamped samples and counts losses and errors. The state is independent of frames,
+calibration and other sources.
 """
 
 from __future__ import annotations
@@ -81,8 +81,8 @@ class SourceState:
     def start(self) -> None:
         """Start with a new decoder when the source was opened.
 
-        The next sample of an IMU shows what its clock did meanwhile. The clock of a mocap server
-        settles within a second, so its old fit is discarded.
+        The next sample of an IMU determines whether its clock restarted meanwhile. The clock of a
+        mocap server settles within a second, so its old fit is discarded.
         """
         if self.counts.opened and self.source.kind == "mocap":
             self.clock.feed_restart()

@@ -1,4 +1,4 @@
-"""Sync lines of a rig: which edges of which sources belong together.
+"""Sync lines of a rig: assignment of the edges of different sources to common instants.
 
 The reference of a line is the mocap source whose table names the line (``sync_line``: one edge per
 exposure), else the first source whose edge arrived. The clocks of all other sources on the line are
