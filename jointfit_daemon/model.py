@@ -285,7 +285,7 @@ class LimbState(NamedTuple):
 
 
 class OpticalSegment(NamedTuple):
-    """One segment as the cameras see it."""
+    """One segment according to the cameras."""
 
     name: str
     q_world_segment: Quaternion | None
@@ -297,11 +297,11 @@ class OpticalSegment(NamedTuple):
 
 
 class OpticalJoint(NamedTuple):
-    """One joint as the cameras see it; residuals are IMU minus cameras."""
+    """One joint according to the cameras; residuals are IMU minus cameras."""
 
     name: str
     position: Vector | None
-    """Mean of the joint center as carried by the two adjacent body parts, m."""
+    """Mean of the joint centers fixed in the two adjacent body parts, m."""
     gap: float | None
     """Distance between these two, m; None unless both are visible."""
     distance: float | None
@@ -318,7 +318,7 @@ class OpticalJoint(NamedTuple):
 
 
 class OpticalState(NamedTuple):
-    """The limb as the cameras see it in one frame, and the errors of the IMUs against it."""
+    """The limb according to the cameras in one frame, and the errors of the IMUs relative to it."""
 
     number: int
     """Frame number of the camera server."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 _CUTOFF = 0.5
-"""Least similarity, 0 to 1, of a spelling worth suggesting: half of the characters agree."""
+"""Least similarity, 0 to 1, of a suggested spelling: half of the characters agree."""
 
 
 def nearest_names(name: object, known: Iterable[str], *, count: int = 1) -> list[str]:
@@ -43,7 +43,7 @@ def unknown_name(
 ) -> str:
     """Return an error message for an unknown name: nearest spelling, then all known names.
 
-    `candidates` are the names worth suggesting, `known` by default.
+    `candidates` are the names that may be suggested, `known` by default.
     """
     names = list(known)
     hint = did_you_mean(name, names if candidates is None else candidates)

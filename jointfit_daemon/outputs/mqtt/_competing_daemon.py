@@ -1,8 +1,8 @@
 """Detection of another daemon with the same client id, and the wait for its end.
 
 A broker ends the older of two connections with one client id, so two daemons with the same base
-topic would take the connection from each other without end. The daemon whose connection lasted
-shorter gives way: it connects with another client id and waits until the other daemon is gone.
+topic would end each other's connection repeatedly. The daemon with the shorter connection gives
+way: it connects with another client id and waits until the other daemon is gone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 SHORT_S = 5.0
-"""Shorter connections belong to the newcomer, s; longer than any daemon needs to reconnect."""
+"""Connection time below which this daemon gives way, s; longer than any reconnection takes."""
 UNEXPLAINED = 3
 """Short connections in a row, without a reason from the broker, that raise the suspicion: MQTT
 3.1.1 has no reasons, and some MQTT 5 brokers send none."""

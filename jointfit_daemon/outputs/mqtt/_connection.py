@@ -70,7 +70,7 @@ class BrokerLostError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Outgoing:
-    """One message to publish. The properties travel with MQTT 5 only."""
+    """One message to publish. The properties are sent with MQTT 5 only."""
 
     topic: str
     payload: bytes

@@ -35,7 +35,7 @@ _UNAVAILABLE = "the broker is not available: check its log"
 _CREDENTIALS = (
     "the broker refuses user name or password: correct username and password_file in [mqtt]"
 )
-_RIGHTS = (  # mosquitto answers so to a wrong password, too
+_RIGHTS = (  # mosquitto sends this code for a wrong password, too
     "the broker does not authorize this user: correct username and password_file in [mqtt], or the"
     " broker's ACL"
 )
@@ -75,7 +75,7 @@ def broker_fault(error: BaseException) -> str:
 def session_fault(error: BaseException) -> str:
     """Return cause and remedy of a failed operation on an established connection.
 
-    There the numbers are those of paho: 4 means "not connected", not "wrong password".
+    For an operation, the numbers are those of paho: 4 means "not connected", not "wrong password".
     """
     text = str(error)
     if text == "Operation timed out":

@@ -4,7 +4,7 @@ Invariant: the size is limited, the oldest message is dropped first, and drops a
 
 Three kinds wait separately. State is retained: the last value of a topic replaces earlier ones, and
 all state is sent again on every connection. Events are sent once, in order. Stream messages are
-worthless when late.
+useless when late.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class PacketLimitSocket:
         """Number of packets above the limit."""
         self._wrapped, self._longest_bytes, self._admit = wrapped, longest_bytes, admit
         self._header = b""
-        """Header of the packet being read; complete before any byte of it is passed on."""
+        """Header of the packet being read; it is complete before its first byte is passed on."""
         self._start = b""
         """Bytes read after the header to find the topic."""
         self._ready = b""

@@ -45,7 +45,8 @@ REQUEST_RATE_HZ = 10.0
 REQUEST_BURST = 20.0
 """Permitted requests at once after a pause."""
 CHECK_S = 10.0
-"""Interval at which a stream's topic is published at QoS 1, s: acknowledgements show refusals."""
+"""Interval at which a stream's topic is published at QoS 1, s: acknowledgements contain
+refusals."""
 _NOTICE_S = 10.0
 """Shortest interval between log lines on ignored requests, s."""
 _CORRECTION_S = 0.1
@@ -151,10 +152,12 @@ class MqttPublisher:
         delay_s = _FIRST_RETRY_S
         while True:
             began_s = self._loop.time()
-            attempt = asyncio.create_task(self._serve(), name="mqtt connection")  # see _serve
+            # reason: see _serve
+            attempt = asyncio.create_task(self._serve(), name="mqtt connection")
             reason = ""
             try:
-                await attempt  # no TaskGroup: it loses a cancellation that meets a failure
+                # no TaskGroup, because it drops a cancellation that coincides with a failure
+                await attempt
             except* BrokerLostError as lost:
                 error: BaseException = lost
                 while isinstance(error, BaseExceptionGroup):
@@ -260,7 +263,7 @@ class MqttPublisher:
     def _note_acknowledgement(self, topic: str, refusal: str | None) -> None:
         """Note whether the broker accepted a message on `topic`; log a change."""
         if topic.startswith(responses := topics.RESPONSE.name(self._base)):
-            topic = responses + "#"  # clients choose the last levels: one entry for all
+            topic = responses + "#"  # clients choose the last levels, so all of them have one entry
 
         if refusal is None:
             self.denied.discard(topic)
@@ -334,7 +337,7 @@ class MqttPublisher:
             async with asyncio.timeout(ECHO_S):
                 await echo.arrived.wait()
         except TimeoutError:
-            if not self._modern:  # MQTT 5 acknowledgements show refusals
+            if not self._modern:  # with MQTT 5, acknowledgements contain refusals
                 self.denied.add(topic)
             log.warning(
                 "mqtt: the daemon's own message on %s does not come back: the broker may forbid "

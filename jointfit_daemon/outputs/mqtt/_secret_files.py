@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 CREDENTIAL = "jointfitd.mqtt-password"
 """Name of the systemd credential that holds the password."""
 LEAST_KEY_BYTES = 16
-"""Shortest request key, bytes: 128 bit resist guessing."""
+"""Shortest request key, bytes: 128 bit cannot be guessed."""
 _OTHERS = stat.S_IROTH | stat.S_IWOTH
 
 

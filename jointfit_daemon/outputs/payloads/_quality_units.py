@@ -1,7 +1,7 @@
 """Units of a calibration's quality on MQTT: degrees, milliseconds, and four digits.
 
-The core uses radians and nanoseconds, and its tables by method carry no unit. Invariant: on a topic
-every quantity has a unit, in its own key or in the key of the table that holds it.
+The core uses radians and nanoseconds, and its tables by method have no unit. Invariant: on a topic
+every quantity has a unit, in its own key or in the key of the table that contains it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 _CONVERTED = {"_rad": ("_deg", 180.0 / math.pi), "_ns": ("_ms", 1e-6)}
 """Suffix of the core, suffix on MQTT, and factor."""
 _TABLES = {"segments": "segments_rad", "flexion": "flexion_rad"}
-"""Tables of ``holdout`` that hold radians by segment or joint, and method."""
+"""Tables of ``holdout`` with values in radians by segment or joint, and method."""
 _DIGITS = 4
 
 
