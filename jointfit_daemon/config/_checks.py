@@ -35,7 +35,7 @@ _LEAST_MARKERS = 3
 
 
 def check_control_characters(value: object, key: str = "") -> Iterator[Fault]:
-    """Check that no text contains NUL, which no name of a file, port or topic may contain."""
+    """Check that no text contains NUL, which is invalid in names of files, ports and topics."""
     if isinstance(value, dict):
         for name, inner in value.items():
             yield from check_control_characters(name, f"key {name!r}")

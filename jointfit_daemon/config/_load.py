@@ -227,7 +227,7 @@ class _RigReader:
             bus = self._validate(f"can.{name}", tables[name], CanBusSettings)
             partial = self.partial.get(f"can.{name}")
             if bus is None and partial is not None:
-                # A stand-in for a wrong channel: identifiers and load are checked all the same.
+                # Replacement of a wrong channel, so that identifiers and load are still checked.
                 bus = partial.model_copy(update={"channel": f"unknown{at}"})
             if bus is not None and None not in dict(bus).values():
                 buses[name] = bus
@@ -267,7 +267,7 @@ class _RigReader:
         if isinstance(named, dict) and name not in named:
             text = f"no table [can.{name}]; known: {', '.join(buses) or 'none'}"
             self.faults.append(Fault(f"{key}.can", text, name, nearest_name(name, buses)))
-        # The fault is reported already: any valid bus will do.
+        # The fault is already reported: any valid bus can replace it.
         return imu | {"can": CanBusSettings(channel="unknown").model_dump()}
 
     def _driver(

@@ -76,7 +76,7 @@ def _parse(lines: list[str]) -> tuple[dict[str, Any] | None, list[Fault]]:
             remedy = "; use a decimal point, not a comma" if _DECIMAL_COMMA.search(line) else ""
             faults.append(Fault(f"line {number}", f"{text[:1].lower()}{text[1:]}{remedy}", line))
             if not line or line.startswith("["):
-                break  # its keys would belong to another table
+                break  # otherwise its keys would belong to another table
             lines[number - 1], last = "", number
             opened = any(mark in line for mark in _OF_SEVERAL_LINES)
     return None, faults

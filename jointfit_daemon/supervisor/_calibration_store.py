@@ -1,6 +1,6 @@
 """Stored calibrations of the running rig: loading, and writing in the background.
 
-Invariant: an unreadable file costs the stored calibration, not the run. The calibration that the
+Invariant: an unreadable calibration file does not stop the daemon. The calibration that the
 core uses and the one that a reload finds are the same, even while a write is pending or has failed.
 A calibration that could not be written is written again.
 """

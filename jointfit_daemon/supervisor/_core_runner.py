@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 LONGEST_TICK_INTERVAL_NS = 100_000_000
 """Longest time without an event for the core, ns."""
 _SHORTEST_WAIT_NS = 1_000_000
-"""Shortest wait for a deadline, ns: a deadline that stays in the past must not spin the loop."""
+"""Shortest wait for a deadline, ns: otherwise a deadline that stays in the past would block the
+loop."""
 _NS_PER_S = 1e9
 
 

@@ -1,7 +1,7 @@
 """One task per source: retries a lost device, pauses a misconfigured one, propagates bugs.
 
 Invariant: a source is opened in the core with its first chunk and closed when its driver ends. No
-source stops for good: a misconfigured one is retried with another device on its port, after one
+source stops permanently: a misconfigured one is retried with another device on its port, after one
 minute, or at a reload. Any other exception of a driver is a bug and ends the daemon.
 """
 
@@ -100,7 +100,8 @@ async def run_source(
     """
     state = state or _RunningSource(source)
     reporter = _SourceReporter(source.id, deliver, state.known)
-    driver = source.driver_class(source.settings)  # one object: it may learn from failed attempts
+    # one object for all attempts, which may store findings of failed ones
+    driver = source.driver_class(source.settings)
     path = device_path(source.settings)
     loop = asyncio.get_running_loop()
     delay = FIRST_RETRY_S
@@ -112,7 +113,7 @@ async def run_source(
         except DeviceLostError as lost:
             if loop.time() - began > HEALTHY_S:
                 delay = FIRST_RETRY_S
-            reporter.closed("lost", str(lost))  # the core logs it
+            reporter.closed("lost", str(lost))  # the core logs the fault
         except DeviceMisconfiguredError as wrong:
             again = f"retrying with another device on the port, or every {PAUSE_S:g} s"
             reporter.closed("misconfigured", f"{wrong} ({again})")

@@ -1,4 +1,4 @@
-"""The status line of the service, as ``systemctl status`` shows it."""
+"""The status line of the service in ``systemctl status``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Source
 
 _PLAIN_PHASES = (CalibrationPhase.CALIBRATED, CalibrationPhase.UNCALIBRATED)
-"""Phases that are clear without the word calibration."""
+"""Phases whose names are displayed without the word calibration."""
 
 
 class FrameRateCounter:

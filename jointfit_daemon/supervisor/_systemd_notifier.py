@@ -59,7 +59,7 @@ class SystemdNotifier:
         if not self._address:
             return
         with (
-            contextlib.suppress(OSError),  # systemd restarts now and then
+            contextlib.suppress(OSError),  # the socket is absent while systemd itself restarts
             socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as notify,
         ):
             notify.settimeout(TIMEOUT_S)

@@ -188,7 +188,7 @@ class Daemon:
         tasks.create_task(self._reload_on_request(), name="reload")
         await self._sources.apply(self._rig.sources)
 
-        gc.freeze()  # objects of the start live on: scanning them again takes milliseconds
+        gc.freeze()  # permanent objects are excluded, because scanning them takes milliseconds
         log.info("%s: running, %d sources", self._rig.name, len(self._rig.sources))
         tasks.create_task(self._notify_when_ready(), name="ready")
 

@@ -1,4 +1,4 @@
-"""Entry point of the `jointfit` command line: registers one command a module or package.
+"""Entry point of the `jointfit` command line: registers one command for each module or package.
 
 Invariant: numpy is not imported before a command runs, because OpenBLAS reads its number of threads
 on import.

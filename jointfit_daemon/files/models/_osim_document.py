@@ -176,7 +176,7 @@ def numbers_of(element: ET.Element, tag: str, count: int | None = None) -> Array
         values = np.array([float(cell) for cell in text_of(element, tag).split()])
     except ValueError:
         values = np.array([np.nan])
-        count = count or 0  # text without numbers is an error, whatever count was expected
+        count = count or 0  # text without numbers is an error for any expected count
     if count is not None and (values.size != count or not np.isfinite(values).all()):
         name = element.get("name", element.tag)
         raise ValueError(f"{name}: {tag} is {text_of(element, tag)!r}, expected {count} numbers")

@@ -100,7 +100,7 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
                 data = file.read(most_bytes + 1)
         finally:
             os.close(descriptor)
-    except ValueError as error:  # a NUL in the name; or MalformedFileError, from above
+    except ValueError as error:  # a NUL in the name, or the MalformedFileError raised above
         if isinstance(error, MalformedFileError):
             raise
         raise MalformedFileError(f"{str(path)!r}: not a valid file name: {error}") from error
@@ -133,7 +133,7 @@ def parse_json(text: str) -> Any:
     Raises
     ------
     ValueError
-        Not JSON, or holds NaN or infinity.
+        Not JSON, or contains NaN or infinity.
     RecursionError
         Nested too deeply.
     """
@@ -149,7 +149,7 @@ def _parsed(path: Path, name: str, parse: Callable[[str], Any], text: str) -> An
         value = parse(text)
     except RecursionError as error:
         raise MalformedFileError(f"{path}: nested more than {MAX_NESTING} levels deep") from error
-    except ValueError as error:  # an integer of 5000 digits is one, too
+    except ValueError as error:  # an integer of 5000 digits raises ValueError, too
         raise MalformedFileError(f"{path}: not {name}: {error}") from error
     if fault := find_structure_fault(value):
         raise MalformedFileError(f"{path}: {fault}")

@@ -46,7 +46,7 @@ class UnsuitableTrialError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ParentFrameMotion:
-    """ChildProcess markers in the parent's coordinates, and how to come back."""
+    """Child markers in the parent's coordinates, and the transformation back to the world."""
 
     movement: Movement
     """Marker positions of all frames, m, in the parent frame."""

@@ -135,7 +135,7 @@ class DemoRun:
                 share = len(self.online & wanted) / len(wanted)
                 self.display.step("connect", share, f"{len(self.online)} of {len(wanted)} sources")
                 await asyncio.sleep(0.1)
-        await asyncio.sleep(SETTLE_S)  # device clocks converge
+        await asyncio.sleep(SETTLE_S)  # wait until the device clocks have converged
 
     async def _calibrate(self, client: MqttClient) -> None:
         self._tracker = PhaseTracker(self.display.step, self.display.figures)

@@ -29,7 +29,7 @@ def draw_evaluation(path: Path, found: MethodEvaluation) -> None:
         rows = [row for row in found.rows if row.trial == trial]
         if joint:
             _flexions(left, found, rows, joint)
-        else:  # a single segment has no inner joint
+        else:  # single segment without inner joint
             left.set_axis_off()
         if joint == joints[0]:
             _bars(right, rows)
