@@ -1,1 +1,1 @@
-"""Drivers open, configure and read devices: one package a device family, found by entry point."""
+"""Drivers open, configure and read devices: one package per device family, found by entry point."""

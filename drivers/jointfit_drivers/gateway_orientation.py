@@ -7,8 +7,9 @@ interval), angular rates are scaled so that every step turns by the true angle:
 
 .. math:: \omega_\text{fed} = \omega\, \bar T / T_s
 
-Up to three missing measurements are interpolated. After a longer gap the filter restarts: it keeps
-the gyroscope bias and, without a magnetometer, continues with the last heading, which is uncertain.
+Up to three missing measurements are interpolated. After a longer gap the filter restarts: it
+retains the gyroscope bias and, without a magnetometer, continues with the last heading, which is
+uncertain.
 
 A filter that has just started takes its vertical from one accelerometer measurement. In fast motion
 the error is 20 degrees in the first second and 4 degrees in the next two, and normal afterwards
@@ -80,7 +81,8 @@ class FilterStep(NamedTuple):
     missing: int = 0
     """Readings missing before this one."""
     restarted: bool = False
-    """The gap was too long: heading is uncertain, inclination comes from the accelerometer."""
+    """Whether the filter restarted after a gap: heading is uncertain, inclination comes from the
+    accelerometer."""
 
 
 class FilterState(NamedTuple):
@@ -130,7 +132,7 @@ class GatewayOrientation:
         self._magnetic = magnetometer
         self._filter: Any = None
         self._last: RawReading | None = None
-        self._period_ns = 0.0  # what the filter was built for
+        self._period_ns = 0.0  # step for which the filter was created
         self._passed_ns = self._steps = 0
         self._turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)

@@ -1,1 +1,1 @@
-"""Wire formats without I/O: the same codecs serve drivers and simulators, one package a family."""
+"""Wire formats without I/O: codecs for drivers and simulators, one package per family."""

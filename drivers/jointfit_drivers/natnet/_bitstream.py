@@ -1,4 +1,4 @@
-"""Bitstream version of one NatNet server, changed only by a datagram that proves the new one.
+"""Bitstream version of one NatNet server, changed only by a datagram that confirms the new one.
 
 An announced version is a candidate. It is adopted when a frame or a model cannot be decoded
 with the version in use and decodes exactly with the candidate. A forged announcement alone

@@ -10,8 +10,8 @@ from typing import NamedTuple
 _REORDERED = 100
 """Frames by which a number may decrease in a reordered datagram; more is a restart or a loop."""
 _FASTEST_HZ = 2000
-"""Upper limit of the frame rate of camera systems, Hz: a number further ahead was not counted up
-to."""
+"""Upper limit of the frame rate of camera systems, Hz: a larger step of the number is not due to
+lost frames."""
 _BURST = 2000
 """Frames that may arrive at once, from a queue that was emptied."""
 _LATE_RUN = 10

@@ -122,7 +122,7 @@ class NatNetDecoder:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Return nothing: datagrams are complete."""
+        """Return an empty list, because datagrams are complete."""
         return []
 
     def _take(self, chunk: Chunk, message: natnet.Message, out: list[Decoded]) -> None:
@@ -134,7 +134,8 @@ class NatNetDecoder:
                 self._server(message, out)
             case natnet.ModelDefinition():
                 self._model(message, out)
-            case natnet.EchoRequest(stamp):  # of a recorded client: the time at which it was sent
+            # echo request of a recorded client: the time at which it was sent
+            case natnet.EchoRequest(stamp):
                 if len(self._asked) >= _PENDING_ECHOES:
                     del self._asked[next(iter(self._asked))]
                 self._asked[stamp] = chunk.t_ns

@@ -66,7 +66,7 @@ class NatNetSettings(MocapSettings):
     def usual_delay_ms(self) -> tuple[float, float] | None:
         """Mean and standard deviation, ms, of the delay from exposure to arrival.
 
-        For frames stamped by PTP. None for frames stamped by the server, whose echoes measure
-        its clock.
+        The value applies to frames stamped by PTP. It is None for frames stamped by the server,
+        whose clock is measured by echoes.
         """
         return None if self.time == "server" else (self.latency_ms, self.latency_ms / 2)

@@ -161,7 +161,7 @@ class PythonCanBus:
                 # The thread cannot be cancelled: close its bus when it is open.
                 making.add_done_callback(close_late)
                 raise
-        except Exception as error:  # a missing vendor library gives even NameError
+        except Exception as error:  # a missing vendor library may raise even NameError
             raise self._opening_error(error) from error
 
     def _make(self) -> can.BusABC:
@@ -258,7 +258,7 @@ def _require_interface(name: str) -> None:
     socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
     try:
         socket.if_nametoindex(name)  # not if_nameindex: that asks netlink, which the unit refuses
-    except OSError as error:  # CPython gives it no number
+    except OSError as error:  # CPython sets no error number here
         raise OSError(errno.ENODEV, "no such interface") from error
 
 

@@ -79,7 +79,7 @@ class SlcanBus:
         )
 
     def listen(self, ids: Collection[tuple[int, bool]] | None) -> None:
-        """Accept all frames: the acceptance filter of SLCAN cannot hold a list."""
+        """Accept all frames: the acceptance filter of SLCAN does not support lists."""
 
     async def close(self) -> None:
         """Stop reading, then close the bus and the port."""
@@ -173,7 +173,7 @@ class SlcanBus:
             return []
         found = self._decoder.feed(chunk.data, chunk.t_ns)
         lines = [item for item in found if isinstance(item, SlcanLine)]
-        # A bare CR is no evidence: every device that answers in lines of text sends some.
+        # A bare CR does not identify an adapter: every device with text replies sends it.
         frames = [item for item in found if isinstance(item, CanFrame)]
         if frames:  # frames that follow the answer to `O` in the same chunk
             self._early.append((chunk.t_ns, frames))

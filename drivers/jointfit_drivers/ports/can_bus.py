@@ -166,7 +166,7 @@ class SharedBus:
             Time without a frame with the identifier `needed`, s, after which the device counts
             as lost.
         needed : CanKey
-            The one of `ids` that carries measurements.
+            Identifier in `ids` of the frames with measurements.
         resembles : callable
             Whether the data of a frame look like those of `needed`, for a hint in messages.
 
@@ -222,7 +222,8 @@ class SharedBus:
             key for key, t_ns in subscriber.arrived.items() if t_ns > since_ns and key != needed
         )
 
-        if subscriber.is_complete and not others:  # its settings are right: all arrived before
+        # its settings are correct, because all identifiers arrived before
+        if subscriber.is_complete and not others:
             return (
                 f"{subscriber.name} ({self.channel}): silent for {subscriber.silence_s:g} s: "
                 "check its power and wiring"
@@ -294,7 +295,7 @@ class SharedBus:
                 shares.setdefault(subscriber, []).append(frame)
                 continue
 
-            # For subscribers to come, and for messages.
+            # Stored for later subscribers, and for messages.
             self.foreign += 1
             self._unclaimed.append((t_ns, frame))
             if key in self._seen or len(self._seen) < _SEEN:
@@ -308,7 +309,7 @@ class SharedBus:
                 self._filter()
 
     def _fail(self, error: Exception) -> None:
-        """End every device's pump; the first device to leave closes the bus."""
+        """End the pump of every device; the first device that ends closes the bus."""
         self._failed = error
         for each in self._subscribers:
             if not each.ended.done():

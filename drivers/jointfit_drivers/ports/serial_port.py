@@ -92,7 +92,8 @@ class SerialPort:
         try:
             self._port.set_low_latency_mode(True)
         except (ValueError, NotImplementedError, AttributeError, OSError) as error:
-            log.debug("%s: no low-latency mode: %s", self.path, error)  # ptys, some adapters
+            # not supported by ptys and some adapters
+            log.debug("%s: no low-latency mode: %s", self.path, error)
         return self
 
     def __exit__(self, *_: object) -> None:

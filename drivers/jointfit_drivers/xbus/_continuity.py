@@ -2,7 +2,7 @@
 
 An orientation *follows* another one if counter and device time advanced together, or, where only
 one of them is sent, if it advanced by a few periods. Every MTData2 increments the counter. Only
-messages with an orientation are compared, because others may carry foreign time (GNSS).
+messages with an orientation are compared, because others may contain time of another clock (GNSS).
 
 | orientation                                   | outcome                                         |
 |-----------------------------------------------|-------------------------------------------------|
@@ -46,17 +46,17 @@ class XbusStep(NamedTuple):
     """Classification of one orientation."""
 
     lost: int = 0
-    """Messages lost before it, or before the held one that it confirms."""
+    """Messages lost before this orientation, or before the held one that it confirms."""
     restarted: bool = False
-    """The device restarted before the held one."""
+    """The device restarted before the held orientation."""
     held: bool = False
-    """Hold this one until the next."""
+    """Hold this orientation until the next one."""
     confirmed: bool = False
-    """The held one is valid and comes first; otherwise a held one is dropped."""
+    """The held orientation is valid and is returned first; otherwise it is dropped."""
     lost_since: int = 0
     """Messages lost between the confirmed one and this one."""
     counter_jumped: bool = False
-    """Only the counter jumped before the held one; no message was lost."""
+    """Only the counter jumped before the held orientation; no message was lost."""
 
 
 class _Point(NamedTuple):
@@ -78,12 +78,13 @@ class XbusContinuity:
     Parameters
     ----------
     rate_hz : float
-        Nominal rate, Hz, used until the stream has shown its own.
+        Nominal rate, Hz, used until the rate of the stream is measured.
     """
 
     def __init__(self, rate_hz: float) -> None:
         self.modulus: int | None = None
-        """Ticks after which device time restarts at 0; None until the model or a wrap shows it."""
+        """Ticks after which device time restarts at 0; None until determined by the model or a
+        wrap."""
         self._nominal = 1_000_000_000 / TICK_NS / rate_hz
         self._messages = 0
         self._last: _Point | None = None
@@ -141,7 +142,8 @@ class XbusContinuity:
         self._last, self._trusted = point, True
 
         counts, ticks = _counts(last, point), self._ticks(last, point)
-        if counts and ticks and counts <= _DISTINCT:  # a clock that does not advance shows no rate
+        # the rate cannot be measured with a clock that does not advance
+        if counts and ticks and counts <= _DISTINCT:
             self._sum_ticks += ticks
             self._sum_counts += counts
         lost = _lost(last, point)
@@ -184,7 +186,7 @@ class XbusContinuity:
         return self._sum_ticks / self._sum_counts
 
     def _ticks(self, last: _Point, point: _Point) -> int | None:
-        """Return the step of time, a wrap undone; None where one of the points has no time."""
+        """Return the step of time without wraps; None if one of the points has no time."""
         if last.ticks is None or point.ticks is None:
             return None
         step = point.ticks - last.ticks
@@ -214,7 +216,7 @@ class XbusContinuity:
 
 
 def _counts(last: _Point, point: _Point) -> int | None:
-    """Return the step of the counter; None where one of the points has no counter."""
+    """Return the step of the counter; None if one of the points has no counter."""
     if last.counter is None or point.counter is None:
         return None
     return (point.counter - last.counter) % _COUNTS

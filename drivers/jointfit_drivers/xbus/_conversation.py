@@ -136,7 +136,8 @@ class XbusConversation:
                 reply = await self.receive({XbusMessageId.GOTO_CONFIG_ACK}, wait_s)
             if reply is not None:
                 took = loop.time() - began
-                if took > wait_s and late_s:  # the pending requests may still be answered, in order
+                # replies to the pending requests may still arrive, in order
+                if took > wait_s and late_s:
                     self.reply_s = min((sent + 1) * took, _MOST_REPLY_S)
                 return True
 

@@ -38,7 +38,7 @@ _BITS = 10
 """Bits of one byte on the line, 8N1."""
 _SILENCE_FLOOR_NS = 250_000_000
 """Shortest silence, ns, that ends a pending message. At high speed, 1.5 messages take so little
-time that a stalled host would look like a silent line.
+time that a stalled host could not be distinguished from a silent line.
 """
 _COUNTER, _TIME = int(Item.PACKET_COUNTER), int(Item.SAMPLE_TIME_FINE)
 _QUATERNION = int(Item.QUATERNION)
@@ -66,7 +66,7 @@ class XbusDecoder:
     baud : int, optional
         Line speed, bit/s, for back-dating of stamps; None for USB.
     rate_hz : float
-        Nominal rate, Hz, used until the stream has shown its own.
+        Nominal rate, Hz, used until the rate of the stream is measured.
     wires : mapping, optional
         Sync wire of the rig for each item that reports edges.
     raw : RawOrientation, optional
@@ -193,7 +193,7 @@ class XbusDecoder:
         else:
             is_orientation = ticks is not None and self._raw.is_complete(values)
 
-        if not is_orientation:  # as from a GNSS receiver
+        if not is_orientation:  # such as messages of a GNSS receiver
             self._continuity.other()
             return pulses
 

@@ -56,8 +56,7 @@ class XbusImu:
         Raises
         ------
         DeviceLostError
-            The port is absent, in use, unplugged, or silent for ``silence_s``; worth another
-            attempt.
+            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
             The file is no serial port, the speed is another, no Xbus device answers, or the output
             configuration differs while ``persist`` is false.

@@ -146,7 +146,7 @@ class RawOrientation:
         return out
 
     def _state_events(self) -> list[Decoded]:
-        """Return the filter's state where it is due."""
+        """Return the filter's state if it is due."""
         out: list[Decoded] = []
         if not self._started and not self._made[1]:
             out.append(DeviceEvent("warning", _NEW_HEADING))

@@ -35,9 +35,9 @@ _NEAR = 10
 """Counts that corruption of counter and time may appear to skip."""
 _SLACK_SHARE = 0.01
 _LONGEST = 20_000
-"""Longest gap, groups: beyond, the slack would let any pair agree."""
+"""Longest gap, groups; beyond, the tolerance would accept any pair."""
 _BLIND = 100
-"""Longest gap, groups, that time alone may show, once the next group confirms it."""
+"""Longest gap, groups, that is accepted from time alone if the next group confirms it."""
 _WINDOW = 20
 """Groups over which contradictions are counted."""
 _CONTRADICTIONS = 3
@@ -57,7 +57,7 @@ class XcdiStep(NamedTuple):
     held: bool = False
     """Hold this group until the next."""
     confirmed: bool = False
-    """The held group is valid and comes first; otherwise a held one is dropped."""
+    """The held group is valid and is returned first; otherwise it is dropped."""
 
 
 _CONTINUES = XcdiStep()
@@ -150,10 +150,10 @@ class _Track:
     def __init__(self, period: float | None = None) -> None:
         self.period = period
         self.settled = period is not None
-        """Whether enough steps have shown the period."""
+        """Whether the period was determined from enough steps."""
         self._ticks: int | None = None
         self._counter: int | None = None
-        self._groups = 0  # since the last group that had time, as the counter says
+        self._groups = 0  # number of groups since the last one with time, according to the counter
         self._uncounted = 0  # groups received, or known to be lost, since the last counter
         self._counted = False  # whether every group since then had a counter
         self._steps: list[float] = []
@@ -228,7 +228,7 @@ class _Track:
         return lost
 
     def _count(self, counter: int | None) -> int | None:
-        """Return the step of the counter; None where one of the groups has none."""
+        """Return the step of the counter; None if one of the groups has none."""
         if counter is None or self._counter is None:
             return None
         return (counter - self._counter) % COUNTER_MODULUS

@@ -32,7 +32,7 @@ once."""
 _SAMPLE_BYTES = {DataId.SAMPLE_TIME: 4, DataId.GROUP_COUNTER: 2, DataId.QUATERNION: 8}
 _ID_NAMES = XcdiIds._fields[:5]
 _RAW_FRAMES = 20
-"""Frames logged at debug level, so that the log shows the raw data of a device."""
+"""Frames logged at debug level, so that the log contains raw data of a device."""
 
 
 class XcdiIdSettings(Settings):

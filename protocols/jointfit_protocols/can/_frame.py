@@ -1,7 +1,7 @@
 """CAN frames as fixed-size records: the `Chunk.data` of a driver with ``wire = "can"``.
 
-A record has 24 bytes and carries the stamp of its frame. A chunk of many frames therefore keeps all
-stamps, and a recording of chunks replays exactly.
+A record has 24 bytes and contains the stamp of its frame. A chunk of many frames therefore contains
+all stamps, and a recording of chunks replays exactly.
 
      0        8          12      13     14    16         24
     | t_ns i64 | id u32   | flags | size | zero | data[8] |   little-endian
@@ -9,7 +9,7 @@ stamps, and a recording of chunks replays exactly.
     flags: 1 extended (29-bit), 2 remote request, 4 error frame
 
 Error frames have Linux's layout (linux/can/error.h): the identifier is a set of error classes. Two
-classes that Linux leaves free carry notes of the host, see `host_dropped` and `host_corrupt`.
+classes that Linux does not use contain notes of the host, see `host_dropped` and `host_corrupt`.
 
 Invariant: unpacking never raises; a record that is no CAN frame becomes `CorruptBytes`.
 """
@@ -79,7 +79,7 @@ def unpack_frames(data: bytes) -> list[CanFrame | CorruptBytes]:
     """Return the frames of the records in `data`; accepts any bytes.
 
     A record that `pack_frames` cannot have written is corrupt with 24 bytes, and unpacking
-    continues with the next one. An incomplete last record is corrupt too, because chunks hold
+    continues with the next one. An incomplete last record is corrupt too, because chunks contain
     complete records.
     """
     found: list[CanFrame | CorruptBytes] = []

@@ -4,7 +4,7 @@ Data that contradict the layout raise `MalformedError` (or `struct.error`, with 
 meaning). The codec's outer functions convert both to `CorruptBytes`, so neither leaves the
 package.
 
-Invariant: no read passes the end, and a count is used only if the remaining bytes can hold it.
+Invariant: no read passes the end, and a count is used only if the remaining bytes suffice for it.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ SectionReader = Callable[[Cursor, int], tuple[Any, ...]]
 
 OLDEST: Version = (3, 0)
 SIZED: Version = (4, 1)
-"""From this bitstream on, sections carry their size in bytes."""
+"""From this bitstream on, sections contain their size in bytes."""
 
 BODY_TRACKED = 0x01
 MARKER_OCCLUDED = 0x01
@@ -78,7 +78,7 @@ class LabeledMarker(NamedTuple):
     params: int
     """``MARKER_`` bits; usable if not occluded and point-cloud solved."""
     residual: float
-    """Metres a ray."""
+    """Mean residual of the camera rays, m."""
 
 
 class MarkerSet(NamedTuple):

@@ -96,7 +96,7 @@ class Trigger(NamedTuple):
     time: int
     """Ticks of SampleTimeFine."""
     frame: int
-    """Counts edges, as far as documented."""
+    """Counter of edges, according to the documentation."""
 
 
 Value = int | Reals | UtcTime | Trigger | bytes
