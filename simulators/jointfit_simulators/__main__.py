@@ -6,7 +6,7 @@ DEG``, ``occlude on|off``, ``mocap stop|start|restart``, ``pause on|off``, ``sta
 is a sensor, ``can0`` for the bus adapter, or (to reboot) ``mocap``. ``--at SECONDS=COMMAND``
 schedules a command. The simulator continues after the end of stdin. SIGTERM and SIGINT stop it.
 
-Invariant: stdout carries JSON lines only: one when all devices are ready, one for each ``status``,
+Invariant: stdout contains JSON lines only: one when all devices are ready, one for each ``status``,
 ``{"error": …}`` for each invalid command, ``{"motion": …}`` for each motion started by
 ``--follow``, and finally the numbers of samples sent.
 """

@@ -13,8 +13,8 @@ TOML: degrees, clinical signs, one table for each key; a cubic spline interpolat
 NPZ, radians: ``t`` (n,) seconds and any of ``hip knee ankle pelvis`` (n, 3).
 
 MOT or STO: the coordinates of OpenSim's lower-limb models, right leg. Their axes (x forward, y up,
-z right) are ours in the order (y, z, x). Their pelvis rotates by tilt, list and rotation, in this
-order.
+z right) are the project's axes in the order (y, z, x). Their pelvis rotates by tilt, list and
+rotation, in this order.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Subject that replays a `RecordedTrial`.
 
 Invariant: the recording is not altered. During synthetic intervals (the blend between standing and
-trial, the final pose) the cameras see no bones and the ground truth has no positions, so these
+trial, the final pose) the cameras return no bones and the ground truth has no positions, so these
 intervals enter neither training nor evaluation.
 """
 

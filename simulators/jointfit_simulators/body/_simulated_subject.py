@@ -63,7 +63,7 @@ class SimulatedSubject:
     """
 
     visible_bones: tuple[str, ...] = ()
-    """Empty: the cameras see markers only."""
+    """Empty, because the cameras measure markers only."""
 
     def __init__(
         self,

@@ -79,7 +79,7 @@ def _rotation_vector(before: Quaternion, after: Quaternion) -> Vector:
     )
     real = a * w + b * x + c * y + d * z
 
-    # q and -q are one rotation: use the one with a positive real part
+    # q and -q are the same rotation: use the one with a positive real part
     if real < 0.0:
         real, v = -real, (-v[0], -v[1], -v[2])
     length = sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
