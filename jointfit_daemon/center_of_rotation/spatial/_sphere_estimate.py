@@ -190,7 +190,6 @@ def objection(
     if conditioning < MIN_CONDITIONING:
         remedy = SOFT_TISSUE if soft_tissue else FURTHER
         return (
-            f"the standard deviation of the center is {1000 * radius / conditioning:.0f} mm"
-            f"{remedy}"
+            f"the standard deviation of the center is {1000 * radius / conditioning:.0f} mm{remedy}"
         )
     return None
