@@ -14,9 +14,9 @@ class Material(NamedTuple):
 
 SEEDED = Material("none; seeded random numbers", "exact by construction")
 SIMULATED_SUBJECTS = Material(
-    "simulated subjects, one a seed: sensor-to-segment alignment, heading, soft-tissue artefact, "
-    "markers and sensor errors differ",
-    "bones of the simulator, which no estimator receives",
+    "simulated subjects, one per random seed, with different sensor-to-segment alignment, heading, "
+    "soft-tissue artefact, markers and sensor errors",
+    "true bone orientations, not available to the estimators",
 )
 KNEE = Material(
     "1 adult (OpenCap subject 4), right leg; 4 virtual IMUs made of skin markers, with the "

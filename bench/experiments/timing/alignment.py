@@ -320,7 +320,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     ),
     Experiment(
         "synchronization-flags",
-        "Samples that are flagged as synchronized, bytes to frames",
+        "Samples that are flagged as synchronized, from received bytes to output frames",
         honesty,
         SIMULATED_CLOCKS,
         headline=True,

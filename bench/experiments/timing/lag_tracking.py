@@ -130,7 +130,10 @@ def drifting(_: Path) -> list[Result]:
         truth = LEAST_MS + 1e-3 * case.unseen_ppm * 114.0
         slack = 1e-3 * abs(case.unseen_ppm) * 2.0
         off = max(0.0, abs(found.lag_ms - truth) - slack)
-        label = f"{case.sensor_ppm:+g} and {case.cameras_ppm:+g} ppm, {case.unseen_ppm:g} unseen"
+        label = (
+            f"{case.sensor_ppm:+g} and {case.cameras_ppm:+g} ppm, "
+            f"{case.unseen_ppm:g} ppm of lag drift"
+        )
         estimate = f"estimate {found.drift_ppm:.2f} ± {found.drift_sigma_ppm:.2f} ppm"
         apart = abs(found.drift_ppm - case.unseen_ppm) / found.drift_sigma_ppm
         wanted = 1.0 if case.unseen_ppm else 0.0
