@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _FINE = 1e-9
 _RISES = 2
-"""Number of consecutive increases of the hold-out error that are accepted."""
+"""Consecutive steps without a new minimum of the hold-out error that end the iteration."""
 
 
 def refine_markers(

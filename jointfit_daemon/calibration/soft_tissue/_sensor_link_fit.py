@@ -53,8 +53,8 @@ def fit_links(
     chain : Chain
         Segments and their sensors.
     sensors : mapping of str to ndarray, shape (n, 4)
-        q_optical_segment of each sensor through its mount, at common instants in order of time;
-        frames with NaN are ignored.
+        q_optical_segment of each sensor, computed with its mount, at common instants in order of
+        time; frames with NaN are ignored.
     q_static : mapping
         q_optical_segment of each segment in the static pose.
 

@@ -171,7 +171,7 @@ def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, flo
     Returns
     -------
     center, covariance, s2 : ndarray, ndarray, float
-        The covariance includes the part of the difference that the limit removed.
+        The covariance includes a term for a remaining inconsistency of path and angles.
     """
     if not bool(circle.valid):
         return center, C, 0.0

@@ -84,7 +84,7 @@ class ObservedCenter:
     spread: Array
     """Covariance along the basis, m², shape (r, r)."""
     tilt: Array
-    """Part of a squared lever arm along the unobserved direction that adds to `spread`, shape (r,
+    """Part of a squared lever arm along unobserved directions that adds to `spread`, shape (r,
     r)."""
     bound2: float
     """Trace of the Cramér-Rao bound, m²."""

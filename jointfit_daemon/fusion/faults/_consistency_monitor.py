@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 UPDATE_NS = 39_000_000
 """Interval of the comparisons, ns: 25 a second with frames at 100 Hz."""
 SUDDEN_SD = radians(2.0)
-"""Change of a segment's standard deviation from one comparison to the next, rad, from which on the
-next frame is compared, too: one wrong sample must not count for a whole interval."""
+"""Change of a segment's standard deviation from one comparison to the next, rad, above which the
+next frame is compared, too, so that one wrong sample does not count for a whole interval."""
 MIN_DRIFT = radians(0.2)
 """Smallest heading drift that is corrected, rad."""
 REPORTED_DRIFT = radians(5.0)
@@ -124,7 +124,7 @@ class ConsistencyMonitor:
         self._corrections: dict[str, Quaternion] = {}
         """Rotations in segment axes that reduce the differences of pairs."""
         self._consistent = [True] * len(chain.segments)
-        """By segment, whether all pairs are consistent."""
+        """Whether all pairs of each segment are consistent."""
         self._all_consistent = True
         self._next_ns = 0
         self._no_fault = ConsistencyResult((0.0,) * len(chain.segments), frozenset(), ())
@@ -163,7 +163,7 @@ class ConsistencyMonitor:
         t_ns : int
             Instant of the frame.
         inputs : dict
-            q_optical_segment by sensor, headings corrected.
+            q_optical_segment by sensor, with corrected headings.
         """
         if t_ns < self._next_ns and self._next_ns - t_ns <= UPDATE_NS:
             return self._result
@@ -221,7 +221,8 @@ class ConsistencyMonitor:
             pair.clear_excess()
             return ()
 
-        # A slipped neighbor gives a wrong posture and would make this pair look inconsistent, too.
+        # A slipped neighbor gives a wrong posture and would make this pair appear inconsistent,
+        # too.
         near = None
         for neighbor in link.near:
             if neighbor in verticals:
