@@ -72,7 +72,7 @@ class ImuSample(NamedTuple):
     """Status word of the device; None without one."""
     rate: Vector | None = None
     """Angular rate at the instant of the orientation, sensor axes, rad/s; None without one. A mean
-    since the last sample does not qualify."""
+    over the interval since the last sample is not accepted."""
     acceleration: Vector | None = None
     """Specific force, sensor axes, m/s² (+9.81 upwards at rest); None without one."""
     magnetic: Vector | None = None
@@ -303,7 +303,7 @@ class OpticalJoint(NamedTuple):
     position: Vector | None
     """Mean of the joint centers fixed in the two adjacent body parts, m."""
     gap: float | None
-    """Distance between these two, m; None unless both are visible."""
+    """Distance between these two centers, m; None unless both are visible."""
     distance: float | None
     """Distance between the positions from the IMUs and from the cameras, m."""
     distance_rms: float | None

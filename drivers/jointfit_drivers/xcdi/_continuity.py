@@ -13,9 +13,9 @@ their widths, and P the measured step of SampleTime per group:
 | three contradictions that continue each other, or       | two sensors share the identifiers   |
 | 14 broken groups, within 20 groups                      |                                     |
 
-The line of an adapter has no checksum, so a single group proves no restart. A sensor that is reset
-contradicts the previous groups once. Two sensors contradict each other continuously. Their groups
-cannot be separated, so none of them is used.
+The line of an adapter has no checksum, so a single group is not sufficient evidence of a restart. A
+sensor that is reset contradicts the previous groups once. Two sensors contradict each other
+continuously. Their groups cannot be separated, so none of them is used.
 
 Invariant: integers in, steps out; every input is accepted.
 """

@@ -191,7 +191,7 @@ class RecordingHealth:
     file: str
     written_bytes: int
     backlog_bytes: int
-    """Not yet written."""
+    """Lines not yet written."""
     failure: str | None
     """Reason for which logging ended early; None while it works."""
 

@@ -78,7 +78,7 @@ class LabeledMarker(NamedTuple):
     params: int
     """``MARKER_`` bits; usable if not occluded and point-cloud solved."""
     residual: float
-    """Mean residual of the camera rays, m."""
+    """Marker residual, metres per camera ray."""
 
 
 class MarkerSet(NamedTuple):

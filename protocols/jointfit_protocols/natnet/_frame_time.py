@@ -1,7 +1,7 @@
 """Times of other clocks than the server's in a NatNet frame: precision timestamp and timecode.
 
 The precision timestamp, two u32, is that of a PTP clock: seconds, and a fraction whose unit the
-vendor does not document. A fraction of 10^9 or more proves units of 2^-32 s. Without one in twenty
+vendor does not document. A fraction of 10^9 or more implies units of 2^-32 s. Without one in twenty
 frames the unit is nanoseconds: of twenty uniformly distributed fractions in 2^-32 s, one would be
 that large with probability 1 - 0.23^20. Zeros mean that there is no such clock.
 

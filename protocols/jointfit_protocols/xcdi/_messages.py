@@ -1,6 +1,6 @@
 """Xsens XCDI: the CAN messages of MTi-600, Sirius and Avior, decoded and encoded.
 
-Every quantity has a frame of its own. The frames of one sensor at one instant form a group:
+Every quantity is sent in a separate frame. The frames of one sensor at one instant form a group:
 
     SampleTime  GroupCounter  ...  Quaternion        lowest identifier first
     U4 ticks    U2            ...  4 x I2 / 32767, w x y z, sensor to world, ENU
@@ -191,7 +191,7 @@ class XcdiCodec:
         self._by_id = ids.by_id()
         self._messages = _STRUCTS[byte_order]
         self._start_ns = 0
-        self._ticks: int | None = None  # of the open group
+        self._ticks: int | None = None  # values of the open group
         self._counter: int | None = None
         self._status: int | None = None
         self.messages = 0

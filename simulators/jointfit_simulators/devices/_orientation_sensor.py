@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from jointfit_simulators.settings import Knobs
 
 _DRIFT_HZ = (0.005, 0.1)
-"""Frequency band of the slow error, Hz: periods of ten seconds to minutes, as of fusion filters."""
+"""Frequency band of the slow error, Hz: periods of ten seconds to minutes, typical of fusion
+filters."""
 
 
 class OrientationSensor:

@@ -307,7 +307,7 @@ class XbusDevice:
 
     def _send(self, mid: int, data: bytes = b"", bid: int = MASTER) -> bool:
         wire = encode(mid, data, bid)
-        if not self._same_speed:  # as many bytes, none of them correct
+        if not self._same_speed:  # the same number of bytes, none of them correct
             wire = bytes((byte * 7 + 1) & 0x7F for byte in wire)
         return self._line.write(self._noise(wire))
 

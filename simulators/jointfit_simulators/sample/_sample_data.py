@@ -248,7 +248,7 @@ def _bodies(trial: SampleTrial, index: int) -> dict[str, Pose | None]:
 
 
 class _NoWire:
-    """Closed bus of a device that only returns its frames."""
+    """Closed bus for a device whose frames are only returned."""
 
     bitrate: int | None = None
     is_open = False

@@ -191,7 +191,7 @@ def optical_server(
     timing
         Clock of the server.
     ptp
-        Whether frames carry PTP precision timestamps.
+        Whether frames contain PTP precision timestamps.
     command_port
         UDP port on loopback for client commands; 0 selects a free port.
     """

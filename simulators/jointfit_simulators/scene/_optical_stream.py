@@ -2,7 +2,7 @@
 
 The optical world is z up here; the server converts to its own axes.
 
-Invariant: a frame carries its exposure time, even if it is sent late.
+Invariant: a frame contains its exposure time, even if it is sent late.
 """
 
 from __future__ import annotations

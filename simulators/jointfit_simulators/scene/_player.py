@@ -31,7 +31,7 @@ BLOCK_NS = NS // 5
 AHEAD_NS = NS // 10
 """Remaining part of a block at which the next block is planned, ns."""
 SKIP_NS = 2 * NS
-"""Interruption from which the missed time is skipped, ns."""
+"""Duration of an interruption above which the missed time is skipped, ns."""
 TRUTH_NS = NS // 100
 """Interval of the ground truth, ns."""
 _FLUSH_NS = NS // 10

@@ -2,7 +2,7 @@ r"""Log of the true sampling times, one JSON object per line, for clock experime
 
 Invariant: only samples that were sent are logged.
 
-A sample is identified by its device and its number on the wire, which restarts with the device::
+A sample is identified by its device and its number on the wire; numbers restart with the device::
 
     {"id": "S1", "number": 4711, "host_ns": true instant of sampling, host CLOCK_MONOTONIC}
 """

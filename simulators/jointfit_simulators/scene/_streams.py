@@ -1,7 +1,7 @@
 """Streams of IMU samples: one stream per device, planned in blocks, sent one by one.
 
-Invariant: a sample carries its sampling time, even if it is sent late. Every sample taken while the
-device measures is counted as sent, dropped (`Knobs.dropout`) or refused by a full line.
+Invariant: a sample contains its sampling time, even if it is sent late. Every sample taken while
+the device measures is counted as sent, dropped (`Knobs.dropout`) or refused by a full line.
 """
 
 from __future__ import annotations
