@@ -67,6 +67,8 @@ def _record(line: bytes) -> tuple[int, bytes] | None:
         return None
     seconds, fraction, digits, remote, body = match.groups()
     t_ns = int(seconds) * 10**9 + int((fraction or b"0").ljust(9, b"0"))
+    if t_ns >= 2**63:  # no time that a record can hold
+        return None
     number, extended = int(digits, 16), len(digits) > _STANDARD_DIGITS
     error = bool(extended and number & _ERROR_BIT)
     number &= ~_ERROR_BIT
