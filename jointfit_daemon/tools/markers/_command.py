@@ -120,13 +120,9 @@ def markers(
     names = (tuple(lock or ()), tuple(unlock or ()), tuple(without or ()))
     asked = ModelRequest(model, *names, up or None)
     chosen = cast("RefinementMethod", method)
+    search = SearchSettings(1e-3 * first_step, 1e-3 * threshold)
     settings = RefinementSettings(
-        chosen,
-        prior,
-        frames=frames,
-        evenness=evenness,
-        holdout_share=holdout,
-        search=SearchSettings(1e-3 * first_step, 1e-3 * threshold),
+        chosen, prior, frames=frames, evenness=evenness, holdout_share=holdout, search=search
     )
     try:
         chain, remarks, found = _refined(asked, (trials, validate or []), settings)
