@@ -446,6 +446,19 @@ class _Client(aiomqtt.Client):
         if not self._connected.done():
             self._connected.set_exception(aiomqtt.MqttError(_CLOSED_EARLY))
 
+    def _on_socket_unregister_write(  # type: ignore[explicit-override]  # Python 3.12's
+        self, client: Any, userdata: Any, sock: Any
+    ) -> None:
+        """Have what arrives next acknowledged at once; called when everything is sent.
+
+        After a transmission of ours, a ping for instance, the kernel delays an acknowledgement by
+        40 ms, for which a broker with Nagle's algorithm holds the next messages back (RFC 1122,
+        4.2.3.2 and 4.2.3.4).
+        """
+        super()._on_socket_unregister_write(client, userdata, sock)
+        if sock.fileno() >= 0:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+
     def _on_publish(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
         self, client: Any, userdata: Any, mid: int, reason_code: Any, properties: Any
     ) -> None:

@@ -6,6 +6,7 @@ Invariant: the daemon is observed over MQTT only, and ground truth comes from th
 from __future__ import annotations
 
 import asyncio
+import gc
 import math
 import time
 from dataclasses import dataclass, field
@@ -39,6 +40,8 @@ PHASES = (
 MOTIONS = ("walk", "squat", "sit_to_stand")
 MOTION_S = 8.0
 """Duration of each motion in the live phase, s."""
+TRUTH_S = 0.1
+"""Interval between readings of the ground truth, s."""
 MATURE_NS = 300_000_000
 """Age, ns, at which the ground truth of a pose is written and the pose is evaluated."""
 CALIBRATIONS = "state/calibrations"
@@ -71,15 +74,23 @@ class DemoRun:
         """Run all steps; `figures` returns the results, also after an interruption."""
         async with MqttClient(self.rig.mqtt) as client:
             await client.subscribe(*TOPICS)
-            listening = asyncio.create_task(self._listen(client), name="demo listener")
+
+            # A pause of this process counts as latency of the daemon: imported objects are excluded
+            # from garbage collection, and the ground truth is read continuously.
+            gc.freeze()
+            tasks = [
+                asyncio.create_task(self._listen(client), name="demo listener"),
+                asyncio.create_task(self._read_truth(), name="demo ground truth"),
+            ]
             try:
                 await self._connect()
                 await self._calibrate(client)
                 await self._live(seconds)
                 self._sent = await self._finish()
             finally:
-                listening.cancel()
-                await asyncio.wait([listening])
+                for task in tasks:
+                    task.cancel()
+                await asyncio.wait(tasks)
 
     # --- messages of the daemon --------------------------------------------------------------
 
@@ -107,6 +118,11 @@ class DemoRun:
         self.latencies_ms.append((now_us - pose["completed_us"]) / 1e3)
         unix_minus_monotonic_ns = time.time_ns() - time.monotonic_ns()
         self._poses.append((pose["t_us"] * 1000 - unix_minus_monotonic_ns, pose))
+
+    async def _read_truth(self) -> None:
+        while True:
+            self.truth.read()
+            await asyncio.sleep(TRUTH_S)
 
     def _evaluate(self) -> None:
         """Compare the poses whose ground truth is available."""

@@ -417,3 +417,16 @@ async def test_connecting_can_be_cancelled_at_any_moment(broker: Broker) -> None
     connecting.cancel()
     await asyncio.wait([connecting], timeout=2)
     assert connecting.cancelled()
+
+
+async def test_messages_after_a_transmission_are_acknowledged_without_the_delay_of_the_kernel(
+    broker: Broker,
+) -> None:
+    async with MqttConnection(settings(broker.port)) as connection:
+        await connection.subscribe([f"{BASE}/#"])
+        for number in range(8):  # the kernel delays after a few exchanges in both directions
+            await connection.publish(Outgoing(f"{BASE}/a", b"%d" % number, 1))
+            await anext(connection.messages())
+        assert connection._client is not None
+        sock = connection._client._client.socket()
+        assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK) == 1
