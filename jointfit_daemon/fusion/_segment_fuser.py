@@ -269,10 +269,11 @@ class SegmentFuser:
 
     def _blended(self, t_ns: int, inputs: Inputs, target: Quaternion) -> Quaternion:
         """Return the output, blended from the sets of sensors that are faded out to `target`."""
-        done = [k for k, one in enumerate(self._blends, 1) if t_ns - one.start_ns >= FADE_NS]
-        if done:
-            del self._blends[: done[-1]]
-            self._fading = None
+        if self._blends:
+            done = [k for k, one in enumerate(self._blends, 1) if t_ns - one.start_ns >= FADE_NS]
+            if done:
+                del self._blends[: done[-1]]
+                self._fading = None
         if not self._blends:
             return self._faded(t_ns, target)
 

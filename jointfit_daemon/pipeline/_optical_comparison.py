@@ -23,6 +23,7 @@ from jointfit_daemon.model import (
     OpticalState,
     SyncState,
 )
+from jointfit_daemon.timing.alignment import RateDivider
 
 if TYPE_CHECKING:
     from jointfit_daemon.fusion import OpticalReading
@@ -77,8 +78,7 @@ class OpticalComparison:
         self._chain = chain
         self._limb = OpticalLimb(chain, calibration) if usable and calibration else None
         self._signs = [flexion_sign(joint) for joint in chain.joints]
-        self._period_ns = round(1e9 / rate_hz) if usable else 0
-        self._next_ns = 0
+        self._rate = RateDivider(rate_hz or 1.0)
         self._waiting: deque[tuple[int, int, bool, OpticalReading]] = deque(maxlen=_WAITING)
         """Instant, frame number, whether the stamp is synchronized, and the limb in the frame."""
         self._states: deque[LimbState] = deque(maxlen=_STATES)
@@ -86,11 +86,8 @@ class OpticalComparison:
 
     def add_frame(self, t_ns: int, frame: MocapFrame, *, synced: bool) -> None:
         """Add one live mocap frame with its stamp."""
-        if self._limb is None or t_ns < self._next_ns:
+        if self._limb is None or not self._rate.is_due(t_ns):
             return
-        # A fixed grid keeps the mean rate; after a pause it begins again.
-        late = t_ns - self._next_ns > self._period_ns
-        self._next_ns = (t_ns if late else self._next_ns) + self._period_ns
         self._waiting.append((t_ns, frame.number, synced, self._limb.read(frame)))
 
     def add_state(self, state: LimbState) -> list[OpticalState]:

@@ -33,6 +33,7 @@ from jointfit_daemon.pipeline.events import (
     NoticeKind,
     Reply,
 )
+from jointfit_daemon.timing.alignment import RateDivider
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -43,23 +44,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.topics import Topic
     from jointfit_daemon.outputs.unix_clock import UnixClock
     from jointfit_daemon.pipeline.events import Event, Output
-
-_NS_PER_S = 1_000_000_000
-
-
-class _RateDivider:
-    """Selects frames at a lower rate; a fixed grid preserves the mean rate."""
-
-    def __init__(self, rate_hz: float) -> None:
-        self._period_ns = round(_NS_PER_S / rate_hz)
-        self._next_ns = 0
-
-    def is_due(self, now_ns: int) -> bool:
-        if now_ns < self._next_ns:
-            return False
-        late = now_ns - self._next_ns > self._period_ns
-        self._next_ns = (now_ns if late else self._next_ns) + self._period_ns
-        return True
 
 
 class TopicWriter:
@@ -84,8 +68,8 @@ class TopicWriter:
 
     def configure(self, rig: Rig) -> None:
         """Publish the layout of `rig`, and clear the retained topics of removed devices."""
-        self._pose_ui_rate = _RateDivider(rig.mqtt.pose_ui_hz)
-        self._joint_rate = _RateDivider(rig.mqtt.joint_hz)
+        self._pose_ui_rate = RateDivider(rig.mqtt.pose_ui_hz)
+        self._joint_rate = RateDivider(rig.mqtt.joint_hz)
 
         devices = tuple(source.id for source in rig.sources)
         for removed in set(self._devices) - set(devices):

@@ -427,6 +427,5 @@ async def test_messages_after_a_transmission_are_acknowledged_without_the_delay_
         for number in range(8):  # the kernel delays after a few exchanges in both directions
             await connection.publish(Outgoing(f"{BASE}/a", b"%d" % number, 1))
             await anext(connection.messages())
-        assert connection._client is not None
-        sock = connection._client._client.socket()
+        sock: Any = connection._client._client.socket()
         assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK) == 1
