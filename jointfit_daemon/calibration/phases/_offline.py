@@ -127,6 +127,7 @@ def fit_offline(
     mounts: Mapping[str, Array],
     method: Method,
     *,
+    lengths: Mapping[str, tuple[float, float]] | None = None,
     notes: tuple[str, ...] = (),
     software: str = "",
     created_utc: str = "",
@@ -137,12 +138,15 @@ def fit_offline(
     ----------
     mounts : mapping
         ``q_sensor_segment`` of each sensor, shape (4,).
+    lengths : mapping, optional
+        Length of each segment and its standard deviation, m; others remain unknown.
 
     Raises
     ------
     CalibrationError
         Fewer than 30 complete frames of a segment.
     """
+    known_lengths: Mapping[str, tuple[float | None, float | None]] = lengths or {}
     training = _training(chain, trials, mounts)
     _refuse_few(chain, training, "the training data")
     models = fit_models(chain, training, method)
@@ -160,7 +164,9 @@ def fit_offline(
             for name in group
         },
         segment={
-            segment: SegmentCalibration(identity, None, None, models[segment])
+            segment: SegmentCalibration(
+                identity, *known_lengths.get(segment, (None, None)), models[segment]
+            )
             for segment in chain.segments
         },
         joint={name: JointCalibration(None, None, "unknown") for name in chain.joints},

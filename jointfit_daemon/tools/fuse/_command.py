@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.calibration.phases import OfflineTrial
     from jointfit_daemon.files.axes import Axis
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.tools.fuse._trial import LimbDescription
 
 METHODS_WITHOUT_MOTION = ("mean", "single")
@@ -67,7 +68,17 @@ Markers = Annotated[
     list[str] | None,
     typer.Option("--markers", help="NAME=M1,M2,M3: markers of a segment in .trc and .c3d files."),
 ]
-Up = Annotated[str, typer.Option("--up", help="Vertical axis of .sto files: z, or y (OpenSim).")]
+Up = Annotated[
+    str, typer.Option("--up", help="Vertical axis of .sto and .mot files: z, or y (OpenSim).")
+]
+Lengths = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--length",
+        help="SEGMENT=METRES: distance between its joint centers; repeatable. Needed for joint"
+        " positions.",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object in SI units.")]
 
 
@@ -123,6 +134,7 @@ def fit(
     static: Static = None,
     markers: Markers = None,
     up: Up = "z",
+    length: Lengths = None,
     json: Json = False,
 ) -> None:
     """Fit a model to all trials and write it as a calibration of the daemon."""
@@ -131,6 +143,7 @@ def fit(
     from jointfit_daemon import __version__
     from jointfit_daemon.calibration.phases import fit_offline, mounts_of
     from jointfit_daemon.calibration.soft_tissue import METHODS
+    from jointfit_daemon.tools.fuse import _lengths
 
     check_output("--out", out, (".json",))
     if method not in METHODS:
@@ -140,13 +153,15 @@ def fit(
     )
     if method not in METHODS_WITHOUT_MOTION:
         _refuse_unmoved(limb, read)
-    if mounts is None:
-        mounts = {s: mean.q for s, mean in mounts_of(limb.chain, read).items()}
+    files = [_pair(text) for text in (*trials, static) if text is not None]
+    lengths = _lengths.segment_lengths(length or (), files, limb)
+    mounts = mounts or {s: mean.q for s, mean in mounts_of(limb.chain, read).items()}
     calibration = fit_offline(
         limb.chain,
         read,
         mounts,
         cast("Any", method),
+        lengths=lengths,
         notes=tuple(trial_warnings),
         software=__version__,
         created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -154,7 +169,9 @@ def fit(
     out.write_bytes(orjson.dumps(calibration.to_dict(), option=orjson.OPT_INDENT_2) + b"\n")
     frames = sum(len(trial.t_s) for trial in read)
     if json:
-        echo_json({"model": str(out), "frames": frames, "notes": trial_warnings})
+        lengths_m = {segment: found.length for segment, found in lengths.items()}
+        shown = {"model": str(out), "frames": frames, "notes": trial_warnings}
+        echo_json(shown | {"lengths_m": lengths_m})
     else:
         typer.echo(_report.fit_summary(calibration, frames))
         typer.echo(f"wrote {out}", err=True)
@@ -166,7 +183,8 @@ def apply(
     sensors: Annotated[Path, typer.Argument(help="Sensors: .npz or .sto.")],
     *,
     out: Annotated[
-        Path, typer.Option("--out", help="Orientations and joint angles: .sto, .npz or .csv.")
+        Path,
+        typer.Option("--out", help="Orientations, angles, positions: .sto, .mot, .npz or .csv."),
     ],
     without: Annotated[
         list[str] | None, typer.Option("--without", help="Sensor to ignore; repeatable.")
@@ -175,36 +193,52 @@ def apply(
         bool, typer.Option("--left", help="Left limb (signs of adduction, rotation).")
     ] = False,
     up: Up = "z",
+    length: Lengths = None,
+    origin: Annotated[
+        str | None,
+        typer.Option("--origin", help="X,Y,Z of the first joint, m, z up. Default: 0,0,0."),
+    ] = None,
     json: Json = False,
 ) -> None:
-    """Fuse the sensors of a trial as the daemon does, with uncertainty."""
-    from jointfit_daemon.calibration.record import MOST_BYTES
-    from jointfit_daemon.files.text import read_json
-    from jointfit_daemon.limb_model import Calibration, CalibrationSchemaError
-    from jointfit_daemon.tools.fuse import _output
+    """Fuse the sensors of a trial as the daemon does: angles and positions with uncertainty."""
+    from jointfit_daemon.tools.fuse import _lengths, _output
     from jointfit_daemon.tools.fuse._trial import read_available_sensors
 
     check_output("--out", out, _output.ENDINGS)
     check_choice("--up", up, "yz")
-    data = read_json(model, MOST_BYTES)
-    try:
-        calibration = Calibration.from_dict(data if isinstance(data, dict) else {})
-    except CalibrationSchemaError as fault:
-        raise ValueError(
-            f"{model}: expected a model written by `jointfit fuse fit`: {fault}"
-        ) from fault
-
+    calibration = _read_model(model)
     axis = cast("Axis", up)
-    chain = _output.chain_of(calibration, left=left)
+    chain = _output.chain_of(
+        calibration,
+        left=left,
+        lengths=_lengths.parse_lengths(length or (), calibration.segments),
+        origin=_lengths.parse_origin(origin),
+    )
     table = read_available_sensors(sensors, chain, axis, without or ())
-    found = _output.fuse_trial(calibration, table, left=left)
+    found = _output.fuse_trial(calibration, table, chain)
     files = _output.write_fused(out, found, table, axis)
     if json:
         shares = {"known": found.known, "flags": dict(found.flags)}
-        echo_json({"frames": len(found.t_s), **shares, "files": [str(file) for file in files]})
+        written = {"notes": found.notes, "files": [str(file) for file in files]}
+        echo_json({"frames": len(found.t_s), **shares, **written})
     else:
         typer.echo(_report.fusion_summary(found))
         typer.echo(f"wrote {', '.join(map(str, files))}", err=True)
+
+
+def _read_model(path: Path) -> Calibration:
+    """Return the calibration of a model file; ValueError if it is none."""
+    from jointfit_daemon.calibration.record import MOST_BYTES
+    from jointfit_daemon.files.text import read_json
+    from jointfit_daemon.limb_model import Calibration, CalibrationSchemaError
+
+    data = read_json(path, MOST_BYTES)
+    try:
+        return Calibration.from_dict(data if isinstance(data, dict) else {})
+    except CalibrationSchemaError as fault:
+        raise ValueError(
+            f"{path}: expected a model written by `jointfit fuse fit`: {fault}"
+        ) from fault
 
 
 def _inputs(

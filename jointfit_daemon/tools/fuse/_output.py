@@ -1,4 +1,4 @@
-"""Applies a model to recorded sensors and writes orientations and joint angles.
+"""Applies a model to recorded sensors; writes orientations, joint angles and joint positions.
 
 Invariant: runs the fusion of the daemon frame by frame, so results equal those of a live rig.
 """
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.files.axes import from_z_up
 from jointfit_daemon.files.orientations import (
     OrientationTable,
     OrientationTrial,
@@ -21,22 +22,52 @@ from jointfit_daemon.files.orientations import (
     write_sto,
 )
 from jointfit_daemon.fusion import LimbFuser
-from jointfit_daemon.limb_model import visible
+from jointfit_daemon.kinematics.joint_angles import read_patent
+from jointfit_daemon.limb_model import configured_length, visible
 from jointfit_daemon.model import Chain
+from jointfit_daemon.tools.fuse._lengths import left_out_positions
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.files.axes import Axis
     from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.model import LimbState, Vector
     from jointfit_daemon.tools.fuse._tables import OrientationRecording
 
 
 ANGLES = ("flexion", "adduction", "rotation")
-ENDINGS = (".sto", ".npz", ".csv")
-_UNKNOWN = (float("nan"),) * 4
+PATENT_ANGLES = ("alpha", "beta", "gamma", "joint")
+ENDINGS = (".sto", ".mot", ".npz", ".csv")
+_UNKNOWN = (float("nan"),) * 5
+
+
+@dataclass(frozen=True, slots=True)
+class FusedAngles:
+    """Angles of one joint over time, rad; NaN where unknown."""
+
+    anatomical: Array
+    """Flexion, adduction, internal rotation, shape (n, 3)."""
+    flexion_sd: Array
+    """Standard deviation of flexion, shape (n,)."""
+    inner: Array
+    """Angle between the two segments, shape (n,)."""
+    patent: Array
+    """`PATENT_ANGLES` of `read_patent`, shape (n, 4)."""
+    patent_gimbal: Array
+    """1 in gimbal lock of the patent's angles, else 0, shape (n,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class FusedPosition:
+    """Position of one joint over time, m, z up; NaN where unknown."""
+
+    position: Array
+    """Shape (n, 3)."""
+    sd: Array
+    """Standard deviation per axis, shape (n,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +79,14 @@ class FusedTrial:
     """q_world_segment, z up, shape (n, 4); NaN where unknown."""
     sd: Mapping[str, Array]
     """Standard deviation of each segment, rad, shape (n,)."""
-    angles: Mapping[str, Array]
-    """Flexion, adduction, internal rotation of each inner joint, rad, shape (n, 3)."""
-    angle_sd: Mapping[str, Array]
-    """Standard deviation of flexion, rad, shape (n,)."""
+    angles: Mapping[str, FusedAngles]
+    """Joints between two segments."""
+    positions: Mapping[str, FusedPosition]
+    """Joints from proximal to distal as far as lengths are known; empty if the first is not."""
     flags: Mapping[str, float]
     """Share of frames with each flag, 0 to 1."""
+    notes: tuple[str, ...] = ()
+    """Missing quantities and remedies."""
 
     @property
     def known(self) -> dict[str, float]:
@@ -61,16 +94,36 @@ class FusedTrial:
         return {s: float(visible(q).mean()) for s, q in self.segments.items()}
 
 
-def chain_of(calibration: Calibration, *, left: bool) -> Chain:
-    """Return the kinematic chain of a calibration."""
+def chain_of(
+    calibration: Calibration,
+    *,
+    left: bool,
+    lengths: Mapping[str, float] | None = None,
+    origin: Vector | None = None,
+) -> Chain:
+    """Return the kinematic chain of a calibration; `lengths` (m) override its lengths."""
+    given = lengths or {}
     return Chain(
-        calibration.joints, calibration.segments, calibration.chain_sensors, left_side=left
+        calibration.joints,
+        calibration.segments,
+        calibration.chain_sensors,
+        left_side=left,
+        origin=origin,
+        lengths=tuple(given.get(segment) for segment in calibration.segments),
     )
 
 
-def fuse_trial(calibration: Calibration, table: OrientationRecording, *, left: bool) -> FusedTrial:
-    """Fuse recorded sensors frame by frame; NaN orientations count as missing sensors."""
-    chain = chain_of(calibration, left=left)
+def fuse_trial(calibration: Calibration, table: OrientationRecording, chain: Chain) -> FusedTrial:
+    """Fuse recorded sensors frame by frame; NaN orientations count as missing sensors.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    table : OrientationRecording
+        Sensors of the trial.
+    chain : Chain
+        The chain of the calibration, see `chain_of`.
+    """
     fuser = LimbFuser(chain, calibration)
     columns = {name: q.tolist() for name, q in table.q.items()}
     seen = {name: visible(q) for name, q in table.q.items()}
@@ -80,65 +133,81 @@ def fuse_trial(calibration: Calibration, table: OrientationRecording, *, left: b
         t_ns = round(t_s * 1e9)
         states.append(fuser.fuse(t_ns, t_ns, k, alive))
 
+    # The lengths of all proximal segments are needed; the first joint alone is the origin.
+    configured = [configured_length(chain, i) for i in range(len(chain.segments))]
+    lengths = [
+        calibration.segment[name].length if length is None else length
+        for name, length in zip(chain.segments, configured, strict=True)
+    ]
+    note = left_out_positions(chain, lengths)
+    segments_placed = lengths.index(None) if note else len(lengths)
+    placed = chain.joints[: segments_placed + 1] if segments_placed else ()
+
     flags = Counter(flag for state in states for flag in state.flags)
-    inner = range(1, len(chain.joints) - 1)
     return FusedTrial(
         table.t_s,
         {
-            name: np.array([state.segments[i].q_world_segment or _UNKNOWN for state in states])
+            name: np.array([state.segments[i].q_world_segment or _UNKNOWN[:4] for state in states])
             for i, name in enumerate(chain.segments)
         },
         {
             name: np.array([state.segments[i].sd for state in states], np.float64)
             for i, name in enumerate(chain.segments)
         },
+        {chain.joints[i]: _joint_over_time(states, i) for i in range(1, len(chain.segments))},
         {
-            chain.joints[i]: np.array([state.joints[i].angles or _UNKNOWN[:3] for state in states])
-            for i in inner
-        },
-        {
-            chain.joints[i]: np.array([state.joints[i].angle_sd for state in states], np.float64)
-            for i in inner
+            name: FusedPosition(
+                np.array([state.joints[i].position or _UNKNOWN[:3] for state in states]),
+                np.array([state.joints[i].position_sd for state in states], np.float64),
+            )
+            for i, name in enumerate(placed)
         },
         {flag: count / len(states) for flag, count in sorted(flags.items())},
+        () if note is None else (note,),
+    )
+
+
+def _joint_over_time(states: Sequence[LimbState], number: int) -> FusedAngles:
+    """Return the angles of joint `number`, which lies between two segments."""
+    joints = [state.joints[number] for state in states]
+    ends = [[segment.q_world_segment for segment in state.segments] for state in states]
+    patent = np.array(
+        [
+            _UNKNOWN if above is None or below is None else read_patent(above, below)
+            for above, below in [(q[number - 1], q[number]) for q in ends]
+        ]
+    )
+    return FusedAngles(
+        np.array([joint.angles or _UNKNOWN[:3] for joint in joints]),
+        np.array([joint.angle_sd for joint in joints], np.float64),
+        np.array([joint.inner for joint in joints], np.float64),
+        patent[:, :-1],
+        patent[:, -1],
     )
 
 
 def write_fused(path: Path, found: FusedTrial, table: OrientationRecording, up: Axis) -> list[Path]:
     """Write a fused trial in the format of the file extension; return the files written.
 
-    ``.sto``: orientations, and joint angles in a second file ``NAME_angles.sto`` (degrees).
-    ``.npz``: readable by `read_orientations_npz`, with ``angles_JOINT``, ``sd_SEGMENT`` (rad).
+    ``.sto``: orientations, joint angles in a second file ``NAME_angles.sto`` (degrees) and, where
+    known, joint positions in a third file ``NAME_positions.sto`` (m).
+    ``.mot``: joint angles (degrees) and positions (m) in one table; a cell of a MOT file contains
+    one number, so orientations are left out.
+    ``.npz``: readable by `read_orientations_npz`; joint quantities by name, rad and m.
     ``.csv``: all columns in one table.
     """
     kind = path.suffix.lower()
-    if kind == ".npz":
-        write_orientations_npz(path, OrientationTrial(found.t_s, table.q, found.segments, {}))
-        with np.load(path, allow_pickle=False) as arrays:
-            all_arrays = {name: arrays[name] for name in arrays.files}
-        all_arrays |= {f"angles_{joint}": angles for joint, angles in found.angles.items()}
-        all_arrays |= {f"sd_flexion_{joint}": sd for joint, sd in found.angle_sd.items()}
-        all_arrays |= {f"sd_{segment}": sd for segment, sd in found.sd.items()}
-        np.savez_compressed(path, allow_pickle=False, **all_arrays)
+    if kind in {".npz", ".csv"}:
+        if kind == ".npz":
+            _write_npz(path, found, table)
+        else:
+            _write_csv(path, found)
         return [path]
 
-    # Angles and standard deviations as columns, degrees
-    names, columns = [], []
-    for joint, angles in found.angles.items():
-        names += [f"{joint}_{angle}" for angle in ANGLES] + [f"{joint}_flexion_sd"]
-        columns += [*angles.T, found.angle_sd[joint]]
-    for segment, sd in found.sd.items():
-        names.append(f"{segment}_sd")
-        columns.append(sd)
-    values = np.rad2deg(np.stack(columns, axis=1))
-
-    if kind == ".csv":
-        quaternions = [f"{segment}_q{part}" for segment in found.segments for part in "wxyz"]
-        head = ",".join(("t_s", *quaternions, *(f"{name}_deg" for name in names)))
-        cells = np.column_stack((found.t_s, *found.segments.values(), values))
-        rows = (",".join(f"{x:.9g}" if isfinite(x) else "" for x in row) for row in cells.tolist())
-        path.write_text("\n".join((head, *rows)) + "\n", encoding="utf-8")
-        return [path]
+    angles, positions = _angle_columns(found), _position_columns(found, up)
+    if kind == ".mot":
+        name = "joint angles and positions"
+        return [_write_numbers(path, found.t_s, angles | positions, in_degrees=True, name=name)]
 
     rate_hz = float(np.round(1.0 / np.median(np.diff(found.t_s)), 6))
     q = np.stack(list(found.segments.values()), axis=1)
@@ -146,8 +215,74 @@ def write_fused(path: Path, found: FusedTrial, table: OrientationRecording, up: 
     write_orientations_sto(
         path, OrientationTable(tuple(found.segments), found.t_s, turned, rate_hz)
     )
+    files = [path]
     second = path.with_name(f"{path.stem}_angles.sto")
-    write_sto(
-        second, TimeTable(tuple(names), found.t_s, values, in_degrees=True, name="joint angles")
-    )
-    return [path, second]
+    files.append(_write_numbers(second, found.t_s, angles, in_degrees=True, name="joint angles"))
+    if positions:
+        third = path.with_name(f"{path.stem}_positions.sto")
+        name = "joint positions"
+        files.append(_write_numbers(third, found.t_s, positions, in_degrees=False, name=name))
+    return files
+
+
+def _angle_columns(found: FusedTrial) -> dict[str, Array]:
+    """Return angles and standard deviations as columns, degrees; a gimbal flag is 0 or 1."""
+    columns: dict[str, Array] = {}
+    for joint, angles in found.angles.items():
+        anatomical = zip(ANGLES, np.rad2deg(angles.anatomical.T), strict=True)
+        patent = zip(PATENT_ANGLES, np.rad2deg(angles.patent.T), strict=True)
+        columns |= {f"{joint}_{name}": column for name, column in anatomical}
+        columns[f"{joint}_flexion_sd"] = np.rad2deg(angles.flexion_sd)
+        columns[f"{joint}_inner"] = np.rad2deg(angles.inner)
+        columns |= {f"{joint}_patent_{name}": column for name, column in patent}
+        columns[f"{joint}_patent_gimbal"] = angles.patent_gimbal
+    return columns | {f"{segment}_sd": np.rad2deg(sd) for segment, sd in found.sd.items()}
+
+
+def _position_columns(found: FusedTrial, up: Axis) -> dict[str, Array]:
+    """Return joint positions and their standard deviations as columns, m, in the axes of `up`."""
+    columns: dict[str, Array] = {}
+    for joint, place in found.positions.items():
+        columns |= zip(
+            [f"{joint}_{axis}" for axis in "xyz"], from_z_up(place.position, up).T, strict=True
+        )
+        columns[f"{joint}_position_sd"] = place.sd
+    return columns
+
+
+def _write_npz(path: Path, found: FusedTrial, table: OrientationRecording) -> None:
+    write_orientations_npz(path, OrientationTrial(found.t_s, table.q, found.segments, {}))
+    with np.load(path, allow_pickle=False) as arrays:
+        all_arrays = {name: arrays[name] for name in arrays.files}
+    for joint, angles in found.angles.items():
+        all_arrays[f"angles_{joint}"] = angles.anatomical
+        all_arrays[f"sd_flexion_{joint}"] = angles.flexion_sd
+        all_arrays[f"inner_{joint}"] = angles.inner
+        all_arrays[f"patent_{joint}"] = angles.patent
+        all_arrays[f"patent_gimbal_{joint}"] = angles.patent_gimbal
+    for joint, place in found.positions.items():
+        all_arrays[f"position_{joint}"] = place.position
+        all_arrays[f"sd_position_{joint}"] = place.sd
+    all_arrays |= {f"sd_{segment}": sd for segment, sd in found.sd.items()}
+    np.savez_compressed(path, allow_pickle=False, **all_arrays)
+
+
+def _write_csv(path: Path, found: FusedTrial) -> None:
+    columns = {"t_s": found.t_s}
+    for segment, q in found.segments.items():
+        columns |= zip([f"{segment}_q{part}" for part in "wxyz"], q.T, strict=True)
+    for name, angles in _angle_columns(found).items():
+        columns[name if name.endswith("_gimbal") else f"{name}_deg"] = angles
+    columns |= {f"{name}_m": column for name, column in _position_columns(found, "z").items()}
+
+    cells = np.column_stack(list(columns.values()))
+    rows = (",".join(f"{x:.9g}" if isfinite(x) else "" for x in row) for row in cells.tolist())
+    path.write_text("\n".join((",".join(columns), *rows)) + "\n", encoding="utf-8")
+
+
+def _write_numbers(
+    path: Path, t_s: Array, columns: Mapping[str, Array], *, in_degrees: bool, name: str
+) -> Path:
+    values = np.column_stack(list(columns.values()))
+    write_sto(path, TimeTable(tuple(columns), t_s, values, in_degrees=in_degrees, name=name))
+    return path

@@ -85,23 +85,25 @@ def evaluation_json(found: MethodEvaluation) -> dict[str, Any]:
 
 def fit_summary(calibration: Calibration, frames: int) -> str:
     """Return a summary of the fit: one line per segment, then notes."""
-    rows = [("segment", "sensors", "models", "residual sd, deg")]
+    rows = [("segment", "sensors", "models", "residual sd, deg", "length, m")]
     for i, (name, segment) in enumerate(calibration.segment.items()):
         sensors = calibration.chain_sensors[i]
         whole = max(segment.models, key=len, default=None)
         left = "–" if whole is None else _deg(segment.models[whole].residual_sd)
-        rows.append((name, ", ".join(sensors), str(len(segment.models)), left))
+        length = "–" if segment.length is None else f"{segment.length:.3f}"
+        rows.append((name, ", ".join(sensors), str(len(segment.models)), left, length))
     lines = [f"method {calibration.method}, {frames} frames", "", _format_columns(rows)]
     return "\n".join([*lines, *(f"note: {note}" for note in calibration.notes)])
 
 
 def fusion_summary(found: FusedTrial) -> str:
-    """Return the shares of frames with known segments and with each flag."""
+    """Return the shares of frames with known segments and with each flag, and missing positions."""
     count = len(found.t_s)
     lines = [f"{count} frames, {found.t_s[-1] - found.t_s[0]:.2f} s"]
     for name, known in found.known.items():
         lines.append(f"{name}: known in {100 * known:.0f} % of the frames")
     lines += [f"{flag}: {100 * share:.0f} % of the frames" for flag, share in found.flags.items()]
+    lines += found.notes
     return "\n".join(lines)
 
 

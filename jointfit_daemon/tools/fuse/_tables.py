@@ -6,7 +6,7 @@ Invariants: returned orientations have z up. Implausible units, component order 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -49,6 +49,8 @@ class OrientationRecording:
     """q_world_sensor by sensor, shape (n, 4) each; NaN where missing."""
     bones: Mapping[str, Array]
     """q_world_segment by bone, shape (n, 4) each; equal to `q` for an STO file."""
+    origins: Mapping[str, Array] = field(default_factory=dict)
+    """Proximal joint center of each bone, m, shape (n, 3); NaN where missing."""
 
 
 def read_recording(path: Path, up: Axis) -> OrientationRecording:
@@ -65,7 +67,7 @@ def read_recording(path: Path, up: Axis) -> OrientationRecording:
         for name, array in read_arrays(path).items():  # as written: the trial is normalized
             if name.endswith("_quat") or name.startswith("q_"):
                 check_unit_norm(path, name, np.asarray(array, dtype=np.float64))
-        table = OrientationRecording(trial.t_s, trial.sensors, trial.bones)
+        table = OrientationRecording(trial.t_s, trial.sensors, trial.bones, trial.origins)
     elif kind == ".sto":
         sto = read_orientations_sto(path)
         columns = {name: sto.quaternions[:, k] for k, name in enumerate(sto.names)}

@@ -335,5 +335,5 @@ def test_invalid_model_and_format_are_rejected(files: Path, fitted: Callable[...
     assert "expected a model" in said(run("apply", files / "no.json", files / "m0.npz", *out))
     model = fitted()
     text = said(run("apply", model, files / "m0.npz", "--out", files / "o.txt"))
-    assert "ends in .sto, .npz or .csv" in text
+    assert "ends in .sto, .mot, .npz or .csv" in text
     assert "No such file" in said(run("apply", model, files / "none.npz", *out))

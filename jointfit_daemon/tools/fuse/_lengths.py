@@ -1,0 +1,168 @@
+"""Segment lengths and the position of the first joint, from options and from reference files.
+
+The forward kinematics of fusion needs both to compute joint positions. Lengths in m, positions in
+the world of the project, z up.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import isfinite
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.nearest_name import unknown_name
+from jointfit_daemon.tools.fuse._tables import FEWEST, UnusableInputError, read_recording
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from pathlib import Path
+
+    from jointfit_daemon.model import Chain, Vector
+    from jointfit_daemon.tools.fuse._trial import LimbDescription
+
+LONGEST_M = 3.0
+"""Upper limit of a segment length, m; larger numbers are probably millimetres."""
+_COORDINATES = 3
+_MAD_TO_SD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+
+class MeasuredLength(NamedTuple):
+    """Length of a segment, m."""
+
+    length: float
+    sd: float
+    """Standard deviation, m; 0 for a length given as an option."""
+
+
+def parse_lengths(texts: Sequence[str], segments: Sequence[str]) -> dict[str, float]:
+    """Parse ``--length SEGMENT=METRES`` options.
+
+    Raises
+    ------
+    UnusableInputError
+        Unknown or repeated segment, or a value that is not a length in metres.
+    """
+    found: dict[str, float] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        length = _number(value)
+        if not equals or length is None:
+            raise UnusableInputError(f"--length {text!r}: expected SEGMENT=METRES, as thigh=0.42")
+        if name not in segments:
+            problem = unknown_name("segment", name, segments)
+            raise UnusableInputError(f"--length {text!r}: {problem}")
+        if name in found:
+            raise UnusableInputError(f"--length: {name} appears more than once: give it once")
+        if not 0.0 < length < LONGEST_M:
+            raise UnusableInputError(
+                f"--length {text!r}: expected more than 0 and less than {LONGEST_M:g} m: "
+                "convert the length to metres"
+            )
+        found[name] = length
+    return found
+
+
+def parse_origin(text: str | None) -> Vector | None:
+    """Parse the ``--origin X,Y,Z`` option, m; None if it is not given.
+
+    Raises
+    ------
+    UnusableInputError
+        Not three finite numbers.
+    """
+    if text is None:
+        return None
+    numbers = [_number(part) for part in text.split(",")]
+    known = [number for number in numbers if number is not None]
+    if len(numbers) != _COORDINATES or len(known) != _COORDINATES:
+        raise UnusableInputError(
+            f"--origin {text!r}: expected X,Y,Z of the first joint in metres, z up, as 0,0,0.9"
+        )
+    return known[0], known[1], known[2]
+
+
+def segment_lengths(
+    texts: Sequence[str], trials: Iterable[tuple[Path, Path | None]], limb: LimbDescription
+) -> dict[str, MeasuredLength]:
+    """Return the segment lengths of ``--length`` options, else those of the reference files.
+
+    Parameters
+    ----------
+    texts
+        The options, see `parse_lengths`.
+    trials
+        Sensor file and, if separate, reference file of each trial.
+    limb
+        Segments and their names in the reference files.
+
+    Raises
+    ------
+    UnusableInputError
+        As `parse_lengths`, or the bone origins are not the ends of a segment in metres.
+    """
+    given = parse_lengths(texts, limb.chain.segments)
+    references = (reference or sensors for sensors, reference in trials)
+    found = _measured_lengths(references, limb)
+    return found | {segment: MeasuredLength(length, 0.0) for segment, length in given.items()}
+
+
+def _measured_lengths(
+    references: Iterable[Path], limb: LimbDescription
+) -> dict[str, MeasuredLength]:
+    """Return the lengths of segments whose two joint centers are in the reference files.
+
+    The origin of a bone (``p_BONE``) is its proximal joint center. The length of a segment is the
+    median distance of its origin from that of the next segment, over the instants of all files; its
+    standard deviation is robust (median absolute deviation). The last segment has no next one.
+    """
+    arrays = [path for path in references if path.suffix.lower() == ".npz"]
+    recordings = [read_recording(path, limb.up) for path in arrays]
+    found = {}
+    for segment, distal in pairwise(limb.chain.segments):
+        above, below = limb.bones[segment], limb.bones[distal]
+        distances = [
+            np.linalg.norm(table.origins[below] - table.origins[above], axis=1)
+            for table in recordings
+            if above in table.origins and below in table.origins
+        ]
+        known = np.concatenate(distances) if distances else np.empty(0)
+        known = known[np.isfinite(known)]
+        if len(known) < FEWEST:
+            continue
+
+        length = float(np.median(known))
+        if not 0.0 < length < LONGEST_M:
+            raise UnusableInputError(
+                f"p_{above} and p_{below} are {length:.3g} m apart, expected more than 0 and less "
+                f"than {LONGEST_M:g} m: store the proximal joint center of each bone in metres, or"
+                " omit both arrays"
+            )
+        sd = _MAD_TO_SD * float(np.median(np.abs(known - length)))
+        found[segment] = MeasuredLength(length, sd)
+    return found
+
+
+def left_out_positions(chain: Chain, lengths: Sequence[float | None]) -> str | None:
+    """Return a note on the joints without position, with the remedy; None if all are known."""
+    known = dict(zip(chain.segments, lengths, strict=True))
+    unknown = [segment for segment, length in known.items() if length is None]
+    if not unknown:
+        return None
+    left_out = chain.joints[chain.segments.index(unknown[0]) + 1 :]
+    options = " ".join(f"--length {segment}=METRES" for segment in unknown)
+    return (
+        f"positions of {', '.join(left_out)} left out, because the length of "
+        f"{', '.join(unknown)} is unknown: add {options}"
+    )
+
+
+def _number(text: str) -> float | None:
+    """Return a finite number, or None."""
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return number if isfinite(number) else None

@@ -1,0 +1,289 @@
+"""Joint positions and the angles of the patent in the output of `jointfit fuse apply`.
+
+The expected values are computed with scipy rotations and with quaternion products written out here.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jointfit_daemon.calibration.phases import OfflineTrial, fit_offline
+from jointfit_daemon.files.orientations import (
+    OrientationTrial,
+    read_sto,
+    write_orientations_npz,
+)
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.model import Chain
+from jointfit_daemon.tools.fuse._output import chain_of, fuse_trial
+from jointfit_daemon.tools.fuse._tables import OrientationRecording
+from tests.tools.fuse.fuse_files import LIMB, N, movement, run, said, still, write_trials
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.limb_model import Calibration
+
+KNEE = Chain(("hip", "knee", "ankle"), ("thigh", "shank"), (("A", "B"), ("C", "D")))
+LENGTHS = ["--length", "thigh=0.42", "--length", "shank=0.4"]
+
+
+@cache
+def mean_model(lengths: tuple[tuple[str, float], ...] = ()) -> Calibration:
+    """Return a calibration whose segments have the mean orientation of their two sensors."""
+    trial = movement()
+    mounts = {sensor: np.array(rotation.IDENTITY) for sensor in "ABCD"}
+    offline = OfflineTrial("m", trial.t_s, trial.sensors, trial.bones)
+    return fit_offline(
+        KNEE, [offline], mounts, "mean", lengths={name: (m, 0.01) for name, m in lengths}
+    )
+
+
+def recorded(thigh: Array, shank: Array) -> OrientationRecording:
+    """Return sensors that have the orientations of their segments, 100 Hz."""
+    q = {"A": thigh, "B": thigh, "C": shank, "D": shank}
+    return OrientationRecording(np.arange(len(thigh)) / 100.0, q, {})
+
+
+def product(a: Array, b: Array) -> Array:
+    """Return the Hamilton product, written out."""
+    (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
+    return np.stack(
+        (
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ),
+        axis=1,
+    )
+
+
+def below(origin: Array, q: Array, length: float) -> Array:
+    """Return P + q (0, 0, 0, -L) q*: step S5 of the patent with z from distal to proximal."""
+    along = np.tile((0.0, 0.0, 0.0, -length), (len(q), 1))
+    return origin + product(product(q, along), q * (1.0, -1.0, -1.0, -1.0))[:, 1:]
+
+
+def euler(above: Array, distal: Array) -> Array:
+    """Return alpha, beta, gamma of R = Rz(gamma) Ry(beta) Rx(alpha), rad."""
+    joint = Rotation.from_quat(above[:, [1, 2, 3, 0]]).inv() * Rotation.from_quat(
+        distal[:, [1, 2, 3, 0]]
+    )
+    return joint.as_euler("ZYX")[:, ::-1]
+
+
+@settings(max_examples=10, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    lengths=st.tuples(st.floats(0.05, 1.0), st.floats(0.05, 1.0)),
+    origin=st.tuples(*[st.floats(-5.0, 5.0)] * 3),
+)
+def test_positions_are_segments_rotated_by_their_quaternions(
+    seed: int, lengths: tuple[float, float], origin: tuple[float, float, float]
+) -> None:
+    rng = np.random.default_rng(seed)
+    swing = np.linspace(0.0, 1.0, 20)[:, None] * rng.normal(size=(2, 1, 3))
+    thigh, shank = rotation.exp(swing)
+    given_m = dict(zip(KNEE.segments, lengths, strict=True))
+    chain = chain_of(mean_model(), left=False, lengths=given_m, origin=origin)
+    found = fuse_trial(mean_model(), recorded(thigh, shank), chain)
+
+    q1, q2 = found.segments["thigh"], found.segments["shank"]
+    knee = below(np.array(origin), q1, lengths[0])
+    assert found.positions["hip"].position == pytest.approx(np.tile(origin, (20, 1)))
+    assert found.positions["knee"].position == pytest.approx(knee, abs=1e-12)
+    ankle = below(knee, q2, lengths[1])
+    assert found.positions["ankle"].position == pytest.approx(ankle, abs=1e-12)
+    assert found.positions["ankle"].position == pytest.approx(
+        below(below(np.array(origin), thigh, lengths[0]), shank, lengths[1]), abs=1e-9
+    )
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_angles_of_the_patent_are_those_of_the_rotation_sequence_z_y_x(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    thigh, shank = rotation.exp(np.linspace(0.0, 1.0, 20)[:, None] * rng.normal(size=(2, 1, 3)))
+    found = fuse_trial(mean_model(), recorded(thigh, shank), KNEE)
+    knee = found.angles["knee"]
+    expected = euler(found.segments["thigh"], found.segments["shank"])
+    away = np.abs(np.sin(expected[:, 1])) < 0.999
+    assert knee.patent[away, :3] == pytest.approx(expected[away], abs=1e-9)
+    assert knee.patent[:, 3] == pytest.approx(np.pi - np.abs(knee.patent[:, 0]))
+    assert not knee.patent_gimbal[away].any()
+
+
+def test_gimbal_lock_of_the_patent_is_flagged() -> None:
+    upright = np.tile(rotation.IDENTITY, (20, 1))
+    turned = np.tile(rotation.exp(np.array((0.0, np.pi / 2.0, 0.0))), (20, 1))
+    found = fuse_trial(mean_model(), recorded(upright, turned), KNEE)
+    assert found.angles["knee"].patent_gimbal == pytest.approx(1.0)
+    assert found.angles["knee"].patent[:, 2] == pytest.approx(0.0)
+
+
+def test_a_stored_length_and_its_uncertainty_give_positions() -> None:
+    model = mean_model((("thigh", 0.42), ("shank", 0.4)))
+    upright = np.tile(rotation.IDENTITY, (20, 1))
+    found = fuse_trial(model, recorded(upright, upright), chain_of(model, left=False))
+    assert found.positions["ankle"].position[-1] == pytest.approx((0.0, 0.0, -0.82))
+    sure = replace(model, segment={k: replace(v, length_sd=0.0) for k, v in model.segment.items()})
+    same = fuse_trial(sure, recorded(upright, upright), chain_of(sure, left=False))
+    added = found.positions["ankle"].sd ** 2 - same.positions["ankle"].sd ** 2
+    assert added == pytest.approx(2 * 0.01**2 / 3.0)
+
+
+def test_positions_are_unknown_while_a_segment_is_lost() -> None:
+    upright = np.tile(rotation.IDENTITY, (200, 1))
+    gone = upright.copy()
+    gone[50:] = np.nan
+    chain = chain_of(mean_model(), left=False, lengths={"thigh": 0.4, "shank": 0.4})
+    found = fuse_trial(mean_model(), recorded(upright, gone), chain)
+    assert np.isfinite(found.positions["knee"].position).all()
+    assert np.isnan(found.positions["ankle"].position[-1]).all()
+    assert np.isnan(found.angles["knee"].patent[-1]).all()
+    assert np.isnan(found.angles["knee"].patent_gimbal[-1])
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with trials and a model of known orientations and unknown lengths."""
+    folder = write_trials(tmp_path_factory.mktemp("positions"))
+    (folder / "model.json").write_text(json.dumps(mean_model().to_dict()))
+    return folder
+
+
+def apply(files: Path, out: Path, *options: object) -> Any:
+    result = run("apply", files / "model.json", files / "m1.npz", "--out", out, *options)
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def test_all_formats_contain_the_same_positions_and_patent_angles(
+    files: Path, tmp_path: Path
+) -> None:
+    options = [*LENGTHS, "--origin", "0.1,0.2,0.9", "--up", "y"]
+    for ending in ("npz", "csv", "sto", "mot"):
+        apply(files, tmp_path / f"r.{ending}", *options)
+    with np.load(tmp_path / "r.npz", allow_pickle=False) as arrays:
+        ankle, patent = arrays["position_ankle"], np.rad2deg(arrays["patent_knee"])
+        gimbal, sd = arrays["patent_gimbal_knee"], arrays["sd_position_ankle"]
+
+    # CSV files have z up
+    with (tmp_path / "r.csv").open() as text:
+        table = list(csv.DictReader(text))
+    written = np.array([[float(row[f"ankle_{axis}_m"]) for axis in "xyz"] for row in table])
+    assert written == pytest.approx(ankle, abs=1e-8)
+    assert float(table[7]["knee_patent_gamma_deg"]) == pytest.approx(patent[7, 2], abs=1e-6)
+    assert {row["knee_patent_gimbal"] for row in table} == {"0"} == {f"{x:g}" for x in gimbal}
+
+    # STO and MOT files with y up: x forward, z to the right
+    positions, both = read_sto(tmp_path / "r_positions.sto"), read_sto(tmp_path / "r.mot")
+    angles = read_sto(tmp_path / "r_angles.sto")
+    assert (positions.in_degrees, angles.in_degrees, both.in_degrees) == (False, True, True)
+    for place in (positions, both):
+        columns = [place.column(f"ankle_{axis}") for axis in "xyz"]
+        assert np.stack(columns, axis=1) == pytest.approx(ankle[:, [1, 2, 0]], abs=1e-6)
+        assert place.column("ankle_position_sd") == pytest.approx(sd, abs=1e-6)
+    for table_of_angles in (angles, both):
+        for k, name in enumerate(("alpha", "beta", "gamma", "joint")):
+            column = table_of_angles.column(f"knee_patent_{name}")
+            assert column == pytest.approx(patent[:, k], abs=1e-4)
+
+
+def test_positions_below_an_unknown_length_are_left_out_with_the_remedy(
+    files: Path, tmp_path: Path
+) -> None:
+    result = apply(files, tmp_path / "r.csv", "--length", "thigh=0.42")
+    assert (
+        "positions of ankle left out, because the length of shank is unknown: add"
+        " --length shank=METRES" in result.stdout
+    )
+    head = (tmp_path / "r.csv").read_text().partition("\n")[0].split(",")
+    assert {"hip_x_m", "knee_x_m"} < set(head)
+    assert not any(name.startswith("ankle") for name in head)
+
+
+def test_no_position_is_written_without_the_first_length(files: Path, tmp_path: Path) -> None:
+    result = apply(files, tmp_path / "r.sto", "--length", "shank=0.4", "--json")
+    found = json.loads(result.stdout)
+    assert "positions of knee, ankle left out" in found["notes"][0]
+    assert found["files"] == [str(tmp_path / "r.sto"), str(tmp_path / "r_angles.sto")]
+
+
+def fit(folder: Path, *options: object) -> dict[str, Any]:
+    """Fit the mean to a trial; return the segments of the model."""
+    out = folder / "fitted.json"
+    result = run("fit", folder / "t.npz", *LIMB, "--method", "mean", "--out", out, *options)
+    assert result.exit_code == 0, result.output
+    segments: dict[str, Any] = json.loads(out.read_text())["segment"]
+    return segments
+
+
+def write_with_origins(path: Path, trial: OrientationTrial, shank: Array) -> None:
+    """Write a trial with the hip at the origin of the world and the knee at `shank`."""
+    origins = {"thigh": np.zeros((N, 3)), "shank": shank}
+    write_orientations_npz(path, OrientationTrial(trial.t_s, trial.sensors, trial.bones, origins))
+
+
+def test_a_fit_stores_lengths_between_bone_origins_and_those_of_options(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    knee = np.zeros((N, 3))
+    knee[:, 2] = -0.42 + 0.002 * rng.normal(size=N)
+    knee[:5] = np.nan
+    knee[5:10, 2] = -9.0  # outliers
+    write_with_origins(tmp_path / "t.npz", movement(), knee)
+    found = fit(tmp_path, "--length", "shank=0.39")
+    assert found["thigh"]["length"] == pytest.approx(0.42, abs=0.0005)
+    assert found["thigh"]["length_sd"] == pytest.approx(0.002, rel=0.3)
+    assert (found["shank"]["length"], found["shank"]["length_sd"]) == (0.39, 0.0)
+    assert fit(tmp_path, "--length", "thigh=0.4")["thigh"]["length"] == 0.4
+
+
+def test_a_static_trial_with_bone_origins_gives_the_length(tmp_path: Path) -> None:
+    write_orientations_npz(tmp_path / "t.npz", movement())
+    write_with_origins(tmp_path / "still.npz", still(), np.tile((0.0, 0.0, -0.44), (N, 1)))
+    found = fit(tmp_path, "--static", tmp_path / "still.npz")
+    assert found["thigh"]["length"] == pytest.approx(0.44)
+    assert found["shank"]["length"] is None
+
+
+def test_bone_origins_in_millimetres_are_rejected(tmp_path: Path) -> None:
+    write_with_origins(tmp_path / "t.npz", movement(), np.tile((0.0, 0.0, -420.0), (N, 1)))
+    options = [*LIMB, "--method", "mean", "--out", tmp_path / "x.json"]
+    text = said(run("fit", tmp_path / "t.npz", *options))
+    assert "p_thigh and p_shank are 420 m apart" in text
+    assert "in metres" in text
+
+
+@pytest.mark.parametrize(
+    ("option", "expected"),
+    [
+        (["--length", "tigh=0.4"], "did you mean 'thigh'?"),
+        (["--length", "thigh"], "expected SEGMENT=METRES"),
+        (["--length", "thigh=long"], "expected SEGMENT=METRES"),
+        (["--length", "thigh=nan"], "expected SEGMENT=METRES"),
+        (["--length", "thigh=420"], "convert the length to metres"),
+        (["--length", "thigh=-0.4"], "more than 0 and less than 3 m"),
+        ([*LENGTHS, "--length", "thigh=0.4"], "thigh appears more than once"),
+        (["--origin", "0,0"], "expected X,Y,Z of the first joint in metres"),
+        (["--origin", "0,inf,0"], "expected X,Y,Z of the first joint in metres"),
+    ],
+)
+def test_lengths_and_origins_that_are_none_are_rejected(
+    files: Path, tmp_path: Path, option: list[str], expected: str
+) -> None:
+    out = ["--out", tmp_path / "r.csv"]
+    text = said(run("apply", files / "model.json", files / "m1.npz", *out, *option))
+    assert expected in text
