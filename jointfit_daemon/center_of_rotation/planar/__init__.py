@@ -11,6 +11,7 @@ from jointfit_daemon.center_of_rotation.planar._geometric_fit import geometric_e
 from jointfit_daemon.center_of_rotation.planar._grid_search import Grid, grid_center
 from jointfit_daemon.center_of_rotation.planar._moments import GATE, ellipse_scale
 from jointfit_daemon.center_of_rotation.planar._oriented_fit import AngleNoise, oriented_estimate
+from jointfit_daemon.center_of_rotation.planar._parent_frame_noise import planar_noise
 from jointfit_daemon.center_of_rotation.planar._plane import plane_of
 from jointfit_daemon.center_of_rotation.planar._running_circle import RunningCircle
 from jointfit_daemon.center_of_rotation.planar._three_frames import (
@@ -35,6 +36,7 @@ __all__ = [
     "geometric_estimate",
     "grid_center",
     "oriented_estimate",
+    "planar_noise",
     "plane_of",
     "three_frame_center",
     "three_frame_estimate",

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_FAILED
-from jointfit_daemon.tools.output_files import check_plot
+from jointfit_daemon.tools.output_files import check_output, check_plot
 from jointfit_daemon.tools.text_output import check_choice, echo_json
 
 if TYPE_CHECKING:
@@ -19,54 +19,101 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.center.trial import ParentFrameMotion, WindowEstimate
 
 
+_Parent = Annotated[
+    str | None, typer.Option("--parent", help="Parent markers M1,M2,M3; M1,M2 with --plane.")
+]
+_Children = Annotated[str | None, typer.Option("--markers", help="Child markers M4,M5,...")]
+_Segments = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--segment",
+        help="Instead: markers of a segment, repeated from one end of a chain to the other.",
+    ),
+]
+_Joints = Annotated[str | None, typer.Option("--joints", help="Names of the joints of the chain.")]
+_Trajectory = Annotated[
+    Path | None,
+    typer.Option("--trajectory", help="Write the joint positions of all frames: .trc or .csv."),
+]
+_Source = Annotated[
+    Path | None,
+    typer.Option("--centers-from", help="Estimate the centres of the chain from this trial."),
+]
+_Method = Annotated[
+    str,
+    typer.Option(
+        "--method",
+        help="sphere, score, sara, halvorsen, ...; with --plane hyper, pratt, taubin, kasa, "
+        "geometric, ...; auto selects one.",
+    ),
+]
+_Plane = Annotated[
+    str | None,
+    typer.Option("--plane", help="Planar movement: the file's axis normal to the plane."),
+]
+_Window = Annotated[
+    float | None, typer.Option("--window", min=0.05, help="Estimate per window of SECONDS.")
+]
+_Up = Annotated[
+    str | None, typer.Option("--up", help="Vertical axis, if the file does not define it.")
+]
+_Plot = Annotated[
+    Path | None,
+    typer.Option("--plot", help="Plot the centre, or a stick figure: .png, .svg or .pdf."),
+]
+
+
 def center(
     trial: Annotated[Path, typer.Argument(help="Marker trial, .c3d or .trc.")],
     *,
-    parent: Annotated[
-        str, typer.Option("--parent", help="Parent markers M1,M2,M3; M1,M2 with --plane.")
-    ],
-    markers: Annotated[str, typer.Option("--markers", help="Child markers M4,M5,...")],
-    method: Annotated[
-        str,
-        typer.Option(
-            "--method",
-            help="sphere, score, sara, halvorsen, ...; with --plane hyper, pratt, taubin, kasa, "
-            "geometric, ...; auto selects one.",
-        ),
-    ] = "auto",
-    plane: Annotated[
-        str | None,
-        typer.Option("--plane", help="Planar movement: the file's axis normal to the plane."),
-    ] = None,
-    window: Annotated[
-        float | None, typer.Option("--window", min=0.05, help="Estimate per window of SECONDS.")
-    ] = None,
-    up: Annotated[
-        str | None, typer.Option("--up", help="Vertical axis, if the file does not define it.")
-    ] = None,
+    parent: _Parent = None,
+    markers: _Children = None,
+    segment: _Segments = None,
+    joints: _Joints = None,
+    trajectory: _Trajectory = None,
+    source: _Source = None,
+    method: _Method = "auto",
+    plane: _Plane = None,
+    window: _Window = None,
+    up: _Up = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object in SI units.")] = False,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", help="Plot markers and centre: .png, .svg or .pdf.")
-    ] = None,
+    plot: _Plot = None,
 ) -> None:
     """Estimate the centre of rotation of a joint, with its uncertainty.
 
-    The centre is given in the frame of the parent's markers. Exits with 1 if every estimate is
-    refused.
+    The centre is given in the frame of the parent's markers. With --segment, all joints of a chain
+    are estimated, and --trajectory writes their positions in every frame. Exits with 1 if every
+    estimate, or a joint of the chain, is refused.
     """
     from jointfit_daemon.files.mocap import read_marker_trial
-    from jointfit_daemon.tools.center.trial import answers, reduce
+    from jointfit_daemon.tools.center._chain_command import ChainOptions, reconstruct_chain
+    from jointfit_daemon.tools.center._chain_report import ENDINGS
 
     check_choice("--plane", plane, "xyz")
     check_choice("--up", up, "xyz")
     check_plot(plot)
+    check_output("--trajectory", trajectory, ENDINGS)
 
-    read = read_marker_trial(trial, cast("Axis | None", up))
+    vertical, normal = cast("Axis | None", up), cast("Axis | None", plane)
+    if segment or trajectory is not None:
+        segments = _segments(parent, markers, segment, window)
+        names = _words(joints or "")
+        options = ChainOptions(segments, names, normal, method, trajectory, plot, json)
+        wide = None if source is None else read_marker_trial(source, vertical)
+        reconstruct_chain(read_marker_trial(trial, vertical), wide, options)
+        return
+
+    if unused := [o for o, v in (("--joints", joints), ("--centers-from", source)) if v]:
+        raise ValueError(f"{unused[0]} is for a chain: name its segments with --segment")
+    if parent is None or markers is None:
+        raise ValueError(
+            "expected --parent and --markers for one joint, or --segment for each segment of a"
+            " chain: name the markers"
+        )
+
     asked = _names(parent), _names(markers)
-    read.points([*asked[0], *asked[1]])  # reports all unknown names at once
-    reduced = reduce(read, *asked, cast("Axis | None", plane))
-    found = list(answers(read, reduced, method, window))
-
+    read = read_marker_trial(trial, vertical)
+    reduced, found = _one_joint(read, asked, normal, method, window)
     _print(read, asked, reduced, found, as_table=window is not None, as_json=json)
     if plot is not None:
         from jointfit_daemon.tools.center._plot import draw_center
@@ -77,9 +124,44 @@ def center(
         raise typer.Exit(EXIT_FAILED)
 
 
+def _one_joint(
+    trial: MarkerTrial,
+    asked: tuple[list[str], list[str]],
+    normal: Axis | None,
+    method: str,
+    window: float | None,
+) -> tuple[ParentFrameMotion, list[WindowEstimate]]:
+    from jointfit_daemon.tools.center.trial import answers, reduce
+
+    trial.points([*asked[0], *asked[1]])  # reports all unknown names at once
+    reduced = reduce(trial, *asked, normal)
+    return reduced, list(answers(trial, reduced, method, window))
+
+
+def _segments(
+    parent: str | None, markers: str | None, segment: list[str] | None, window: float | None
+) -> list[list[str]]:
+    """Return the markers of each segment; --parent and --markers are a chain of two."""
+    if window is not None:
+        raise ValueError("--window is for one joint: omit it, or --segment and --trajectory")
+    if segment and (parent or markers):
+        raise ValueError("--segment names the whole chain: omit --parent and --markers")
+    if segment:
+        return [_words(text) for text in segment]
+    if parent is None or markers is None:
+        raise ValueError(
+            "--trajectory needs a chain: name its segments with --segment, from one end to the"
+            " other"
+        )
+    return [_names(parent), _names(markers)]
+
+
 def _names(text: str) -> list[str]:
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    return list(dict.fromkeys(names))
+    return list(dict.fromkeys(_words(text)))
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def _print(

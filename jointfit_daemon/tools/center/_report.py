@@ -76,24 +76,24 @@ def details(answer: WindowEstimate) -> str:
 
     if not len(e.unseen):
         error = (
-            f"{_mm(e.sd)} mm RMS predicted; lower bound for any method, with independent"
-            f" noise: {_mm(e.bound)} mm"
+            f"{mm(e.sd)} mm RMS predicted; lower bound for any method, with independent"
+            f" noise: {mm(e.bound)} mm"
         )
     else:
         error = "unknown along the unobservable directions"
         if len(e.unseen) < len(e.center):
-            error += f"; {_mm(_sd_seen(answer))} mm RMS predicted in the other directions"
+            error += f"; {mm(sd_seen(answer))} mm RMS predicted in the other directions"
 
     lines += [
-        f"center    in the parent  {_point(e.center)} mm",
-        f"          in the world   {_point(answer.world)} mm, at the mean parent pose, in the"
+        f"center    in the parent  {point(e.center)} mm",
+        f"          in the world   {point(answer.world)} mm, at the mean parent pose, in the"
         " axes of the file",
         f"error     {error}",
         f"          95 % ellipsoid: semi-axes {_semi_axes(answer)} mm",
         f"arc       {degrees(e.arc):.0f}°",
-        f"residual  {_mm(e.residual)} mm RMS; marker noise {_mm(e.noise)} mm per coordinate",
-        f"radius    {', '.join(_mm(r) for r in e.radii)} mm, one value per marker",
-        f"T         {_number(e.conditioning)} (6 or more is usable)",
+        f"residual  {mm(e.residual)} mm RMS; marker noise {mm(e.noise)} mm per coordinate",
+        f"radius    {', '.join(mm(r) for r in e.radii)} mm, one value per marker",
+        f"T         {number(e.conditioning)} (6 or more is usable)",
         f"frames    {e.frames} used, equivalent to {e.effective_frames:.0f} independent frames",
     ]
     lines += [f"unseen    unobservable along {_direction(u)} of the parent" for u in e.unseen]
@@ -104,7 +104,7 @@ def details(answer: WindowEstimate) -> str:
     return "\n".join(lines)
 
 
-def _sd_seen(answer: WindowEstimate) -> float:
+def sd_seen(answer: WindowEstimate) -> float:
     """Return the predicted RMS error in the observable directions, m."""
     e = answer.estimate
     if len(e.unseen) >= len(e.center):
@@ -120,13 +120,13 @@ def windows(found: Sequence[WindowEstimate]) -> str:
         rows.append(
             (
                 f"{answer.start_s:.2f}–{answer.end_s:.2f}",
-                _point(e.center),
-                _mm(e.sd),
-                _mm(e.bound),
+                point(e.center),
+                mm(e.sd),
+                mm(e.bound),
                 _semi_axes(answer),
                 f"{degrees(e.arc):.0f}°",
-                _mm(e.residual),
-                _number(e.conditioning),
+                mm(e.residual),
+                number(e.conditioning),
                 "" if e.refused is None else f"REFUSED: {e.refused}",
             )
         )
@@ -134,7 +134,8 @@ def windows(found: Sequence[WindowEstimate]) -> str:
     return align_columns(rows, right=range(len(_WINDOW_HEAD) - 1))
 
 
-def _point(x: NDArray[np.float64]) -> str:
+def point(x: NDArray[np.float64]) -> str:
+    """Return coordinates in mm, each with its axis."""
     if not np.isfinite(x).all():
         return "unknown"
     return " ".join(f"{name} {_MM * value:.1f}" for name, value in zip("xyz", x, strict=False))
@@ -145,17 +146,19 @@ def _direction(u: NDArray[np.float64]) -> str:
 
 
 def _semi_axes(answer: WindowEstimate) -> str:
-    return " × ".join(_mm(length) for length in answer.semi_axes)
+    return " × ".join(mm(length) for length in answer.semi_axes)
 
 
-def _mm(metres: float) -> str:
+def mm(metres: float) -> str:
+    """Return a length in mm."""
     if not isfinite(metres):
         return "unknown"
     size = _MM * metres
     return f"{size:.1f}" if size >= 1.0 else f"{size:.2g}"
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
+    """Return a number with three digits."""
     return "∞" if value == inf else f"{value:.3g}"
 
 
@@ -174,11 +177,12 @@ def as_json(
         "parent": list(parent),
         "markers": list(markers),
         "parent_rms_m": reduced.rms,
-        "answers": [_answer(answer) for answer in found],
+        "answers": [answer_json(answer) for answer in found],
     }
 
 
-def _answer(answer: WindowEstimate) -> dict[str, Any]:
+def answer_json(answer: WindowEstimate) -> dict[str, Any]:
+    """Return one estimate in SI units."""
     e = answer.estimate
     return {
         "start_s": answer.start_s,
@@ -189,7 +193,7 @@ def _answer(answer: WindowEstimate) -> dict[str, Any]:
         "center_world_m": answer.world.tolist(),
         "covariance_m2": e.covariance.tolist(),
         "sd_m": e.sd,
-        "sd_seen_m": _sd_seen(answer),
+        "sd_seen_m": sd_seen(answer),
         "bound_m": e.bound,
         "semi_axes_95_m": answer.semi_axes.tolist(),
         "unseen": e.unseen.tolist(),

@@ -34,10 +34,14 @@ STILL_M = 0.005
 """RMS movement of the child markers, m, below which the centre is unobservable."""
 _SEGMENT_M = (0.005, 2.0)
 """Plausible extent of the markers of one segment, m; other values indicate a wrong unit."""
-_LEAST_PLANAR = 2
+LEAST_PLANAR = 2
 """Parent markers needed in a plane."""
 _FEWEST_FRAMES = 3
 """Frames of a window at least: three points define a circle."""
+_EXCHANGE_RAD = 2.5
+"""Rotation of a planar parent between two frames, rad, that only exchanged names explain."""
+_EXCHANGE_S = 0.1
+"""Longest time between these two frames, s."""
 
 
 class UnsuitableTrialError(ValueError):
@@ -56,6 +60,8 @@ class ParentFrameMotion:
     """Parent poses in the world (z up); in a plane, the rotation about the normal of the plane."""
     basis: Array
     """Maps parent coordinates (d,) to those of `poses` (3,): identity, or basis of the plane."""
+    template: Array
+    """The parent's markers in its coordinates, m, shape (m, d)."""
 
     def to_world(self, center: Array) -> Array:
         """Return the world position of a parent point at the mean parent pose, m, shape (3,)."""
@@ -88,7 +94,11 @@ class WindowEstimate:
 
 
 def reduce(
-    trial: MarkerTrial, parent: Sequence[str], markers: Sequence[str], plane: Axis | None
+    trial: MarkerTrial,
+    parent: Sequence[str],
+    markers: Sequence[str],
+    plane: Axis | None,
+    option: str = "--parent",
 ) -> ParentFrameMotion:
     """Transform the child markers to the parent frame.
 
@@ -99,6 +109,8 @@ def reduce(
         Marker names; at least three parent markers in space, two in a plane.
     plane : {"x", "y", "z"} or None
         Axis of the file normal to the plane of movement; None for spatial movement.
+    option : str
+        Option that named the parent markers, for messages.
 
     Raises
     ------
@@ -110,16 +122,20 @@ def reduce(
             f"{', '.join(both)}: named in --parent and in --markers; remove from one"
         )
 
-    _check_parent(trial, parent, MIN_MARKERS if plane is None else _LEAST_PLANAR)
+    _check_parent(trial, parent, MIN_MARKERS if plane is None else LEAST_PLANAR, option)
     interval = 1.0 / trial.trajectories.rate_hz
     seen, child = trial.points(parent), trial.points(markers)
     if plane is not None:
-        return _reduce_planar(seen, child, plane_of(trial.direction(plane)), interval)
+        basis = plane_of(trial.direction(plane))
+        _check_planar_parent(seen @ basis, trial, parent, option)
+        reduced = _reduce_planar(seen, child, basis, interval)
+        _check_rigid(reduced.poses.q, parent, option)
+        return reduced
 
     template = moving_template(seen)
     if is_line(template[:MIN_MARKERS]):
         raise UnsuitableTrialError(
-            f"--parent: the first three, {', '.join(parent[:MIN_MARKERS])}, are collinear: list"
+            f"{option}: the first three, {', '.join(parent[:MIN_MARKERS])}, are collinear: list"
             " a marker off the line among the first three"
         )
 
@@ -129,12 +145,7 @@ def reduce(
     x, z = x / np.linalg.norm(x), z / np.linalg.norm(z)
     template = template @ np.column_stack((x, np.cross(z, x), z))
     poses, rms = _poses(template, seen)
-    if not visible(poses.t).any():
-        raise UnsuitableTrialError(
-            f"--parent: {', '.join(parent)} do not move rigidly in any frame"
-            f" (residual above {1000 * MAX_FIT_RMS_M:g} mm RMS): list markers of one segment"
-        )
-
+    _check_rigid(poses.q, parent, option)
     other = None
     if len(markers) >= MIN_MARKERS and visible(child).all(axis=1).any():
         seen_at_all = child[visible(child).any(axis=1)]
@@ -143,21 +154,21 @@ def reduce(
         other = None if is_line(shape) else _poses(moving_template(child), child)[0]
 
     movement = Movement(poses.to_body(child), poses, other, template, interval=interval)
-    return ParentFrameMotion(movement, rms, poses, np.eye(3))
+    return ParentFrameMotion(movement, rms, poses, np.eye(3), template)
 
 
-def _check_parent(trial: MarkerTrial, parent: Sequence[str], least: int) -> None:
+def _check_parent(trial: MarkerTrial, parent: Sequence[str], least: int, option: str) -> None:
     if len(set(parent)) < least:
         more = " (2 for a planar movement, with --plane)" if least == MIN_MARKERS else ""
         raise UnsuitableTrialError(
-            f"--parent: {len(set(parent))} markers, expected at least {least}{more}"
+            f"{option}: {len(set(parent))} markers, expected at least {least}{more}"
         )
 
     seen = visible(trial.points(parent))
     if not seen.all(axis=1).any():
         counts = ", ".join(f"{m} {n}" for m, n in zip(parent, seen.sum(axis=0), strict=True))
         raise UnsuitableTrialError(
-            f"--parent: no frame contains all of them (frames by marker: {counts}): omit the marker"
+            f"{option}: no frame contains all of them (frames by marker: {counts}): omit the marker"
             " with the fewest frames"
         )
 
@@ -165,14 +176,38 @@ def _check_parent(trial: MarkerTrial, parent: Sequence[str], least: int) -> None
     apart = float(np.ptp(whole[0], axis=0).max())
     if not _SEGMENT_M[0] <= apart <= _SEGMENT_M[1]:
         raise UnsuitableTrialError(
-            f"--parent: {', '.join(parent)} are {1000 * apart:.3g} mm apart, expected 5 mm to"
+            f"{option}: {', '.join(parent)} are {1000 * apart:.3g} mm apart, expected 5 mm to"
             " 2 m: check the unit stated in the file, and the marker names"
         )
 
     if least == MIN_MARKERS and is_line(whole[0]):
         raise UnsuitableTrialError(
-            f"--parent: {', '.join(parent)} are collinear, so rotation about the line is"
+            f"{option}: {', '.join(parent)} are collinear, so rotation about the line is"
             " unobservable: add a marker off the line, or use --plane with two markers"
+        )
+
+
+def _check_planar_parent(
+    flat: Array, trial: MarkerTrial, parent: Sequence[str], option: str
+) -> None:
+    """Raise an error if the names of the first two markers are exchanged within the trial."""
+    along = flat[:, 1] - flat[:, 0]
+    whole = np.flatnonzero(np.isfinite(flat).all(axis=(1, 2)))
+    step = np.angle(np.exp(1j * np.diff(np.arctan2(along[whole, 1], along[whole, 0]))))
+    t_s = trial.trajectories.t_s[whole]
+    turned = np.flatnonzero((np.abs(step) > _EXCHANGE_RAD) & (np.diff(t_s) <= _EXCHANGE_S))
+    if turned.size:
+        raise UnsuitableTrialError(
+            f"{option}: {parent[0]} and {parent[1]} exchange places at {t_s[turned[0] + 1]:.2f} s:"
+            " correct their names in the file"
+        )
+
+
+def _check_rigid(q: Array, parent: Sequence[str], option: str) -> None:
+    if not visible(q).any():
+        raise UnsuitableTrialError(
+            f"{option}: {', '.join(parent)} do not move rigidly in any frame"
+            f" (residual above {1000 * MAX_FIT_RMS_M:g} mm RMS): list markers of one segment"
         )
 
 
@@ -190,17 +225,28 @@ def _reduce_planar(seen: Array, child: Array, basis: Array, interval: float) -> 
     z = flat[..., 0] + 1j * flat[..., 1]
     whole = np.flatnonzero(np.isfinite(z).all(axis=1))
     middle = z.mean(axis=1)
-    # Template: mean over frames, each rotated so that x points from the first to the second marker
+    # Template: median over frames, each rotated so that the second marker is along x of the first
     turned = (z - middle[:, None]) * np.exp(-1j * np.angle(z[:, 1] - z[:, 0]))[:, None]
-    template = turned[whole].mean(axis=0)
+    template = np.median(turned[whole].real, axis=0) + 1j * np.median(turned[whole].imag, axis=0)
+    template -= template.mean()
     turn = np.angle(((z - middle[:, None]) * template.conj()).sum(axis=1))
-    gap = np.abs((z - middle[:, None]) * np.exp(-1j * turn)[:, None] - template)[whole]
+    gap = np.abs((z - middle[:, None]) * np.exp(-1j * turn)[:, None] - template)
+    rms = np.sqrt((gap**2).mean(axis=1))
+    turn[~(rms <= MAX_FIT_RMS_M)] = np.nan
+
     marker = child @ basis
     w = (marker[..., 0] + 1j * marker[..., 1] - middle[:, None]) * np.exp(-1j * turn)[:, None]
     normal = np.cross(basis[:, 0], basis[:, 1])
     poses = BodyPoses(rotation.exp(turn[:, None] * normal), seen.mean(axis=1))
     movement = Movement(np.stack((w.real, w.imag), axis=-1), interval=interval)
-    return ParentFrameMotion(movement, float(np.sqrt((gap**2).mean())), poses, basis)
+    rigid = rms[rms <= MAX_FIT_RMS_M]
+    return ParentFrameMotion(
+        movement,
+        float(np.sqrt((rigid**2).mean())) if rigid.size else float("nan"),
+        poses,
+        basis,
+        np.column_stack((template.real, template.imag)),
+    )
 
 
 def answers(

@@ -187,6 +187,16 @@ def knee_swings(style: MovementStyle, t: Array) -> Array:
     return coordinates
 
 
+def leg_swings(style: MovementStyle, t: Array) -> Array:
+    """Flex and extend hip, knee and ankle of the raised leg widely, in the sagittal plane only."""
+    coordinates = upright(style, t)
+    coordinates[:, column(HIP, FLEXION)] = np.radians(25 + 45 * np.sin(2 * np.pi * 0.31 * t))
+    coordinates[:, column(KNEE, FLEXION)] = np.radians(55 + 50 * np.sin(2 * np.pi * 0.43 * t))
+    coordinates[:, column(ANKLE, FLEXION)] = np.radians(-10 + 28 * np.sin(2 * np.pi * 0.67 * t))
+    coordinates[:, 2] += 0.15
+    return coordinates
+
+
 def ankle_circles(style: MovementStyle, t: Array) -> Array:
     """Move the raised foot in circles."""
     coordinates = upright(style, t)
@@ -249,8 +259,8 @@ def functional(style: MovementStyle, t: Array) -> Array:
 MOTIONS: Mapping[str, StyledMotion] = {
     motion.__name__: motion
     for motion in (
-        stand, walk, squat, sit_to_stand, hip_circles, knee_swings, ankle_circles, functional,
-        plate, turn,
+        stand, walk, squat, sit_to_stand, hip_circles, knee_swings, leg_swings, ankle_circles,
+        functional, plate, turn,
     )
 }  # fmt: skip
 """All built-in motions by name."""

@@ -54,6 +54,8 @@ TRIALS = {"standing": 5.0, "squats": 8.0, "walking": 8.0, "knee_swings": 8.0, "s
 """Names and durations of the trials, s."""
 _MOTIONS = {"standing": "stand", "squats": "squat", "walking": "walk"}
 """Motions of trials that have another name."""
+SWINGS_S = 10.0
+"""Duration of the planar movement, s."""
 _IDS = {
     "S2": XcdiIds(0x205, 0x206, 0x221, status_word=None, error=None),
     "S4": XcdiIds(0x405, 0x406, 0x421, status_word=None, error=None),
@@ -119,6 +121,7 @@ def write_sample(folder: Path, *, seed: int = 1, force: bool = False) -> dict[st
     standing = SimulatedSubject(knobs, [Step("stand", 1.0)])
     return (
         _write_marker_trials(folder, trials)
+        | _write_planar_trial(folder, knobs)
         | _write_orientation_trials(folder, trials)
         | _write_models(folder, knobs, standing)
         | _write_captures(folder, knobs, standing)
@@ -167,6 +170,22 @@ def _write_marker_trials(folder: Path, trials: Mapping[str, SampleTrial]) -> dic
     y_up = squats.positions[..., [1, 2, 0]]
     (folder / "squats.c3d").write_bytes(c3d_bytes(squats.markers, y_up, rate_hz=RATE_HZ, up="+Y"))
     return written | {"squats.c3d": "the markers of squats.trc: jointfit center, fuse"}
+
+
+def _write_planar_trial(folder: Path, knobs: Knobs) -> dict[str, str]:
+    # single markers at the ends of a chain determine its joints only without soft-tissue artefact
+    rigid = dataclasses.replace(knobs, marker_soft_tissue_mm=0.0)
+    start_s = APART_S * (len(TRIALS) + 1)
+    trial = _record(rigid, "leg_swings", start_s, SWINGS_S, RATE_HZ)
+    numbers = np.arange(1, len(trial.t_s) + 1)
+    y_up = trial.positions[..., [1, 2, 0]]
+    write_trc(
+        folder / "leg_swings.trc",
+        MarkerTrajectories(trial.markers, trial.t_s, numbers, y_up, RATE_HZ),
+    )
+    return {
+        "leg_swings.trc": "wide movement in a plane, markers rigid on the bones: jointfit center"
+    }
 
 
 def _write_orientation_trials(folder: Path, trials: Mapping[str, SampleTrial]) -> dict[str, str]:

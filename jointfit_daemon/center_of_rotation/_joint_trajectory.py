@@ -1,0 +1,160 @@
+r"""Trajectory of a joint in the world, from centers that are fixed in its two segments.
+
+A center of rotation is estimated once, in the coordinates of a segment. The pose of the segment
+then gives the position of the joint in every frame, also where the other segment is occluded.
+
+Invariant: a frame without a pose of either segment has no position (NaN).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation.planar import planar_noise
+from jointfit_daemon.center_of_rotation.spatial import spatial_noise
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation._movement import BodyPoses
+    from jointfit_daemon.center_of_rotation._result import CenterEstimate
+
+_LEAST_VARIANCE_M2 = 1e-12
+"""Variance, m², of a side without noise, so that weights remain finite."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointSide:
+    """One of the two segments of a joint, with the center in its coordinates."""
+
+    poses: BodyPoses
+    """Poses of the segment in the world; NaN where unknown."""
+    basis: Array
+    """Maps coordinates of the segment, (d,), to those of `poses`: identity, or the plane's basis,
+    shape (3, d)."""
+    markers: Array
+    """Markers of the segment in its coordinates, m, shape (m, d)."""
+    fit_rms: float
+    """RMS residual of the rigid fit to the markers, m."""
+    estimate: CenterEstimate
+    """Center in the coordinates of the segment."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointTrajectory:
+    """Position of a joint in the world over time."""
+
+    positions: Array
+    """m, shape (n, 3); NaN where neither segment has a pose."""
+    error: Array
+    """Predicted RMS error of the position, m, shape (n,), along the directions in which the center
+    was observed; NaN where the position is unknown."""
+    sides_apart: float
+    """RMS distance, in a plane within it, between the positions that the two segments give, m; NaN
+    with one segment."""
+
+
+def joint_trajectory(sides: Sequence[JointSide], frames: int) -> JointTrajectory:
+    r"""Return the position of a joint in every frame.
+
+    .. math:: x(t) = \sum_k w_k(t)\, (R_k(t)\, c_k + t_k(t)), \qquad
+              w_k \propto 1 / (s_k^2 + f_k^2)
+
+    over the segments k with a pose in this frame. :math:`s_k^2` is the trace of the covariance of
+    the center, and :math:`f_k^2` that of the error of the segment's pose at the center. Both
+    centers are estimated from the same movement, so their errors are counted as equal in sign; the
+    errors of the poses are independent:
+
+    .. math:: E^2 = \Big( \sum_k w_k s_k \Big)^2 + \sum_k w_k^2 f_k^2
+
+    If the two sides differ by more than their errors predict, E is multiplied by the ratio.
+
+    A direction that only one side has observed is taken from this side. If neither has, the
+    position along it is that of the first side, and the other one agrees with it on average. In a
+    plane this is the position along the normal: the mean of the segment's markers.
+
+    Parameters
+    ----------
+    sides : sequence of JointSide
+        One or two segments; a side with a refused center is not used.
+    frames : int
+        Number of frames n, the result's length if no side is usable.
+
+    Returns
+    -------
+    JointTrajectory
+        Errors hold for markers that are rigid on the bone. A radial residual beyond the noise of
+        the markers (soft-tissue artefact, a moving center) is counted as motion of the joint.
+    """
+    usable = sorted(
+        (side for side in sides if side.estimate.refused is None),
+        key=lambda side: len(side.estimate.unseen),
+    )
+    if not usable:
+        return JointTrajectory(np.full((frames, 3), np.nan), np.full(frames, np.nan), np.nan)
+
+    tracks = [_in_world(usable[0], usable[0].estimate.center)]
+    tracks += [_agreeing_track(side, tracks[0]) for side in usable[1:]]
+    x = np.stack(tracks, axis=1)
+    known = np.asarray(np.isfinite(x).all(axis=-1))
+    fixed = np.array([sqrt(max(float(np.trace(s.estimate.covariance)), 0.0)) for s in usable])
+    moving = np.array([_pose_variance(side) for side in usable])
+    weight = np.where(known, 1.0 / np.maximum(fixed**2 + moving, _LEAST_VARIANCE_M2), 0.0)
+    total = weight.sum(axis=1, keepdims=True)
+    weight = np.divide(weight, total, out=np.full_like(weight, np.nan), where=total > 0.0)
+
+    error = np.sqrt((weight @ fixed) ** 2 + weight**2 @ moving)
+    both = np.flatnonzero(known.all(axis=1)) if len(usable) > 1 else np.zeros(0, dtype=np.intp)
+    if both.size == 0:
+        apart = np.nan
+    else:
+        gap = (x[both, 0] - x[both, 1]) @ usable[0].basis
+        apart = sqrt(float((gap**2).sum(axis=1).mean()))
+        predicted = sqrt(float((fixed**2 + moving).sum()))
+        error *= max(1.0, apart / max(predicted, sqrt(_LEAST_VARIANCE_M2)))
+
+    positions = (weight[..., None] * np.where(known[..., None], x, 0.0)).sum(axis=1)
+    return JointTrajectory(positions, error, apart)
+
+
+def _in_world(side: JointSide, center: Array) -> Array:
+    return side.poses.to_world(side.basis @ center)
+
+
+def _agreeing_track(side: JointSide, reference: Array) -> Array:
+    """Return positions in the world that on average agree with others where nothing is observed."""
+    center, unseen = side.estimate.center, side.estimate.unseen
+    other = side.poses.to_body(reference[:, None])[:, 0] @ side.basis
+    shared = np.isfinite(other).all(axis=1)
+    if not shared.any():
+        return _in_world(side, center)
+    if len(unseen):
+        center = center + unseen.T @ (unseen @ (other[shared].mean(axis=0) - center))
+
+    found = _in_world(side, center)
+    if len(center) == len("xy"):  # the position normal to the plane is that of the markers
+        normal = np.cross(*side.basis.T)
+        found = found + normal * ((reference - found)[shared] @ normal).mean()
+    return found
+
+
+def _pose_variance(side: JointSide) -> float:
+    """Return the variance of the pose at the center along the observed directions, m²."""
+    m, d = side.markers.shape
+    estimate = side.estimate
+    # m markers have m·d coordinates, of which the fit of the pose uses d (d + 1) / 2
+    noise = side.fit_rms * sqrt(m / (m * d - d * (d + 1) / 2))
+    covariance = planar_noise if d == len("xy") else spatial_noise
+    of_point = covariance(estimate.center, side.markers, noise)
+
+    # motion of the joint that the noise of the markers does not explain, per direction
+    excess = max(estimate.residual**2 - float(np.trace(of_point)) / d, 0.0)
+    per_direction = of_point + (excess - noise**2) * np.eye(d)
+    unseen = estimate.unseen.reshape(-1, d) if len(estimate.unseen) else np.zeros((0, d))
+    hidden = float(np.einsum("ua,ab,ub->", unseen, per_direction, unseen))
+    return float(np.trace(per_direction)) - hidden

@@ -1,0 +1,191 @@
+"""Joints of a chain of segments from one marker trial: centres, and their trajectories.
+
+Each joint is measured in the coordinates of its two segments, where their markers define a frame. A
+segment at an end of the chain needs no frame: in a plane, one marker anywhere on it suffices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import chain, pairwise
+from math import inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation import JointSide, JointTrajectory, joint_trajectory
+from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MIN_MARKERS
+from jointfit_daemon.tools.center.trial import (
+    LEAST_PLANAR,
+    UnsuitableTrialError,
+    answers,
+    reduce,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.files.axes import Axis
+    from jointfit_daemon.files.mocap import MarkerTrial
+    from jointfit_daemon.tools.center.trial import WindowEstimate
+
+
+_LEAST_SEGMENTS = 2
+"""Segments of a chain at least: a joint is between two."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChainSide:
+    """Centre of a joint in the coordinates of one of its segments."""
+
+    parent: Sequence[str]
+    """Markers that define the coordinates."""
+    answer: WindowEstimate
+    rms: float
+    """RMS residual of the rigid fit to these markers, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChainJoint:
+    """Joint between two neighbouring segments."""
+
+    name: str
+    sides: Sequence[ChainSide]
+    trajectory: JointTrajectory
+    """In the axes of the file."""
+    faults: Sequence[str]
+    """Segments without a frame that were expected to have one, each with the reason."""
+
+    @property
+    def refused(self) -> bool:
+        """Return whether no side has a usable centre."""
+        return all(side.answer.estimate.refused is not None for side in self.sides)
+
+
+def joint_names(count: int, names: Sequence[str]) -> list[str]:
+    """Return the names of the joints of a chain; ``joint1``, ``joint2``, ... if none are given.
+
+    Raises
+    ------
+    UnsuitableTrialError
+        Another number of names, or one name twice.
+    """
+    if not names:
+        return [f"joint{i}" for i in range(1, count + 1)]
+    if len(names) != count:
+        raise UnsuitableTrialError(
+            f"--joints: {len(names)} names, expected {count}: one for each pair of neighbouring"
+            " segments, from the first to the last"
+        )
+    if several := sorted({name for name in names if names.count(name) > 1}):
+        raise UnsuitableTrialError(f"--joints: {', '.join(several)}: use every name once")
+    return list(names)
+
+
+def chain_joints(
+    trial: MarkerTrial,
+    segments: Sequence[Sequence[str]],
+    names: Sequence[str],
+    *,
+    plane: Axis | None,
+    method: str,
+    source: MarkerTrial | None = None,
+) -> list[ChainJoint]:
+    """Estimate all joints of a chain, and their positions in every frame of a trial.
+
+    Parameters
+    ----------
+    trial : MarkerTrial
+        Trial whose frames are reconstructed.
+    segments : sequence of sequence of str
+        Markers of each segment, from one end of the chain to the other.
+    names : sequence of str
+        Names of the joints, one fewer than segments.
+    plane : {"x", "y", "z"} or None
+        Axis of the file normal to the plane of movement; None for spatial movement.
+    method : str
+        Estimator of the centres.
+    source : MarkerTrial, optional
+        Trial with the same marker placement that the centres are estimated from; `trial` if None.
+
+    Raises
+    ------
+    UnsuitableTrialError
+        Markers that are too few or named twice, or a joint of which no segment has a frame.
+    """
+    least = MIN_MARKERS if plane is None else LEAST_PLANAR
+    _check_segments(segments, names, least)
+    wide = trial if source is None else source
+
+    joints = []
+    for name, (first, second) in zip(names, pairwise(segments), strict=True):
+        sides, located, faults = [], [], []
+        for parent, child in ((first, second), (second, first)):
+            if len(parent) < least:
+                continue
+            try:
+                moved = reduce(wide, parent, child, plane, "--segment")
+                answer = _refuse_other_segment(next(answers(wide, moved, method, None)), child)
+                here = moved
+                if source is not None:
+                    here = reduce(trial, parent, child, plane, "--segment")
+            except UnsuitableTrialError as fault:
+                faults.append(fault)
+                continue
+            sides.append(ChainSide(parent, answer, here.rms))
+            located.append(
+                JointSide(here.poses, here.basis, here.template, here.rms, answer.estimate)
+            )
+        if not sides:
+            raise faults[0]
+        found = joint_trajectory(located, len(trial.trajectories.t_s))
+        in_file = replace(found, positions=trial.to_file(found.positions))
+        joints.append(ChainJoint(name, sides, in_file, [str(fault) for fault in faults]))
+    return joints
+
+
+def _check_segments(segments: Sequence[Sequence[str]], names: Sequence[str], least: int) -> None:
+    if len(segments) < _LEAST_SEGMENTS:
+        raise UnsuitableTrialError(
+            f"--segment: {len(segments)} segment, expected at least 2: give the option once for"
+            " each segment, from one end of the chain to the other"
+        )
+
+    markers = list(chain.from_iterable(segments))
+    if several := sorted({m for m in markers if markers.count(m) > 1}):
+        raise UnsuitableTrialError(
+            f"--segment: {', '.join(several)} named more than once: a marker belongs to one segment"
+        )
+
+    for name, (first, second) in zip(names, pairwise(segments), strict=True):
+        if max(len(first), len(second)) < least:
+            space = " (2 for a planar movement, with --plane)" if least == MIN_MARKERS else ""
+            raise UnsuitableTrialError(
+                f"--segment: {name} is between {', '.join(first) or 'no marker'} and"
+                f" {', '.join(second) or 'no marker'}, and neither segment has the {least} markers"
+                f" of a frame{space}: add markers to one of the two; only the segments at the ends"
+                " of a chain need fewer"
+            )
+    if empty := [k + 1 for k, segment in enumerate(segments) if not segment]:
+        raise UnsuitableTrialError(
+            f"--segment: number {empty[0]} has no markers, expected at least 1: name one"
+        )
+
+
+def _refuse_other_segment(answer: WindowEstimate, child: Sequence[str]) -> WindowEstimate:
+    """Refuse a centre about which the child's markers do not move on circles or spheres."""
+    e = answer.estimate
+    if not MAX_FIT_RMS_M < e.residual < inf:
+        return answer
+    why = (
+        f"{', '.join(child)}: distance to the centre varies by {1000 * e.residual:.0f} mm RMS,"
+        f" expected at most {1000 * MAX_FIT_RMS_M:g} mm: list markers of the neighbouring segment"
+    )
+    return replace(answer, estimate=replace(e, refused=why))
+
+
+def longest_gap_s(joint: ChainJoint, rate_hz: float) -> float:
+    """Return the duration of the longest run of frames without a position, s."""
+    known = np.isfinite(joint.trajectory.positions).all(axis=1)
+    ends = np.flatnonzero(np.concatenate(([True], known, [True])))
+    return float(np.diff(ends).max() - 1) / rate_hz
