@@ -7,7 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jointfit_daemon.limb_model import SensorCalibration
+    from jointfit_daemon.model import Quaternion
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +23,15 @@ class StaticQuality:
     """Robust scatter of each sensor."""
     body_parts: tuple[str, ...]
     """Body parts that are visible to cameras."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorRotations:
+    """The rotations by which fusion converts the orientation of one sensor to its segment."""
+
+    q_sensor_segment: Quaternion
+    """Sensor-to-segment alignment."""
+    q_optical_world: Quaternion
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +157,19 @@ class HoldoutQuality:
 
 
 @dataclass(frozen=True, slots=True)
+class RegressionQuality:
+    """Regression coefficients of one segment: rows w, x, y, z; columns `sensors`, intercept."""
+
+    sensors: tuple[str, ...]
+    q_sign: Quaternion
+    """Quaternions with a negative product with this one change their sign before the regression."""
+    verified: tuple[tuple[float, ...], ...]
+    """Fitted to the first part of the trial; the errors of ``holdout`` are theirs."""
+    stored: tuple[tuple[float, ...], ...]
+    """Fitted to the whole trial; fusion uses them."""
+
+
+@dataclass(frozen=True, slots=True)
 class OnlineQuality:
     """RMS errors of every segment, and of the flexion of every inner joint, in a refit."""
 
@@ -167,11 +193,22 @@ class CalibrationQuality:
     """All figures of a functional calibration."""
 
     static: StaticQuality
+    sensors: Mapping[str, SensorRotations]
     alignment: Mapping[str, WorldQuality] | None
     lag: Mapping[str, LagQuality]
     markers: MarkerQuality | None = None
     anatomy: AnatomyQuality
     holdout: HoldoutQuality
+    regression: Mapping[str, RegressionQuality] | None = None
+    """Coefficients of every segment; None if the method is no regression."""
+
+
+def sensor_rotations(sensors: Mapping[str, SensorCalibration]) -> dict[str, SensorRotations]:
+    """Return the rotations of every sensor."""
+    return {
+        name: SensorRotations(item.q_sensor_segment, item.q_optical_world)
+        for name, item in sensors.items()
+    }
 
 
 def quality_table(value: Any) -> Any:
@@ -185,4 +222,4 @@ def quality_table(value: Any) -> Any:
         }
     if isinstance(value, Mapping):
         return {key: quality_table(figure) for key, figure in value.items()}
-    return list(value) if isinstance(value, tuple) else value
+    return [quality_table(item) for item in value] if isinstance(value, tuple) else value

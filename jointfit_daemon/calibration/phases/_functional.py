@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration._errors import CalibrationError
-from jointfit_daemon.calibration._quality import CalibrationQuality, quality_table
+from jointfit_daemon.calibration._quality import CalibrationQuality, quality_table, sensor_rotations
 from jointfit_daemon.calibration.anatomy import (
     SKIN_SD_M,
     Anatomy,
@@ -50,6 +50,7 @@ from jointfit_daemon.calibration.soft_tissue import (
     fit_models,
     joint_error_correlations,
     pack,
+    regression_quality,
 )
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
@@ -128,22 +129,22 @@ def fit_calibration(
 
     # Lags and mounts of the sensors.
     moving = _lags(chain, functional, tracks, lag_ns or {})
-    earlier = _earlier_lags(previous, tracked or {})
-    lags = _lags_in_use(chain, moving, alignment, earlier, lag_ns or {})
+    lags = _lags_in_use(chain, moving, alignment, _earlier_lags(previous, tracked), lag_ns or {})
     sensors = _sensors(chain, pose, alignment, anatomy, lags)
 
     # Segment models.
     training, raw, missing = limb_training(chain, functional, tracks, anatomy, sensors)
     models = fit_models(chain, training, settings.method)
     headings = _heading_notes(chain, raw, training) if alignment is None else []
-    assumed = [FrameFlag.HEADINGS_FROM_STATIC] if alignment is None else []
     quality = CalibrationQuality(
         static=pose.quality,
+        sensors=sensor_rotations(sensors),
         alignment=None if alignment is None else alignment.quality,
         lag={name: lag_quality(moving.get(name), lags.get(name, NO_LAG)) for name in sensors},
         markers=refined.figures,
         anatomy=anatomy_quality(anatomy, joints),
         holdout=evaluate_methods(chain, training, settings.method, settings.holdout_share),
+        regression=regression_quality(chain, training, models, settings.holdout_share),
     )
     return Calibration(
         method=settings.method,
@@ -154,7 +155,7 @@ def fit_calibration(
         segment=_segments(anatomy, models),
         joint=joints,
         clusters={name: cluster_record(cluster) for name, cluster in refined.clusters.items()},
-        flags=(*anatomy.flags, *assumed),
+        flags=(*anatomy.flags, *([FrameFlag.HEADINGS_FROM_STATIC] if alignment is None else [])),
         notes=(*refined.notes, *anatomy.notes, *lag_notes(moving, lags), *missing, *headings),
         quality=quality_table(quality),
         digest=trials_digest(None if isinstance(static, StaticPose) else static, functional),
@@ -229,11 +230,11 @@ def _lags(
 
 
 def _earlier_lags(
-    previous: Calibration | None, tracked: Mapping[str, tuple[float, float]]
+    previous: Calibration | None, tracked: Mapping[str, tuple[float, float]] | None
 ) -> dict[str, SensorLag]:
     """Return earlier lags: the stored ones, or the tracked ones if more certain."""
     stored = {} if previous is None else previous.lag_ns
-    seen = tracked_lags(tracked)
+    seen = tracked_lags(tracked or {})
     kept = {
         name: SensorLag(lag, STORED_SD_NS, "stored")
         for name, lag in stored.items()

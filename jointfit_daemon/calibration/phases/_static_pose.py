@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration._errors import CalibrationError
-from jointfit_daemon.calibration._quality import StaticQuality, quality_table
+from jointfit_daemon.calibration._quality import StaticQuality, quality_table, sensor_rotations
 from jointfit_daemon.calibration.anatomy import CONFIGURED_SD_M, marked_parts, static_cluster
 from jointfit_daemon.calibration.record import trials_digest
 from jointfit_daemon.calibration.registration import (
@@ -145,15 +145,15 @@ def fit_static_only(
         for group in chain.sensors
     ]
     lengths = [configured_length(chain, i) for i in range(len(chain.segments))]
+    sensors = {
+        name: sensor_calibration(mean, worlds[name], upright) for name, mean in pose.sensors.items()
+    }
     return Calibration(
         method="mean",
         joints=chain.joints,
         segments=chain.segments,
         chain_sensors=chain.sensors,
-        sensor={
-            name: sensor_calibration(mean, worlds[name], upright)
-            for name, mean in pose.sensors.items()
-        },
+        sensor=sensors,
         segment={
             name: SegmentCalibration(
                 upright, length, None if length is None else CONFIGURED_SD_M, own
@@ -163,7 +163,11 @@ def fit_static_only(
         joint={name: JointCalibration(None, None, "unknown") for name in chain.joints},
         flags=(flag,),
         notes=("no cameras: angles are relative to the static pose; standard deviation assumed",),
-        quality={"static": quality_table(pose.quality), "functional": None},
+        quality={
+            "static": quality_table(pose.quality),
+            "sensors": quality_table(sensor_rotations(sensors)),
+            "functional": None,
+        },
         digest=pose.digest,
         software=software,
     )
@@ -220,6 +224,7 @@ def with_new_static(
     flags = [flag for flag in calibration.flags if flag != same_pose]
     flags += [same_pose] if assumed else []
     quality = {**calibration.quality, "static": quality_table(pose.quality)}
+    quality["sensors"] = quality_table(sensor_rotations(sensors))
     if alignment is not None:
         quality["alignment"] = quality_table(alignment.quality)
     return replace(calibration, sensor=sensors, flags=tuple(flags), quality=quality)

@@ -14,6 +14,7 @@ from jointfit_daemon.calibration.soft_tissue._limb_fit import (
     fit_models,
     flexion_error,
     predict_all_sensors,
+    regression_quality,
 )
 from jointfit_daemon.calibration.soft_tissue._mean_fit import fusion_weights
 from jointfit_daemon.calibration.soft_tissue._robust_ridge import fit_ridge
@@ -43,5 +44,6 @@ __all__ = [
     "joint_error_correlations",
     "pack",
     "predict_all_sensors",
+    "regression_quality",
     "unpack",
 ]

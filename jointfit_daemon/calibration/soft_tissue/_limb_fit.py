@@ -13,11 +13,18 @@ from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from jointfit_daemon.calibration._quality import HoldoutQuality, MethodErrors
+from jointfit_daemon.calibration._quality import HoldoutQuality, MethodErrors, RegressionQuality
 from jointfit_daemon.calibration._robust_weights import rms
 from jointfit_daemon.calibration.soft_tissue._segment_fit import fit_segment
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import Method, equal_weights, fuse, model_key, neighbor
+from jointfit_daemon.limb_model import (
+    Method,
+    PatentModel,
+    equal_weights,
+    fuse,
+    model_key,
+    neighbor,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -101,8 +108,7 @@ def evaluate_methods(
     method : Method
         Method of the calibration; it is named in the result.
     """
-    cut = round(len(training) * (1.0 - share))
-    first, last = training.rows(slice(None, cut)), training.rows(slice(cut, None))
+    first, last = _parts(training, share)
     truth = [last.reference[segment] for segment in chain.segments]
     estimates = {
         m: [
@@ -136,6 +142,45 @@ def evaluate_methods(
         for i, joint in enumerate(chain.joints[1:-1])
     }
     return HoldoutQuality(method, share, len(last), segments, joints)
+
+
+def regression_quality(
+    chain: Chain,
+    training: LimbTraining,
+    models: Mapping[str, Mapping[str, SegmentModel]],
+    share: float,
+) -> dict[str, RegressionQuality] | None:
+    """Return the coefficients of every segment for all its sensors; None for other methods.
+
+    The patent fits one part of the data and verifies the coefficients on the rest. These verified
+    coefficients are those of `evaluate_methods`; the stored ones are fitted to all data.
+
+    Parameters
+    ----------
+    models : mapping
+        The stored models of `fit_models`.
+    share : float
+        Held-out part of the trial.
+    """
+    first, _ = _parts(training, share)
+    found = {}
+    for i, segment in enumerate(chain.segments):
+        stored = models[segment][model_key(chain.sensors[i], None)]
+        if not isinstance(stored, PatentModel):
+            return None
+        verified = fit_all_sensors(chain, i, stored.reading, first)
+        if not isinstance(verified, PatentModel):
+            return None
+        found[segment] = RegressionQuality(
+            chain.sensors[i], stored.q_sign, verified.coefficients, stored.coefficients
+        )
+    return found
+
+
+def _parts(training: LimbTraining, share: float) -> tuple[LimbTraining, LimbTraining]:
+    """Return the first part of a trial, and the last `share` of it."""
+    cut = round(len(training) * (1.0 - share))
+    return training.rows(slice(None, cut)), training.rows(slice(cut, None))
 
 
 def fit_all_sensors(chain: Chain, i: int, method: Method, training: LimbTraining) -> SegmentModel:

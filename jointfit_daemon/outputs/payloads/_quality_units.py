@@ -14,11 +14,14 @@ _CONVERTED = {"_rad": ("_deg", 180.0 / math.pi), "_ns": ("_ms", 1e-6)}
 """Suffix of the core, suffix on MQTT, and factor."""
 _TABLES = {"segments": "segments_rad", "flexion": "flexion_rad"}
 """Tables of ``holdout`` with values in radians by segment or joint, and method."""
+_PARAMETERS = ("sensors", "regression")
+"""Tables of quaternions and coefficients, which are published with all digits: with four, an
+orientation computed from them would be about 0.1 degrees off."""
 _DIGITS = 4
 
 
 def quality_payload(quality: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `quality` in the units of MQTT, rounded to four significant digits.
+    """Return `quality` in the units of MQTT, figures rounded to four significant digits.
 
     Parameters
     ----------
@@ -29,7 +32,8 @@ def quality_payload(quality: Mapping[str, Any]) -> dict[str, Any]:
     found = dict(quality)
     if isinstance(holdout := found.get("holdout"), Mapping):
         found["holdout"] = {_TABLES.get(key, key): value for key, value in holdout.items()}
-    return _convert_table(found, 1.0)
+    parameters = {key: found.pop(key) for key in _PARAMETERS if key in found}
+    return _convert_table(found, 1.0) | parameters
 
 
 def _convert_table(values: Mapping[str, Any], factor: float) -> dict[str, Any]:

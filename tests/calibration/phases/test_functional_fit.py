@@ -89,6 +89,23 @@ def test_json_is_exact_through_text(clean: tuple[Subject, Calibration]) -> None:
     assert len(again.digest) == 64
 
 
+def test_rotations_and_regression_coefficients_in_use_are_published(
+    clean: tuple[Subject, Calibration],
+) -> None:
+    published = clean[1].quality["sensors"]
+    for name, item in clean[1].sensor.items():
+        assert tuple(published[name]["q_sensor_segment"]) == item.q_sensor_segment
+    assert "regression" not in clean[1].quality  # anchored
+
+    static, functional, _ = static_and_functional(Subject(11), 12.0)
+    settings = replace(SETTINGS, method="patent12")
+    found = fit_calibration(static, functional, None, settings, CHAIN)
+    for segment, figures in found.quality["regression"].items():
+        stored = found.segment[segment].models[f"{'+'.join(figures['sensors'])}|"].to_dict()
+        assert figures["stored"] == [list(row) for row in stored["coefficients"]]
+        assert figures["verified"] != figures["stored"]
+
+
 @pytest.mark.parametrize("damage", [{"schema": 99}, {"sensor": {"S1": {}}}, {"segments": None}])
 def test_a_json_of_something_else_is_refused(
     clean: tuple[Subject, Calibration], damage: dict[str, object]

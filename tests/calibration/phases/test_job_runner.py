@@ -107,6 +107,25 @@ def test_without_a_new_alignment_the_worlds_stay() -> None:
     }
 
 
+def test_published_rotations_are_those_after_redonning() -> None:
+    room, worn = worlds(dict.fromkeys(SENSORS, 0.3)), mounts()
+    previous = fit_static_only(fit_static(standing(room, worn), SETTINGS, CHAIN), room, CHAIN)
+    turned = rotation.exp(np.array([0.2, 0.0, 0.0]))
+    found = static_job(
+        standing(room, {**worn, "S4": rotation.multiply(worn["S4"], turned)}), previous, None
+    )
+    for one in (previous, found):
+        assert one.quality["sensors"] == {
+            name: {
+                "q_sensor_segment": list(item.q_sensor_segment),
+                "q_optical_world": list(item.q_optical_world),
+            }
+            for name, item in one.sensor.items()
+        }
+    rotations = [one.quality["sensors"]["S4"]["q_sensor_segment"] for one in (previous, found)]
+    assert rotation.angle_between(*rotations) == pytest.approx(0.2, abs=1e-6)
+
+
 def test_models_of_unaligned_worlds_are_not_moved_to_aligned_ones() -> None:
     before, worn = worlds(dict.fromkeys(SENSORS, 0.0)), mounts()
     pose = fit_static(standing(before, worn), SETTINGS, CHAIN)

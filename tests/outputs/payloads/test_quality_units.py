@@ -41,6 +41,17 @@ def test_holdout_tables_get_a_unit() -> None:
     }
 
 
+def test_rotations_and_coefficients_are_not_rounded() -> None:
+    parameters = {
+        "sensors": {"S1": {"q_sensor_segment": [0.123456789, 0.0, 0.0, 0.99235]}},
+        "regression": {"thigh": {"sensors": ["S1"], "stored": [[1.23456789, 0.1]]}},
+    }
+    assert quality_payload(parameters | {"static": {"still_s": 5.123456}}) == {
+        "static": {"still_s": 5.123},
+        **parameters,
+    }
+
+
 def test_texts_flags_lists_and_nulls_pass_unchanged() -> None:
     told = {"alignment": None, "body_parts": ["foot", "shank"], "joints": {"fit": True}}
     assert quality_payload(told) == told
