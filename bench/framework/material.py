@@ -19,13 +19,13 @@ SIMULATED_SUBJECTS = Material(
     "true bone orientations, not available to the estimators",
 )
 KNEE = Material(
-    "1 adult (OpenCap subject 4), right leg; 4 virtual IMUs made of skin markers, with the "
-    "orientation errors of recorded filters",
+    "1 adult (OpenCap subject 4), right leg; 4 virtual IMUs: orientations of skin-marker "
+    "clusters plus orientation errors recorded from real filters",
     "musculoskeletal model fitted to other markers",
 )
 BOTH_KNEES = Material(
-    "1 adult (OpenCap subject 4), both legs; 8 virtual IMUs made of skin markers, with the "
-    "orientation errors of recorded filters",
+    "1 adult (OpenCap subject 4), both legs; 8 virtual IMUs: orientations of skin-marker "
+    "clusters plus orientation errors recorded from real filters",
     "inverse kinematics of the subject's model without any marker of thighs and shanks",
 )
 BOARD = Material(

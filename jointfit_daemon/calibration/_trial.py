@@ -23,14 +23,14 @@ class SensorTrack:
     """Orientations of one sensor over time."""
 
     t_ns: NDArray[np.int64]
-    """Shape (n,), strictly increasing."""
+    """Time stamps, ns, shape (n,), strictly increasing."""
     q_world_sensor: NDArray[np.float64]
-    """Shape (n, 4), the sensor's own world."""
+    """Orientations in the sensor's own world, shape (n, 4)."""
 
 
 @dataclass(frozen=True, slots=True)
 class OpticalTrack:
-    """Measurements of the optical system; NaN where occluded."""
+    """Measurements of the optical system over time; NaN where occluded."""
 
     t_ns: NDArray[np.int64]
     """Instants of exposure, shape (m,), strictly increasing."""
@@ -39,9 +39,9 @@ class OpticalTrack:
     """Marker positions in the optical world (z up), m, shape (m, len(markers), 3)."""
     bodies: tuple[str, ...]
     body_positions: NDArray[np.float64]
-    """m, shape (m, len(bodies), 3)."""
+    """Positions of the rigid bodies in the optical world, m, shape (m, len(bodies), 3)."""
     body_orientations: NDArray[np.float64]
-    """q_world_body, shape (m, len(bodies), 4)."""
+    """Orientations q_world_body of the rigid bodies, shape (m, len(bodies), 4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +65,13 @@ class CalibrationSettings:
     """Shortest duration of the functional phase, s: the regression needs this much movement even if
     the joint centers converge earlier."""
     center_target_m: float = 0.003
-    """Noise part of the predicted error of every joint center at which the movement suffices, m."""
+    """Random error of the joint centers, m, below which the movement is sufficient.
+
+    It is the part of the predicted error that decreases with more movement."""
     markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Markers of each segment or adjacent body part (pelvis, foot)."""
+    """Marker names, by segment or adjacent body part (pelvis, foot)."""
     rigid_bodies: Mapping[str, str] = field(default_factory=dict)
-    """Rigid body of each segment without markers."""
+    """Rigid body of the mocap software, by segment; for segments without single markers."""
     plate: str | None = None
     """Rigid body of the calibration plate that carries the sensors in the align phase."""
     holdout_share: float = 0.4
@@ -89,9 +91,11 @@ class OnlineFrames:
     """New complete frames of sensors and markers, in order of time."""
 
     sensors: Mapping[str, Array]
-    """q_optical_segment of each sensor, computed with its mount, shape (n, 4)."""
+    """q_optical_segment of each sensor, computed with its sensor-to-segment alignment, shape
+    (n, 4)."""
     markers: Mapping[str, Array]
-    """Markers of the cluster of each segment, optical world, m, shape (n, k, 3); absent for rigid
-    bodies."""
+    """Marker positions of the cluster of each segment in the optical world, m, shape (n, k, 3).
+
+    A segment with a rigid body is in `bodies` instead."""
     bodies: Mapping[str, Array]
     """q_world_body of each segment with a rigid body, shape (n, 4)."""

@@ -1,4 +1,7 @@
-"""Conventions of a chain: body parts beside joints, neighboring segments, signs of flexion."""
+"""Conventions of the limb's chain: adjacent body parts, neighboring segments, signs of flexion.
+
+The joint types of chain models (ball, hinge, coupled) are in ``kinematics/chains/_model.py``.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,13 @@ if TYPE_CHECKING:
 
 
 FLEXES_FORWARD = ("hip", "ankle", "elbow", "shoulder", "wrist")
-"""Joints with positive flexion about x (distal end forward); knees and other names are negative."""
+"""Parts of the names of joints whose flexion is a positive rotation about x (distal end forward).
+
+Knees and joints with other names flex with a negative rotation."""
 
 
 def body_parts(chain: Chain) -> list[str | None]:
-    """Return the body parts beside the joints: joint i lies between parts i and i + 1."""
+    """Return the body parts from proximal to distal: joint i lies between parts i and i + 1."""
     return [chain.proximal, *chain.segments, chain.distal]
 
 

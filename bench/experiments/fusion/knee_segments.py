@@ -201,7 +201,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "knee-heading-invariance",
-        "Squats, hold-out, with the subject facing 10 to 180° elsewhere",
+        "Squats, hold-out, with the subject turned by 10 to 180° after the training",
         facing_elsewhere,
         KNEE,
         _DATA,

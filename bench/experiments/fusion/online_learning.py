@@ -334,8 +334,8 @@ def _anew(one: Person, calibration: Calibration, dice: np.random.Generator) -> P
 
 
 REDONNED = (
-    f"taught; then every sensor turned by {TURN_DEG:g} deg, skin that moves"
-    f" {100 * OTHER_SKIN:g} % otherwise, a new static pose only"
+    f"Models refined online; then every sensor re-donned (turned by {TURN_DEG:g} deg, soft-tissue "
+    f"artefact {100 * OTHER_SKIN:g} % different) with a new static pose only"
 )
 EXPERIMENTS = (
     Experiment(

@@ -248,7 +248,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "heading-and-redonning",
-        "Subject facing elsewhere; sensors re-donned at slightly other places",
+        "Subject turned after the training; sensors re-donned at slightly other places",
         turned_and_donned,
         KNEE,
         _DATA,

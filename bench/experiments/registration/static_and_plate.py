@@ -184,7 +184,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "board-alignment-filtered",
-        "Alignment of a recorded board, orientation of a filter",
+        "Alignment of a recorded board; its IMU orientation is computed by a filter",
         real_plate,
         BOARD,
         ("broad",),
@@ -192,7 +192,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "board-alignment-integrated",
-        "Alignment of a recorded board, orientation of the integrated gyroscope",
+        "Alignment of a recorded board; its IMU orientation is the integrated gyroscope",
         integrated_plate,
         BOARD,
         ("broad_excerpts",),

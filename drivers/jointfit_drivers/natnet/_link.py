@@ -1,7 +1,8 @@
 """Sockets to one NatNet server in the event loop.
 
-A reader callback has no caller, so its error is stored and raised in `NatNetLink.pause`, where the
-driver's coroutine waits: `DeviceLostError` for failures of the network, other exceptions unchanged.
+The event loop calls the reader callbacks, so they cannot raise an error in the driver's coroutine.
+Their error is stored, and `NatNetLink.pause`, in which the coroutine waits, raises it. Failures of the
+network are raised as `DeviceLostError`, other exceptions unchanged.
 
 Frames are accepted from any port of the server, because multicast frames leave its data port.
 Control messages are accepted on the command socket only, and only from the server's command port.
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
 _FLEETING = {errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR}
 """Errors that concern one datagram and not the connection."""
 _FORGED_NS = 100_000_000
-"""Interval, ns, after a datagram of the server in which an ICMP refusal is forged or stale."""
+"""Time, ns, after a datagram from the server for which an ICMP refusal is ignored.
+
+A server that has just sent a datagram does not refuse: the ICMP message is forged or stale."""
 
 
 class NatNetLink:
@@ -56,7 +59,9 @@ class NatNetLink:
         self._failure: Exception | None = None
         self._received_ns = 0
         self.foreign = 0
-        """Datagrams dropped because of their source; the kernel drops most others."""
+        """Number of datagrams that this class dropped because of their source.
+
+        The kernel drops most datagrams of other hosts before, and these are not counted."""
 
     def __enter__(self) -> Self:
         self._command = self._open(UdpSocket(self._local, 0, sender=self._server[0]))
@@ -77,7 +82,7 @@ class NatNetLink:
         Raises
         ------
         DeviceLostError
-            There is no route to the server.
+            The system cannot send to the server, for example because there is no route to it.
         """
         try:
             self._command.send(encode(message), self._server)

@@ -4,7 +4,7 @@ A sample is stamped with the arrival of its first byte. On a serial line this is
 chunk minus the duration of the message and of the bytes behind it, at ten bits per byte. On USB it
 is the arrival of the chunk.
 
-Invariant: a function of the chunks fed; no clock, no port.
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -37,8 +37,10 @@ if TYPE_CHECKING:
 _BITS = 10
 """Bits of one byte on the line, 8N1."""
 _SILENCE_FLOOR_NS = 250_000_000
-"""Shortest silence, ns, that ends a pending message. At high speed, 1.5 messages take so little
-time that a stalled host could not be distinguished from a silent line.
+"""Lower bound, ns, of the silence after which a pending message is discarded.
+
+At high speed the duration of 1.5 messages is so short that a host that reads late would look like a
+silent line.
 """
 _COUNTER, _TIME = int(Item.PACKET_COUNTER), int(Item.SAMPLE_TIME_FINE)
 _QUATERNION = int(Item.QUATERNION)
@@ -68,7 +70,7 @@ class XbusDecoder:
     rate_hz : float
         Nominal rate, Hz, used until the rate of the stream is measured.
     wires : mapping, optional
-        Sync wire of the rig for each item that reports edges.
+        Number of the sync wire of the rig, by the data item that reports its edges.
     raw : RawOrientation, optional
         Computes orientations from raw measurements; None if the device sends orientations.
     """
@@ -98,7 +100,10 @@ class XbusDecoder:
 
     @property
     def tick_clock(self) -> TickClock:
-        """Device time in ticks of 100 us; the modulus follows from the model, or the first wrap."""
+        """Unit and modulus of the device time: ticks of 100 us.
+
+        The modulus follows from the product code, or from the first wrap of the device time.
+        """
         modulus = self._continuity.modulus or setup.WRAP_32_BIT
         if modulus != self._tick_clock.modulus:  # read after every chunk, and changes once
             self._tick_clock = TickClock(setup.TICK_NS, modulus)
@@ -273,7 +278,7 @@ class XbusDecoder:
         """Return the events of a message other than a measurement."""
         mid, data = message.mid, message.data
         if mid == XbusMessageId.WAKE_UP:
-            if data:  # a corrupt measurement
+            if data:  # a WakeUp has no data: this is a corrupt measurement
                 return []
             out = self._drop_held()
             self._continuity.forget()

@@ -4,7 +4,7 @@ Angular rate arrives as RateOfTurn or DeltaQ, specific force as Acceleration or 
 sensor axes. Increments are divided by the mean interval of the device clock. Every complete message
 yields one sample once the filter has settled.
 
-Invariant: a function of the messages fed.
+Invariant: the output depends only on the messages fed; no clock and no port is read.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ RAW = frozenset((*RATES, *FORCES, FIELD))
 _REPORT_NS, _SOON_NS = 10_000_000_000, 1_000_000_000
 """Period, ns, of the filter's state events: in general, and after a change."""
 _TINY = 1e-12
-"""Smallest vector part, rad/2, for which the angle is divided by it."""
+"""Norm of the vector part of a quaternion below which its angle is computed by the series 2 |v|."""
 FAST = 5.0
 """Angular rate, rad/s, below which no gyroscope saturates."""
 _NEW_HEADING = (
@@ -132,8 +132,9 @@ class RawOrientation:
             )
             out.append(DeviceEvent("warning", text, {"missing": missing}))
 
-        # Devices need not send their status word. Noise makes two equal rates improbable: a fast
-        # one that repeats bit by bit is at the end of its range.
+        # The status word reports saturation, but a device need not send it. Without it, saturation is
+        # detected by repetition: because of noise, a high rate repeats exactly only at the end of the
+        # gyroscope's range.
         before, rate = self._rate, cast("Vector | None", values.get(RATES[0]))
         self._rate = rate or (0.0, 0.0, 0.0)
         pairs = zip(self._rate, before, strict=True)

@@ -1,7 +1,8 @@
 """Outputs that an Xbus device must send, by the source of its orientation.
 
-Any item of an entry is sufficient; the first one is requested. Increments (DeltaQ, DeltaV) are
-accepted in place of rates if the device is already configured for them.
+A `RequiredOutput` lists alternative data items; the device must send one of them. If it sends none,
+the driver requests the first. Increments (DeltaQ, DeltaV) are thus accepted in place of rate of
+turn and acceleration if the device is already configured for them.
 """
 
 from __future__ import annotations

@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 
 STANDING_SD_RAD = radians(2.0)
-"""Standard deviation of the tilt of a segment in the static pose, rad per axis, with an operator
-present."""
+"""Standard deviation of the tilt of a segment in the static pose, rad per axis.
+
+The value assumes that an operator asks the subject to stand upright."""
 
 
 def apply_standing_prior(
@@ -43,7 +44,7 @@ def apply_standing_prior(
     centers : sequence of (ndarray, shape (3,)) or None
         Joint centers in the static world (z up), m, from proximal to distal; None if unknown.
     covariances : sequence of (ndarray, shape (3, 3)) or None
-        m², including the soft-tissue artefact.
+        Covariances of the centers, m², including the error caused by soft-tissue artefact.
     sd : float
         Standard deviation of the tilt of a segment in the static pose, rad.
 

@@ -1,9 +1,14 @@
 """Guidance of a functional movement: current accuracy, missing movement, and completion.
 
-The movement is complete if three conditions hold, each with its remedy. Every joint with markers on
-both sides has its center within the target (noise part). Every joint between two sensors has
-flexed far and often enough for the regression. The shortest duration has passed. If a condition
-fails until the longest duration, the phase ends with a message on it.
+The movement is complete if three conditions hold:
+
+1. The random error of the center of every joint with markers on both sides is below the target.
+2. Every joint whose two segments carry sensors has flexed far and often enough to train the
+   soft-tissue models.
+3. The shortest duration has passed.
+
+For each condition that does not hold, a message names the missing movement. At the longest duration
+the phase ends in any case, with these messages.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Instructions for the subject, by kind of joint; joints with unknown names get general ones."""
+"""Instructions for the subject, by kind of joint, with general ones for unknown joint names."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ class JointInstructions(NamedTuple):
     """The joint has one main axis: the position of its center along that axis comes from the static
     pose."""
     arc: float = radians(40.0)
-    """Smallest arc of a joint between two sensors for the regression, rad."""
+    """Smallest arc, rad, that a joint must cover to train the soft-tissue models.
+
+    It applies to joints whose two segments carry sensors."""
 
 
 _GENERAL_INSTRUCTIONS = JointInstructions("bend and stretch it as far as it goes", "circle it")

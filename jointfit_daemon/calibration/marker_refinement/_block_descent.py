@@ -1,15 +1,17 @@
 r"""Block-coordinate descent: marker positions and poses are optimized in turns.
 
-The only requirement on the model is inverse kinematics for given markers. With fixed poses, the
-best positions are a weighted mean of the measured positions in segment axes and the nominal
-positions,
+The symbols are those of the objective F in `_objective`. The poses of a turn are computed by any
+inverse kinematics for given marker positions. With fixed poses, F is minimized by a weighted mean
+of the measured positions in segment axes and the nominal positions,
 
 .. math::
 
-    p_m = \frac{\sum_t w_{tm} R^T (y_{tm} - t) + \lambda n_m p^0_m}{\sum_t w_{tm} + \lambda n_m}
+    p_m = \frac{\sum_t w_{tm} R_{tm}^T (y_{tm} - t_{tm}) + \lambda n_m p^0_m}
+               {\sum_t w_{tm} + \lambda n_m}
 
-With Huber's loss the weights are those at the last errors. Both halves lower F; an accelerated
-proposal is accepted only if it lowers F, too.
+With Huber's loss, :math:`w_{tm}` is multiplied by the robust weight at the errors of the turn
+before. The pose step and the position step each decrease F. Anderson acceleration proposes a
+further step, which is accepted only if it decreases F, too.
 """
 
 from __future__ import annotations
@@ -28,7 +30,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.marker_refinement._objective import RefinementProblem
 
 _TOLERANCE = 1e-4
+"""Relative decrease of F in one turn below which the iteration ends."""
 _MOST_ITERATIONS = 30
+"""Largest number of turns."""
 
 
 class Carriers(NamedTuple):
@@ -37,9 +41,9 @@ class Carriers(NamedTuple):
     rotations: Array
     """R_world_segment of each marker's segment, shape (T, M, 3, 3)."""
     origins: Array
-    """m, shape (T, M, 3)."""
+    """Origin of each marker's segment in the world, m, shape (T, M, 3)."""
     overturning: float = 0.0
-    """Part of F caused by hinges beyond their limits."""
+    """Term of F for the excess of hinge angles over their limits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,9 +66,11 @@ def solve_in_turns(
 
     Parameters
     ----------
+    problem
+        The objective F with its data.
     follow
-        Returns the poses for positions, m, shape (M, 3), and weights of squared errors, shape (T,
-        M).
+        Inverse kinematics: called with marker positions, m, shape (M, 3), and the weights of their
+        squared errors, shape (T, M); returns the poses.
     on_step
         Called with every accepted iterate; True ends the iteration.
     tolerance
@@ -72,8 +78,8 @@ def solve_in_turns(
 
     Returns
     -------
-    list of Turn
-        The start and every accepted iterate; F decreases.
+    list of AlternatingStep
+        The start and every accepted iterate, in order; F decreases from each to the next.
     """
     turns = _AlternatingSolver(problem, follow)
     path, anderson = [turns.first()], Anderson()
@@ -92,7 +98,7 @@ def solve_in_turns(
         if new is None:
             new = turns.follow(plain, last)
 
-        if new.cost >= last.cost:  # both halves are at their minimum, except for rounding
+        if new.cost >= last.cost:  # both steps are at their minimum, except for rounding
             break
         path.append(new)
         done = last.cost - new.cost < tolerance * last.cost
@@ -103,7 +109,7 @@ def solve_in_turns(
 
 
 class _AlternatingSolver:
-    """The two steps of one turn: poses and positions."""
+    """Computes the two steps of one turn: poses and positions."""
 
     def __init__(
         self, problem: RefinementProblem, follow: Callable[[Array, Array], Carriers]

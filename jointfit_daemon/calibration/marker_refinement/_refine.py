@@ -57,7 +57,7 @@ def refine_markers(
     Parameters
     ----------
     model
-        Nominal positions, locks, weights.
+        Chain model with nominal marker positions, locked coordinates and marker weights.
     trials
         Training trials.
     validation
@@ -66,7 +66,8 @@ def refine_markers(
     Raises
     ------
     RefinementError
-        If `check` finds a fault.
+        If the checks of the inputs find a fault, such as a wrong length unit, exchanged labels or
+        too few frames.
     """
     settings = settings or RefinementSettings()
     thin = [trial.thinned(settings.frames) for trial in trials]
@@ -135,7 +136,8 @@ def _task(
     options = IkOptions(huber_m=settings.huber_m, limit_m2=settings.limit_m2)
     first = solve_frames(model, targets, weights, options=options)
     if settings.evenness > 0.0:
-        # The weight of a frame is the error of its trial to a power, with mean 1.
+        # The frames of a trial are weighted by a power of the trial's tracking error. The weights
+        # are scaled to mean 1, so that the prior keeps its meaning.
         lengths = [len(part.targets) for part, _ in parts]
         each = np.split(first.residuals, np.cumsum(lengths)[:-1])
         errors = np.array([tracking_error(part) for part in each])
@@ -160,7 +162,10 @@ class _HoldOut:
         self.positions = model.positions
 
     def enough(self, positions: Array) -> bool:
-        """Record the error at new positions; return True if it has risen twice in a row."""
+        """Record the hold-out error at new positions; return whether the iteration shall stop.
+
+        It stops after `_RISES` consecutive steps without a new minimum.
+        """
         model = self._model.with_markers(positions)
         self._last = solve_frames(
             model, self._targets, start=self._last.state, options=self._options
@@ -249,7 +254,7 @@ class ChainFollower:
 
 
 class _StopCriterion:
-    """Stop criterion, evaluated after every step."""
+    """Reports progress after every step and decides whether the iteration stops."""
 
     def __init__(
         self, holdout: _HoldOut | None, problem: RefinementProblem, progress: Progress | None

@@ -1,8 +1,10 @@
-"""UDP payloads from pcapng and pcap files; a truncated file ends early.
+"""Reader of UDP payloads in pcapng and pcap files.
+
+A truncated file yields the packets before the cut.
 
 Supported: little- and big-endian files, several sections and interfaces, microsecond to nanosecond
 timestamps, Ethernet (with VLAN tags), Linux cooked and raw IP links, IPv4 with reassembly of
-fragments. Everything else in the file is skipped. Time is the packet's own, ns since 1970.
+fragments. Everything else in the file is skipped. Time stamps are those of the file, ns since 1970.
 
 Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791.
 """
@@ -22,13 +24,15 @@ PCAP_MAGICS = {
     b"\x4d\x3c\xb2\xa1": ("<", 1),
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
-"""First bytes of a pcap file: byte order, and nanoseconds per unit of its fraction."""
+"""Byte order (of `struct`), and nanoseconds per unit of the fraction of a second, by the first four
+bytes of a pcap file."""
 
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
 _LITTLE_MAGIC = b"\x4d\x3c\x2b\x1a"
 _RESOLUTION, _OFFSET = 9, 14  # options if_tsresol, if_tsoffset
 _LINK_HEADS = {101: (0, None), 228: (0, None), 113: (16, 14), 276: (20, 0)}
-"""Link types: bytes before the IP header, and the offset of their EtherType."""
+"""Number of bytes before the IP header, and offset of the EtherType in them (None: the link has
+none), by link type."""
 _ETHERNET = 1
 _IPV4, _VLAN = 0x0800, (0x8100, 0x88A8)
 _UDP = 17
@@ -37,7 +41,7 @@ _UDP_HEAD = struct.Struct(">HHHH")
 _BLOCK_EDGES, _INTERFACE_HEAD, _PACKET_HEAD, _OFFSET_BYTES = 12, 8, 20, 8
 _PCAP_HEAD = 24
 _MAX_PENDING = 64
-"""Most datagrams under reassembly at once."""
+"""Largest number of datagrams under reassembly at once."""
 
 
 class UdpPacket(NamedTuple):

@@ -45,8 +45,8 @@ class LagTracker:
     Parameters
     ----------
     window_s, hop_s : float
-            Length of a window, and time from one to the next, s. Overlapping windows are not
-        independent: their variance is multiplied by ``window / hop``.
+        Length of a window, and time from one window to the next, s. Overlapping windows are not
+        independent: the variance of their estimates is multiplied by ``window_s / hop_s``.
     """
 
     __slots__ = ("_drift", "_inflate", "_pp", "_pt", "_refused", "_t_ns", "_tau", "_tt")

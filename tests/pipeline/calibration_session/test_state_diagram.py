@@ -17,13 +17,13 @@ from jointfit_daemon.pipeline.calibration_session._state_machine import (
 from jointfit_daemon.pipeline.events import CalibrationPhase
 
 PAGE = Path(__file__).parents[3] / "docs" / "calibration.md"
-AT_REST = "at rest"
+IDLE = "idle"
 
 
 def diagram() -> str:
-    """Return the transitions as text, one line each; all phases at rest are one."""
+    """Return the transitions as text, one line each; all idle phases are one."""
     rows = dict.fromkeys(
-        (AT_REST if phase in RESTING else str(phase), str(event), str(after))
+        (IDLE if phase in RESTING else str(phase), str(event), str(after))
         for (phase, event), after in TRANSITIONS.items()
     )
     widths = [max(len(row[i]) for row in rows) for i in range(2)]
@@ -32,7 +32,7 @@ def diagram() -> str:
         for _, group in groupby(rows, key=lambda row: row[0])
         for phase, event, after in group
     ]
-    return "\n".join([*lines, f"{AT_REST}: {', '.join(RESTING)}"])
+    return "\n".join([*lines, f"{IDLE}: {', '.join(RESTING)}"])
 
 
 def test_documentation_contains_the_diagram_of_the_transition_table() -> None:
