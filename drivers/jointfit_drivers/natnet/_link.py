@@ -1,8 +1,8 @@
 """Sockets to one NatNet server in the event loop.
 
 The event loop calls the reader callbacks, so they cannot raise an error in the driver's coroutine.
-Their error is stored, and `NatNetLink.pause`, in which the coroutine waits, raises it. Failures of the
-network are raised as `DeviceLostError`, other exceptions unchanged.
+Their error is stored, and `NatNetLink.pause`, in which the coroutine waits, raises it. Failures of
+the network are raised as `DeviceLostError`, other exceptions unchanged.
 
 Frames are accepted from any port of the server, because multicast frames leave its data port.
 Control messages are accepted on the command socket only, and only from the server's command port.

@@ -132,9 +132,9 @@ class RawOrientation:
             )
             out.append(DeviceEvent("warning", text, {"missing": missing}))
 
-        # The status word reports saturation, but a device need not send it. Without it, saturation is
-        # detected by repetition: because of noise, a high rate repeats exactly only at the end of the
-        # gyroscope's range.
+        # The status word reports saturation, but a device need not send it. Otherwise saturation is
+        # detected by repetition: because of noise, a high rate repeats exactly only at the end of
+        # the gyroscope's range.
         before, rate = self._rate, cast("Vector | None", values.get(RATES[0]))
         self._rate = rate or (0.0, 0.0, 0.0)
         pairs = zip(self._rate, before, strict=True)
