@@ -17,6 +17,7 @@ from jointfit_daemon.tools.check import check
 from jointfit_daemon.tools.command_group import EXIT_CODES, CommandGroup
 from jointfit_daemon.tools.decode import decode
 from jointfit_daemon.tools.demo import demo
+from jointfit_daemon.tools.ik import ik
 from jointfit_daemon.tools.markers import markers
 from jointfit_daemon.tools.report import report
 from jointfit_daemon.tools.sample import sample
@@ -31,7 +32,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (check, demo, calibrate, center, decode, markers, report, sample, schema):
+for command in (check, demo, calibrate, center, decode, ik, markers, report, sample, schema):
     app.command()(command)
 app.add_typer(fuse.app)
 

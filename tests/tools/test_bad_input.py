@@ -51,6 +51,8 @@ COMMANDS: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "markers toml": ("leg.toml", ".toml", ("markers", "standing.trc", "--model", BAD)),
     "markers json": ("leg.toml", ".json", ("markers", "standing.trc", "--model", BAD)),
     "markers osim": ("leg.osim", ".osim", ("markers", "standing.trc", "--model", BAD)),
+    "ik trial": ("standing.trc", ".trc", ("ik", BAD, "leg.toml", "--end", "0.1")),
+    "ik osim": ("leg.osim", ".osim", ("ik", "standing.trc", BAD, "--end", "0.1")),
     "fuse npz": ("standing.npz", ".npz", ("fuse", "evaluate", BAD, *SEGMENTS)),
     "fuse sto": (
         "standing.sto",

@@ -2,6 +2,11 @@
 
 from jointfit_daemon.calibration.marker_refinement._block_descent import Carriers
 from jointfit_daemon.calibration.marker_refinement._coordinate_search import SearchSettings, search
+from jointfit_daemon.calibration.marker_refinement._input_checks import (
+    MOST_RMS_M,
+    exchanged_markers,
+    find_trial_faults,
+)
 from jointfit_daemon.calibration.marker_refinement._motion_trial import (
     MotionTrial,
     RefinementError,
@@ -17,6 +22,7 @@ from jointfit_daemon.calibration.marker_refinement._refinement_result import (
 )
 
 __all__ = [
+    "MOST_RMS_M",
     "Carriers",
     "MarkerOutcome",
     "MotionTrial",
@@ -27,6 +33,8 @@ __all__ = [
     "SearchSettings",
     "TrackingStatistics",
     "TrialOutcome",
+    "exchanged_markers",
+    "find_trial_faults",
     "refine_markers",
     "search",
 ]

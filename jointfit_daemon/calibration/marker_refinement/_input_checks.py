@@ -30,7 +30,8 @@ _MOST_STRETCH = 1.3
 _TOLD_STRETCH = 1.1
 _APART_M = 0.04
 """Smallest distance between markers of one segment that is compared, m."""
-_MOST_RMS_M = 0.08
+MOST_RMS_M = 0.08
+"""Tracking error above which labels, scaling or axes must be wrong, m."""
 _SWAP_GAIN = 0.2
 """Share of the squared error that remains after exchanging two labels; below it they were
 exchanged."""
@@ -61,7 +62,7 @@ def check(
         If a fault prevents the refinement; all faults are listed.
     """
     every = [*trials, *validation]
-    faults = [f for trial in every for f in _wrong_size(model, trial)]
+    faults = [f for trial in every for f in find_trial_faults(model, trial)]
     free, held = _movable(model, trials)
     if not trials:
         faults.append("no training trial given")
@@ -86,12 +87,17 @@ def check(
     return CheckedTrials(tuple(usable), free, tuple(notes))
 
 
-def _wrong_size(model: ChainModel, trial: MotionTrial) -> list[str]:
+def find_trial_faults(
+    model: ChainModel, trial: MotionTrial, fewest_frames: int = _LEAST_FRAMES
+) -> list[str]:
+    """Return the reasons why a trial does not belong to the model: markers, unit, size."""
     whole = np.isfinite(trial.targets).all(axis=-1)
-    if (whole.sum(axis=1) >= 3).sum() < _LEAST_FRAMES:
+    if (whole.sum(axis=1) >= 3).sum() < fewest_frames:
+        few = f"fewer than {fewest_frames} frames show"
+        least = "no frame shows" if fewest_frames == 1 else few
         return [
-            f"{trial.name}: fewer than {_LEAST_FRAMES} frames show three or more of the model's"
-            " markers: are the names the model's?"
+            f"{trial.name}: {least} three or more of the model's markers: are the names the"
+            " model's?"
         ]
 
     stretch = _stretch(model, trial)
@@ -185,7 +191,7 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
     if not (trial.targets.shape[0] and np.isfinite(found.residuals).any()):
         return trial, [], [f"{trial.name}: the model follows none of its frames"]
     faults, notes, targets = [], [], trial.targets.copy()
-    for i, j, frames in _exchanged(found.residuals, trial.targets):
+    for i, j, frames in exchanged_markers(found.residuals, trial.targets):
         pair = f"{model.markers[i].name} and {model.markers[j].name}"
         if frames.mean() >= _SWAPPED_TRIAL:
             faults.append(f"{trial.name}: {pair} look exchanged: exchange their labels back")
@@ -194,7 +200,7 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
             targets[frames, i] = targets[frames, j] = np.nan
 
     rms = tracking_error(found.residuals)
-    if rms > _MOST_RMS_M and not faults:
+    if rms > MOST_RMS_M and not faults:
         faults.append(
             f"{trial.name}: the model is {1000 * rms:.0f} mm RMS off its markers: check labels,"
             " scaling and axes"
@@ -203,7 +209,7 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
     return replace(trial, targets=targets), notes, faults
 
 
-def _exchanged(residuals: Array, targets: Array) -> list[tuple[int, int, NDArray[np.bool_]]]:
+def exchanged_markers(residuals: Array, targets: Array) -> list[tuple[int, int, NDArray[np.bool_]]]:
     """Return pairs of markers that fit far better with each other's label, and when."""
     places = targets + residuals  # positions in the model
     own = np.einsum("tmi,tmi->tm", residuals, residuals)

@@ -1,6 +1,7 @@
-"""Chain models in files: the project's TOML and JSON, and OpenSim models."""
+"""Chain models in files: the project's TOML and JSON, and OpenSim models and set-up files."""
 
 from jointfit_daemon.files.models._chain_file import read_model, write_model
 from jointfit_daemon.files.models._osim import read_osim
+from jointfit_daemon.files.models._osim_tasks import IkSetup, read_ik_setup
 
-__all__ = ["read_model", "read_osim", "write_model"]
+__all__ = ["IkSetup", "read_ik_setup", "read_model", "read_osim", "write_model"]

@@ -14,6 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.files.axes import to_z_up
+from jointfit_daemon.files.models._osim_coordinates import (
+    joint_coordinates,
+    unnamed_coordinates,
+)
 from jointfit_daemon.files.models._osim_document import GROUND, read_document
 from jointfit_daemon.files.models._osim_joints import nearest_joint
 from jointfit_daemon.files.models._units import require_metres
@@ -32,8 +36,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.files.models._osim_document import OsimDocument, OsimMarker
+    from jointfit_daemon.files.models._osim_document import OsimDocument, OsimJoint, OsimMarker
     from jointfit_daemon.files.models._osim_joints import NearestJoint
+    from jointfit_daemon.kinematics.chain_coordinates import JointCoordinates
     from jointfit_daemon.kinematics.chains import Sample
     from jointfit_daemon.model import Quaternion, Vector
 
@@ -44,6 +49,8 @@ class ImportedModel:
 
     model: ChainModel
     remarks: tuple[str, ...]
+    coordinates: tuple[JointCoordinates, ...]
+    """Coordinates of each segment, with the names of the file."""
 
 
 def read_osim(path: Path, *, markers: Collection[str] | None = None) -> ImportedModel:
@@ -89,7 +96,8 @@ def read_osim(path: Path, *, markers: Collection[str] | None = None) -> Imported
         model = ChainModel(tuple(segments), tuple(riders), document.name)
     except InvalidChainModelError as error:
         raise MalformedFileError(f"{path}: {error}") from error
-    return ImportedModel(require_metres(path, model), tuple(tree.remarks))
+    coordinates = tuple(tree.coordinates(segment) for segment in segments)
+    return ImportedModel(require_metres(path, model), tuple(tree.remarks), coordinates)
 
 
 class _Tree:
@@ -103,6 +111,7 @@ class _Tree:
         self.segments: dict[str, Segment] = {}
         self._at: dict[str, tuple[str | None, Array]] = {GROUND: (None, np.eye(4))}
         self._told: dict[str, tuple[str, ...]] = {}
+        self._joints: dict[str, tuple[OsimJoint, Array]] = {}
 
         waiting = list(document.joints)
         while waiting:
@@ -113,6 +122,7 @@ class _Tree:
                 if joint.child.body in self._at:
                     raise ValueError(f"body {joint.child.body!r} has two parent joints")
                 nearest = nearest_joint(joint)
+                self._joints[joint.child.body] = joint, self._at[joint.parent.body][1]
                 self._add(joint.parent.body, joint.child.body, nearest)
             waiting = [j for j in waiting if j not in ready]
 
@@ -196,6 +206,16 @@ class _Tree:
                 found.append(Segment(name) if cut else segment)
                 self.remarks += () if cut else self._told[name]
         return found
+
+    def coordinates(self, segment: Segment) -> JointCoordinates:
+        """Return the coordinates of a kept segment; general ones for a root without its parent."""
+        was_cut = segment.parent is None and (
+            segment.name not in self._joints
+            or self._at[self._joints[segment.name][0].parent.body][0] is not None
+        )
+        if was_cut:
+            return unnamed_coordinates(segment.name)
+        return joint_coordinates(segment, *self._joints[segment.name])
 
 
 def _vector(v: Array) -> Vector:

@@ -92,7 +92,7 @@ def read_document(path: Path) -> OsimDocument:
         Not an OpenSim 4 model, invalid XML, a document type declaration, an oversized file, or
         a unit of length other than metres.
     """
-    root = _read_xml(path)
+    root = read_xml(path)
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
         raise MalformedFileError(
@@ -128,7 +128,7 @@ def read_document(path: Path) -> OsimDocument:
         raise MalformedFileError(f"{path}: {error}") from error
 
 
-def _read_xml(path: Path) -> ET.Element:
+def read_xml(path: Path) -> ET.Element:
     """Return the root of an XML file without a document type; `MalformedFileError` otherwise."""
     reject_device(path)
     if path.stat().st_size > LARGEST:

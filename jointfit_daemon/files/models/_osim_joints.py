@@ -71,7 +71,7 @@ def nearest_joint(joint: OsimJoint) -> NearestJoint:
     turning = [c for c in moving if c.name in motion.turning]
     shifting = [c for c in moving if c.name in motion.shifting and c not in turning]
 
-    turns, shifts = _sampled(joint, motion, {})
+    turns, shifts = sampled_joint(joint, motion, {})
     rest = np.eye(4)
     rest[:3, :3], rest[:3, 3] = turns[0], shifts[0]
     welded = NearestJoint(None, rest, shifts[0], np.zeros(3), np.eye(3)[0], None, ())
@@ -102,7 +102,7 @@ def _span(c: Coordinate) -> tuple[float, float]:
     return (low, high) if low < high else (c.default - 0.1, c.default + 0.1)
 
 
-def _sampled(
+def sampled_joint(
     joint: OsimJoint, motion: JointMotion, values: dict[str, Array]
 ) -> tuple[Array, Array]:
     """Return R, shape (n, 3, 3), and t, shape (n, 3), of the child body in the parent body."""
@@ -144,7 +144,7 @@ def _ball(
         for i, c in enumerate(turning)
     }
 
-    above, own, missed = _centers(joint, *_sampled(joint, motion, values))
+    above, own, missed = _centers(joint, *sampled_joint(joint, motion, values))
     remarks = []
     if len(turning) < _ALL:
         remarks.append(f"{joint.name}: rotates about any axis, not only by {_names(turning)}")
@@ -163,7 +163,7 @@ def _about_one(
     span = _span(coordinate)
     zero = min(max(0.0, span[0]), span[1])
     values = np.concatenate(([zero, *span], np.linspace(*span, _SAMPLES)))
-    turns, shifts = _sampled(joint, motion, {coordinate.name: values})
+    turns, shifts = sampled_joint(joint, motion, {coordinate.name: values})
     rest, axis, angles, bent = _axis(np.delete(turns, [1, 2], axis=0))
     above, own, missed = _centers(joint, turns[3:], shifts[3:])
     if missed > _TELL_M or bent > _TELL_RAD:
@@ -191,7 +191,7 @@ def _coupled(
     low, high = _span(coordinate)
     zero = min(max(0.0, low), high)
     values = np.linspace(low - _BEYOND, high + _BEYOND, 2 * _SAMPLES - 1)
-    turns, shifts = _sampled(joint, motion, {coordinate.name: np.append(values, zero)})
+    turns, shifts = sampled_joint(joint, motion, {coordinate.name: np.append(values, zero)})
     own = joint.child.transform[:3, 3]
     seen = shifts + turns @ own
     above = seen[-1]

@@ -82,6 +82,11 @@ class JointMotion:
         self._axes = axes
 
     @property
+    def second_rotation(self) -> str:
+        """Coordinate of the second rotation, or an empty string."""
+        return self._axes[1][0]
+
+    @property
     def turning(self) -> frozenset[str]:
         """Coordinates that rotate the child."""
         return self._driving(self._axes[:_TURNING])

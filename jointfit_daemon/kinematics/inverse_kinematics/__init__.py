@@ -1,12 +1,14 @@
 """Inverse kinematics: the poses of a chain model that best fit measured markers."""
 
 from jointfit_daemon.kinematics.inverse_kinematics._levenberg_marquardt import Band, limits_of
+from jointfit_daemon.kinematics.inverse_kinematics._local_minima import restart_local_minima
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
     MarkerFit,
     lower_equations,
     marker_fit,
     marker_slots,
 )
+from jointfit_daemon.kinematics.inverse_kinematics._pose_covariance import pose_covariance
 from jointfit_daemon.kinematics.inverse_kinematics._solver import (
     OPEN_M2,
     IkOptions,
@@ -25,6 +27,8 @@ __all__ = [
     "lower_equations",
     "marker_fit",
     "marker_slots",
+    "pose_covariance",
+    "restart_local_minima",
     "solve_frames",
     "tracking_error",
 ]

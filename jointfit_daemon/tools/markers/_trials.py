@@ -8,18 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
-import numpy as np
-
-from jointfit_daemon.calibration.marker_refinement import MotionTrial
-from jointfit_daemon.files.mocap import UnknownMarkerError, read_marker_trial
-from jointfit_daemon.nearest_name import did_you_mean
+from jointfit_daemon.files.mocap import read_marker_trial
+from jointfit_daemon.tools.marker_model import load_model, motion_trial, require_marker
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
+    from jointfit_daemon.calibration.marker_refinement import MotionTrial
     from jointfit_daemon.files.axes import Axis
-    from jointfit_daemon.files.mocap import MarkerTrial
     from jointfit_daemon.kinematics.chains import ChainModel
 
 _AXES = "xyz"
@@ -47,26 +44,20 @@ def load(
     ValueError
         Unknown names in locks; `MalformedFileError` for broken files.
     """
-    from jointfit_daemon.files.models import read_model, read_osim
-
     read = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in trials]
     judges = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in validation]
-    remarks: tuple[str, ...] = ()
-    if asked.model.suffix.lower() == ".osim":
-        imported = read_osim(asked.model)
-        chain, remarks = imported.model, imported.remarks
-    else:
-        chain = read_model(asked.model)
+    loaded = load_model(asked.model)
+    chain = loaded.chain
     for name in asked.without:
-        _known(chain, name, "--without")
+        require_marker(chain, name, "--without")
     kept = tuple(m for m in chain.markers if m.name not in asked.without)
     chain = replace(chain, markers=kept)
 
-    learned = [_motion(p.stem, t, chain) for p, t in zip(trials, read, strict=True)]
+    learned = [motion_trial(p.stem, t, chain) for p, t in zip(trials, read, strict=True)]
     chain = _locked(chain, asked.unlock, hold=False)
     chain = _locked(chain, asked.lock, hold=True)
-    judged = [_motion(p.stem, t, chain) for p, t in zip(validation, judges, strict=True)]
-    return chain, remarks, learned, judged
+    judged = [motion_trial(p.stem, t, chain) for p, t in zip(validation, judges, strict=True)]
+    return chain, loaded.remarks, learned, judged
 
 
 def _locked(chain: ChainModel, texts: Iterable[str], *, hold: bool) -> ChainModel:
@@ -80,27 +71,8 @@ def _locked(chain: ChainModel, texts: Iterable[str], *, hold: bool) -> ChainMode
         name, dot, axis = text.rpartition(".")
         if text in locks or not dot or axis not in tuple(_AXES):
             name, axis = text, _AXES
-        _known(chain, name, "--lock" if hold else "--unlock")
+        require_marker(chain, name, "--lock" if hold else "--unlock")
         for letter in axis:
             locks[name][_AXES.index(letter)] = hold
 
     return chain.with_locks({name: (x, y, z) for name, (x, y, z) in locks.items()})
-
-
-def _known(chain: ChainModel, name: str, option: str) -> None:
-    if name in chain.marker_names:
-        return
-    names = chain.marker_names
-    hint = did_you_mean(name, names, count=3) or f"there are: {', '.join(names)}"
-    raise ValueError(f"{option} {name}: unknown marker; {hint}")
-
-
-def _motion(name: str, trial: MarkerTrial, chain: ChainModel) -> MotionTrial:
-    count = len(trial.trajectories.t_s)
-    targets = np.full((count, len(chain.markers), 3), np.nan)
-    for at, marker in enumerate(chain.marker_names):
-        try:
-            targets[:, at] = trial.points([marker])[:, 0]
-        except UnknownMarkerError:
-            continue  # the column remains NaN, which the refinement reports
-    return MotionTrial(name, targets, trial.trajectories.rate_hz)

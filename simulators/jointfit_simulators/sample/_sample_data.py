@@ -164,7 +164,7 @@ def _write_marker_trials(folder: Path, trials: Mapping[str, SampleTrial]) -> dic
             folder / f"{name}.trc",
             MarkerTrajectories(trial.markers, trial.t_s, numbers, y_up, RATE_HZ),
         )
-        written[f"{name}.trc"] = "markers, y up: jointfit center, markers, fuse"
+        written[f"{name}.trc"] = "markers, y up: jointfit center, markers, ik, fuse"
 
     squats = trials["squats"]
     y_up = squats.positions[..., [1, 2, 0]]
@@ -212,8 +212,8 @@ def _write_models(folder: Path, knobs: Knobs, subject: SimulatedSubject) -> dict
     (folder / "leg.toml").write_text(model_toml(parts, markers), encoding="utf-8")
     (folder / "leg.osim").write_text(model_osim(parts, markers), encoding="utf-8")
     return {
-        "leg.toml": "a chain model with marker position errors of about 1 cm: jointfit markers",
-        "leg.osim": "the same model for OpenSim: jointfit markers",
+        "leg.toml": "a chain model with marker position errors of about 1 cm: jointfit markers, ik",
+        "leg.osim": "the same model for OpenSim: jointfit markers, ik",
     }
 
 

@@ -1,0 +1,163 @@
+"""Detection of local minima of inverse kinematics, and restarts from other poses.
+
+Every instant is solved from its own markers, so single instants, or a whole trial, may end in a
+local minimum. Two kinds of instants are solved again from perturbed poses: those with an error well
+above that of their surroundings, and some evenly spaced ones. An improvement spreads to the
+neighbors, which start from the improved pose, as long as it reduces their error.
+
+Invariant: the cost of an instant never increases.
+"""
+
+from __future__ import annotations
+
+from copy import deepcopy
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.ndimage import median_filter
+
+from jointfit_daemon.kinematics.chains import apply_step, layout_of
+from jointfit_daemon.kinematics.inverse_kinematics._levenberg_marquardt import limits_of
+from jointfit_daemon.kinematics.inverse_kinematics._solver import (
+    IkOptions,
+    IkResult,
+    checked_weights,
+    solve_frames,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chains import ChainModel, ChainState
+
+_SURROUNDINGS = 31
+"""Instants in the running median of the error."""
+_JUMP = 1.5
+"""Ratio of the error to its running median that counts as a jump."""
+_JUMP_M = 0.003
+"""Smallest excess of the error over its running median that counts as a jump, m."""
+_PROBES = 24
+"""Evenly spaced instants that are solved from perturbed poses."""
+_POSES = 6
+"""Perturbed poses per instant."""
+_PERTURBATION = 1.0
+"""Largest perturbation of a rotation, rad."""
+_GOLDEN = 0.6180339887498949
+"""Multiples of it, modulo 1, are evenly distributed: perturbations without a random generator."""
+_GAIN = 0.99
+"""Ratio of the new cost to the old one that counts as an improvement; smaller differences are
+rounding and the tolerance of the solver."""
+_PASSES = 400
+"""Largest number of instants over which an improvement spreads in one direction."""
+
+
+def restart_local_minima(
+    model: ChainModel,
+    markers: ArrayLike,
+    weights: ArrayLike | None,
+    found: IkResult,
+    options: IkOptions | None = None,
+) -> tuple[IkResult, NDArray[np.bool_]]:
+    """Return a solution without the local minima that were found, and the improved instants.
+
+    Parameters
+    ----------
+    model, markers, weights, options
+        As in `solve_frames`.
+    found
+        Its result.
+
+    Returns
+    -------
+    result
+        The same as `found`, except for the improved instants.
+    improved
+        Shape (T,).
+    """
+    measured = np.asarray(markers, dtype=np.float64)
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=-1))
+    trial = _Trial(model, measured, checked_weights(model, weights, seen), options or IkOptions())
+    best = _Best(trial, deepcopy(found))
+
+    probes = np.union1d(
+        np.flatnonzero(_jumps(best.cost, trial.weights)),
+        np.linspace(0, len(measured) - 1, min(_PROBES, len(measured))).astype(np.intp),
+    )
+    for k in range(_POSES if len(measured) else 0):
+        start = apply_step(model, best.result.state.take(probes), _perturbation(model, k, probes))
+        best.try_from(probes, start)
+
+    # the wave ends where the start from the neighbor is no improvement
+    last = np.flatnonzero(best.improved)
+    for _ in range(_PASSES):
+        ahead = [(last + s, last) for s in (-1, 1)]
+        at = np.concatenate([to for to, _ in ahead])
+        source = np.concatenate([of for _, of in ahead])
+        inside = (at >= 0) & (at < len(measured))
+        at, first = np.unique(at[inside], return_index=True)
+        if not at.size:
+            break
+        last = at[best.try_from(at, best.result.state.take(source[inside][first]))]
+
+    return best.result, best.improved
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    model: ChainModel
+    measured: Array
+    weights: Array
+    options: IkOptions
+
+    def cost(self, residuals: Array, state: ChainState, at: NDArray[np.intp]) -> Array:
+        """Return the weighted squared errors and excesses over limits, m^2, shape (len(at),)."""
+        square = np.einsum("tmi,tmi->tm", residuals, residuals)
+        cost = np.where(self.weights[at] > 0.0, self.weights[at] * square, 0.0).sum(axis=1)
+        for band in limits_of(self.model, self.options.limit_m2):
+            excess = band.excess(layout_of(self.model), state)
+            cost = cost + (band.weights * excess**2).sum(axis=1)
+        return np.asarray(cost)
+
+
+class _Best:
+    """Best known solution of a trial, overwritten in place."""
+
+    def __init__(self, trial: _Trial, result: IkResult) -> None:
+        self._trial, self.result = trial, result
+        every = np.arange(len(trial.measured))
+        self.cost = trial.cost(result.residuals, result.state, every)
+        self.improved = np.zeros(len(every), dtype=np.bool_)
+
+    def try_from(self, at: NDArray[np.intp], start: ChainState) -> NDArray[np.bool_]:
+        """Solve some instants from other states, and return where this reduced the cost."""
+        trial = self._trial
+        new = solve_frames(
+            trial.model, trial.measured[at], trial.weights[at], start=start, options=trial.options
+        )
+        cost = trial.cost(new.residuals, new.state, at)
+        better = (cost < _GAIN * self.cost[at]) & ~new.underdetermined
+        to = at[better]
+        self.cost[to], self.improved[to] = cost[better], True
+        self.result.state.put(to, new.state.take(better))
+        for f in fields(new):
+            if f.name != "state":
+                getattr(self.result, f.name)[to] = getattr(new, f.name)[better]
+        return better
+
+
+def _jumps(cost: Array, weights: Array) -> NDArray[np.bool_]:
+    """Return the instants with an error well above that of their surroundings."""
+    rms = np.sqrt(cost / np.maximum(weights.sum(axis=1), 1e-12))
+    usual = median_filter(rms, size=min(_SURROUNDINGS, max(len(rms), 1)), mode="nearest")
+    return np.asarray((rms > _JUMP * usual) & (rms > usual + _JUMP_M))
+
+
+def _perturbation(model: ChainModel, k: int, at: NDArray[np.intp]) -> Array:
+    """Return the k-th perturbation of the rotations, rad, shape (len(at), nq)."""
+    layout = layout_of(model)
+    numbers = np.arange(1, model.nq + 1) * (k + 1) * _GOLDEN
+    step = _PERTURBATION * (2.0 * (numbers % 1.0) - 1.0)
+    step[layout.shifts] = 0.0
+    return np.broadcast_to(step, (len(at), model.nq))

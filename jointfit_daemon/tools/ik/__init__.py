@@ -1,0 +1,5 @@
+"""`jointfit ik`: joint coordinates of a marker trial by inverse kinematics."""
+
+from jointfit_daemon.tools.ik._command import ik
+
+__all__ = ["ik"]

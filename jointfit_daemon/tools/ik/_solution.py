@@ -1,0 +1,271 @@
+"""Inverse kinematics of one trial: input checks, solution, and coordinates with uncertainty.
+
+Unknown coordinates are NaN: those of frames without a solution, and those that the visible markers
+do not determine.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from jointfit_daemon.calibration.marker_refinement import (
+    MOST_RMS_M,
+    MotionTrial,
+    RefinementError,
+    exchanged_markers,
+    find_trial_faults,
+)
+from jointfit_daemon.files.mocap import read_marker_trial
+from jointfit_daemon.files.models import IkSetup, read_ik_setup
+from jointfit_daemon.kinematics.chain_coordinates import coordinate_table
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    IkOptions,
+    pose_covariance,
+    restart_local_minima,
+    solve_frames,
+)
+from jointfit_daemon.tools.marker_model import load_model, motion_trial, require_marker
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.files.axes import Axis
+    from jointfit_daemon.files.mocap import MarkerTrial
+    from jointfit_daemon.kinematics.chains import ChainModel
+    from jointfit_daemon.kinematics.inverse_kinematics import IkResult
+    from jointfit_daemon.tools.marker_model import LoadedModel
+
+_LIMIT_M2 = 1.0
+"""Weight of the excess over joint limits, m^2/rad^2, as in `jointfit markers`."""
+_FEWEST_MARKERS = 3
+"""Markers of a frame with a solution: fewer do not determine the position of the first segment."""
+_MISFIT_RAD = 0.0017
+"""Rotation outside of the model's coordinates that is reported, rad: 0.1 degrees."""
+_SHOWN = 8
+"""Most names in a note."""
+
+
+@dataclass(frozen=True, slots=True)
+class IkRequest:
+    """Options of the command line."""
+
+    trial: Path
+    model: Path
+    weights: tuple[str, ...] = ()
+    setup: Path | None = None
+    without: tuple[str, ...] = ()
+    span: tuple[float | None, float | None] = (None, None)
+    use_limits: bool = True
+    up: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TrialSolution:
+    """Coordinates and marker errors at T instants; K coordinates, M tracked markers."""
+
+    trial: str
+    model: ChainModel
+    t_s: Array
+    rate_hz: float
+    names: tuple[str, ...]
+    is_angle: tuple[bool, ...]
+    values: Array
+    """rad and m, shape (T, K); NaN where unknown."""
+    sd: Array
+    """Standard deviations, rad and m, shape (T, K); NaN where unknown."""
+    marker_names: tuple[str, ...]
+    distances: Array
+    """Marker errors, m, shape (T, M); NaN where missing."""
+    solved: NDArray[np.bool_]
+    """Frames with a solution, shape (T,)."""
+    restarted: int
+    """Frames with a smaller error after a restart from another pose."""
+    notes: tuple[str, ...]
+
+    @property
+    def complete(self) -> NDArray[np.bool_]:
+        """Frames in which all coordinates are known, shape (T,)."""
+        return np.asarray(np.isfinite(self.values).all(axis=1))
+
+
+def solve_trial(asked: IkRequest) -> TrialSolution:
+    """Return the solution of a trial.
+
+    Raises
+    ------
+    RefinementError
+        The trial does not fit the model: other markers, unit, size or labels.
+    ValueError
+        Unknown names in options, an empty time range; `MalformedFileError` for broken files.
+    """
+    loaded = load_model(asked.model)
+    setup = IkSetup({}, None, ()) if asked.setup is None else read_ik_setup(asked.setup)
+    trial = read_marker_trial(asked.trial, cast("Axis | None", asked.up))
+    model = loaded.chain
+    weights, notes = _weights(asked, setup, model)
+    notes = [*loaded.remarks, *trial.trajectories.warnings, *notes]
+
+    part = _time_range(asked, setup, trial)
+    targets = motion_trial(asked.trial.stem, trial, model).targets[part]
+    targets[:, weights == 0.0] = np.nan
+    motion = MotionTrial(asked.trial.stem, targets, trial.trajectories.rate_hz)
+    notes += _check(asked, model, motion, trial, weights)
+
+    options = IkOptions(limit_m2=_LIMIT_M2 if asked.use_limits else 0.0)
+    found = solve_frames(model, targets, weights, options=options)
+    found, improved = restart_local_minima(model, targets, weights, found, options)
+    notes += _check_fit(motion, found, model)
+    return _described(loaded, motion, trial.trajectories.t_s[part], (found, improved, notes))
+
+
+def _weights(asked: IkRequest, setup: IkSetup, model: ChainModel) -> tuple[Array, list[str]]:
+    """Return the weight of each marker of the model, and notes."""
+    weights, notes = model.weights.copy(), []
+    index = {name: k for k, name in enumerate(model.marker_names)}
+    if setup.weights:
+        # as in OpenSim, markers without a task are not tracked
+        weights = np.array([setup.weights.get(name, 0.0) for name in index])
+        unknown = [name for name in setup.weights if name not in index]
+        if unknown:
+            notes.append(f"{asked.setup}: tasks of unknown markers ignored: {_listed(unknown)}")
+        if setup.ignored:
+            notes.append(f"{asked.setup}: coordinate tasks ignored: {_listed(setup.ignored)}")
+
+    for text in asked.weights:
+        name, _, number = text.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            value = -1.0
+        if not name or not 0.0 <= value < float("inf"):
+            raise ValueError(
+                f"--weight {text}: expected NAME=NUMBER with a number of at least 0, such as"
+                f" {model.marker_names[0] if index else 'NAME'}=2"
+            )
+        require_marker(model, name, "--weight")
+        weights[index[name]] = value
+    for name in asked.without:
+        require_marker(model, name, "--without")
+        weights[index[name]] = 0.0
+    return weights, notes
+
+
+def _time_range(asked: IkRequest, setup: IkSetup, trial: MarkerTrial) -> NDArray[np.bool_]:
+    """Return the frames in the time range; options take precedence over the set-up file."""
+    t_s = trial.trajectories.t_s
+    given = setup.time_range or (-np.inf, np.inf)
+    low, high = (g if a is None else a for g, a in zip(given, asked.span, strict=True))
+    half = 0.5 / trial.trajectories.rate_hz
+    inside = (t_s >= low - 1e-3 * half) & (t_s <= high + 1e-3 * half)
+    if not inside.any():
+        raise ValueError(
+            f"{asked.trial}: no frame between {low:g} and {high:g} s: the trial lasts from"
+            f" {t_s.min():g} to {t_s.max():g} s: change --start, --end or the set-up file"
+        )
+    return np.asarray(inside)
+
+
+def _check(
+    asked: IkRequest, model: ChainModel, motion: MotionTrial, trial: MarkerTrial, weights: Array
+) -> list[str]:
+    """Return notes on missing markers; `RefinementError` if the trial is of another model."""
+    seen: NDArray[np.bool_] = np.asarray(np.isfinite(motion.targets).all(axis=-1).any(axis=0))
+    if not seen.any():
+        raise RefinementError(
+            f"{asked.trial} has none of the {int((weights > 0).sum())} tracked markers of"
+            f" {asked.model}: found {_listed(trial.trajectories.names)}, expected"
+            f" {_listed(model.marker_names)}: rename the markers, or use the model of this marker"
+            " set"
+        )
+    faults = find_trial_faults(model, motion, fewest_frames=1)
+    if faults:
+        raise RefinementError("; ".join(faults))
+    absent = [m.name for m, s, w in zip(model.markers, seen, weights, strict=True) if not s and w]
+    return [f"not in the trial: {_listed(absent)}"] if absent else []
+
+
+def _check_fit(motion: MotionTrial, found: IkResult, model: ChainModel) -> list[str]:
+    """Return notes on exchanged labels; `RefinementError` if the model does not fit."""
+    notes = []
+    for i, j, frames in exchanged_markers(found.residuals, motion.targets):
+        pair = f"{model.marker_names[i]} and {model.marker_names[j]}"
+        notes.append(f"{pair} look exchanged in {int(frames.sum())} frames: check their labels")
+
+    square = np.einsum("tmi,tmi->tm", found.residuals, found.residuals)
+    rms = float(np.sqrt(np.nanmean(square)))
+    if rms > MOST_RMS_M:
+        raise RefinementError(
+            f"{motion.name}: the model is {1000 * rms:.0f} mm RMS off its markers, expected less"
+            f" than {1000 * MOST_RMS_M:.0f} mm: check labels, scaling and axes (--up)"
+            + "".join(f"; {note}" for note in notes)
+        )
+    return notes
+
+
+def _described(
+    loaded: LoadedModel,
+    motion: MotionTrial,
+    t_s: Array,
+    result: tuple[IkResult, NDArray[np.bool_], list[str]],
+) -> TrialSolution:
+    found, improved, notes = result
+    model = loaded.chain
+    covariance, determined = pose_covariance(model, found)
+    table = coordinate_table(model, found.state, covariance, loaded.coordinates)
+    notes += [
+        f"{segment}: rotates by up to {np.degrees(most):.1f}° outside of its coordinates"
+        for segment, most in table.misfit.items()
+        if most > _MISFIT_RAD
+    ]
+
+    seen = np.isfinite(found.residuals).all(axis=-1)
+    solved = found.converged & (seen.sum(axis=1) >= _FEWEST_MARKERS)
+    known = _known(loaded, determined) & solved[:, None]
+
+    ever = known.any(axis=0)
+    if not ever.any():
+        raise RefinementError(
+            f"{motion.name}: the markers determine no coordinate in any frame: track more markers"
+            f" of {model.name}"
+        )
+    never = [name for name, some in zip(table.names, ever, strict=True) if not some]
+    if never:
+        notes.append(f"no markers determine, left out: {_listed(never)}")
+
+    tracked = seen.any(axis=0)
+    return TrialSolution(
+        motion.name,
+        model,
+        t_s,
+        motion.rate_hz,
+        tuple(np.array(table.names)[ever].tolist()),
+        tuple(np.array(table.is_angle)[ever].tolist()),
+        np.where(known, table.values, np.nan)[:, ever],
+        np.where(known, table.sd, np.nan)[:, ever],
+        tuple(np.array(model.marker_names)[tracked].tolist()),
+        np.linalg.norm(found.residuals[:, tracked], axis=-1),
+        solved,
+        int(improved.sum()),
+        tuple(notes),
+    )
+
+
+def _known(loaded: LoadedModel, determined: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the coordinates of joints with markers for all degrees of freedom, shape (T, K)."""
+    whole = [
+        determined[:, columns].all(axis=1)
+        for columns, joint in zip(loaded.chain.columns, loaded.coordinates, strict=True)
+        for _ in joint.names
+    ]
+    return np.stack(whole, axis=1)
+
+
+def _listed(names: tuple[str, ...] | list[str]) -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more
