@@ -14,6 +14,10 @@ from jointfit_daemon.center_of_rotation.planar._oriented_fit import AngleNoise, 
 from jointfit_daemon.center_of_rotation.planar._parent_frame_noise import planar_noise
 from jointfit_daemon.center_of_rotation.planar._plane import plane_of
 from jointfit_daemon.center_of_rotation.planar._running_circle import RunningCircle
+from jointfit_daemon.center_of_rotation.planar._three_frame_errors import (
+    three_frame_error,
+    three_frame_mean_squares,
+)
 from jointfit_daemon.center_of_rotation.planar._three_frames import (
     equal_step_error,
     three_frame_center,
@@ -39,5 +43,7 @@ __all__ = [
     "planar_noise",
     "plane_of",
     "three_frame_center",
+    "three_frame_error",
     "three_frame_estimate",
+    "three_frame_mean_squares",
 ]

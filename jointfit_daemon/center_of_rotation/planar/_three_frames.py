@@ -79,15 +79,16 @@ def _offset(u: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
     return np.stack((x, y), axis=-1), flat
 
 
-def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
+def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
     """Estimate a center from three points, with the error predicted from the given noise.
 
     Parameters
     ----------
     points : array_like, shape (3, 2)
         One marker in three frames, m.
-    noise : float
-        Standard deviation of each coordinate, m; three points do not determine it.
+    noise : array_like, broadcast to (3, 2)
+        Standard deviations of x and y in each frame, m; three points do not determine them. One
+        value for all, (3, 1) for one a frame, (2,) for one an axis, or six.
 
     Returns
     -------
@@ -96,32 +97,37 @@ def three_frame_estimate(points: ArrayLike, noise: float) -> CenterEstimate:
         on a line, or closer to a line than the noise.
     """
     p = np.asarray(points, dtype=np.float64)
+    variances = np.broadcast_to(np.asarray(noise, dtype=np.float64) ** 2, (3, 2))
+    typical = sqrt(float(variances.mean()))
     if not seen_places(p).all():
         return _refusal(
-            p, noise, "a marker is missing in one of the three frames: choose other frames"
+            p, typical, "a marker is missing in one of the three frames: choose other frames"
         )
     u, v, size = _sides(p)
     offset, flat = _offset(u, v)
     if flat or not np.isfinite(size):
         reason = "the three points are on a line or repeat: choose frames further apart"
-        return _refusal(p, noise, reason)
+        return _refusal(p, typical, reason)
 
     spokes = np.stack((-offset, u - offset, v - offset))
     # noise e along the spokes gives u·δ = r (e₂ - e₁), v·δ = r (e₃ - e₁), so that
-    # C = σ² r² A⁻¹ [[2, 1], [1, 2]] A⁻ᵀ with A = (u v)ᵀ; the unit of sides and radius cancels
+    # C = r² A⁻¹ [[σ₁² + σ₂², σ₁²], [σ₁², σ₁² + σ₃²]] A⁻ᵀ with A = (u v)ᵀ and radial variances σ²;
+    # the unit of sides and radius cancels
     moves = float(np.hypot(*offset)) * np.linalg.inv(np.stack((u, v)))
-    covariance = np.asarray(noise**2 * moves @ np.array([[2.0, 1.0], [1.0, 2.0]]) @ moves.T)
+    first, second, third = (variances * spokes**2).sum(axis=1) / (spokes**2).sum(axis=1)
+    chords = np.array([[first + second, first], [first, first + third]])
+    covariance = np.asarray(moves @ chords @ moves.T)
     error = sqrt(float(np.trace(covariance)))
     radius = float(size * np.hypot(*offset))
 
     # beyond it noise dominates and the mean square error is not finite
-    lost = f"noise of {1000 * noise:.1f} mm hides the arc: choose frames further apart"
+    lost = f"noise of {1000 * typical:.1f} mm hides the arc: choose frames further apart"
     turned = np.unwrap(np.arctan2(spokes[:, 1], spokes[:, 0]))
     return CenterEstimate(
         method="three_frames",
         center=p[0] + size * offset,
         covariance=covariance,
-        noise=noise,
+        noise=typical,
         residual=0.0,
         radii=np.array([radius]),
         arc=float(np.ptp(turned)),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from bench.baselines.circle_theory import (
@@ -22,7 +22,9 @@ from jointfit_daemon.center_of_rotation.planar import (
     grid_center,
     plane_of,
     three_frame_center,
+    three_frame_error,
     three_frame_estimate,
+    three_frame_mean_squares,
 )
 from jointfit_daemon.center_of_rotation.planar._grid_search import grid_cost
 from jointfit_daemon.center_of_rotation.study._circle_study import uniform_arc_rms
@@ -158,3 +160,46 @@ def test_bound_is_infinite_without_information(angles: Any) -> None:
     assert uniform_arc_rms(0.0, 10, 0.001) == inf
     assert uniform_arc_rms(1e-100, 10, 0.001) == inf
     assert uniform_arc_rms(1e-9, 10, 0.001, known_radius=True) == inf
+
+
+@given(
+    st.lists(st.floats(0.0, 6.2), min_size=3, max_size=3),
+    st.floats(0.05, 1.0),
+    st.integers(0, 10_000),
+)
+def test_the_exact_error_is_that_of_the_closed_form(
+    angles: list[float], radius: float, seed: int
+) -> None:
+    t = np.array(angles)
+    assume(np.abs(np.sin((t - np.roll(t, 1)) / 2)).min() > 0.1)
+    errors = np.random.default_rng(seed).normal(0.0, 0.002, (50, 3, 2))
+    measured = on_circle(t, radius) + errors
+    found = three_frame_error(t, radius, errors)
+    np.testing.assert_allclose(found, three_frame_center(measured), rtol=1e-6, atol=1e-9)
+
+
+SIX = np.array([[0.3, 1.2], [0.8, 0.4], [1.5, 0.6]]) * 1e-3
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [SIX, SIX[:, :1], SIX[1], 0.0007],
+    ids=["six", "one a frame", "one an axis", "one"],
+)
+def test_predicted_mean_squares_are_those_of_simulated_noise(noise: Any) -> None:
+    t = np.array([0.3, 1.4, 2.9])
+    drawn = np.random.default_rng(3).normal(size=(400_000, 3, 2)) * noise
+    found = three_frame_center(on_circle(t, 0.4) + drawn)
+    expected = three_frame_mean_squares(t, noise)
+    np.testing.assert_allclose((found**2).mean(axis=0), expected, rtol=0.01)
+    estimate = three_frame_estimate(on_circle(t, 0.4), noise)
+    np.testing.assert_allclose(np.diag(estimate.covariance), expected, rtol=1e-9)
+    products = float((found[:, 0] * found[:, 1]).mean())
+    assert products == pytest.approx(estimate.covariance[0, 1], abs=0.01 * expected.max())
+
+
+def test_both_mean_squares_add_up_to_equation_14() -> None:
+    t = np.array([[0.2, 0.9, 1.7], [0.1, 2.0, 4.5]])
+    total = three_frame_mean_squares(t, 0.001).sum(axis=-1)
+    np.testing.assert_allclose(total, arbitrary_error(t, 0.001) ** 2, rtol=1e-12)
+    assert np.isinf(three_frame_mean_squares([0.5, 0.5, 1.0], 0.001)).all()
