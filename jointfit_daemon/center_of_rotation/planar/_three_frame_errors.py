@@ -53,7 +53,7 @@ def three_frame_error(angles: ArrayLike, radius: ArrayLike, errors: ArrayLike) -
     double_area = (p[..., 0] * side[..., 1]).sum(axis=-1)
     along_x, along_y = (u * side[..., 1]).sum(axis=-1), (u * side[..., 0]).sum(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.stack((along_x, -along_y), axis=-1) / (2.0 * double_area)[..., None]
+        return np.asarray(np.stack((along_x, -along_y), axis=-1) / (2.0 * double_area)[..., None])
 
 
 def three_frame_mean_squares(angles: ArrayLike, noise: ArrayLike) -> Array:

@@ -48,7 +48,11 @@ def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> 
     from rich.console import Console
     from rich.progress import Progress
 
-    from jointfit_daemon.center_of_rotation.study import StudySetup, run_study
+    from jointfit_daemon.center_of_rotation.study import (
+        StudySetup,
+        compare_methods,
+        run_study,
+    )
     from jointfit_daemon.tools.plotting import PlottingUnavailableError
     from jointfit_daemon.tools.report._plot import draw_study
     from jointfit_daemon.tools.report.tables import as_json, tables
@@ -65,10 +69,13 @@ def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> 
         task = bar.add_task("computing nine maps", total=1.0)
         study = run_study(setup, lambda share: bar.update(task, completed=share))
 
-    text = tables(setup, study)
+    comparison = compare_methods(setup)
+    text = tables(setup, study, comparison)
     typer.echo(text, nl=False)
     if json is not None:
-        json.write_bytes(orjson.dumps(as_json(setup, study), option=orjson.OPT_INDENT_2))
+        json.write_bytes(
+            orjson.dumps(as_json(setup, study, comparison), option=orjson.OPT_INDENT_2)
+        )
     if out is None:
         return
     (out / "cor-study.txt").write_text(text, encoding="utf-8")

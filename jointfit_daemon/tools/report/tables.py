@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.center_of_rotation.study import CLIPS_M, PRINTED, correlation
+from jointfit_daemon.center_of_rotation.study import APART_RAD, CLIPS_M, PRINTED, correlation
 from jointfit_daemon.tools.text_output import align_columns
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
+    from jointfit_daemon.arrays import Array
     from jointfit_daemon.center_of_rotation.study import PairMaps, StudySetup
 
 NEAREST = {"α–σ": 0.3, "r–σ": None, "r–α": 0.15}
@@ -40,8 +41,8 @@ _MM = 1000.0
 _METHODS = ("predicted", "three frames", "grid", "shifted grid", "bound", "hyper", "oriented")
 
 
-def tables(setup: StudySetup, study: Sequence[PairMaps]) -> str:
-    """Return setup, correlations, errors over the arc and limits of the comparison."""
+def tables(setup: StudySetup, study: Sequence[PairMaps], comparison: Mapping[str, Array]) -> str:
+    """Return setup, correlations, errors over the arc, other methods and limits."""
     parts = [
         "Center of rotation from a marker on a circle: the numerical experiment of Akbarifar et al."
         " (2021), repeated",
@@ -53,6 +54,11 @@ def tables(setup: StudySetup, study: Sequence[PairMaps]) -> str:
         f"RMS error of the center, mm, at r = {setup.radii[-1]:g} m and"
         f" σ = {_MM * setup.noise:g} mm; refused: share of runs that hyper refuses",
         _indented(_errors(study)),
+        f"Median error, mm, of two markers {np.rad2deg(APART_RAD):.0f}° apart that rotate by 2α, at"
+        f" r = {setup.radius:g} m and σ = {_MM * setup.noise:g} mm; bisectors: both markers, three"
+        " frames; Reuleaux and helical axis: both markers, first and last frame; the others: one"
+        f" marker, hyper with {setup.frames} frames",
+        _indented(_comparison(setup, comparison)),
         "Limits",
         "\n".join(f"- {text}" for text in CAVEATS),
     ]
@@ -118,12 +124,23 @@ def _errors(study: Sequence[PairMaps]) -> list[tuple[str, ...]]:
     return rows
 
 
+def _comparison(setup: StudySetup, comparison: Mapping[str, Array]) -> list[tuple[str, ...]]:
+    degrees = np.rint(np.rad2deg(setup.steps)).astype(int).tolist()
+    rows: list[tuple[str, ...]] = [("α", *comparison)]
+    for angle in (a for a in _SHOWN_DEG if a in degrees):
+        at = degrees.index(angle)
+        rows.append((f"{angle}°", *(f"{_MM * errors[at]:.3g}" for errors in comparison.values())))
+    return rows
+
+
 def _indented(rows: Sequence[Sequence[str]]) -> str:
     return indent(align_columns(rows, right=range(len(rows[0]))), "  ")
 
 
-def as_json(setup: StudySetup, study: Sequence[PairMaps]) -> dict[str, Any]:
-    """Return setup, correlations and maps in SI units; NaN becomes null."""
+def as_json(
+    setup: StudySetup, study: Sequence[PairMaps], comparison: Mapping[str, Array]
+) -> dict[str, Any]:
+    """Return setup, correlations, maps and other methods in SI units; NaN becomes null."""
     return {
         "setup": {
             "radii_m": setup.radii.tolist(),
@@ -139,6 +156,7 @@ def as_json(setup: StudySetup, study: Sequence[PairMaps]) -> dict[str, Any]:
             "seed": setup.seed,
         },
         "caveats": list(CAVEATS),
+        "median_error_m": {name: errors.tolist() for name, errors in comparison.items()},
         "pairs": [_pair_json(pair) for pair in study],
     }
 

@@ -1,0 +1,122 @@
+r"""Comparison of the three-frame solution with geometric methods at the same range of motion.
+
+Two markers of a rigid body, at the same distance from the center and `APART_RAD` apart, rotate by
+2α. Methods of two frames use the first and the last.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation.planar import fit_circles, three_frame_center
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import ArrayLike
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation.study._circle_study import StudySetup
+
+APART_RAD = np.pi / 3.0
+"""Angle between the two markers about the center, rad."""
+_LEAST_TURN = 1e-12
+"""Rotation, rad, that is rounding."""
+
+
+def bisector_center(points: ArrayLike) -> Array:
+    r"""Return the point nearest to the perpendicular bisectors of all chords.
+
+    .. math:: \min_c \sum_{k,a<b} \left[ (p_{kb} - p_{ka})^T c
+              - \tfrac12 (|p_{kb}|^2 - |p_{ka}|^2) \right]^2
+
+    over markers k and pairs of frames a, b. Two markers in two frames give Reuleaux's construction,
+    and one marker in three frames gives `three_frame_center`.
+
+    Parameters
+    ----------
+    points : array_like, shape (..., k, n, 2)
+        k markers in n frames, m.
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        Centers, m; not finite if all bisectors are parallel.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    middle = p.mean(axis=(-3, -2), keepdims=True)
+    p = p - middle
+    first, second = np.array(list(combinations(range(p.shape[-2]), 2))).T
+    chord = p[..., second, :] - p[..., first, :]
+    half = ((p[..., second, :] ** 2).sum(axis=-1) - (p[..., first, :] ** 2).sum(axis=-1)) / 2.0
+
+    A = np.einsum("...kca,...kcb->...ab", chord, chord)
+    b = np.einsum("...kca,...kc->...a", chord, half)
+    det = A[..., 0, 0] * A[..., 1, 1] - A[..., 0, 1] ** 2
+    x = A[..., 1, 1] * b[..., 0] - A[..., 0, 1] * b[..., 1]
+    y = A[..., 0, 0] * b[..., 1] - A[..., 0, 1] * b[..., 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.stack((x, y), axis=-1) / det[..., None] + middle[..., 0, 0, :])
+
+
+def rotation_pole(first: ArrayLike, second: ArrayLike) -> Array:
+    r"""Return the pole of a planar displacement: where the finite helical axis meets the plane.
+
+    .. math:: c = (\bar b - R \bar a) (I - R)^{-1}
+
+    in complex numbers, with R the rotation of the least-squares rigid fit of both marker sets
+    a and b.
+
+    Parameters
+    ----------
+    first, second : array_like, shape (..., k, 2)
+        k markers in two frames, m; at least two markers.
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+        m; not finite without rotation.
+    """
+    a, b = (np.asarray(p, dtype=np.float64) @ np.array([1.0, 1.0j]) for p in (first, second))
+    mean_a, mean_b = a.mean(axis=-1), b.mean(axis=-1)
+    moment = ((b - mean_b[..., None]) * (a - mean_a[..., None]).conj()).sum(axis=-1)
+    turn = np.exp(1j * np.angle(moment))
+    still = np.abs(1.0 - turn) < _LEAST_TURN
+    pole = (mean_b - turn * mean_a) / np.where(still, 1.0, 1.0 - turn)
+    return np.where(still[..., None], np.inf, np.stack((pole.real, pole.imag), axis=-1))
+
+
+def compare_methods(setup: StudySetup) -> Mapping[str, Array]:
+    """Return the median error of each method over α, m, shape (len(setup.steps),).
+
+    The median, because some of the errors have no finite mean square. Radius, noise, number of runs
+    and seed are those of the setup.
+    """
+    rng = np.random.default_rng(setup.seed)
+    found: dict[str, list[float]] = {}
+    for step in setup.steps:
+        shares = np.linspace(0.0, 1.0, setup.frames)
+        three = _body(setup, rng, step * np.arange(3.0), setup.repeats)
+        many = _body(setup, rng, 2.0 * step * shares, setup.frames_repeats)
+        ends = three[:, :, [0, -1]]
+        centers = {
+            "three frames": three_frame_center(three[:, 0]),
+            "bisectors": bisector_center(three),
+            "Reuleaux": bisector_center(ends),
+            "helical axis": rotation_pole(ends[:, :, 0], ends[:, :, 1]),
+            "hyper": fit_circles(many[:, 0]).center,
+        }
+        for name, center in centers.items():
+            error = np.linalg.norm(center, axis=-1)
+            found.setdefault(name, []).append(float(np.median(error)))
+    return {name: np.array(errors) for name, errors in found.items()}
+
+
+def _body(setup: StudySetup, rng: np.random.Generator, angles: Array, repeats: int) -> Array:
+    """Return both markers about the origin, measured, shape (repeats, 2, frames, 2)."""
+    turned = angles + np.array([[0.0], [APART_RAD]])
+    true = setup.radius * np.stack((np.cos(turned), np.sin(turned)), axis=-1)
+    return np.asarray(true + rng.normal(0.0, setup.noise, (repeats, *true.shape)))
