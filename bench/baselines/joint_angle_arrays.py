@@ -21,7 +21,7 @@ class AngleSequence(NamedTuple):
     """Three angles of a rotation sequence."""
 
     angles: Array
-    """rad, shape (..., 3)."""
+    """Joint angles, rad, shape (..., 3)."""
     gimbal: NDArray[np.bool_]
     """Where the first and last angle are not separable, shape (...)."""
 

@@ -42,7 +42,7 @@ class ModelTrial:
     frames: NDArray[np.int64]
     """Frames of `markers` to which the model was fitted."""
     centers: dict[str, NDArray[np.float64]]
-    """By joint of the model, m, world z up, shape (len(frames), 3)."""
+    """Joint centers by joint of the model, m, world z up, shape (len(frames), 3)."""
 
 
 @cache

@@ -25,7 +25,7 @@ class Runs:
     """Centers of many runs about the origin."""
 
     centers: Array
-    """Shape (runs, 2), m; NaN where no circle was found."""
+    """Estimated centers, m, shape (runs, 2); NaN where no circle was found."""
     covariances: Array
     conditioning: Array
     bound: float

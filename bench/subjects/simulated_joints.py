@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 CHILD = np.array([[0.05, 0, -0.25], [-0.04, 0.05, -0.3], [0, -0.06, -0.2], [0.06, 0.04, -0.32]])
-"""m, shape (4, 3)."""
+"""Marker positions on the child segment, m, shape (4, 3)."""
 PARENT = np.array([[0.1, 0.1, 0.05], [-0.1, 0.1, 0.04], [0.1, -0.08, 0.06], [-0.1, -0.08, 0.1]])
 TEMPLATE_ERROR_M = 0.0003
 RADII = (0.30, 0.35, 0.20, 0.28)

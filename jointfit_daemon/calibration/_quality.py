@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class StaticQuality:
-    """The static pose."""
+    """Quality of the static pose."""
 
     still_s: float
     spread_rad: Mapping[str, float]
-    """Robust scatter of each sensor."""
+    """Robust scatter of the orientation of each sensor, rad."""
     body_parts: tuple[str, ...]
     """Body parts that are visible to cameras."""
 
@@ -41,7 +41,8 @@ class WorldQuality:
     kind: str
     """``full`` | ``heading`` (both verticals assumed correct) | ``stored``."""
     kappa: float
-    """1 if world and mount are indistinguishable."""
+    """Measure of observability from 0 to 1: at 1, the rotation of the world and the
+    sensor-to-segment alignment cannot be distinguished."""
     error_rad: float
     """Standard error of the weakest direction."""
     rms_rad: float
@@ -66,7 +67,7 @@ class LagQuality:
     """The lag in use of one sensor, and the lag of the functional movement alone."""
 
     source: str
-    """See `SensorLag`."""
+    """Source of the lag in use, as in `SensorLag`."""
     lag_ns: int | None = None
     sigma_ns: int | None = None
     refused: str | None = None
@@ -86,16 +87,16 @@ class PartQuality:
 
 @dataclass(frozen=True, slots=True)
 class MarkerQuality:
-    """Refinement of the markers."""
+    """Quality of the marker refinement."""
 
     parts: Mapping[str, PartQuality]
     moved_m: Mapping[str, float]
-    """Displacement of each refined marker."""
+    """Displacement of each refined marker by the refinement, m."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointQuality:
-    """One joint center."""
+    """Quality of one joint center."""
 
     source: str
     sd_m: float | None
@@ -107,7 +108,7 @@ class JointQuality:
 
 @dataclass(frozen=True, slots=True)
 class AxisQuality:
-    """One flexion axis."""
+    """Quality of one flexion axis."""
 
     rms_rad: float
     off_plane_rad: float
@@ -115,7 +116,7 @@ class AxisQuality:
 
 @dataclass(frozen=True, slots=True)
 class AnatomyQuality:
-    """Joint centers, segment lengths and flexion axes."""
+    """Quality of joint centers, segment lengths and flexion axes."""
 
     joints: Mapping[str, JointQuality]
     lengths_m: Mapping[str, float | None]
@@ -135,7 +136,7 @@ class MethodErrors:
     mean: float | None
     single: float | None
     sensors: Mapping[str, float | None]
-    """Error of each sensor, or pair of sensors, without a model."""
+    """Error of each sensor alone (orientation), or of one sensor of each segment (flexion), rad."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,9 +147,9 @@ class HoldoutQuality:
     share: float
     frames: int
     segments: Mapping[str, MethodErrors]
-    """Orientation of each segment."""
+    """Errors of the orientation of each segment."""
     flexion: Mapping[str, MethodErrors]
-    """Flexion of each inner joint."""
+    """Errors of the flexion of each inner joint."""
     meaning: str = (
         "RMS distance from the optical reference on the last part of the trial, after a fit to the"
         " first part; the stored models were then fitted to all of it"
@@ -179,7 +180,7 @@ class OnlineQuality:
     before_rad: Mapping[str, float]
     after_rad: Mapping[str, float]
     known_before_rad: Mapping[str, float]
-    """On the training frames of the calibration."""
+    """Errors of the models in force on the training frames of the calibration, rad."""
     known_after_rad: Mapping[str, float]
     rounds: int | None = None
     """Number of accepted refits since the functional calibration."""

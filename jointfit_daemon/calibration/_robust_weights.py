@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 HUBER_K = 1.5
-"""Residuals above this number of robust scales have reduced weight."""
+"""Residual in robust scales above which the weight is reduced."""
 
 MAX_PASSES = 30
 """Largest number of reweighting iterations."""

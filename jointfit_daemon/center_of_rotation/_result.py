@@ -27,9 +27,9 @@ class CenterEstimate:
     method: str
     """Name of the estimator: ``hyper``, ``sphere``, ``score``, ..."""
     center: Array
-    """m, shape (d,), d = 2 (plane) or 3 (space), in the parent's coordinates."""
+    """Position in the parent's coordinates, m, shape (d,), d = 2 (plane) or 3 (space)."""
     covariance: Array
-    """m², shape (d, d); zero along the directions in `unseen`."""
+    """Covariance of the position, m², shape (d, d); zero along the directions in `unseen`."""
     noise: float
     """Standard deviation of each coordinate of a point, estimated from the residuals, m."""
     residual: float

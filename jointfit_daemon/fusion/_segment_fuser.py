@@ -9,8 +9,8 @@ the new one within 0.25 s:
 - A sensor was lost: the difference between both sets in the frames before fades out. A last sample
   that contradicts those before does not count.
 
-Invariant: the orientation does not jump, unless back from a wrong sample, and every degradation
-sets a flag.
+Invariant: every degradation sets a flag. The orientation does not jump, except back from a wrong
+sample.
 """
 
 from __future__ import annotations
@@ -36,13 +36,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion, Vector
 
 MIN_SD = 0.0005
-"""Smallest standard deviation of an orientation, rad: the resolution of common sensors."""
+"""Smallest standard deviation of an orientation, rad; it is the resolution of common sensors."""
 HEADING_SD = radians(2.0)
 """Standard deviation of the heading of a sensor's world just after calibration, rad. The error is
 common to the sensors of a segment, so it is not observable in the training data (measured on
 simulated subjects one minute after calibration). It hardly affects flexion."""
 HEADING_WALK = radians(0.3)
-"""Random walk of that heading, rad per square root of a minute: doubled after an hour."""
+"""Random walk of that heading, rad per square root of a minute.
+
+After an hour the standard deviation is about 3°."""
 _HEADING_VAR, _WALK_VAR = HEADING_SD * HEADING_SD, HEADING_WALK * HEADING_WALK
 FADE_NS = 250_000_000
 """Fade time after a change of the set of sensors, ns."""
@@ -61,7 +63,7 @@ HELD_RATE = 2.0
 gait."""
 
 Inputs = dict[str, "Quaternion"]
-"""q_optical_segment by sensor: the segment orientation according to that sensor alone."""
+"""Orientation of the segment, q_optical_segment, computed from each sensor alone, by sensor."""
 Names = tuple[str, ...]
 
 

@@ -120,9 +120,9 @@ class PatentReading(NamedTuple):
     """Joint angles of the patent in one frame; see ``read_patent``."""
 
     alpha: float
-    """rad, about x."""
+    """Rotation about x, rad."""
     beta: float
-    """rad, about y."""
+    """Rotation about y, rad."""
     gamma: float
     """Angle about z, rad; 0 in gimbal lock."""
     joint: float

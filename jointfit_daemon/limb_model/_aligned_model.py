@@ -1,10 +1,11 @@
-r"""Weighted mean of sensors whose worlds and mounts were aligned with the reference: a baseline.
+r"""Weighted mean of sensors that are aligned with the reference by constant rotations: a baseline.
 
 .. math:: \hat q = \operatorname{mean}_\omega \left( q_{W,m} \otimes q_m \otimes q_{B,m} \right)
 
-The model has constants only: for each sensor a rotation of its world about the vertical, a mount
-and a weight. It has no posture-dependent term. The fitted heading absorbs soft-tissue artefact that
-correlates with flexion, so the model is valid only at the heading of the training movement.
+The model has constants only: for each sensor a rotation of its world about the vertical, a
+sensor-to-segment alignment and a weight. It has no posture-dependent term. The fitted heading
+absorbs soft-tissue artefact that correlates with flexion, so the model is valid only at the heading
+of the training movement.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class AlignedModel(SegmentModel):
     worlds: tuple[Quaternion, ...]
     """q_optical_world of each sensor beyond its calibration: rotations about the vertical."""
     mounts: tuple[Quaternion, ...]
-    """q_segment_bone of each sensor beyond its static mount."""
+    """q_segment_bone of each sensor: correction of its sensor-to-segment alignment."""
     weights: tuple[float, ...]
     """Weight of each sensor; the sum is 1."""
     residual_sd: float

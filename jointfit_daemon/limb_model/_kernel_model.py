@@ -8,8 +8,9 @@ r"""The recommended model: mean of the sensors with a posture-dependent soft-tis
 uses relative rotations only and generalizes to other movements. Expert b also uses the tilt of the
 segment and has smaller errors on the trained movements. Inside the training range both have equal
 weight. Outside, their corrections fade (:math:`\eta`) into the linear trend T of `kernel_trend`,
-which extrapolates best: expert b fades at once, expert a at a larger distance. The trend has no
-component about the long axis. There b fades into a, and a into the mean.
+which extrapolates best. Expert b fades at the limit of the training range, expert a at a larger
+distance. The trend has no component about the long axis: there the correction of b fades to that of
+a, and the correction of a fades to zero.
 
 Invariants: the correction is zero if the segment is upright, the joint is straight and the sensors
 agree. A rotation of the world about the vertical does not change the correction.
@@ -51,9 +52,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 HULL = 3.0
-"""Leverage ratio above which the correction of expert a fades, by the root of the ratio.
+"""Leverage ratio above which the weight of expert a is the root of HULL over the ratio.
 
-The correction of expert b fades from ratio 1, in proportion to the ratio."""
+The weight of expert b is the inverse of its ratio from 1 on."""
 OUTSIDE = 3.0
 """Leverage ratio of either expert above which a frame counts as extrapolation."""
 SHARE = 0.5
@@ -69,16 +70,17 @@ class KernelModel(SegmentModel):
 
     sensors: int
     plain: KernelExpert
-    """Expert a."""
+    """Expert a: regression on relative rotations."""
     tilted: KernelExpert
-    """Expert b."""
+    """Expert b: regression on relative rotations and tilt."""
     trend: tuple[tuple[float, ...], tuple[float, ...]]
     """T about x and y: coefficients of [1, relative rotations, tilts]."""
     spread: LeverageVariance
     residual_sd: float
     mean_sd: float
-    """Standard deviation of the uncorrected mean in training, rad per axis; applies without
-    neighbor."""
+    """Standard deviation of the uncorrected mean in training, rad per axis.
+
+    It is the standard deviation of the output without a neighboring segment."""
     _tables: KernelTables = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Vector
 
 _BENDS = 6
-"""Number of smooth terms that precede u."""
+"""Number of smooth terms that precede the features u themselves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +35,15 @@ class KernelTables:
     """Arrays for the evaluation of single frames."""
 
     terms: Array
-    """Shape (bumps + p + q + 8, 2 width + 7). Its product with [bends, u, u^2, 1] contains the
-    exponents of all bumps, the roots of both leverages, the smooth parts of both corrections, and
-    the trend."""
+    """Matrix of the first product, shape (bumps + p + q + 8, 2 width + 7).
+
+    Its product with [bends, u, u^2, 1] contains the exponents of all bumps, the roots of both
+    leverages, the smooth parts of both corrections, and the trend."""
     sums: Array
-    """Shape (10, bumps + p + q + 8). Its product with the bumps, squared roots, smooth parts and
-    trend contains both corrections, the trend and both leverage ratios."""
+    """Matrix of the second product, shape (10, bumps + p + q + 8).
+
+    Its product with the bumps, squared roots, smooth parts and trend contains both corrections, the
+    trend and both leverage ratios."""
     bumps: int
     """Number of exponents at the start of the terms."""
     roots: int

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 FARTHEST = 30.0
 """Leverage ratio above which the variance no longer increases."""
 WITHIN = 0.5
-"""Leverage ratio below which the variance is constant: the center of the training range."""
+"""Leverage ratio below which the variance is constant, for postures in the middle of the training
+range."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +30,9 @@ class LeverageVariance:
     """Variances of the three axes as a function of the leverage ratio."""
 
     inside: Vector
-    """a, rad²."""
+    """a: variance within the training range, rad², by axis."""
     outside: Vector
-    """b, rad²."""
+    """b: growth of the variance per unit of the leverage ratio, rad², by axis."""
 
     def at(self, ratio: float) -> Vector:
         """Return the standard deviations about x, y and z of the segment, rad."""

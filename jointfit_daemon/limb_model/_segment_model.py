@@ -2,7 +2,8 @@
 
 A model is frozen plain data with an exact JSON form. It is trained for one ordered set of sensors.
 A segment has one model for each set of sensors that can be available. The inputs are bone-aligned
-orientations ``q_world_segment``, one for each sensor, computed with its static mount.
+orientations ``q_world_segment``, one for each sensor, computed with its
+sensor-to-segment alignment from the static pose.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 FEW_MOVEMENTS = 3
 """Number of training movements from which the claimed standard deviation is not increased."""
 FEW_MOVEMENTS_FACTOR = 2.5
-"""Factor on the standard deviation with fewer training movements. Measured: errors on an untrained
-movement were 2.2 to 2.7 times larger."""
+"""Factor on the standard deviation with fewer training movements. In measurements, errors on an
+untrained movement were 2.2 to 2.7 times larger than on trained ones."""
 
 
 class Prediction(NamedTuple):
@@ -39,7 +40,7 @@ class Prediction(NamedTuple):
     sd: float
     """Standard deviation of the orientation, rad (root mean variance per axis)."""
     extrapolating: bool
-    """The pose is outside the training range."""
+    """Whether the posture is outside the training range."""
     axis_sd: Vector | None = None
     """Standard deviations about x, y and z of the segment, rad; None if not known separately."""
 

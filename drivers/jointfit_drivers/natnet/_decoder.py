@@ -4,7 +4,7 @@ A capture contains datagrams of both directions. Those of a client have no effec
 arrival of an echo request is the sending time of its answer. A frame that arrives before its model
 is counted in `unpublished` and dropped. Every number is checked against its range before use.
 
-Invariant: a function of the chunks fed; no clock, no socket.
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no socket.
 """
 
 from __future__ import annotations

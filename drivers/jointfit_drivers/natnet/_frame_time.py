@@ -1,6 +1,6 @@
 """Clock of the frame stamps, and the timecode of frames.
 
-Invariant: pure; a frame in, ticks out.
+Invariant: pure; the result depends only on the frames passed in.
 """
 
 from __future__ import annotations

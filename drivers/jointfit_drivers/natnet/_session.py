@@ -9,8 +9,8 @@ Every accepted datagram is emitted before it is processed here, so that a replay
 The receiver of the chunks decodes the frames. This module reads only their flags, and decodes one
 frame a second to check that it can be decoded and that its ids are known.
 
-Invariant: control messages are accepted as answers to open requests only (`OpenRequests`). A server
-none of whose frames can be decoded is lost, like a silent one.
+Invariant: control messages are accepted as answers to open requests only (`OpenRequests`). If no
+frame of a server can be decoded, the server is lost, like a silent one.
 """
 
 from __future__ import annotations

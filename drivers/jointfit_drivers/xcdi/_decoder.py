@@ -4,7 +4,7 @@ A sample is stamped with the first frame of its group, because arbitration delay
 Every record of 24 bytes is a message of this sensor, a foreign frame, a note of the host, or
 discarded.
 
-Invariant: a function of the chunks fed; no clock, no bus.
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no bus.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ class ClusterTrack:
     """Poses of one body part over time."""
 
     t_ns: NDArray[np.int64]
-    """Shape (m,)."""
+    """Time stamps, ns, shape (m,)."""
     q: Array
     """q_now_static, shape (m, 4); NaN without a pose."""
     p: Array

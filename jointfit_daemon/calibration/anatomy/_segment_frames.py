@@ -59,9 +59,9 @@ class JointCenter:
     """Joint center in the static world, estimated together with the other centers of the chain."""
 
     center: Array
-    """m, shape (3,)."""
+    """Position in the static world, m, shape (3,)."""
     covariance: Array
-    """m², shape (3, 3)."""
+    """Covariance of the position, m², shape (3, 3)."""
     source: str
     """``fit``, or ``length``: from the other end of a segment and its configured length."""
     fit: CenterEstimate | None

@@ -24,17 +24,20 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel
 
 _LEAST_FRAMES = 10
+"""Smallest number of frames with enough markers."""
 _UNIT_FACTOR = 100.0
 """Size ratio above which the length unit must be wrong."""
 _MOST_STRETCH = 1.3
-_TOLD_STRETCH = 1.1
+"""Size ratio of trial and model above which the refinement is refused."""
+_NOTED_STRETCH = 1.1
+"""Size ratio of trial and model above which a note is returned."""
 _APART_M = 0.04
 """Smallest distance between markers of one segment that is compared, m."""
 MOST_RMS_M = 0.08
 """Tracking error above which labels, scaling or axes must be wrong, m."""
 _SWAP_GAIN = 0.2
-"""Share of the squared error that remains after exchanging two labels; below it they were
-exchanged."""
+"""Ratio of the squared error after and before an exchange of two labels, below which the labels
+were exchanged in the trial."""
 _SWAP_LEAST_M = 0.05
 _SWAPPED_TRIAL = 0.5
 """Share of the frames above which a whole trial counts as labelled wrongly."""
@@ -47,7 +50,7 @@ class CheckedTrials:
 
     trials: tuple[MotionTrial, ...]
     free: NDArray[np.bool_]
-    """Shape (M, 3)."""
+    """Coordinates that the refinement may move, shape (M, 3)."""
     notes: tuple[str, ...]
 
 
@@ -137,7 +140,7 @@ def _stretches(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
         " refinement compensates for its size"
         for trial in trials
         if np.isfinite(stretch := _stretch(model, trial))
-        and not 1.0 / _TOLD_STRETCH < stretch < _TOLD_STRETCH
+        and not 1.0 / _NOTED_STRETCH < stretch < _NOTED_STRETCH
     ]
 
 

@@ -8,11 +8,11 @@ With the markers' errors :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and weigh
               + \tfrac12 \lambda \sum_m n_m\, |p_m - p^0_m|^2
               + \tfrac12 \kappa \sum_{tk} x_{tk}^2, \qquad n_m = \sum_t w_{tm}
 
-where :math:`\rho(r) = r^2/2`, beyond c Huber's :math:`c (r - c/2)`. The prior grows with the number
-of frames in which a marker is visible, so decimating frames does not change its meaning. Poses q
-are free in every frame, positions p are the same in all of them; x is the excess of hinge angles
-over their limits, rad. Without this term, a program with joint limits could not follow the refined
-markers.
+where :math:`\rho` is the Huber loss: :math:`r^2/2`, and :math:`c (r - c/2)` beyond c. The prior
+grows with the number of frames in which a marker is visible, so decimating frames does not change
+its meaning. Poses q are free in every frame, positions p are the same in all of them; x is the
+excess of hinge angles over their limits, rad. Without this term, a program with joint limits could
+not follow the refined markers.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class RefinementProblem:
     free: NDArray[np.bool_]
     """Coordinates that may move, shape (M, 3)."""
     prior: float
-    """lambda."""
+    """Weight lambda of the distances from the nominal positions."""
     huber_m: float | None
-    """c, m; None: plain squares."""
+    """Error c above which the loss is linear, m; None: quadratic for all errors."""
     limit_m2: float = 0.0
-    """kappa; 0: hinge angles are not limited."""
+    """Weight kappa of the excess of hinge angles, m²/rad²; 0: hinge angles are not limited."""
 
     @cached_property
     def seen(self) -> Array:
@@ -62,7 +62,7 @@ class RefinementProblem:
 
     @cached_property
     def counts(self) -> Array:
-        """n_m, shape (M,)."""
+        """Sum n_m of the weights of each marker, shape (M,)."""
         return np.asarray(self.weights.sum(axis=0))
 
     @cached_property

@@ -38,7 +38,7 @@ class TrialOutcome:
 
     name: str
     trained: bool
-    """False: the trial was not used in the refinement."""
+    """Whether the trial was used in the refinement."""
     frames: int
     rate_hz: float
     before: TrackingStatistics
@@ -54,7 +54,7 @@ class MarkerOutcome:
     name: str
     segment: str
     moved: tuple[float, float, float]
-    """In segment axes, m."""
+    """Displacement by the refinement in segment axes, m."""
     held: tuple[bool, bool, bool]
     """Coordinates that were locked, or that the trials do not determine."""
     rms_before: float

@@ -31,10 +31,14 @@ if TYPE_CHECKING:
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-12, 1e9
 _FLOOR = 1e-11
-"""Added to A_t, so that degrees of freedom without markers stay constant."""
+"""Constant added to the diagonal of A_t, so that degrees of freedom without markers stay
+constant."""
 _TOLERANCE = 1e-6
+"""Relative decrease of F below which the iteration ends."""
 _MOST_ITERATIONS = 30
+"""Largest number of steps."""
 _FRAMES_AT_ONCE = 128
+"""Number of frames whose blocks are in memory at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,15 +55,15 @@ class NormalEquations:
     """Blocks of one linearization, for f unlocked coordinates and nq degrees of freedom."""
 
     A: Array
-    """Shape (T, nq, nq)."""
+    """Pose block A_t of each frame, shape (T, nq, nq)."""
     B: Array
-    """Shape (T, nq, f)."""
+    """Coupling block B_t of poses and markers of each frame, shape (T, nq, f)."""
     g: Array
-    """Shape (T, nq)."""
+    """Gradient with respect to the pose of each frame, shape (T, nq)."""
     h: Array
-    """Shape (f,)."""
+    """Gradient with respect to the unlocked marker coordinates, shape (f,)."""
     C: Array
-    """Diagonal, shape (f,)."""
+    """Diagonal of the marker block C, shape (f,)."""
 
     def solve(self, damping: float) -> tuple[Array, Array]:
         """Return the step of the markers, shape (f,), and of the poses, shape (T, nq)."""

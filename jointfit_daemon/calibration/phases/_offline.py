@@ -58,7 +58,7 @@ class OfflineTrial:
 
     name: str
     t_s: Array
-    """Shape (n,), s."""
+    """Time stamps, s, shape (n,)."""
     sensors: Mapping[str, Array]
     """q_world_sensor of each sensor, shape (n, 4); NaN if missing."""
     reference: Mapping[str, Array]

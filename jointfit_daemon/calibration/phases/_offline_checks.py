@@ -23,9 +23,10 @@ if TYPE_CHECKING:
 
 
 HEADING_SEPARABLE = 0.98
-"""Ratio of singular values above which heading and mount are indistinguishable."""
+"""Ratio of singular values above which heading and sensor-to-segment alignment cannot be
+distinguished."""
 FAR = np.deg2rad(45.0)
-"""Median angle between a mounted sensor and its reference that soft tissue does not explain,
+"""Median angle between an aligned sensor and its reference that soft tissue does not explain,
 rad."""
 LEAST_TURN = np.deg2rad(5.0)
 """0.95 quantile of the rotation of a joint below which the trials do not constrain its model,

@@ -176,7 +176,7 @@ def fit_static_only(
 def with_new_static(
     calibration: Calibration, pose: StaticPose, alignment: PlateAlignment | None = None
 ) -> Calibration:
-    """Return the calibration after sensors were re-donned: only the mounts change.
+    """Return the calibration after sensors were re-donned: with new alignments.
 
     If cameras see the markers of a segment at their earlier places on the body, they determine its
     current orientation. Otherwise it is assumed to stand as in the earlier pose, with the same

@@ -42,7 +42,7 @@ class TrainingSet(NamedTuple):
     """Training frames of a functional trial."""
 
     training: LimbTraining
-    """Frames with lag, world and mount applied."""
+    """Frames in segment axes: lags are subtracted, worlds and sensors are aligned."""
     raw: dict[str, Array]
     """q_world_sensor of every sensor at the same instants, shape (n, 4)."""
     notes: list[str]
@@ -105,7 +105,8 @@ def identical_sensors(chain: Chain, sensors: Mapping[str, Array]) -> list[str]:
     Parameters
     ----------
     sensors : mapping of str to ndarray, shape (n, 4)
-        Orientations of each sensor, in any world, on any mount; NaN if missing.
+        Orientations of each sensor, in any world, with any
+        sensor-to-segment alignment; NaN if missing.
     """
     found = []
     for group in chain.sensors:

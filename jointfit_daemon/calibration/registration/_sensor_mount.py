@@ -52,8 +52,9 @@ class SensorAlignment:
     q_mount: Array
     """q_sensor_body, shape (4,)."""
     kappa: float
-    """Second over first singular value: 1 if world and mount are indistinguishable, 0 for kind
-    ``mount``."""
+    """Second over first singular value; 0 for kind ``mount``.
+
+    At 1 the rotation of the world and the sensor-to-segment alignment cannot be distinguished."""
     weak_error: float
     """Standard error of the weakest direction, rad; inf where it is unobservable."""
     residual_rms: float

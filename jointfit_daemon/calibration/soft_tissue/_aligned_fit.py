@@ -1,4 +1,4 @@
-"""Fit of the aligned mean: world and mount of each sensor, and its weight."""
+"""Fit of the aligned mean: world, sensor-to-segment alignment and weight of each sensor."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ def fit_aligned(training: SegmentTraining) -> AlignedModel:
 
 
 def _aligned(training: SegmentTraining, sd: float) -> AlignedModel:
-    # World and mount of each sensor, then weights from the errors of the aligned sensors.
+    # World and sensor-to-segment alignment of each sensor, then weights from the errors of the
+    # aligned sensors.
     found = [fit_sensor_alignment("heading", q, training.q_reference) for q in training.sensors]
     turned = [
         rotation.multiply(rotation.multiply(one.q_world, q), one.q_mount)

@@ -36,15 +36,16 @@ RATIOS = (1.0, 0.1, 10.0)
 PASSES = 3
 """Reweighting iterations."""
 SMALLEST_SCALE = 1e-3
-"""Added to the RMS of each regressor, rad, so that a nearly constant one is not amplified."""
+"""Constant added to the RMS of each regressor, rad, so that a nearly constant regressor is not
+amplified."""
 _JITTER = 1e-6
-"""Added to diagonals of kernel matrices, relative, for a stable Cholesky decomposition."""
+"""Constant added to the diagonal of a kernel matrix for a stable Cholesky decomposition."""
 _HEAVY = 1e3
 """Relative weight of the row that fixes the sum of the shares."""
 _SMALLEST_SHARE = 1e-3
-"""Shares below this are ignored in the final fit."""
+"""Share of a penalty below which its fit is omitted from the final sum."""
 _BUMPS_COUNT_AS = 5.0
-"""All bumps together are scaled like this number of regressors."""
+"""Number of smooth terms to which the bumps together are equal in scale."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,11 +53,11 @@ class Basis:
     """Scaled regressors of the training frames, and the transformation back to raw regressors."""
 
     g: Array
-    """Shape (n, p): smooth terms, then whitened bumps."""
+    """Scaled regressors, smooth terms before whitened bumps, shape (n, p)."""
     smooth: int
     """Number of smooth terms."""
     back: Array
-    """Shape (p, p): coefficients of raw regressors are ``back @ c``."""
+    """Transformation of coefficients c to those of raw regressors, ``back @ c``, shape (p, p)."""
 
     @staticmethod
     def of(smooth: Array, raw_bumps: Array, at_centers: Array) -> Basis:
@@ -95,7 +96,7 @@ class HeldOut:
     """Shares of the penalties for one grouping, with the held-out residuals."""
 
     shares: Array
-    """a for each axis, ratio and penalty, shape (3, ratios, penalties)."""
+    """Share a of each axis, ratio and penalty, shape (3, ratios, penalties)."""
     residuals: Array
     """rho minus prediction of held-out frames, in order of time, rad, shape (n, 3)."""
 

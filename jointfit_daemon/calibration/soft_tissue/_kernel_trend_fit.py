@@ -27,7 +27,8 @@ PENALTY = 1e-2
 """Ridge penalty of the trend."""
 
 SMALLEST_SCALE = 0.02
-"""Added to the RMS of each regressor, rad, so that a nearly constant one is not amplified."""
+"""Constant added to the RMS of each regressor, rad, so that a nearly constant regressor is not
+amplified."""
 
 
 def fit_trend(u: Array, rho: Array) -> tuple[Row, Row]:

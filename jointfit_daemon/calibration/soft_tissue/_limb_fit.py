@@ -47,7 +47,7 @@ class LimbTraining:
     """Training frames of a limb at common instants."""
 
     sensors: Mapping[str, Array]
-    """q_optical_segment of each sensor, computed with its mount, shape (n, 4)."""
+    """q_optical_segment of each sensor, with its sensor-to-segment alignment, shape (n, 4)."""
     reference: Mapping[str, Array]
     """q_optical_segment from optical markers, shape (n, 4)."""
     trials: NDArray[np.int64] | None = None

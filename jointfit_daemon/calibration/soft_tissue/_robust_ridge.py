@@ -24,12 +24,12 @@ _SMALLEST_SCALE = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Ridge:
-    """A fit, in units of the raw regressors."""
+    """Result of a fit, in units of the raw regressors."""
 
     coefficients: Array
-    """Shape (p, k): k targets per unit of regressor."""
+    """Coefficients of k targets per unit of each regressor, shape (p, k)."""
     leverage: Array
-    """Shape (p, p): ``phi @ leverage @ phi`` is the leverage n g^T H^-1 g of a row."""
+    """Matrix of the leverage n g^T H^-1 g = ``phi @ leverage @ phi`` of a row, shape (p, p)."""
     scales: Array
     """RMS of each regressor in training, shape (p,): g = phi / scales."""
 

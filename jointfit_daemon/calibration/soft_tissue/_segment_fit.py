@@ -35,7 +35,7 @@ def fit_segment(
         ``markley`` aligns each sensor by a heading and a mount and weights sensors by their errors;
         ``mean`` weights all sensors equally; ``single`` uses the best sensor.
     sensors : sequence of array_like, shape (n, 4)
-        q_world_segment of each sensor through its static mount; any number of sensors.
+        q_world_segment of each sensor with its static alignment; any number of sensors.
     q_other : array_like, shape (n, 4), or None
         Orientation of the neighboring segment: of one sensor, or the mean of several.
     q_reference : array_like, shape (n, 4)

@@ -38,7 +38,7 @@ class MarkerPaths:
     n: Array
     """Effective frames, shape (k,)."""
     mean: Array
-    """m, shape (k, r)."""
+    """Mean of each path, m, shape (k, r)."""
     C: Array
     """Covariance of the path, m², shape (k, r, r)."""
     c: Array
@@ -79,13 +79,13 @@ class ConcentricSpheres:
     """Common center with noise and radius of each marker."""
 
     center: Array
-    """m, shape (r,)."""
+    """Common center, m, shape (r,)."""
     noise2: float
     """Unbiased variance of a coordinate of a marker whose relative noise is one, m²."""
     relative: Array
     """Noise variance of each marker divided by the common variance, shape (k,)."""
     radii2: Array
-    """m², shape (k,)."""
+    """Squared radius of each marker, m², shape (k,)."""
     information: Array
     """Squared change of direction, summed over frames and markers, without noise; each marker is
     weighted by the common noise variance over its own. Shape (r, r)."""

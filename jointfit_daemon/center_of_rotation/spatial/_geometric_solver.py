@@ -39,7 +39,7 @@ class SphereOptions:
     """Settings of a geometric sphere fit."""
 
     huber: float = HUBER
-    """Residuals above this number of scales have reduced weight; inf: plain least squares."""
+    """Residual in scales above which the weight is reduced; inf: plain least squares."""
     smallest_scale: float = _ROUNDED
     """Smallest residual scale, m; 0.1 mm with soft-tissue artefact, so that a few good
     frames do not dominate."""
@@ -58,7 +58,7 @@ class SphereFit:
     """Geometric fit with the statistics for its acceptance."""
 
     center: Array
-    """m, shape (3,)."""
+    """Position of the center, m, shape (3,)."""
     basis: Array
     """Observed directions, the columns, shape (3, r)."""
     residuals: Array

@@ -47,7 +47,7 @@ class _ExpectedMarkers:
     f: Array
     """Radial residual of a marker is f·φ, m, shape (k, e); zero where nothing is known."""
     noise: Array
-    """m, shape (k,); inf where nothing is known."""
+    """Standard deviation of a coordinate of each marker, m, shape (k,); inf where unknown."""
     mean: Array
     """Mean of each marker's path, from its fixed point, m, shape (k, d)."""
     unsure: Array

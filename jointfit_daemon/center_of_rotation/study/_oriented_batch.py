@@ -30,11 +30,11 @@ class _Weights(NamedTuple):
     """Inverse covariance M = U diag(d) Uᵀ - h hᵀ of the angles of every run."""
 
     U: Array
-    """Shape (n, n)."""
+    """Orthogonal matrix U, shape (n, n)."""
     d: Array
-    """Shape (runs, n)."""
+    """Diagonal d of every run, shape (runs, n)."""
     h: Array
-    """Shape (runs, n)."""
+    """Vector h of every run, shape (runs, n)."""
 
     def times(self, a: Array) -> Array:
         """Return M a of every run, shape (runs, n), or (runs, k, n) for k vectors in each run."""

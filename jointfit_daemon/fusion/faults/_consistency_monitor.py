@@ -10,8 +10,9 @@ difference about the vertical that grows over minutes is heading drift. Heading 
 from the sensors before fusion. Only differences are observable, so the drifts of the segments, and
 of the sensors of each segment, have the mean 0.
 
-Pairs with a larger difference than soft tissue causes are brought back to the usual difference,
-each sensor by the same share: the soft-tissue model does not hold for a sensor that slipped.
+If the difference of a pair is larger than soft tissue causes, both sensors are rotated by equal
+amounts until it is as large as usual, because the soft-tissue model does not hold for a sensor that
+slipped.
 
 Invariant: the cost per frame is O(1).
 """
@@ -46,8 +47,8 @@ if TYPE_CHECKING:
 UPDATE_NS = 39_000_000
 """Interval of the comparisons, ns: 25 a second with frames at 100 Hz."""
 SUDDEN_SD = radians(2.0)
-"""Change of a segment's standard deviation from one comparison to the next, rad, above which the
-next frame is compared, too, so that one wrong sample does not count for a whole interval."""
+"""Change of a segment's standard deviation between two comparisons above which the next frame is
+compared, too, rad. One wrong sample thus has no effect for a whole interval."""
 MIN_DRIFT = radians(0.2)
 """Smallest heading drift that is corrected, rad."""
 REPORTED_DRIFT = radians(5.0)

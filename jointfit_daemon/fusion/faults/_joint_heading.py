@@ -27,8 +27,8 @@ HINGE_SPREAD = radians(6.0)
 """Largest spread of the flexion axes against each other at a hinge, posture removed, rad. Headings
 across a joint with a larger spread are not compared."""
 LIMIT_SIGMA = 3.0
-"""Heading difference at which two segments are inconsistent, in standard deviations of a healthy
-difference."""
+"""Heading difference at which two segments are inconsistent, in standard deviations of
+the difference without a fault."""
 RESIDUAL_SMOOTHING_S = 0.2
 """Time constant of the remaining heading difference that enters the uncertainty, s."""
 

@@ -9,8 +9,8 @@ is corrected; every segment has the same weight:
           \text{correction: } o_i \cdot \mathrm{clip}\bigl((|o_i| - s_0) / (s_1 - s_0), 0, 1\bigr)
 
 One disturbed sensor of four is thus identified and corrected, and the others are unchanged. If two
-halves contradict each other, the median is an interval. Its middle is used, which preserves joint
-angles, and half its width is the uncertainty of all headings.
+halves of the sensors contradict each other, the median is an interval. Its middle is used, which
+preserves joint angles, and half its width is the uncertainty of all headings.
 
 Only differences are observable: a disturbance that turns all sensors alike is not detected.
 """
@@ -29,7 +29,8 @@ SMOOTHING_S = 0.4
 CORRECTION_S = 0.25
 """Time constant with which corrections follow, s: the output does not jump."""
 STALE_NS = 500_000_000
-"""A difference that was not measured for longer starts from 0 again, ns."""
+"""Longest time without a measurement after which a difference continues, ns; later it starts from
+0."""
 CORRECTION_START = 1.6
 """Deviation from the median at which the correction starts, in standard deviations."""
 CORRECTION_FULL = 3.2
@@ -46,9 +47,9 @@ class HeadingDifference(NamedTuple):
     a: str
     b: str
     angle: float
-    """rad."""
+    """Measured heading difference, rad."""
     sd: float
-    """Standard deviation of a healthy difference, rad."""
+    """Standard deviation of a difference without disturbance, rad."""
 
 
 class _SmoothedDifference:

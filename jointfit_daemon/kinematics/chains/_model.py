@@ -80,7 +80,7 @@ class Marker:
     name: str
     segment: str
     position: Vector
-    """In segment axes, m."""
+    """Position in segment axes, m."""
     weight: float = 1.0
     """Weight of its squared error; 0 excludes the marker."""
     locked: tuple[bool, bool, bool] = (False, False, False)
@@ -144,7 +144,7 @@ class ChainModel:
 
     @cached_property
     def weights(self) -> Array:
-        """Shape (M,)."""
+        """Weights of the markers, shape (M,)."""
         return np.array([m.weight for m in self.markers], dtype=np.float64)
 
     @cached_property

@@ -58,10 +58,11 @@ class Band:
     reference: ChainState
     """State with A_ref, at T instants or one."""
     weights: Array
-    """m^2/rad^2, shape (T, nq)."""
+    """Weight of the squared excess, m^2/rad^2, shape (T, nq)."""
     low: Array
-    """rad, shape (nq,)."""
+    """Lowest joint rotations relative to the reference, rad, shape (nq,)."""
     high: Array
+    """Highest joint rotations relative to the reference, rad, shape (nq,)."""
 
     @classmethod
     def holding(cls, model: ChainModel, reference: ChainState, weights: Array) -> Band:
@@ -121,9 +122,9 @@ class PoseProblem:
 
     model: ChainModel
     measured: Array
-    """m, shape (T, S, 3, K), finite."""
+    """Measured markers by segment, m, shape (T, S, 3, K), finite."""
     weights: Array
-    """Shape (T, S, K)."""
+    """Weights of the squared errors, shape (T, S, K)."""
     tolerance: float
     iterations: int
     huber_m: float | None
@@ -172,7 +173,7 @@ class PoseSolution:
 
     state: ChainState
     weights: Array
-    """Shape (T, S, K), robust factors included."""
+    """Final weights, robust factors included, shape (T, S, K)."""
     converged: NDArray[np.bool_]
     iterations: NDArray[np.intp]
 

@@ -76,11 +76,11 @@ class IkResult:
     weights: Array
     """Final weights, shape (T, M): 0 where missing, robust factors included."""
     converged: NDArray[np.bool_]
-    """Shape (T,)."""
+    """Whether the iteration converged, shape (T,)."""
     underdetermined: NDArray[np.bool_]
-    """The markers left a degree of freedom undetermined; shape (T,)."""
+    """Whether the markers left a degree of freedom undetermined, shape (T,)."""
     iterations: NDArray[np.intp]
-    """Shape (T,)."""
+    """Number of iterations, shape (T,)."""
 
 
 def solve_frames(

@@ -140,7 +140,7 @@ class LagMonitor:
         self._next_ns: int | None = None
         self._mocap_epoch: int | None = None
         self._tracks: dict[str, tuple[int, Track]] = {}
-        """By segment, end of the window and orientations from the markers."""
+        """End of the window, and orientations from the markers, by segment."""
         for name, old in ({} if before is None else before.sensors).items():
             lag = self.sensors.get(name)
             if lag is not None:

@@ -6,8 +6,8 @@ near the minimum are fitted by ``theta(m) = theta_0 + s (m - m_0)``: weighted le
 Huber weights and a prior on s, which keeps the slope small in the first seconds. Half the path
 asymmetry remains in theta_0; ``bound_ns`` is its limit.
 
-Invariant: a single wrong or forged echo changes nothing. An echo that contradicts the fit is set
-aside; only a second one in a row that agrees with it indicates a restart of the server clock.
+Invariant: a single wrong or forged echo changes nothing. An echo that contradicts the fit is not
+used. If the next echo agrees with it, the server clock was restarted.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ class Stamp(NamedTuple):
     """Standard deviation, ns; inf before the first fit. The constant minimum delay is not included.
     """
     synced: bool
-    """False while the clock settles."""
+    """Whether the clock has settled."""
     epoch: int
     """Incremented when earlier and later times must not be combined."""
     duplicate: bool = False

@@ -65,7 +65,7 @@ class FusedPosition:
     """Position of one joint over time, m, z up; NaN where unknown."""
 
     position: Array
-    """Shape (n, 3)."""
+    """Position, m, shape (n, 3)."""
     sd: Array
     """Standard deviation per axis, shape (n,)."""
 

@@ -30,9 +30,9 @@ class CameraFrames(NamedTuple):
     """Camera frames of one block; occluded markers and untracked bodies are NaN."""
 
     markers: Array
-    """Shape (n, markers, 3)."""
+    """Marker positions, shape (n, markers, 3)."""
     body_positions: Array
-    """Shape (n, bodies, 3)."""
+    """Positions of the rigid bodies, shape (n, bodies, 3)."""
     body_orientations: Array
     """q_world_body, shape (n, bodies, 4)."""
 
