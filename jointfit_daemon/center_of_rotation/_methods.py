@@ -50,9 +50,9 @@ class EstimationMethod:
     needs: tuple[str, ...]
     """Fields of `Movement` that must be given: ``points``, ``parent`` and ``child``, ``angles``."""
     planar: bool
-    """Works in a plane: points in space are projected along `Movement.axis`."""
+    """Whether the method works in a plane; points in space are projected along `Movement.axis`."""
     run: Callable[..., CenterEstimate]
-    """Called with the movement and then with its fields in `needs`."""
+    """Function of the movement and of its fields in `needs`."""
 
 
 def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterEstimate:

@@ -16,8 +16,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 PARENT_TURN_RAD = radians(0.8)
-"""Noise of 1 mm of markers 10 cm from their mean rotates the fitted frame by half of this value.
-Such rotations cannot be distinguished from joint rotations."""
+"""Rotation against the parent that is attributed to noise of its markers, rad.
+
+Noise of 1 mm of markers 10 cm from their mean rotates the fitted frame by half of this value. Such
+rotations cannot be distinguished from joint rotations."""
 
 
 @dataclass(frozen=True, slots=True)

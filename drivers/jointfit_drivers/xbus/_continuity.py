@@ -29,34 +29,38 @@ from jointfit_protocols.xbus.configuration import TICK_NS, WRAP_32_BIT, WRAP_DAY
 
 _COUNTS = 1 << 16
 _GAP = 1.5
-"""Periods of time, at most, between two messages of which only the counter jumped."""
+"""Largest time, periods, between two messages of which only the counter jumped."""
 _PLAUSIBLE_GAP = 3600 * 1_000_000_000 // TICK_NS
 """Longest plausible gap, ticks: one hour, longer than any stall or buffered data."""
 _SLACK_COUNTS = 4
+"""Counts by which counter and time may differ."""
 _SLACK_SHARE = 0.02
+"""Share of the elapsed counts by which counter and time may differ in addition."""
 _LEARNED = 10
 """Counts after which the measured rate replaces the nominal one."""
 _PACE_NS = 250_000_000
 """Largest difference, ns, of elapsed device and arrival time without a restart."""
 _DISTINCT = 50_000
-"""Counts up to which counter and time can disagree; beyond, the slack allows any pair."""
+"""Longest gap, counts, in which counter and time can disagree.
+
+After a longer gap, the slack allows any pair of counter and time."""
 
 
 class XbusStep(NamedTuple):
     """Classification of one orientation."""
 
     lost: int = 0
-    """Messages lost before this orientation, or before the held one that it confirms."""
+    """Number of messages lost before this orientation, or before the held one that it confirms."""
     restarted: bool = False
-    """The device restarted before the held orientation."""
+    """Whether the device restarted before the held orientation."""
     held: bool = False
-    """Hold this orientation until the next one."""
+    """Whether this orientation is to be held until the next one."""
     confirmed: bool = False
-    """The held orientation is valid and is returned first; otherwise it is dropped."""
+    """Whether the held orientation is valid and is returned first; otherwise it is dropped."""
     lost_since: int = 0
-    """Messages lost between the confirmed one and this one."""
+    """Number of messages lost between the confirmed orientation and this one."""
     counter_jumped: bool = False
-    """Only the counter jumped before the held orientation; no message was lost."""
+    """Whether only the counter jumped before the held orientation; no message was then lost."""
 
 
 class _Point(NamedTuple):

@@ -1,7 +1,7 @@
 """Driver of Xsens / Movella IMUs that use Xbus on a serial port or USB.
 
 `XbusDecoder` is the pure part. `XbusImu.run` opens the port, brings the device into measurement
-mode and reads until cancelled. Only chunks pass from one to the other.
+mode and reads until cancelled. The two share only chunks.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
 
 _PERIODS_OF_SILENCE = 3
-"""Sample periods without data, at least, before a device counts as silent: a slow device may be
-silent for two periods.
+"""Smallest number of sample periods without data after which a device counts as silent. A slow
+device may be silent for two periods.
 """
 _HUNT_EVERY = 10
-"""Attempts to connect per search at other speeds, which takes longer than an attempt."""
+"""Number of attempts to connect per search at other speeds, which takes longer than an attempt."""
 
 
 class XbusImu:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _MOST = 0xFFFF
 """Largest value of a 16-bit field."""
 _UNITS_PER_MS = 10
-"""Pulse width and delay are sent in units of 100 us."""
+"""Number of units of pulse width and delay, 100 us, in a millisecond."""
 TRIGGERS = {"in1": Item.TRIGGER_IN1, "in2": Item.TRIGGER_IN2}
 """Item that reports edges of a line."""
 

@@ -51,13 +51,13 @@ class XcdiStep(NamedTuple):
 
     lost: int = 0
     restarted: bool = False
-    """The sensor restarted before the held group."""
+    """Whether the sensor restarted before the held group."""
     shared: bool = False
-    """Two sensors send with the same identifiers: this group may be a mixture."""
+    """Whether two sensors send with the same identifiers; this group may then be a mixture."""
     held: bool = False
-    """Hold this group until the next."""
+    """Whether this group is to be held until the next one."""
     confirmed: bool = False
-    """The held group is valid and is returned first; otherwise it is dropped."""
+    """Whether the held group is valid and is returned first; otherwise it is dropped."""
 
 
 _CONTINUES = XcdiStep()

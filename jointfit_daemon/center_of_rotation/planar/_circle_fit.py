@@ -34,9 +34,9 @@ class Circles(NamedTuple):
     """Circles fitted to sets of points; all fields have the leading shape (...)."""
 
     center: Array
-    """m, shape (..., 2); NaN where `valid` is False."""
+    """Center, m, shape (..., 2); NaN where `valid` is False."""
     radius: Array
-    """m."""
+    """Radius, m."""
     covariance: Array
     """Covariance of the center, m², shape (..., 2, 2)."""
     noise: Array
@@ -44,7 +44,7 @@ class Circles(NamedTuple):
     conditioning: Array
     """T, the radius over the center's largest standard error."""
     valid: NDArray[np.bool_]
-    """True where a circle exists and its arc exceeds the noise."""
+    """Whether a circle exists and its arc exceeds the noise."""
 
 
 def polynomial(m: CircleMoments[Number], method: str) -> tuple[Number, Number, Number, float]:

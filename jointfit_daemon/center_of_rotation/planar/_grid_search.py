@@ -26,11 +26,11 @@ class Grid:
     """A square grid of nodes; its middle is a node."""
 
     middle: tuple[float, float] = (0.0, 0.0)
-    """m."""
+    """Middle of the grid, m."""
     half_width: float = 0.05
-    """m."""
+    """Distance from the middle to the edge, m."""
     step: float = 0.005
-    """m."""
+    """Distance between neighboring nodes, m."""
 
     def nodes(self) -> Array:
         """Return the nodes row by row, x varying fastest, m, shape (g, 2)."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _STEPS = 40
 _REWEIGHED = 6
 _NOTHING_M2 = 1e-18
-"""Noise below a nanometer is rounding."""
+"""Variance below which noise is rounding, m²: a nanometer squared."""
 _REACH_M = 1e3
 
 

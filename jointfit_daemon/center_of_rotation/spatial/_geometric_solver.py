@@ -28,7 +28,7 @@ Mask = NDArray[np.bool_]
 
 HUBER = 1.5
 NOISE_FACTOR = 6.0
-"""A direction is observed if the rotation exceeds the rotation caused by noise by this factor."""
+"""Ratio of the rotation to the rotation caused by noise above which a direction is observed."""
 _PASSES = 30
 _ROUNDED = 1e-9
 _LONGEST_STEP_M = 0.2

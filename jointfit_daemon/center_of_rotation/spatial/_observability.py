@@ -54,7 +54,8 @@ class SphereLimits:
     reach: tuple[float, float] = (0.02, 1.0)
     """Least and largest distance of the markers from the center, m."""
     posture: bool = True
-    """Count persistent residuals as soft-tissue artefact. False: the caller adds its variance."""
+    """Whether persistent residuals count as soft-tissue artefact; if not, the caller adds its
+    variance."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 
 OUTLIER = 3.0
-"""Residuals above this number of standard deviations have reduced weight. It is larger than Huber's
-1.5 because a frame is weighted only once, and the noise estimate must not shrink."""
+"""Residual in standard deviations above which the weight is reduced. It is larger than Huber's 1.5
+because a frame is weighted only once, and the noise estimate must not shrink."""
 OFF = 8.0
 """Residual in standard deviations, and at least `OFF_M`, above which a marker is off its sphere."""
 OFF_M = 0.01

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 OUTLIER = 3.0
-"""Residuals above this number of standard deviations have reduced weight. Noise rarely exceeds it,
-so that the noise variance is not underestimated."""
+"""Residual in standard deviations above which the weight is reduced. Noise rarely exceeds it, so
+that the noise variance is not underestimated."""
 STILL_M = 1e-6
 _HALVORSEN_STEPS = 20
 FLAT = (
