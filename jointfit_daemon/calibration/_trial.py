@@ -54,7 +54,10 @@ class CalibrationTrial:
 
 @dataclass(frozen=True, slots=True)
 class CalibrationSettings:
-    """Settings of the calibration in rig.toml, in SI units."""
+    """Settings of the calibration in rig.toml, in SI units.
+
+    The keys in rig.toml are the fields of `config._tables.CalibrationTable`.
+    """
 
     method: Method = "anchored"
     static_s: float = 5.0

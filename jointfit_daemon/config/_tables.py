@@ -81,8 +81,8 @@ class CalibrationTable(Settings):
         3.0,
         gt=0,
         le=100,
-        description="target error of the joint centers from noise, mm; the error from soft-tissue "
-        "artefacts is reported separately",
+        description="random error of the joint centers, mm, at which the movement suffices; the "
+        "error caused by soft-tissue artefact is reported separately",
     )
     holdout_share: float = Field(
         0.4,

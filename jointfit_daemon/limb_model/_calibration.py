@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, Quaternion, Vector
 
 Method = Literal["anchored", "patent12", "patent6", "markley", "mean", "single"]
+"""Names of the fusion methods.
+
+`calibration.soft_tissue.fit_segment` fits them, and `tools.fuse` names them in its help."""
 
 SCHEMA = 1
 """Version of the JSON form; other versions are rejected."""

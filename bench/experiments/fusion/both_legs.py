@@ -220,7 +220,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "static-pose-correction",
-        "Size of the correction in the static pose, where the mean is the reference",
+        "Error that the correction causes in the static pose, where the mean equals the reference",
         standing,
         BOTH_KNEES,
         _DATA,

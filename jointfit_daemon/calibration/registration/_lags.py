@@ -37,7 +37,9 @@ PLATE = LagSettings(
     min_acceleration=radians(60),
     min_valid=0.5,
 )
-"""Limits of the lag estimate for a rigid plate: only noise and occlusion disturb it."""
+"""Limits of the lag estimate on a rigid plate, where only noise and occlusion disturb it.
+
+The defaults of `LagSettings` are the limits for live tracking."""
 SKIN = replace(PLATE, max_sigma_ns=5e6, min_r2=0.7, min_weight=0.5)
 """Limits of the lag estimate on skin: R² is lower; 5 ms at 3 rad/s is still below 1°."""
 

@@ -1,4 +1,4 @@
-"""Fit of one segment model by any method."""
+"""Fit of one segment model by any method; `limb_model.Method` lists the methods."""
 
 from __future__ import annotations
 

@@ -65,7 +65,11 @@ _AGREE = 0.005
 
 @dataclass(frozen=True, slots=True)
 class LagSettings:
-    """Search range of the lag, and the thresholds an estimate must pass."""
+    """Search range of the lag, and the thresholds that an estimate must pass.
+
+    The defaults are for live tracking. ``calibration.registration`` has the thresholds for the
+    plate and the body, and `LagTracker` those for a step of the lag.
+    """
 
     span_s: float = 0.15
     """Largest lag in the search, s; use 3 s if a clock is not mapped to host time."""
@@ -267,7 +271,7 @@ def _best_and_rival(fits: list[LagFit], seen: LagEstimate) -> tuple[LagFit, LagF
 
 
 def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | None:
-    """Return the message of the first threshold that the estimate fails, or None."""
+    """Return the message of the first threshold of `settings` that the estimate fails, or None."""
     share, bias = estimate.valid_share, float(np.degrees(np.linalg.norm(fit.bias)))
     gates = (
         (

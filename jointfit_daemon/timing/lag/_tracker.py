@@ -19,7 +19,9 @@ DRIFT_NOISE = 0.02e-6
 DRIFT_SD = 5e-6
 """Prior standard deviation of the drift of two mapped clocks, dimensionless."""
 GATE_SIGMAS = 4.0
-"""Innovation threshold in standard deviations."""
+"""Innovation, in standard deviations, above which a window may be the begin of a step.
+
+The thresholds for a single window are `LagSettings`."""
 STEP_WINDOWS = 3
 """Consistent windows in a row beyond the threshold that count as a step."""
 AGREE_NS = 500_000.0

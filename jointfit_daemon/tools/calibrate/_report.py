@@ -64,15 +64,15 @@ def report(quality: Mapping[str, Any]) -> list[str]:
 def movement_lines(data: Mapping[str, Any]) -> list[str]:
     """Return one line for each joint in ``data`` of topic ``calibration/progress``.
 
-    The first number is the predicted error with soft-tissue artefact, the second its part from
-    measurement noise, which decreases with more movement.
+    The first number is the predicted error with soft-tissue artefact. The second is its random
+    part, which decreases with more movement.
     """
     lines = []
     for name, joint in (data.get("joints") or {}).items():
         noise, total = joint.get("noise_error_mm"), joint.get("predicted_error_mm")
         words = [
             "center unknown" if total is None else f"center ± {total:.1f} mm",
-            *([] if noise is None else [f"{noise:.1f} mm from noise"]),
+            *([] if noise is None else [f"random error {noise:.1f} mm"]),
             *([] if joint.get("arc_deg") is None else [f"{joint['arc_deg']:.0f}° range"]),
             *([] if joint.get("bends") is None else [f"{joint['bends']} bends"]),
             *([] if joint.get("source") == "markers" else [f"from {joint.get('source')}"]),

@@ -105,7 +105,7 @@ def test_movement_lines_contain_one_line_per_joint() -> None:
            "arc_deg": 64.2}  # fmt: skip
     knee = {"met": False, "source": "sensors", "predicted_error_mm": None, "bends": 3}
     assert movement_lines({"joints": {"hip": hip, "knee": knee}}) == [
-        "✔ hip: center ± 16.7 mm, 2.1 mm from noise, 64° range",
+        "✔ hip: center ± 16.7 mm, random error 2.1 mm, 64° range",
         "… knee: center unknown, 3 bends, from sensors",
     ]
     assert movement_lines({}) == []
