@@ -100,7 +100,7 @@ _DATA = (FOLDER,)
 EXPERIMENTS = (
     Experiment(
         "knee-joint-rotation",
-        "Rotation of the knee from both segments, and from a fit to the joint alone",
+        "Error of the knee rotation from both segments, and from a fit to the joint alone",
         joint_itself,
         KNEE,
         _DATA,

@@ -290,7 +290,7 @@ def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
 
 def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
     """Return the errors of learned subjects after re-donning, with a new static pose only."""
-    rows: dict[str, list[Array]] = {"as worn": [], "put on anew": []}
+    rows: dict[str, list[Array]] = {"as calibrated": [], "re-donned": []}
     for seed in seeds:
         calibration = calibrated(seed)
         if calibration is None:
@@ -298,15 +298,15 @@ def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
         calibration, _rounds = taught(seed, calibration)
         one, dice = person(seed), np.random.default_rng(seed)
         again = _anew(one, calibration, dice)
-        rows["as worn"].append(squares(one, calibration, KINDS["new movements"]))
+        rows["as calibrated"].append(squares(one, calibration, KINDS["new movements"]))
         rig = bench_rig()
         try:
             pose = fit_static(again.trial(STAND_S + 2.0, JUDGE_S), rig.calibration, rig.chain)
         except CalibrationError:
-            rows["as worn"].pop()
+            rows["as calibrated"].pop()
             continue
         new = with_new_static(calibration, pose)
-        rows["put on anew"].append(squares(again, new, KINDS["new movements"]))
+        rows["re-donned"].append(squares(again, new, KINDS["new movements"]))
         person.cache_clear()
     was, now = (np.rad2deg(np.sqrt(np.mean(found, axis=0))) for found in rows.values())
     figures = []
@@ -340,14 +340,14 @@ REDONNED = (
 EXPERIMENTS = (
     Experiment(
         "online-learning-new-movements",
-        "Calibrated on walking, learning squats and sitting down online",
+        "Errors before and after online learning of squats and sitting, calibrated on walking",
         online,
         SIMULATED_SUBJECTS,
         long=True,
     ),
     Experiment(
         "online-learning-wrong-cameras",
-        "Optical references with errors, which online learning must reject",
+        "Number of accepted refits from wrong optical references; all must be rejected",
         guarded,
         SIMULATED_SUBJECTS,
         long=True,

@@ -267,7 +267,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "sphere-several-markers",
-        "Four markers around a joint, 20° arc",
+        "Centre from four markers around a joint, 20° arc: RMS error over the Cramér-Rao bound",
         four_markers,
         SEEDED,
     ),

@@ -154,7 +154,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "chain-occluded-markers",
-        "Occluded markers, without noise",
+        "Errors of inverse kinematics with occluded markers, without noise",
         occluded,
         LOWER_LIMBS,
         _RECORDED,

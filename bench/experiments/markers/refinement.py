@@ -309,7 +309,7 @@ FREE_FEET = (
 EXPERIMENTS = (
     Experiment(
         "marker-refinement-walking",
-        "Simultaneous refinement on walking",
+        "Simultaneous refinement on walking: tracking error afterwards",
         fast,
         LOWER_LIMBS,
         _RECORDED,
@@ -323,7 +323,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "marker-refinement-monotonic",
-        "The objective never increases",
+        "Increases of the objective during a refinement, 20 random starts",
         never_rises,
         LOWER_LIMBS,
         _RECORDED,
@@ -339,14 +339,14 @@ EXPERIMENTS = (
     ),
     Experiment(
         "marker-refinement-unseen-movement",
-        "Refined on three movements, evaluated on a fourth",
+        "Markers refined on three movements: tracking error on a fourth",
         unseen,
         LOWER_LIMBS,
         _RECORDED,
     ),
     Experiment(
         "marker-refinement-simulated-subjects",
-        "Eight simulated subjects, three walking speeds",
+        "Effect of refinement, eight simulated subjects, three walking speeds",
         people,
         SIMULATED_MARKERS,
         _RECORDED,
@@ -361,7 +361,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "marker-refinement-locked-landmarks",
-        "Simulated truth, anatomical markers locked",
+        "Errors of refined markers against simulated truth, anatomical markers locked",
         truth,
         SIMULATED_MARKERS,
         _RECORDED,
@@ -369,7 +369,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "marker-refinement-free-feet",
-        "Simulated truth, markers of the feet free",
+        "Errors of refined markers against simulated truth, feet not locked",
         feet_let_go,
         SIMULATED_MARKERS,
         _RECORDED,

@@ -111,7 +111,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "gateway-orientation-start-in-motion",
-        "Orientation filter started during fast motion, by second",
+        "Error of an orientation filter started during fast motion, by second",
         begun_in_motion,
         BOARD,
         recordings=("broad",),

@@ -394,7 +394,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "lag-orientation-input",
-        "Lag of orientations against the gyroscope",
+        "Lead of the orientations of a filter over its gyroscope",
         quaternion_input,
         BOARD,
         EXCERPTS,
