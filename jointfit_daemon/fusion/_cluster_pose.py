@@ -1,6 +1,6 @@
 """Pose of a marker cluster, and of points fixed to it, in single mocap frames.
 
-The fit is that of ``calibration.markers.rigid_fit``, to rounding. Quantities that do not change
+The fit is that of ``limb_model.rigid_fit``, to rounding. Quantities that do not change
 from frame to frame are computed once for each set of visible markers, which takes a tenth of the
 time of the general fit (25 instead of 250 microseconds).
 """

@@ -102,7 +102,8 @@ class Calibration:
     correlations: Mapping[str, float] = field(default_factory=dict)
     """Error correlation of the two segments at each inner joint, see `joint_error_correlations`."""
     memory: str = ""
-    """Training frames, encoded by `pack_training`; the basis of online learning."""
+    """Training frames, encoded by ``calibration.soft_tissue.pack``; the basis of online
+    learning."""
 
     @property
     def lag_ns(self) -> dict[str, int]:

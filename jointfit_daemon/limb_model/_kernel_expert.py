@@ -2,7 +2,7 @@ r"""One soft-tissue correction by kernel ridge regression.
 
 .. math:: c(u) = \mathrm{clip}(C^T [s(u), a_{z_1}(u / \ell) \dots a_{z_m}(u / \ell)])
 
-with the smooth terms s and the anchored bumps a of `kernel_features`. An expert returns its
+with the smooth terms s and the anchored bumps a of `_kernel_features`. An expert returns its
 correction and the leverage of the frame; `KernelModel` combines two experts.
 """
 
@@ -43,12 +43,14 @@ class KernelExpert:
     hull_leverage: float
     """0.995 quantile of the leverage over the training frames."""
     carried: tuple[float, ...]
-    """Sum of the stacking shares of each axis: the share that generalizes to unseen frames."""
+    """Sum of the stacking shares of each axis: the part of the correction that generalizes to
+    held-out frames."""
 
     def correct(self, u: Array, sensors: int) -> tuple[Array, Array]:
         """Return the correction, rad, shape (n, 3), and the leverage ratio, shape (n,).
 
-        The leverage ratio is the leverage of a frame over its 0.995 quantile in training.
+        The leverage ratio is the leverage of a frame over the 0.995 quantile of the leverages in
+        training.
 
         Parameters
         ----------

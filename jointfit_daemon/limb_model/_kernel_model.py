@@ -7,7 +7,7 @@ r"""The recommended model: mean of the sensors with a posture-dependent soft-tis
 :math:`c_b` are two fits (`KernelExpert`) of :math:`\rho = \log(\bar q^* \otimes q_{ref})`. Expert a
 uses relative rotations only and generalizes to other movements. Expert b also uses the tilt of the
 segment and has smaller errors on the trained movements. Inside the training range both have equal
-weight. Outside, their corrections fade (:math:`\eta`) into the linear trend T of `kernel_trend`,
+weight. Outside, their corrections fade (:math:`\eta`) into the linear trend T of `_kernel_trend`,
 which extrapolates best. Expert b fades at the limit of the training range, expert a at a larger
 distance. The trend has no component about the long axis: there the correction of b fades to that of
 a, and the correction of a fades to zero.

@@ -37,7 +37,7 @@ class ClusterVisibility(NamedTuple):
     suspect: str | None
     """Marker that deviated most often in those frames."""
     absent: tuple[str, ...]
-    """Markers (or the rigid body) that the stream does not name."""
+    """Markers (or the rigid body) that are not in the stream."""
 
 
 class LiveClusters:

@@ -52,15 +52,14 @@ class LiveJointCenter:
 
     joint: str
     center: Array | None
-    """Static world, m, shape (3,); None without an estimate."""
+    """Position in the static world, m, shape (3,); None without an estimate."""
     noise: float
-    """Standard deviation due to noise, m: root mean variance of the observed directions; inf
-    without any."""
+    """Random error, m: root mean variance of the observed directions; inf without any."""
     noise_across: float
-    """The same without the least certain direction: all that a hinge determines."""
+    """Random error without the least certain direction, m; a hinge determines the others only."""
     total: float
-    """Standard deviation per axis, m, including soft-tissue artefact and the prior of the static
-    pose in unobserved directions: the value stored in a calibration."""
+    """Total error: standard deviation per axis, m, with soft-tissue artefact, and with the prior of
+    the static pose in unobserved directions. A calibration stores this value."""
     arc: float
     """Range of the marker directions about the center, rad."""
     conditioning: float
@@ -71,7 +70,7 @@ class LiveJointCenter:
     unseen: int
     """Number of unobserved directions, 0 to 3."""
     refused: str | None
-    """Reason of the estimator for the lack of a center."""
+    """Reason for which the estimator returned no center."""
 
 
 class LiveJointCenters:

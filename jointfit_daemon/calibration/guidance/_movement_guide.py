@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
 
 MIN_BENDS = 12
-"""Required number of flexions of a joint between two sensors: half a minute of steps and squats."""
+"""Smallest number of flexions of a joint whose two segments carry sensors: half a minute of steps
+and squats."""
 MIN_SEEN = 0.5
 """Share of frames with a body part below which the fit is rejected."""
 MAX_MISFITS = 0.1

@@ -89,7 +89,7 @@ def robust_mean(q: ArrayLike, weights: ArrayLike | None = None) -> RobustMean:
 def static_mount(
     q_world_sensor: ArrayLike, q_world_segment: ArrayLike = rotation.IDENTITY
 ) -> RobustMean:
-    r"""Return the mount ``q_sensor_segment`` of a sensor from the static pose.
+    r"""Return the sensor-to-segment alignment ``q_sensor_segment`` from the static pose.
 
     .. math:: b_i = q_{s,i}^* \otimes q_{O,i}
 

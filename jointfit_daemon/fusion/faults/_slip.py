@@ -1,9 +1,9 @@
 """Detection of sensor slip: pairs of sensors of one segment against their calibrated relation.
 
 The calibration predicts the rotation between two sensors of a segment from posture
-(:mod:`jointfit_daemon.calibration.sensor_links`). A difference beyond the usual residual enters
+(`limb_model.SensorLink`). A difference beyond the usual residual enters
 the uncertainty at once; the pair is reported as inconsistent only if the difference persists, and
-as consistent after it stayed well below the limit for longer.
+as consistent after the difference has been well below the limit for a longer time.
 """
 
 from __future__ import annotations

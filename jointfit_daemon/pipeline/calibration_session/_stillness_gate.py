@@ -1,6 +1,6 @@
 """Stillness of all sensors of a rig during a static pose.
 
-Every sensor has a causal stillness monitor (:mod:`jointfit_daemon.calibration.stillness`). The pose
+Every sensor has a causal stillness monitor (`calibration.registration.StillnessMonitor`). The pose
 is still while every sensor is still; a sensor without data is not still.
 """
 

@@ -1,8 +1,8 @@
 """Collection of training frames for online learning: pairs of sensor and mocap frames.
 
 Ten frames a second are examined. A frame is retained if all sensors and markers are present, the
-clocks are synchronized, no sensor fault is flagged, and the limb moves; of a posture that is held,
-one frame a second is retained.
+clocks are synchronized, and no sensor fault is flagged. While the subject holds a posture, one
+frame a second is retained.
 
 Invariant: the collection is bounded, and no frames are paired across a restart of a clock.
 """
@@ -34,11 +34,12 @@ INTERVAL_NS = 100_000_000
 POSTURE_NS = 1_000_000_000
 """Time between retained frames of the same posture, ns."""
 POSTURE_COSINE = 0.99985
-"""Cosine of half of 2°: segments that turned by less since the last retained frame are at rest."""
+"""Cosine of half of 2°, the rotation of a segment since the last retained frame below which the
+subject holds a posture."""
 MAX_GAP_NS = 60_000_000
 """Longest time between two sensor frames that is interpolated, ns."""
 MAX_FRAMES = 3000
-"""Number of frames that are retained: the newest."""
+"""Largest number of retained frames; the newest are retained."""
 MIN_FRAMES = 600
 """Number of frames that trigger a refit: one minute of movement."""
 REFIT_NS = 180_000_000_000
@@ -59,7 +60,7 @@ class _TrainingFrame(NamedTuple):
 
 
 class OnlineFrameCollector:
-    """Collects frames for ``calibration.online_fit``.
+    """Collects frames for ``calibration.phases.refit_models``.
 
     Parameters
     ----------
