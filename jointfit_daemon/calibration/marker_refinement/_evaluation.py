@@ -36,6 +36,7 @@ def tracking_statistics(residuals: Array) -> TrackingStatistics:
     frame = np.sqrt(_mean(square, seen, axis=1))
     return TrackingStatistics(
         float(np.sqrt(square.sum() / max(seen.sum(), 1))),
+        float(np.sqrt(square.max(initial=0.0))),
         float(np.var(frame[seen.any(axis=1)])) if seen.any() else float("nan"),
         np.sqrt(_mean(square, seen, axis=0)),
     )

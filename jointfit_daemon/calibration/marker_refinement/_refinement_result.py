@@ -26,6 +26,8 @@ class TrackingStatistics:
 
     rms: float
     """RMS over all markers and frames, m."""
+    maximum: float
+    """Largest error of one marker in one frame, m."""
     variance: float
     """Variance over time of the RMS over the markers of each frame, m²."""
     by_marker: Array

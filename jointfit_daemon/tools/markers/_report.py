@@ -5,12 +5,23 @@ from __future__ import annotations
 from math import degrees, isfinite
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.tools.marker_limits import (
+    ACCEPTED_MAXIMUM_M,
+    ACCEPTED_RMS_M,
+    SOURCE,
+    comparison,
+    is_accepted,
+)
 from jointfit_daemon.tools.text_output import align_columns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.marker_refinement import Refinement, TrialOutcome
+    from jointfit_daemon.calibration.marker_refinement import (
+        Refinement,
+        TrackingStatistics,
+        TrialOutcome,
+    )
     from jointfit_daemon.kinematics.chains import ChainModel
 
 _MM = 1000.0
@@ -72,6 +83,14 @@ def _summary(found: Refinement) -> list[str]:
                 f"variance  of RMS across {word} trials: {_mm2(before)} → {_mm2(after)} mm²"
             )
 
+    for trained, word in ((True, "training"), (False, "validation")):
+        rms_after, largest = _errors_after(found, trained=trained)
+        if isfinite(rms_after):
+            lines.append(
+                f"errors    {word}: {comparison('RMS', rms_after, ACCEPTED_RMS_M)};"
+                f" {comparison('maximum', largest, ACCEPTED_MAXIMUM_M)} ({SOURCE})"
+            )
+
     gauge = found.gauge
     if gauge.free:
         held = {
@@ -90,6 +109,16 @@ def _summary(found: Refinement) -> list[str]:
     return lines
 
 
+def _errors_after(found: Refinement, *, trained: bool) -> tuple[float, float]:
+    """Return the RMS of the trial with the largest RMS, and the largest marker error, m."""
+    errors = [t.after for t in found.trials if t.trained is trained]
+    unknown = float("nan")
+    return (
+        max((e.rms for e in errors), default=unknown),
+        max((e.maximum for e in errors), default=unknown),
+    )
+
+
 def _mm(metres: float) -> str:
     return f"{_MM * metres:.2f}" if isfinite(metres) else "–"
 
@@ -100,6 +129,21 @@ def _mm2(square: float) -> str:
 
 def _change(before: float, after: float) -> str:
     return f"{100 * (after / before - 1):+.0f} %" if before > 0.0 else ""
+
+
+def _statistics(errors: TrackingStatistics) -> dict[str, float]:
+    return {"rms_m": errors.rms, "maximum_m": errors.maximum, "variance_m2": errors.variance}
+
+
+def _gauge(found: Refinement) -> dict[str, Any]:
+    gauge = found.gauge
+    return {
+        "free": gauge.free,
+        "weak": gauge.weak,
+        "fixed_by": gauge.fixed_by,
+        "markers": list(gauge.involved),
+        "eigenvalues": gauge.eigenvalues.tolist(),
+    }
 
 
 def as_json(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> dict[str, Any]:
@@ -132,8 +176,9 @@ def as_json(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> dic
                 "trained": t.trained,
                 "frames": t.frames,
                 "rate_hz": t.rate_hz,
-                "before": {"rms_m": t.before.rms, "variance_m2": t.before.variance},
-                "after": {"rms_m": t.after.rms, "variance_m2": t.after.variance},
+                "before": _statistics(t.before),
+                "after": _statistics(t.after),
+                "accepted": is_accepted(t.after.rms, t.after.maximum),
                 "angles_rad": {
                     name: {"rms": rms, "max": most} for name, (rms, most) in t.angles.items()
                 },
@@ -145,11 +190,5 @@ def as_json(chain: ChainModel, remarks: Sequence[str], found: Refinement) -> dic
             word: found.variance_of_trials(trained=trained)
             for word, trained in (("trained", True), ("unseen", False))
         },
-        "gauge": {
-            "free": found.gauge.free,
-            "weak": found.gauge.weak,
-            "fixed_by": found.gauge.fixed_by,
-            "markers": list(found.gauge.involved),
-            "eigenvalues": found.gauge.eigenvalues.tolist(),
-        },
+        "gauge": _gauge(found),
     }

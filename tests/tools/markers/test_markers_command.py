@@ -84,6 +84,21 @@ def test_training_and_validation_trials_are_reported_separately(folder: Path, me
     assert found["method"] == method
 
 
+def test_errors_are_compared_with_the_accepted_limits(folder: Path) -> None:
+    result = run(app, asked(folder, "--validate", str(folder / "run.trc")))
+    lines = [line for line in result.stdout.splitlines() if line.startswith("errors")]
+    assert [line.split()[1] for line in lines] == ["training:", "validation:"]
+    assert all("below 20 mm" in line for line in lines)
+
+    # one marker off by 8 cm in one frame exceeds the limit of a single error, not that of the RMS
+    trial = read_trc(folder / "walk.trc")
+    trial.positions[30, 1] += 0.08
+    write_trc(folder / "walk.trc", trial)
+    (walk,) = answer(folder)["trials"]
+    assert walk["after"]["maximum_m"] > 0.04 > 2.0 * walk["after"]["rms_m"]
+    assert walk["accepted"] is False
+
+
 def test_coordinate_search_reports_its_inverse_kinematics_runs(folder: Path) -> None:
     found = answer(folder, "--method", "search", "--frames", "10")
     assert found["runs"] > 50
