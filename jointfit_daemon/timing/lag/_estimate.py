@@ -77,6 +77,10 @@ class LagSettings:
     cutoff_hz: float = 10.0
     """Low-pass cut-off for both rates, Hz; at most 0.4 of the lower sample rate."""
     bridge_s: float = BRIDGE_S
+    stamp_sd_ns: float = 144_000.0
+    """Standard deviation of the sawtooth error of the stamps, ns: a tick of 0.5 ms over sqrt(12).
+    Zero if the stamps are exact.
+    """
     min_rate: float = radians(30.0)
     """Least RMS angular rate of the reference, rad/s."""
     min_acceleration: float = radians(300.0)
@@ -102,7 +106,7 @@ class LagEstimate:
     lag_ns: float
     """IMU timestamp minus reference timestamp of the same event, ns; NaN without a fit."""
     sigma_ns: float
-    """Standard deviation, ns, valid for correlated residuals."""
+    """Standard deviation, ns, valid for correlated residuals and slowly varying stamp errors."""
     r2: float
     """1 - sum |residual|² / sum |omega|²."""
     refused: str | None
@@ -221,7 +225,7 @@ def estimate_in_steps(
     fits: list[LagFit] = []
     for start in coarse:
         yield
-        found = yield from fit_lag(imu, ref, start)
+        found = yield from fit_lag(imu, ref, start, 1e-9 * settings.stamp_sd_ns)
         fits += [] if found is None else [found]
     if not fits:
         return replace(seen, refused=NO_OVERLAP)

@@ -64,7 +64,9 @@ class _State(NamedTuple):
     bias: Floats
 
 
-def fit_lag(imu: Rates, ref: Rates, start_s: float) -> Generator[None, None, LagFit | None]:
+def fit_lag(
+    imu: Rates, ref: Rates, start_s: float, stamp_sd_s: float = 0.0
+) -> Generator[None, None, LagFit | None]:
     r"""Fit :math:`r_j = g(t_j + \tau) - b - R\omega_j` over (R, b, tau).
 
     Gauss-Newton on all seven unknowns with Huber weights on |r|; the threshold is chosen by the
@@ -76,6 +78,8 @@ def fit_lag(imu: Rates, ref: Rates, start_s: float) -> Generator[None, None, Lag
         Low-pass filtered with the same kernel.
     start_s : float
         Coarse lag, s.
+    stamp_sd_s : float
+        Standard deviation of the slowly varying error of the stamps, s.
 
     Yields
     ------
@@ -121,7 +125,7 @@ def fit_lag(imu: Rates, ref: Rates, start_s: float) -> Generator[None, None, Lag
     square = float(norm @ norm)
     return LagFit(
         tau_s=-state.tau if swapped else state.tau,
-        sigma_s=lag_sigma(linear, 2.0 * KERNEL_HALF_S),
+        sigma_s=lag_sigma(linear, 2.0 * KERNEL_HALF_S, stamp_sd_s),
         rotation=rot,
         bias=bias,
         r2=1.0 - square / max(float(np.sum(linear.rate**2)), _TINY),

@@ -1,8 +1,20 @@
-"""A lag window in which hardly anything moves; the goals are in tests/bench/test_tables.py."""
+"""Lag windows with little motion; the goals are in tests/bench/test_tables.py."""
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+import numpy as np
+
 from bench.experiments.timing import lag
+from bench.subjects.gyro_rates import rates_from_gyro
+from jointfit_daemon.timing.lag import LagSettings, estimate_lag_of_rates, rates_from_orientations
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+TICK_MS, PERIOD_S = 0.5, 3.9
+"""Height and period of a sawtooth error of stamps, at a skew of 128 ppm."""
 
 
 def test_a_tap_in_a_window_of_rest_is_no_lag() -> None:
@@ -12,3 +24,42 @@ def test_a_tap_in_a_window_of_rest_is_no_lag() -> None:
         q[t > 5.25e9] = q[t > 5.25e9][0]
     found = lag.estimate_between(lag.LagTracks(t_imu, q_imu, t_ref, q_ref), 0.4, 9.6)
     assert found.refused is not None
+
+
+def errors_of_short_passages(data: Path, settings: LagSettings) -> list[float]:
+    """Lag errors over their standard deviations, in 32 passages of one second of fast motion."""
+    recording = lag.excerpt(data, lag.FAST)
+    body = rates_from_orientations(recording.t_ns, recording.optical, 0)
+    rng = np.random.default_rng(1)
+    gyro = body.w + rng.normal(scale=np.radians(1.0), size=body.w.shape)
+    sawtooth_ms = TICK_MS * (body.t_s / PERIOD_S % 1.0 - 0.5)
+    t_ns = np.rint(1e9 * body.t_s + lag.MS * sawtooth_ms).astype(np.int64)
+    found = []
+    for start_s in np.linspace(4.0, 58.0, 32):
+        near = np.abs(body.t_s - start_s - 0.5) < 0.8
+        seen = np.abs(1e-9 * recording.t_ns - start_s - 0.5) < 0.5
+        imu = rates_from_gyro(t_ns[near], gyro[near], 0)
+        ref = rates_from_orientations(recording.t_ns[seen], recording.optical[seen], 0)
+        estimate = estimate_lag_of_rates(imu, ref, settings)
+        if estimate.refused is None:
+            found.append(abs(estimate.lag_ns) / estimate.sigma_ns)
+    return found
+
+
+def test_the_standard_deviation_contains_the_stamp_error_of_a_short_passage(
+    shared_data: Path,
+) -> None:
+    found = errors_of_short_passages(shared_data, LagSettings())
+    assert len(found) >= 20
+    assert max(found) < 4.0
+    # The residuals alone miss it.
+    assert max(errors_of_short_passages(shared_data, LagSettings(stamp_sd_ns=0.0))) > 4.0
+
+
+def test_even_motion_averages_the_stamp_error(shared_data: Path) -> None:
+    """Ten seconds of even motion: the accuracy of vigorous motion remains."""
+    recording = lag.excerpt(shared_data, lag.FAST)
+    part = (recording.t_ns > 10e9) & (recording.t_ns < 20e9)
+    imu = rates_from_gyro(recording.t_ns[part], recording.gyro[part], 0)
+    ref = rates_from_orientations(recording.t_ns[part], recording.optical[part], 0)
+    assert estimate_lag_of_rates(imu, ref).sigma_ns < 0.06 * lag.MS

@@ -1,0 +1,104 @@
+"""Lag windows of all recorded trials, short passages, and the error of the recorded stamps.
+
+The stamps of the recordings have a sawtooth error of one tick of the sensor's clock, 0.5 ms. A
+window that contains one second of fast motion sees a part of it, and its residuals do not show it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.experiments.timing.lag import FAST, HALF_FRAME_MS, MS, Recording, whole, windows
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import BOARD
+from bench.subjects.gyro_rates import rates_from_gyro
+from jointfit_daemon.timing.lag import Rates, estimate_lag_of_rates, rates_from_orientations
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+LENGTHS_S = (1.0, 2.0, 5.0, 10.0)
+HOP_S = {1.0: 0.5}
+"""Time between starts of windows, s, if not 2.5 s."""
+MOST_SIGMAS = 4.0
+TICK_MS, TICK_TOLERANCE_MS = 0.5, 0.05
+"""Tick of the sensor's clock, 1/2000 s, and the accuracy of its measured value."""
+SAWTOOTH_HZ = np.arange(0.3, 1.0, 0.002)
+"""Searched frequencies, Hz. The first 26 s of a trial are at rest."""
+
+
+def all_trials(data: Path) -> list[Result]:
+    """Return the largest error over its standard deviation for each trial and length of window."""
+    figures = []
+    for path in sorted((data / "broad").glob("*.hdf5")):
+        recording = whole(data, path.stem)
+        for length_s in LENGTHS_S:
+            found = windows(recording, length_s, hop_s=HOP_S.get(length_s, 2.5))
+            off = [abs(one.lag_ms - HALF_FRAME_MS) / one.sigma_ms for one in found if one.used]
+            name, note = f"trial {path.stem[:2]}: {length_s:g} s", f"{len(off)} windows"
+            worst = max(off, default=0.0)
+            figures.append(Result(name, worst, MOST_SIGMAS, unit="sd", note=note))
+    period_s, height_ms = stamp_sawtooth(whole(data, FAST))
+    return [
+        *figures,
+        Result("sawtooth of the stamps: period", period_s, unit="s"),
+        Result(
+            "sawtooth of the stamps: height",
+            height_ms,
+            TICK_MS + TICK_TOLERANCE_MS,
+            TICK_MS - TICK_TOLERANCE_MS,
+            "ms",
+        ),
+    ]
+
+
+def stamp_sawtooth(recording: Recording) -> tuple[float, float]:
+    r"""Return the period, s, and the height, ms, of the sawtooth error of the sensor's stamps.
+
+    A stamp error e(t) adds :math:`\dot g(t) e(t)` to the residual of the lag fit. Its first
+    harmonic is fitted by least squares; a sawtooth of height A has the amplitude :math:`A / \pi`.
+    """
+    imu = rates_from_gyro(recording.t_ns, recording.gyro, 0)
+    ref = rates_from_orientations(recording.t_ns, recording.optical, 0)
+    lag_s = 1e-9 * estimate_lag_of_rates(imu, ref).lag_ns
+    at = ref.t_s + lag_s
+    inside = (at > imu.t_s[0]) & (at < imu.t_s[-1])
+    t_s, omega = ref.t_s[inside], ref.w[inside]
+    g = np.stack([np.interp(at[inside], imu.t_s, imu.w[:, k]) for k in range(3)], axis=1)
+
+    # the residual along the angular acceleration is the local stamp error times its square
+    residual = g - omega - np.mean(g - omega, axis=0)
+    slope = np.gradient(_smooth(omega, ref), ref.period_s, axis=0)
+    pull, weight = np.sum(slope * residual, axis=1), np.sum(slope**2, axis=1)
+
+    best = (0.0, 0.0, 0.0)
+    for hz in SAWTOOTH_HZ:
+        angle = 2.0 * np.pi * hz * t_s
+        basis = np.stack([np.ones_like(t_s), np.cos(angle), np.sin(angle)], axis=1)
+        right = basis.T @ pull
+        fit = np.linalg.solve(basis.T @ (basis * weight[:, None]), right)
+        best = max(best, (float(fit @ right), 1.0 / hz, float(np.hypot(fit[1], fit[2]))))
+    return best[1], 1e9 * np.pi * best[2] / MS
+
+
+def _smooth(omega: np.ndarray, rates: Rates) -> np.ndarray:
+    """Return rates without noise above 20 Hz, so that their slope is the motion's."""
+    width = round(0.025 / rates.period_s) | 1
+    kernel = np.hanning(width + 2)
+    kernel /= kernel.sum()
+    return np.stack([np.convolve(omega[:, k], kernel, "same") for k in range(3)], axis=1)
+
+
+EXPERIMENTS = (
+    Experiment(
+        "lag-all-trials",
+        "Largest lag error over its standard deviation, all trials and short passages",
+        all_trials,
+        BOARD,
+        ("broad",),
+        ("h5py",),
+        long=True,
+    ),
+)
