@@ -4,7 +4,14 @@ from jointfit_daemon.calibration.record._store import (
     MOST_BYTES,
     CalibrationFileError,
     CalibrationStore,
+    calibration_of,
 )
 from jointfit_daemon.calibration.record._trial_digest import trials_digest
 
-__all__ = ["MOST_BYTES", "CalibrationFileError", "CalibrationStore", "trials_digest"]
+__all__ = [
+    "MOST_BYTES",
+    "CalibrationFileError",
+    "CalibrationStore",
+    "calibration_of",
+    "trials_digest",
+]

@@ -166,7 +166,7 @@ class CalibrationStore:
         except MalformedFileError as error:
             raise CalibrationFileError(str(error)) from error
         try:
-            return _calibration_of(data)
+            return calibration_of(parse_json(data.decode("utf-8-sig")))
         except (CalibrationSchemaError, ValueError, RecursionError) as error:
             raise _DamagedFileError(
                 f"{path}: cannot be used ({str(error) or type(error).__name__:.300}); "
@@ -215,21 +215,20 @@ def checksum(content: Mapping[str, object]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _calibration_of(data: bytes) -> Calibration:
-    """Return the calibration in a file.
+def calibration_of(table: object) -> Calibration:
+    """Return the calibration in the JSON value of a file: a stored version, or a bare calibration.
 
     Raises
     ------
     ValueError, RecursionError
         The content cannot be used; includes `CalibrationSchemaError`.
     """
-    table = parse_json(data.decode("utf-8-sig"))
     content = None
     if isinstance(table, dict):
         content = table if "schema" in table else table.get("calibration")
     if not isinstance(table, dict) or not isinstance(content, dict):
         raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - file content
-    # A bare calibration was written before there were checksums.
+    # A bare calibration has no checksum: `jointfit fuse fit` writes it.
     if content is not table and table.get("sha256") != checksum(content):
         raise ValueError("the checksum differs: the file was damaged or edited")
     if fault := find_structure_fault(content):

@@ -179,7 +179,7 @@ def fit(
 
 @app.command()
 def apply(
-    model: Annotated[Path, typer.Argument(help="Model file written by `fit`.")],
+    model: Annotated[Path, typer.Argument(help="Model of `fit`, or stored calibration.")],
     sensors: Annotated[Path, typer.Argument(help="Sensors: .npz or .sto.")],
     *,
     out: Annotated[
@@ -228,16 +228,16 @@ def apply(
 
 def _read_model(path: Path) -> Calibration:
     """Return the calibration of a model file; ValueError if it is none."""
-    from jointfit_daemon.calibration.record import MOST_BYTES
+    from jointfit_daemon.calibration.record import MOST_BYTES, calibration_of
     from jointfit_daemon.files.text import read_json
-    from jointfit_daemon.limb_model import Calibration, CalibrationSchemaError
 
-    data = read_json(path, MOST_BYTES)
+    table = read_json(path, MOST_BYTES)
     try:
-        return Calibration.from_dict(data if isinstance(data, dict) else {})
-    except CalibrationSchemaError as fault:
+        return calibration_of(table)
+    except (ValueError, RecursionError) as fault:
         raise ValueError(
-            f"{path}: expected a model written by `jointfit fuse fit`: {fault}"
+            f"{path}: expected a model written by `jointfit fuse fit`, or a calibration stored by"
+            f" the daemon: {fault}"
         ) from fault
 
 

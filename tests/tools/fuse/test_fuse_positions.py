@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jointfit_daemon.calibration.phases import OfflineTrial, fit_offline
+from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.files.orientations import (
     OrientationTrial,
     read_sto,
@@ -220,6 +221,30 @@ def test_no_position_is_written_without_the_first_length(files: Path, tmp_path: 
     found = json.loads(result.stdout)
     assert "positions of knee, ankle left out" in found["notes"][0]
     assert found["files"] == [str(tmp_path / "r.sto"), str(tmp_path / "r_angles.sto")]
+
+
+def test_a_calibration_stored_by_the_daemon_is_a_model_with_its_lengths(
+    files: Path, tmp_path: Path
+) -> None:
+    store = CalibrationStore(tmp_path, "leg")
+    version = store.save(mean_model((("thigh", 0.42), ("shank", 0.4))))
+    out = tmp_path / "r.npz"
+    stored = run("apply", store.path(version), files / "m1.npz", "--out", out)
+    assert stored.exit_code == 0, stored.output
+    with np.load(out, allow_pickle=False) as arrays:
+        position = arrays["position_ankle"]
+    apply(files, out, *LENGTHS)
+    with np.load(out, allow_pickle=False) as arrays:
+        assert position == pytest.approx(arrays["position_ankle"])
+
+
+def test_an_edited_calibration_is_rejected(files: Path, tmp_path: Path) -> None:
+    store = CalibrationStore(tmp_path, "leg")
+    path = store.path(store.save(mean_model((("thigh", 0.42),))))
+    path.write_text(path.read_text().replace("0.42", "0.43"))
+    text = said(run("apply", path, files / "m1.npz", "--out", tmp_path / "r.csv"))
+    assert "the checksum differs" in text
+    assert "expected a model written by" in text
 
 
 def fit(folder: Path, *options: object) -> dict[str, Any]:
