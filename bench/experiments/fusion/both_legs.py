@@ -125,17 +125,18 @@ def coverage(data: Path) -> list[Result]:
 
 
 def standing(data: Path) -> list[Result]:
-    """Correction in the static pose of simulated subjects in natural stance.
+    """Return the errors in the static pose of the recorded subject, in natural stance.
 
-    In stance the bones lean and the knees are slightly flexed. The sensor mounts make the mean the
-    reference, so any correction is an error. Trained on squats, and on deep squats alone.
+    In stance the bones lean and the knees are slightly flexed. The sensor-to-segment alignments
+    make the mean equal to the reference, so any correction is an error. The methods are trained on
+    squats, and on the part of the squats with a larger flexion alone.
     """
     figures = []
     for side, trials in _both(data).items():
         squats, static = trials["squats1"], skin_knee(data, STATIC, SIDES[side])
         bend = rotation.angle_between(squats.thigh, squats.shank)
         deep = squats.part(bend > np.deg2rad(DEEP_DEG))
-        for label, taught in (("squats", squats), (f"beyond {DEEP_DEG:g} deg", deep)):
+        for label, taught in (("squats", squats), (f"squats beyond {DEEP_DEG:g} deg", deep)):
             for method in ("mean", DEFAULT):
                 said = fusion_methods.fit(method, [taught])(static)
                 errors = Judge.of(squats).errors(said, static)

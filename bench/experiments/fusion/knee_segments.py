@@ -156,7 +156,7 @@ def one_sensor(data: Path) -> list[Result]:
     for index, goals in ((0, (1.5, 1.9)), (1, (2.1, 2.0))):
         models = KneeModels("anchored", [squats.training], (index,), (2 + index,))
         errors = squats.judge.errors(models.predict(squats.held), squats.held)
-        figures += _goals(errors, goals, f"{'AB'[index]} only: ")
+        figures += _goals(errors, goals, f"{('first', 'second')[index]} sensor of each segment: ")
     return figures
 
 
