@@ -14,7 +14,7 @@ from jointfit_daemon.tools.center.chain import longest_gap_s
 from jointfit_daemon.tools.text_output import align_columns
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from jointfit_daemon.files.mocap import MarkerTrial
@@ -29,45 +29,9 @@ _TRAJECTORIES = ("joint", "known", "longest gap, s", "error, mm", "sides apart, 
 def text(trial: MarkerTrial, joints: Sequence[ChainJoint]) -> str:
     """Return the centres and a summary of the trajectories as two tables."""
     data = trial.trajectories
-    centers: list[tuple[str, ...]] = [_CENTERS]
-    trajectories: list[tuple[str, ...]] = [_TRAJECTORIES]
-    notes = []
-    for joint in joints:
-        for side in joint.sides:
-            e = side.answer.estimate
-            error = _report.sd_seen(side.answer)
-            centers.append(
-                (
-                    joint.name,
-                    ",".join(side.parent),
-                    _report.point(e.center),
-                    _report.mm(error),
-                    f"{degrees(e.arc):.0f}°",
-                    _report.mm(e.residual),
-                    _report.number(e.conditioning),
-                    "" if e.refused is None else f"REFUSED: {e.refused}",
-                )
-            )
-        unseen = [len(s.answer.estimate.unseen) for s in joint.sides if not joint.refused]
-        if unseen and min(unseen) > 0:
-            notes.append(
-                f"note      {joint.name}: its position along the joint axis is unobservable and"
-                " not part of its error"
-            )
-        notes += [f"note      {joint.name}: {fault}" for fault in joint.faults]
-
-        track = joint.trajectory
-        known = np.isfinite(track.error)
-        trajectories.append(
-            (
-                joint.name,
-                f"{100 * known.mean():.0f} %",
-                f"{longest_gap_s(joint, data.rate_hz):.2f}",
-                _report.mm(float(np.median(track.error[known]))) if known.any() else "unknown",
-                _report.mm(track.sides_apart) if isfinite(track.sides_apart) else "one side",
-            )
-        )
-
+    centers = [_CENTERS, *(row for joint in joints for row in _center_rows(joint))]
+    trajectories = [_TRAJECTORIES, *(_trajectory_row(joint, data.rate_hz) for joint in joints)]
+    notes = [f"note      {joint.name}: {fact}" for joint in joints for fact in _notes(joint)]
     head = (
         f"trial     {len(data.t_s)} frames at {data.rate_hz:g} Hz,"
         f" {len(data.t_s) / data.rate_hz:.2f} s; {trial.up_axis} is up ({trial.up_said_by})"
@@ -79,6 +43,43 @@ def text(trial: MarkerTrial, joints: Sequence[ChainJoint]) -> str:
         align_columns(trajectories, range(1, 5)),
     ]
     return "\n".join([head, *warnings, "", *tables, *([""] if notes else []), *notes])
+
+
+def _center_rows(joint: ChainJoint) -> Iterator[tuple[str, ...]]:
+    for side in joint.sides:
+        e = side.answer.estimate
+        yield (
+            joint.name,
+            ",".join(side.parent),
+            _report.point(e.center),
+            _report.mm(_report.sd_seen(side.answer)),
+            f"{degrees(e.arc):.0f}°",
+            _report.mm(e.residual),
+            _report.number(e.conditioning),
+            "" if e.refused is None else f"REFUSED: {e.refused}",
+        )
+
+
+def _trajectory_row(joint: ChainJoint, rate_hz: float) -> tuple[str, ...]:
+    track = joint.trajectory
+    known = np.isfinite(track.error)
+    apart = _report.mm(track.sides_apart)
+    if not isfinite(track.sides_apart):
+        apart = "refused" if joint.refused else "one side"
+    return (
+        joint.name,
+        f"{100 * known.mean():.0f} %",
+        f"{longest_gap_s(joint, rate_hz):.2f}",
+        _report.mm(float(np.median(track.error[known]))) if known.any() else "unknown",
+        apart,
+    )
+
+
+def _notes(joint: ChainJoint) -> Iterator[str]:
+    used = [s.answer.estimate for s in joint.sides if s.answer.estimate.refused is None]
+    if used and all(len(e.unseen) for e in used):
+        yield "its position along the joint axis is unobservable and not part of its error"
+    yield from joint.faults
 
 
 def as_json(trial: MarkerTrial, joints: Sequence[ChainJoint]) -> dict[str, Any]:

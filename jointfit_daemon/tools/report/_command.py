@@ -50,7 +50,7 @@ def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> 
 
     from jointfit_daemon.center_of_rotation.study import (
         StudySetup,
-        compare_methods,
+        extend_study,
         run_study,
     )
     from jointfit_daemon.tools.plotting import PlottingUnavailableError
@@ -69,13 +69,11 @@ def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> 
         task = bar.add_task("computing nine maps", total=1.0)
         study = run_study(setup, lambda share: bar.update(task, completed=share))
 
-    comparison = compare_methods(setup)
-    text = tables(setup, study, comparison)
+    more = extend_study(setup)
+    text = tables(setup, study, more)
     typer.echo(text, nl=False)
     if json is not None:
-        json.write_bytes(
-            orjson.dumps(as_json(setup, study, comparison), option=orjson.OPT_INDENT_2)
-        )
+        json.write_bytes(orjson.dumps(as_json(setup, study, more), option=orjson.OPT_INDENT_2))
     if out is None:
         return
     (out / "cor-study.txt").write_text(text, encoding="utf-8")

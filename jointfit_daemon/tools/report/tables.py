@@ -7,14 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.center_of_rotation.study import APART_RAD, CLIPS_M, PRINTED, correlation
+from jointfit_daemon.center_of_rotation.study import (
+    APART_RAD,
+    CLIPS_M,
+    LARGE_NOISE_M,
+    PRINTED,
+    RADII_M,
+    STEPS_RAD,
+    correlation,
+)
 from jointfit_daemon.tools.text_output import align_columns
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
-    from jointfit_daemon.arrays import Array
-    from jointfit_daemon.center_of_rotation.study import PairMaps, StudySetup
+    from jointfit_daemon.center_of_rotation.study import PairMaps, StudyExtension, StudySetup
 
 NEAREST = {"α–σ": 0.3, "r–σ": None, "r–α": 0.15}
 """Clipping limit, m, with the correlations nearest to the printed table, by pair."""
@@ -41,7 +48,7 @@ _MM = 1000.0
 _METHODS = ("predicted", "three frames", "grid", "shifted grid", "bound", "hyper", "oriented")
 
 
-def tables(setup: StudySetup, study: Sequence[PairMaps], comparison: Mapping[str, Array]) -> str:
+def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -> str:
     """Return setup, correlations, errors over the arc, other methods and limits."""
     parts = [
         "Center of rotation from a marker on a circle: the numerical experiment of Akbarifar et al."
@@ -58,7 +65,14 @@ def tables(setup: StudySetup, study: Sequence[PairMaps], comparison: Mapping[str
         f" r = {setup.radius:g} m and σ = {_MM * setup.noise:g} mm; bisectors: both markers, three"
         " frames; Reuleaux and helical axis: both markers, first and last frame; the others: one"
         f" marker, hyper with {setup.frames} frames",
-        _indented(_comparison(setup, comparison)),
+        _indented(_comparison(setup, more)),
+        f"Repetition of small angles: median error, mm, after averaging {setup.repeats} repetitions"
+        f" at r = {setup.radius:g} m and σ = {_MM * setup.noise:g} mm",
+        _indented(_repetition(more)),
+        "Effect of the radius: 95th percentile of the error over that at"
+        f" r = {100 * setup.radii[-1]:g} cm, α = {np.rad2deg(setup.step):.0f}°,"
+        f" σ = {_MM * LARGE_NOISE_M:g} mm",
+        _indented(_radius(more)),
         "Limits",
         "\n".join(f"- {text}" for text in CAVEATS),
     ]
@@ -124,22 +138,36 @@ def _errors(study: Sequence[PairMaps]) -> list[tuple[str, ...]]:
     return rows
 
 
-def _comparison(setup: StudySetup, comparison: Mapping[str, Array]) -> list[tuple[str, ...]]:
+def _comparison(setup: StudySetup, more: StudyExtension) -> list[tuple[str, ...]]:
     degrees = np.rint(np.rad2deg(setup.steps)).astype(int).tolist()
-    rows: list[tuple[str, ...]] = [("α", *comparison)]
+    rows: list[tuple[str, ...]] = [("α", *more.median_errors)]
     for angle in (a for a in _SHOWN_DEG if a in degrees):
         at = degrees.index(angle)
-        rows.append((f"{angle}°", *(f"{_MM * errors[at]:.3g}" for errors in comparison.values())))
+        rows.append(
+            (f"{angle}°", *(f"{_MM * errors[at]:.3g}" for errors in more.median_errors.values()))
+        )
     return rows
+
+
+def _repetition(more: StudyExtension) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = [("α", "mean of centers", "center of mean positions")]
+    for step, *errors_m in zip(STEPS_RAD, *more.repetition, strict=True):
+        rows.append((f"{np.rad2deg(step):.0f}°", *(f"{_MM * m:.2g}" for m in errors_m)))
+    return rows
+
+
+def _radius(more: StudyExtension) -> list[tuple[str, ...]]:
+    return [
+        ("r, cm", *(f"{100 * r:g}" for r in RADII_M)),
+        ("ratio", *(f"{ratio:.2f}" for ratio in more.radius_effect)),
+    ]
 
 
 def _indented(rows: Sequence[Sequence[str]]) -> str:
     return indent(align_columns(rows, right=range(len(rows[0]))), "  ")
 
 
-def as_json(
-    setup: StudySetup, study: Sequence[PairMaps], comparison: Mapping[str, Array]
-) -> dict[str, Any]:
+def as_json(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -> dict[str, Any]:
     """Return setup, correlations, maps and other methods in SI units; NaN becomes null."""
     return {
         "setup": {
@@ -156,7 +184,13 @@ def as_json(
             "seed": setup.seed,
         },
         "caveats": list(CAVEATS),
-        "median_error_m": {name: errors.tolist() for name, errors in comparison.items()},
+        "median_error_m": {name: errors.tolist() for name, errors in more.median_errors.items()},
+        "repetition": {
+            "steps_rad": STEPS_RAD.tolist(),
+            "mean_of_centers_m": more.repetition.mean_of_centers.tolist(),
+            "center_of_means_m": more.repetition.center_of_means.tolist(),
+        },
+        "radius": {"radii_m": RADII_M.tolist(), "error_ratio": more.radius_effect.tolist()},
         "pairs": [_pair_json(pair) for pair in study],
     }
 

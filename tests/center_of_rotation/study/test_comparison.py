@@ -11,9 +11,13 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.center_of_rotation.planar import three_frame_center
 from jointfit_daemon.center_of_rotation.study import (
+    RADII_M,
+    STEPS_RAD,
     StudySetup,
+    average_repetitions,
     bisector_center,
     compare_methods,
+    effect_of_radius,
     rotation_pole,
 )
 
@@ -59,3 +63,20 @@ def test_two_markers_reduce_the_error_of_short_arcs_and_all_frames_that_of_long_
     )
     assert long["hyper"] < min(long["bisectors"], long["Reuleaux"], long["helical axis"]) / 2
     assert long["three frames"] == pytest.approx(0.00111, rel=0.1)
+
+
+def test_averaged_centers_of_small_angles_are_worse_than_centers_of_averaged_positions() -> None:
+    found = average_repetitions(StudySetup())
+    at = dict(zip(np.rint(np.rad2deg(STEPS_RAD)).tolist(), range(len(STEPS_RAD)), strict=True))
+    assert found.mean_of_centers[at[10]] > 3.0 * found.center_of_means[at[10]]
+    # with enough rotation both averages fall with the root of the repetitions
+    expected = 0.001 * 4.3 / np.sqrt(StudySetup().repeats)
+    assert found.mean_of_centers[at[45]] < expected
+    assert found.center_of_means[at[45]] < expected
+
+
+def test_the_radius_matters_below_seven_centimeters_only_for_large_noise() -> None:
+    ratio = dict(zip(RADII_M.tolist(), effect_of_radius(StudySetup()).tolist(), strict=True))
+    assert ratio[0.03] > 1.8
+    assert 1.05 < ratio[0.07] < 1.2
+    assert ratio[0.2] == pytest.approx(1.0, abs=0.03)

@@ -47,6 +47,8 @@ def test_report_contains_its_setup_both_tables_and_every_limitation(tmp_path: Pa
     assert [pair["name"] for pair in found["pairs"]] == ["α–σ", "r–σ", "r–α"]
     assert len(found["pairs"][0]["rms_m"]["three frames"]) == 35
     assert "Reuleaux and helical axis: both markers" in result.stdout
+    assert "Repetition of small angles" in result.stdout
+    assert len(found["radius"]["error_ratio"]) == len(found["radius"]["radii_m"])
     for errors_m in found["median_error_m"].values():
         assert len(errors_m) == 35
 

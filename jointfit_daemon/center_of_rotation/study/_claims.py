@@ -1,0 +1,89 @@
+"""Two claims of the source about three-frame centers: repetition of small angles, and the radius.
+
+The source recommends small angles α, repeated and averaged, and states that the distance r of the
+marker has no effect unless the noise is large relative to it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation.planar import three_frame_center
+from jointfit_daemon.center_of_rotation.study._comparison import compare_methods
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation.study._circle_study import StudySetup
+
+STEPS_RAD = np.deg2rad([10.0, 20.0, 30.0, 45.0])
+"""Angles α at which repetitions are averaged, rad."""
+RADII_M = np.array([0.03, 0.04, 0.06, 0.07, 0.08, 0.1, 0.2])
+"""Distances of the marker, m."""
+LARGE_NOISE_M = 0.005
+"""Noise at which the radius is varied, m: the largest of the source."""
+_BLOCKS = 40
+_RUNS = 40_000
+
+
+class Repetition(NamedTuple):
+    """Median error over α of two ways to average repetitions, m, shape (len(STEPS_RAD),)."""
+
+    mean_of_centers: Array
+    """The center is computed in every repetition, and the centers are averaged."""
+    center_of_means: Array
+    """The marker positions are averaged over the repetitions, and the center is computed once."""
+
+
+def average_repetitions(setup: StudySetup) -> Repetition:
+    """Return the errors after averaging `setup.repeats` repetitions, medians of 40 simulations."""
+    rng = np.random.default_rng(setup.seed)
+    found = []
+    for step in STEPS_RAD:
+        true = _on_circle(setup.radius, step)
+        drawn = rng.normal(0.0, setup.noise, (_BLOCKS, setup.repeats, 3, 2))
+        centers = three_frame_center(true + drawn).mean(axis=1)
+        once = three_frame_center(true + drawn.mean(axis=1))
+        found.append([np.median(np.linalg.norm(x, axis=-1)) for x in (centers, once)])
+    return Repetition(*np.array(found).T)
+
+
+def effect_of_radius(setup: StudySetup) -> Array:
+    """Return the 95th percentile of the error at `RADII_M` over that at the largest radius.
+
+    With noise of `LARGE_NOISE_M` and the fixed step of the setup. The percentile, because the error
+    has no finite mean square.
+    """
+    rng = np.random.default_rng(setup.seed)
+    drawn = rng.normal(0.0, LARGE_NOISE_M, (_RUNS, 3, 2))
+    radii = [*RADII_M, float(setup.radii[-1])]
+    errors = [
+        np.linalg.norm(three_frame_center(_on_circle(r, setup.step) + drawn), axis=-1)
+        for r in radii
+    ]
+    high = np.quantile(errors, 0.95, axis=1)
+    return np.asarray(high[:-1] / high[-1])
+
+
+class StudyExtension(NamedTuple):
+    """Results beyond the maps of the source."""
+
+    median_errors: Mapping[str, Array]
+    """`compare_methods`: m, by method."""
+    repetition: Repetition
+    radius_effect: Array
+
+
+def extend_study(setup: StudySetup) -> StudyExtension:
+    """Compare the three-frame solution with geometric methods, and test the two claims."""
+    return StudyExtension(
+        compare_methods(setup), average_repetitions(setup), effect_of_radius(setup)
+    )
+
+
+def _on_circle(radius: float, step: float) -> Array:
+    angles = step * np.arange(3.0)
+    return radius * np.stack((np.cos(angles), np.sin(angles)), axis=-1)
