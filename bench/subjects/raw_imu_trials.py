@@ -16,7 +16,7 @@ from jointfit_protocols.xbus import mtdata2
 from jointfit_protocols.xbus.mtdata2 import Item
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -101,3 +101,18 @@ def through_driver(felt: Sequence[Array], *, magnetometer: bool, settle_s: float
         if isinstance(item, ImuSample)
     ]
     return np.array(said)
+
+
+def output_by_sample(felt: Sequence[Array], kept: Iterable[int], *, settle_s: float) -> Array:
+    """Return q_world_sensor of each sample, with magnetometer; NaN where there is no output.
+
+    Only the messages of the samples `kept` arrive.
+    """
+    path = decoder(magnetometer=True, settle_s=settle_s)
+    sent = messages(felt)
+    q = np.full((len(sent), 4), np.nan)
+    for k in kept:
+        for item in path.feed(Chunk(k * PERIOD_NS, sent[k])):
+            if isinstance(item, ImuSample):
+                q[k] = item.q_world_sensor
+    return q

@@ -16,6 +16,14 @@ the error is 20 degrees in the first second and 4 degrees in the next two, and n
 (``gateway-orientation-start-in-motion``). No orientation is therefore returned until the filter has
 detected rest or has run for `SETTLE_S`.
 
+The heading from a magnetometer contains the error of the inclination, multiplied by the tangent of
+the dip of the field. While the filter settles it therefore runs without magnetometer. Then the
+retained readings are processed backwards, which gives the inclination at the start, and again
+forwards, backwards and forwards with the magnetometer, so that all of them contribute to the
+heading (``gateway-orientation-ten-starts``). Magnetometers are slower than gyroscopes: at 579
+degrees per second the delay of 13 ms of the recorded sensor is an error of 8 degrees. The delay is
+estimated from the retained readings and compensated.
+
 Invariant: a function of the readings fed, without a clock of its own: a replay yields identical
 orientations. Only this module imports ``vqf`` (an extra), and it contains no device.
 
@@ -32,6 +40,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from jointfit_daemon.model import Quaternion, Vector
 
 PACKAGE_MISSING = (
@@ -46,6 +56,13 @@ FASTEST = 200.0
 """Largest plausible angular rate, rad/s: 11 000 degrees per second."""
 HARDEST = 5000.0
 """Largest plausible specific force, m/s^2: 500 g."""
+RIDGE_RATE = 1.0
+"""Angular rate, rad/s, below which the delay of the magnetometer is not estimated: 2 % of the field
+in 20 ms."""
+MOST_DELAY_S = 0.05
+"""Largest delay of the magnetometer, s."""
+NO_FIELD = (0.0, 0.0, 0.0)
+"""Field of a reading without one, which the filter ignores."""
 _NS = 1e9
 
 
@@ -133,6 +150,8 @@ class GatewayOrientation:
         self._filter: Any = None
         self._last: RawReading | None = None
         self._period_ns = 0.0  # step for which the filter was created
+        self._delay_s = 0.0
+        self._withheld: list[tuple[Vector, Vector, Vector]] = []
         self._passed_ns = self._steps = 0
         self._turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -195,12 +214,13 @@ class GatewayOrientation:
                 oriented.clear()
             else:
                 self._started_ns = None
-                oriented = oriented[-1:]
+                oriented = [self._refine(reading)]
         return FilterStep(tuple(oriented), steps - 1, restarted=not followed)
 
     def _start(self, period_ns: float, t_ns: int) -> None:
         self._period_ns = period_ns
         self._started_ns = t_ns if self._settle_ns else None
+        self._withheld = []
         self._filter = import_module("vqf").VQF(period_ns / _NS)  # an extra
 
     def _update(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
@@ -211,13 +231,48 @@ class GatewayOrientation:
         self._rate[:] = (x * scale, y * scale, z * scale)
         self._force[:] = reading.force
 
-        vqf = self._filter
-        if self._magnetic and reading.magnetic is not None:
-            self._field[:] = reading.magnetic
-            vqf.update(self._rate, self._force, self._field)
+        if self._magnetic and self.settling:
+            fed = (x * scale, y * scale, z * scale)
+            self._withheld.append((fed, reading.force, reading.magnetic or NO_FIELD))
+            self._filter.update(self._rate, self._force)
+        elif self._magnetic and reading.magnetic is not None:
+            self._field[:] = _ahead(reading.magnetic, reading.rate, self._delay_s)
+            self._filter.update(self._rate, self._force, self._field)
         else:
-            vqf.update(self._rate, self._force)
+            self._filter.update(self._rate, self._force)
+        return self._output(reading, follows=follows)
 
+    def _refine(self, reading: RawReading) -> FilterOutput:
+        """Process the readings since the start again, twice backwards and forwards."""
+        withheld, self._withheld = self._withheld, []
+        if not withheld:
+            return self._output(reading)
+
+        rates, forces = (np.array([part[kind] for part in withheld]) for kind in (0, 1))
+        backwards = (np.ascontiguousarray(-rates[::-1]), np.ascontiguousarray(forces[::-1]))
+
+        # inclination at the start, and the delay of the magnetometer
+        self._run_backwards(*backwards)
+        q = self._filter.updateBatch(rates, forces)["quat6D"]
+        self._delay_s = _field_delay(q, rates, np.array([part[2] for part in withheld]))
+        fields = np.array([_ahead(field, rate, self._delay_s) for rate, _, field in withheld])
+
+        # heading from all readings
+        self._run_backwards(*backwards, np.ascontiguousarray(fields[::-1]))
+        self._filter.updateBatch(rates, forces, fields)
+        return self._output(reading)
+
+    def _run_backwards(self, *readings: NDArray[np.float64]) -> None:
+        """Process readings in reverse order, in which the gyroscope bias has the opposite sign."""
+        for values in (readings, None):
+            bias, sd = self._filter.getBiasEstimate()
+            self._filter.setBiasEstimate(-bias, sd)
+            if values is not None:
+                self._filter.updateBatch(*values)
+
+    def _output(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
+        """Return the present orientation, and the rate of a reading without bias."""
+        vqf = self._filter
         w, i, j, k = (vqf.getQuat9D() if self._magnetic else vqf.getQuat6D()).tolist()
         if not follows and not self._magnetic:
             self._turn = _heading_between((w, i, j, k), self._q)
@@ -227,8 +282,56 @@ class GatewayOrientation:
         if s != 0.0:
             self._q = (c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w)
 
+        x, y, z = reading.rate
         bx, by, bz = vqf.getBiasEstimate()[0].tolist()
         return FilterOutput(self._q, (x - bx, y - by, z - bz))
+
+
+def _field_delay(
+    q: NDArray[np.float64], rates: NDArray[np.float64], fields: NDArray[np.float64]
+) -> float:
+    r"""Return the delay of the magnetometer behind the gyroscope, s.
+
+    The field is constant in the world. With a delay d the measured field m, rotated to the world,
+    is to first order
+
+    .. math:: R m = m_w + d\, R (\omega \times m) ,
+
+    a linear regression. The ridge keeps d near zero without rotation: it is the ratio of a
+    disturbance of 2 % of the field to a delay of 20 ms.
+
+    Parameters
+    ----------
+    q : ndarray, shape (n, 4)
+        q_world_sensor; the heading is arbitrary.
+    rates, fields : ndarray, shape (n, 3)
+        Angular rates, rad/s, and fields in sensor axes; rows of zeros are missing fields.
+    """
+    known = fields.any(axis=1)
+    if not known.any():
+        return 0.0
+    q, rates, fields = q[known], rates[known], fields[known]
+
+    world, moved = (_rotated(q, v) for v in (fields, np.cross(rates, fields)))
+    world, moved = world - world.mean(axis=0), moved - moved.mean(axis=0)
+    ridge = RIDGE_RATE**2 * float(np.sum(fields**2))
+    delay_s = float(np.sum(world * moved)) / (float(np.sum(moved**2)) + ridge)
+    return min(max(delay_s, 0.0), MOST_DELAY_S)
+
+
+def _rotated(q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors rotated by quaternions."""
+    twice = 2.0 * np.cross(q[:, 1:], v)
+    return np.asarray(v + q[:, :1] * twice + np.cross(q[:, 1:], twice))
+
+
+def _ahead(field: Vector, rate: Vector, delay_s: float) -> Vector:
+    """Return the field that a sensor with this angular rate measures `delay_s` later."""
+    x, y, z = field
+    a, b, c = (-0.5 * delay_s * value for value in rate)
+    scale = 2.0 / (1.0 + a * a + b * b + c * c)
+    i, j, k = scale * (b * z - c * y), scale * (c * x - a * z), scale * (a * y - b * x)
+    return (x + i + b * k - c * j, y + j + c * i - a * k, z + k + a * j - b * i)
 
 
 def _heading_between(q_from: Quaternion, q_to: Quaternion) -> Quaternion:
