@@ -31,6 +31,7 @@ from jointfit_daemon.center_of_rotation.planar import (
     fit_circles,
     geometric_estimate,
     three_frame_center,
+    three_frame_mean_squares,
 )
 
 if TYPE_CHECKING:
@@ -79,6 +80,25 @@ def equal_steps(_: Path) -> list[Result]:
         rms = float(np.sqrt((three_frame_center(p) ** 2).sum(axis=1).mean()))
         ratio = rms / float(equal_step_error(alpha, 0.001))
         figures.append(Result(f"{step}°: simulated over predicted", ratio, 1.01, 0.99, ""))
+    return figures
+
+
+SIX_NOISES_M = 1e-3 * np.array([[0.3, 1.2], [0.8, 0.4], [1.5, 0.6]])
+"""Standard deviations of x and y in three frames, m."""
+
+
+def unequal_noise(_: Path) -> list[Result]:
+    """Mean squares along x and y for six standard deviations, and for one a frame."""
+    t = np.array([0.3, 1.4, 2.9])
+    drawn = np.random.default_rng(5).normal(size=(400_000, 3, 2))
+    figures = []
+    for label, noise in (("six", SIX_NOISES_M), ("one a frame", SIX_NOISES_M[:, :1])):
+        squares = (three_frame_center(arc_points(t, 0.2) + noise * drawn) ** 2).mean(axis=0)
+        ratios = np.sqrt(squares / three_frame_mean_squares(t, noise))
+        figures += [
+            Result(f"{label}, {axis}: simulated over predicted", float(ratio), 1.01, 0.99, "")
+            for axis, ratio in zip("xy", ratios, strict=True)
+        ]
     return figures
 
 
@@ -278,6 +298,12 @@ EXPERIMENTS = (
         "circle-error-prediction",
         "Predicted error of equal steps against 200 000 simulated runs",
         equal_steps,
+        SEEDED,
+    ),
+    Experiment(
+        "circle-unequal-noise",
+        "Predicted errors along x and y for unequal noise against 400 000 simulated runs",
+        unequal_noise,
         SEEDED,
     ),
     Experiment(
