@@ -241,17 +241,27 @@ def test_counter_that_stood_still_while_disconnected_is_no_restart() -> None:
     assert bench.devices()["S3"]["restarts"] == 0
 
 
-@pytest.mark.parametrize("begins_at", [0, 5, 600, 850, 1_000])
-def test_reconnect_with_changed_time_or_counter_discards_the_pose(
-    begins_at: int,
-) -> None:
+def moved_samples(begins_at: int) -> list[Event]:
+    """Return samples of S3 from number `begins_at` on that arrive after the port was opened."""
     later = at(922) - at(begins_at)
-    moved = [
+    return [
         ChunkArrived(one.source, Chunk(one.chunk.t_ns + later, one.chunk.data))
         for one in samples(["S3"], begins_at, begins_at + 40)
         if isinstance(one, ChunkArrived)
     ]
-    bench, notices = reconnected(moved)
+
+
+def test_device_that_counts_for_longer_than_the_port_was_closed_has_not_restarted() -> None:
+    bench, notices = reconnected(moved_samples(850))
+    assert notices == []
+    assert bench.devices()["S3"]["restarts"] == 0
+
+
+@pytest.mark.parametrize("begins_at", [0, 5, 600, 1_000])
+def test_reconnect_with_changed_time_or_counter_discards_the_pose(
+    begins_at: int,
+) -> None:
+    bench, notices = reconnected(moved_samples(begins_at))
     assert bench.devices()["S3"]["restarts"] == 1
     assert [(notice.id, notice.kind) for notice in notices] == [
         ("S3", "clock"),

@@ -54,6 +54,8 @@ class SourceState:
     """Reason of the last closing."""
     _withheld: dict[str, int] = field(default_factory=lambda: dict.fromkeys(WITHHELD, 0))
     _decoder: Decoder | None = None
+    _tick_clock: TickClock | None = None
+    """Time base of the decoder before, until the decoder has determined its own."""
 
     @classmethod
     def create(
@@ -101,6 +103,7 @@ class SourceState:
         if decoder is None:
             return []
         items = self._process(decoder.flush(), decoder)
+        self._tick_clock = decoder.tick_clock or self._tick_clock
         for name in WITHHELD:
             self._withheld[name] += getattr(decoder, name, 0)
         return items
@@ -166,7 +169,9 @@ class SourceState:
         self, decoded: list[Decoded], decoder: Decoder
     ) -> list[StampedMeasurement | Corrupt | DeviceEvent]:
         items: list[StampedMeasurement | Corrupt | DeviceEvent] = []
-        clock, tick_clock = self.clock, decoder.tick_clock
+        # A new decoder may need seconds to determine the unit of device time. Samples numbered by
+        # their counter meanwhile would look like another clock, that is, a restart.
+        clock, tick_clock = self.clock, decoder.tick_clock or self._tick_clock
         for item in decoded:
             if isinstance(item, _MEASUREMENTS):
                 stamped = self._stamp(item, tick_clock)

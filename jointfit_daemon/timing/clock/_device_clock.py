@@ -185,7 +185,9 @@ class DeviceClock:
 
     def feed_reopened(self) -> None:
         """Note that the port was reopened; the next sample shows whether the device restarted."""
-        self._away_since_ns = self._arrival_ns
+        # The instant of the last sample, because its arrival may have been delayed.
+        last_t = self._line.last_t if self._synced else None
+        self._away_since_ns = self._arrival_ns if last_t is None else last_t
         if isinstance(self._reader, TickTime):
             self._reader.forget_counter()
 
@@ -346,9 +348,17 @@ class DeviceClock:
         slack_ns = AWAY_SLACK_NS + _AWAY_SHARES[self._kind] * elapsed_ns
         if last_u is None or turn_ns is None or 0 < turn_ns < AWAY_TURNS * slack_ns:
             return _clock_events.UNKNOWN_AFTER_RECONNECT
-        if abs(u - last_u - elapsed_ns) > slack_ns:
-            return _clock_events.clock_reset_event(u - last_u, elapsed_ns)
-        return None
+        off_ns = u - last_u - elapsed_ns
+        if abs(off_ns) <= slack_ns:
+            return None
+
+        # Device time starts at 0. A device that has counted for longer than the port was closed did
+        # not restart meanwhile: an adapter or a buffer delayed its samples.
+        uptime_ns = u % turn_ns if turn_ns else u
+        counted = self._kind == _TICKS and uptime_ns > elapsed_ns + slack_ns
+        if counted and last_u < u and off_ns < 0:
+            return None
+        return _clock_events.clock_reset_event(u - last_u, elapsed_ns)
 
     def _impossible(self, u: int, arrival_ns: int) -> ClockEvent | None:
         """Return the event if a sample contradicts the fit: too early, or permanently late."""

@@ -5,8 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import pytest
+
 from jointfit_daemon.config import load_rig
-from jointfit_daemon.model import Chunk
+from jointfit_daemon.model import Chunk, DeviceEvent
 from jointfit_daemon.pipeline.sources import SourceState, StampedMeasurement
 from jointfit_protocols import xcdi
 from jointfit_protocols.can import CanFrame, pack_frames
@@ -20,6 +22,45 @@ HOUR_NS = 3_600_000_000_000
 
 def can_source() -> Source:
     return next(source for source in load_rig(EXAMPLE).sources if source.id == "S2")
+
+
+def restarts_after_reopening(pause_s: float, stall_s: float) -> tuple[list[str], int]:
+    """Close and reopen a sensor that goes on counting; return restart events and their count.
+
+    The samples of the first `stall_s` after the pause arrive at once, so that the decoder needs
+    longer to determine the unit of device time.
+    """
+    state = SourceState.create(can_source())
+    events: list[str] = []
+    k, start_ns = 0, 5_000_000_000
+
+    def play(seconds: float, late_until_ns: int = 0) -> None:
+        nonlocal k
+        for _ in range(round(seconds * 100)):
+            k += 1
+            t_ns = max(start_ns + k * 10_000_000, late_until_ns)
+            events.extend(
+                item.text
+                for item in state.feed(group(t_ns, t_ns, k))
+                if isinstance(item, DeviceEvent) and item.kind == "restart"
+            )
+
+    state.start()
+    play(20.0)
+    state.stop()
+    k += round(pause_s * 100)
+    state.start()
+    play(stall_s, start_ns + k * 10_000_000 + round(stall_s * 1e9))
+    play(5.0)
+    return events, state.counts.restarts
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 1.5, 5.0])
+@pytest.mark.parametrize("stall_s", [0.0, 0.3, 1.8])
+def test_reopened_sensor_that_continued_counting_has_not_restarted(
+    pause_s: float, stall_s: float
+) -> None:
+    assert restarts_after_reopening(pause_s, stall_s) == ([], 0)
 
 
 def group(t_ns: int, stamp_ns: int, k: int) -> Chunk:
