@@ -271,7 +271,11 @@ def handle_message(tracker: PhaseTracker, topic: str, payload: dict[str, Any]) -
         return tracker.on_state(payload.get("state"))
 
     # Events of the calibration at level "warning" repeat the status line.
-    urgent = {"device": ("warning", "error"), "calibration": ("error",)}
+    urgent = {
+        "device": ("warning", "error"),
+        "state": ("warning", "error"),
+        "calibration": ("error",),
+    }
     if payload.get("level") not in urgent.get(str(payload.get("kind")), ()):
         return None
     if text == tracker.status.get("text") and not sys.stderr.isatty():

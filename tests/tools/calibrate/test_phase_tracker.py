@@ -132,6 +132,12 @@ def test_result_that_is_not_stored_is_printed_once(
     assert sum(line is not None for line in printed) == 1
 
 
+def test_state_directory_without_write_access_is_printed() -> None:
+    text = "state directory cannot be written: no permission"
+    event = {"kind": "state", "level": "error", "id": "bench", "text": text}
+    assert _command.handle_message(tracker_after(), "bridge/event", event) == f"bench: {text}"
+
+
 async def interrupted(phase: str, *states: Mapping[str, object]) -> object:
     """Return the status that ends `phase` if the daemon was offline before `states`."""
     one = tracker_after("calibrated", phase)
