@@ -27,7 +27,9 @@ from debian_root import CACHE, SEARCH, RootBuildError, bootstrap, kept, run
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGES = ("python3", "python3-venv", "make", "git", "ca-certificates")
-COMMAND = "make test && make demo ARGS='--headless --seconds 20'"
+DEMO = "make demo ARGS='--headless --seconds 20'"
+COMMAND = f"make test && {{ {DEMO} || {{ echo 'the demo failed: once more'; {DEMO}; }}; }}"
+"""The demo is judged in real time, which another guest of the machine can disturb once."""
 UPTIME_S = 60
 HOME = Path("/home/stranger")
 PIP_CONFIGURATIONS = (
