@@ -20,11 +20,16 @@ from pathlib import Path
 
 from numpy._core import _multiarray_umath as umath  # type: ignore[attr-defined]  # no stub
 
-CORE = (
-    "timing", "kinematics", "center_of_rotation", "limb_model", "fusion", "calibration",
-    "pipeline",
-)  # fmt: skip
-TESTS = [f"tests/{name}" for name in CORE]
+TESTS = [
+    f"tests/{name}"
+    for name in (
+        "timing/lag", "timing/alignment", "kinematics", "center_of_rotation", "limb_model",
+        "fusion", "calibration", "pipeline/calibration_session", "pipeline/online_learning",
+        "pipeline/sources",
+    )
+]  # fmt: skip
+"""Tests of packages that compute with numpy. Plain Python, such as the device clocks and the frames
+of the core, rounds alike on all processors."""
 CORE_TYPES = {"Nehalem": "sse4_2", "Haswell": "avx2", "SkylakeX": "avx512f", "Zen": "avx2"}
 """Kernels of OpenBLAS, and the flag of /proc/cpuinfo that a processor needs for them."""
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # The suite draws the same inputs in every run, so that it passes on all machines or on none; new
 # ones are searched with HYPOTHESIS_PROFILE=search and `make fuzz`. No deadline: load may be high.
 settings.register_profile("suite", deadline=None, derandomize=True, max_examples=50)
-settings.register_profile("few", deadline=None, derandomize=True, max_examples=20)
+settings.register_profile("few", deadline=None, derandomize=True, max_examples=10)
 settings.register_profile("search", deadline=None, max_examples=500)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "suite"))
 
