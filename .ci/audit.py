@@ -1,6 +1,6 @@
-"""Ask the Python vulnerability service whether anything in requirements.lock is known to be unsafe.
+"""Query the Python vulnerability service for the distributions of requirements.lock.
 
-Law: a service that cannot be reached proves nothing and fails nothing; it is said.
+An unreachable service is reported and does not fail the check.
 """
 
 import json
@@ -15,7 +15,7 @@ PATIENCE_S = 10.0
 
 
 def main() -> int:
-    """Print what is known; 1 if anything is."""
+    """Print the known vulnerabilities; return 1 if there are any."""
     try:
         socket.create_connection(SERVICE, PATIENCE_S).close()
     except OSError as error:

@@ -1,7 +1,7 @@
 """Check Debian packages without installing them: `check_deb.py PACKAGE...`.
 
-Every library is of the package's architecture, every file is listed with its checksum, and nothing
-tells of the machine that built it.
+Every library must have the architecture of the package, every file must be listed with its
+checksum, and no file may contain paths of the machine that built it.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ NEEDED = (
 
 
 def faults(package: Path) -> Iterator[str]:
-    """Yield what is wrong with a package."""
+    """Yield the defects of a package."""
     with tempfile.TemporaryDirectory(prefix="check-deb-") as folder:
         tree = Path(folder)
         subprocess.run(["dpkg-deb", "-R", str(package), folder], check=True)  # noqa: S603, S607 - Debian's
@@ -43,9 +43,9 @@ def faults(package: Path) -> Iterator[str]:
 
 
 def faults_of(name: str, content: bytes, machine: int, md5: str) -> Iterator[str]:
-    """Yield what is wrong with a file of a package."""
+    """Yield the defects of a file of a package."""
     if hashlib.md5(content).hexdigest() != md5:  # noqa: S324 - dpkg's format
-        yield f"{name}: another checksum than md5sums says"
+        yield f"{name}: checksum differs from md5sums"
     if content[:4] == b"\x7fELF" and int.from_bytes(content[18:20], "little") != machine:
         yield f"{name}: for another machine"
     if str(ROOT).encode() in content or b"/tmp/jointfitd-deb-" in content:
@@ -53,7 +53,7 @@ def faults_of(name: str, content: bytes, machine: int, md5: str) -> Iterator[str
 
 
 def main() -> int:
-    """Print what is wrong; 1 if anything is."""
+    """Print the defects; return 1 if there are any."""
     packages = [Path(word) for word in sys.argv[1:]]
     wrong = [f"{package.name}: {fault}" for package in packages for fault in faults(package)]
     print(*wrong, f"{len(packages)} packages, {len(wrong)} faults", sep="\n")

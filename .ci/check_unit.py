@@ -8,7 +8,7 @@ from pathlib import Path
 UNITS = sorted((Path(__file__).resolve().parents[1] / "systemd").glob("jointfitd*.service"))
 THRESHOLD = "14"  # tenths, as systemd-analyze counts
 ELSEWHERE = "/usr/bin/jointfitd"
-"""What ExecStart names; it is not installed where the unit is only checked."""
+"""Program of ExecStart; it is not installed where the unit is only checked."""
 
 
 def analyze(unit: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -22,16 +22,16 @@ def analyze(unit: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def complaints(unit: Path) -> list[str]:
-    """Return what is wrong with a unit."""
-    said = analyze(unit, "verify", "--man=no").stderr.splitlines()
-    wrong = [line for line in said if "jointfitd" in line and ELSEWHERE not in line]
+    """Return the defects of a unit."""
+    lines = analyze(unit, "verify", "--man=no").stderr.splitlines()
+    wrong = [line for line in lines if "jointfitd" in line and ELSEWHERE not in line]
     security = analyze(unit, "security", "--offline=yes", f"--threshold={THRESHOLD}", "--no-pager")
     print(*security.stdout.splitlines()[-1:], security.stderr.strip())
     return wrong + ([f"{unit.name}: too much exposed"] if security.returncode else [])
 
 
 def main() -> int:
-    """Print what is wrong; 1 if anything is."""
+    """Print the defects; return 1 if there are any."""
     if shutil.which("systemd-analyze") is None:
         print("systemd-analyze is not installed: apt install systemd")
         return 1

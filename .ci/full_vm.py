@@ -44,7 +44,7 @@ START = (
 
 
 def main() -> int:
-    """Make what is missing, boot, judge."""
+    """Build the missing parts, boot, and evaluate the reports."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--deb", type=Path, help="the package (default: built now)")
     parser.add_argument("--image", type=Path, help="the disk (default: this week's, see vm_image)")
@@ -80,7 +80,7 @@ def build_deb(work: Path, *extra: str) -> Path:
 
 
 def fill(share: Path, deb: Path, tests: list[str]) -> None:
-    """Put into the folder that the guest sees what it needs, and nothing of an earlier run."""
+    """Fill the folder shared with the guest; remove files of an earlier run."""
     share.mkdir(parents=True, exist_ok=True)
     for leftover in ("junit.xml", "pytest.log", "guest.log", "journal.txt", "console.log"):
         (share / leftover).unlink(missing_ok=True)
@@ -92,7 +92,7 @@ def fill(share: Path, deb: Path, tests: list[str]) -> None:
 
 
 def make_newer(deb: Path, newer: Path) -> None:
-    """Write the same package with a higher version: what an upgrade installs."""
+    """Write the same package with a higher version, for the upgrade."""
     with tempfile.TemporaryDirectory(prefix="newer-deb-") as scratch:
         tree = Path(scratch) / "tree"
         subprocess.run(["dpkg-deb", "-R", str(deb), str(tree)], check=True)  # noqa: S603, S607 - Debian's
@@ -112,7 +112,7 @@ def make_newer(deb: Path, newer: Path) -> None:
 
 
 def run(work: Path, disk: Path, share: Path, memory: str, limit_s: float) -> int:
-    """Boot and return the judgement."""
+    """Boot; return the exit status."""
     service = START.format(no_result=uml.NO_RESULT, share=share)
     guest = uml.NO_AVX if uml.has_amx() else {}
     command = [

@@ -85,7 +85,7 @@ def main() -> int:
 
 
 def arguments() -> argparse.Namespace:
-    """Return what the command line asks for."""
+    """Return the arguments of the command line."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--time-limit", type=float, default=180.0, help="seconds, whole run")
     parser.add_argument("--memory", default="512M", help="memory of the guest")
@@ -96,7 +96,7 @@ def arguments() -> argparse.Namespace:
 
 
 def mounts(out: Path) -> list[str]:
-    """Return the shell lines that hide the host's volatile folders and show what is needed."""
+    """Return shell lines that hide the host's volatile folders and mount the needed ones back."""
     needed = {CHECKOUT, Path(sys.prefix), Path(sys.base_prefix)}
     shared = CHECKOUT.parent / "shared" / "data"
     if shared.is_dir():

@@ -1,4 +1,4 @@
-"""Print the installed distributions as constraints: what CI and `make` install, exactly.
+"""Print the installed distributions as constraints: the exact versions for CI and `make`.
 
 A constraint installs nothing by itself: a line for something that a machine does not need is
 without effect there. But every line must fit every Python that the project supports: Debian 12

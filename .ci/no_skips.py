@@ -16,7 +16,7 @@ NOT_INSTALLABLE = (
     "vectors.json is not here",
     "loopback carries no multicast here",
 )
-"""Reasons of tests that a clean machine may skip; they are counted and told."""
+"""Reasons of tests that a clean machine may skip; they are counted and printed."""
 NOT_IN_MINIMAL = tuple(
     f"(Debian: apt install {package})" for package in ("mosquitto", "systemd", "groff-base")
 )
@@ -35,7 +35,7 @@ def skipped(cases: list[ET.Element]) -> list[tuple[str, str]]:
 
 
 def main(words: list[str]) -> int:
-    """Print what was skipped; return 1 if anything was that must not be, or if nothing ran."""
+    """Print the skipped tests; return 1 if one of them had to run, or if no test ran."""
     reports = [Path(word) for word in words if word != "--minimal"]
     allowed = NOT_INSTALLABLE + (NOT_IN_MINIMAL if "--minimal" in words else ())
     trees = [ET.parse(report) for report in reports]  # noqa: S314 - pytest's, just made

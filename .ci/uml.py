@@ -39,7 +39,7 @@ NO_AVX = {
 
 
 def say(text: str) -> None:
-    """Tell what is done; flushed, for it mixes with the guest's console."""
+    """Print one line, flushed because it mixes with the guest's console."""
     print(f"{Path(sys.argv[0]).stem}: {text}", flush=True)
 
 
@@ -161,7 +161,7 @@ def exit_status(code: int) -> int:
 
 
 def judge(code: int, report: Path) -> int:
-    """Return the exit status: pytest's, unless the report says less was tested than asked."""
+    """Return the exit status: pytest's, or 1 if the report lacks or skipped a test."""
     if code == TIMED_OUT:
         return code
     if not report.is_file():
