@@ -170,7 +170,9 @@ class MocapSettings(Settings):
         default_factory=dict, description="rigid body of each segment, instead of markers"
     )
     plate: str | None = Field(
-        None, description="rigid body of the plate that carries the sensors in the align phase"
+        None,
+        min_length=1,
+        description="rigid body of the plate that carries the sensors in the align phase",
     )
     silence_s: float = Field(
         1.0, gt=0, description="time without a datagram after which the server counts as lost, s"

@@ -3,7 +3,7 @@
 Invariant: degrees and millimetres exist in this package only; no device is opened here.
 """
 
-from jointfit_daemon.config._checks import drifting_imus, heading_warning
+from jointfit_daemon.config._checks import drifting_imus, heading_warning, missing_files
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._load import load_rig, parse_rig
 from jointfit_daemon.config._rig import Rig, Source
@@ -22,6 +22,7 @@ __all__ = [
     "faults_of",
     "heading_warning",
     "load_rig",
+    "missing_files",
     "parse_rig",
     "rig_schema",
 ]

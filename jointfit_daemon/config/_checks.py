@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from jointfit_daemon.config._rig import Source
-    from jointfit_daemon.config._tables import ChainTable
+    from jointfit_daemon.config._tables import ChainTable, MqttSettings
     from jointfit_daemon.driver import CanBusSettings, MocapSettings
 
 _FORBIDDEN = "+#/"
@@ -213,6 +213,23 @@ def check_can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
                 if derived:
                     text = f"{text}. It is{derived}: set it to an unused one"
                 yield Fault(f"imu[{source.id}].ids.{message}", text)
+
+
+def missing_files(mqtt: MqttSettings) -> list[str]:
+    """Return a warning for every configured file that does not exist.
+
+    It is no fault: the files may be created after the check, or by another user.
+    """
+    tls = mqtt.tls
+    files = {"password_file": mqtt.password_file, "request_key_file": mqtt.request_key_file}
+    if tls is not None:
+        files |= {"tls.ca": tls.ca, "tls.cert": tls.cert, "tls.key": tls.key}
+    return [
+        f"mqtt.{key} = {path!r}: no such file; create it before the daemon starts, or correct the "
+        "name"
+        for key, path in files.items()
+        if path is not None and not os.path.exists(path)  # noqa: PTH110 - NUL returns False
+    ]
 
 
 def drifting_imus(sources: Sequence[Source]) -> frozenset[str]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import PydanticUndefined
 
 from jointfit_daemon.nearest_name import nearest_name
 
@@ -41,6 +42,11 @@ class Fault:
     def has_value(self) -> bool:
         """Whether the fault concerns an existing value, not a missing one."""
         return self.value is not _NO_VALUE
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return its attributes for JSON; ``value`` exists only if the fault has one."""
+        fields = {"key": self.key, "expected": self.expected, "near": self.near}
+        return fields | {"value": self.value} if self.has_value else fields
 
     def text(self) -> str:
         """Return the message, one line."""
@@ -100,11 +106,27 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
             return Fault(
                 path, f"expected {choices}", detail["input"], nearest_name(detail["input"], words)
             )
+        case "model_type" | "model_attributes_type" | "dict_type":
+            return Fault(path, f"expected a table{_example(model, loc)}", detail["input"])
         case _:
             name = next((part for part in reversed(loc) if part in fields), loc[-1] if loc else "")
             why = f" ({about})" if (about := _described(fields, name)) else ""
             text = detail["msg"].removeprefix("Value error, ").removeprefix("Input ")
-            return Fault(path, f"{text[:1].lower()}{text[1:]}{why}", detail["input"])
+            expected = f"{text[:1].lower()}{text[1:]}{why}"
+            # A check of a whole table names the keys; the table itself would be cut.
+            whole = detail["type"] == "value_error" and isinstance(detail["input"], dict)
+            return Fault(path, expected, _NO_VALUE if whole else detail["input"])
+
+
+def _example(model: type[BaseModel], loc: Sequence[int | str]) -> str:
+    """Return an example of the table at `loc`, from the first key of its model."""
+    inner = _model_at(model, loc)
+    if inner is None or not inner.model_fields:
+        return ""
+    name, field = next(iter(inner.model_fields.items()))
+    value = (field.examples or [field.default])[0]
+    shown = '"…"' if value is None or value is PydanticUndefined else value
+    return f", such as {loc[-1]} = {{ {name} = {shown} }}" if loc else ""
 
 
 def join(key: str, loc: Sequence[int | str]) -> str:

@@ -14,6 +14,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from jointfit_daemon.calibration import CalibrationSettings
 from jointfit_daemon.config import _bandwidth, _checks
+from jointfit_daemon.config._bus_faults import complete_bus, likely_interface, unknown_interface
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._rig import MOCAP, Rig, Source
 from jointfit_daemon.config._syntax import read_table
@@ -135,6 +136,8 @@ class _RigReader:
         """Tables with faults, by key, as partial models for the checks across tables."""
         self.imus_read: list[Source] = []
         """All IMUs whose tables could be read, even with faults."""
+        self.imus_with_load: list[Source] = []
+        """IMUs of `imus_read` whose load is known: their faults concern names only."""
         for key in table:
             if key not in SECTIONS:
                 known = f"unknown table; known: {', '.join(SECTIONS)}"
@@ -158,8 +161,12 @@ class _RigReader:
         # Checks across tables, even if some of them have faults.
         self.faults += _checks.check_ports(self.imus_read, buses)
         self.faults += _checks.check_can_ids(self.imus_read)
-        self.faults += _bandwidth.check_serial_lines(sources)
-        self.faults += _bandwidth.check_can_buses(sources, buses)
+        reported = {fault.key for fault in self.faults}  # a wrong bit rate has no load
+        loads = [
+            *_bandwidth.check_serial_lines(self.imus_with_load),
+            *_bandwidth.check_can_buses(self.imus_with_load, buses),
+        ]
+        self.faults += [fault for fault in loads if fault.key not in reported]
         self.faults += self._names()
         if limb is not None:
             self.faults += _checks.check_chain(limb)
@@ -224,12 +231,17 @@ class _RigReader:
             return {}
         buses = {}
         for at, name in enumerate(tables):
-            bus = self._validate(f"can.{name}", tables[name], CanBusSettings)
-            partial = self.partial.get(f"can.{name}")
+            key, table = f"can.{name}", tables[name]
+            kind = table.get("interface") if isinstance(table, dict) else None
+            if isinstance(kind, str) and (text := unknown_interface(kind)) is not None:
+                self.faults.append(Fault(f"{key}.interface", text, kind))
+                table = table | {"interface": likely_interface(kind)}
+
+            bus = self._validate(key, table, CanBusSettings)
+            partial = self.partial.get(key)
             if bus is None and partial is not None:
-                # Replacement of a wrong channel, so that identifiers and load are still checked.
-                bus = partial.model_copy(update={"channel": f"unknown{at}"})
-            if bus is not None and None not in dict(bus).values():
+                bus = complete_bus(partial, f"unknown{at}")
+            if bus is not None:
                 buses[name] = bus
         return buses
 
@@ -244,31 +256,40 @@ class _RigReader:
         for at, imu in enumerate(tables, 1):
             key = f"imu[{imu.get('id', f'#{at}')}]"
             driver = self._driver(key, imu, ImuSettings)
-            table = self._with_bus(key, imu, buses)
+            has_bus = driver is None or "can" in driver.Settings.model_fields
+            table = self._with_bus(key, imu, buses) if has_bus else imu
             settings = self._settings(key, table, driver, ImuSettings)
             if driver is not None and settings is not None:
                 found.append(_imu_source(imu["driver"], settings, driver))
 
             known = settings or self.partial.get(key)
             if driver is not None and known is not None and known.id is not None:
-                self.imus_read.append(_imu_source(imu["driver"], known, driver))
+                source = _imu_source(imu["driver"], known, driver)
+                self.imus_read.append(source)
+                if imu.keys() <= driver.Settings.model_fields.keys() and _has_load(known):
+                    self.imus_with_load.append(source)
         return found
 
     def _with_bus(
         self, key: str, imu: dict[str, Any], buses: Mapping[str, CanBusSettings]
     ) -> dict[str, Any]:
         """Replace the name of a bus by its ``[can.NAME]`` table."""
-        name = imu.get("can")
-        if not isinstance(name, str):
+        if "can" not in imu:
             return imu
-        if name in buses:
+        name = imu["can"]
+        if isinstance(name, str) and name in buses:
             return imu | {"can": buses[name].model_dump()}
+
         named = self.table.get("can", {})
-        if isinstance(named, dict) and name not in named:
-            text = f"no table [can.{name}]; known: {', '.join(buses) or 'none'}"
-            self.faults.append(Fault(f"{key}.can", text, name, nearest_name(name, buses)))
-        # The fault is already reported: any valid bus can replace it.
-        return imu | {"can": CanBusSettings(channel="unknown").model_dump()}
+        if not isinstance(name, str):
+            text = "expected the name of a [can.NAME] table"
+            self.faults.append(Fault(f"{key}.can", text, name))
+        elif isinstance(named, dict) and name not in named:
+            text = f"no table [can.{name}]; known: {', '.join(named) or 'none'}"
+            self.faults.append(Fault(f"{key}.can", text, name, nearest_name(name, named)))
+        # The fault is already reported: a valid bus of its own replaces it.
+        bus = CanBusSettings(interface="virtual", channel=f"unknown {name}")
+        return imu | {"can": bus.model_dump()}
 
     def _driver(
         self, key: str, table: dict[str, Any], base: type[BaseModel]
@@ -315,6 +336,14 @@ class _RigReader:
             return None
         rate = getattr(settings, "rate_hz", None) or head.output_rate_hz
         return Source(MOCAP, "mocap", table["driver"], rate, None, settings, driver)
+
+
+def _has_load(settings: BaseModel) -> bool:
+    """Return whether only required keys have faults: names, which do not change the load."""
+    return all(
+        getattr(settings, name) is not None or field.is_required() or field.default is None
+        for name, field in type(settings).model_fields.items()
+    )
 
 
 def _imu_source(name: str, settings: Any, driver: type[Driver]) -> Source:

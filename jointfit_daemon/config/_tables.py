@@ -160,6 +160,13 @@ class MqttSettings(Settings):
     joint_hz: float = Field(1.0, gt=0, le=1, description="rate of the topics joint/NAME, Hz")
     health_s: float = Field(10.0, gt=0, le=60, description="interval of the topic bridge/health, s")
 
+    @field_validator("host")
+    @classmethod
+    def _check_host(cls, host: str) -> str:
+        if any(letter.isspace() or letter == "/" for letter in host):
+            raise ValueError("expected one name or address without spaces and slashes")
+        return host
+
     @field_validator("insecure")
     @classmethod
     def _check_insecure(cls, insecure: bool, info: ValidationInfo) -> bool:

@@ -18,21 +18,27 @@ def check(
 ) -> None:
     """Check a rig.toml: print all faults, or a summary. Opens no device or connection."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
-    from jointfit_daemon.config import ConfigError, heading_warning, load_rig
+    from jointfit_daemon.config import ConfigError, heading_warning, load_rig, missing_files
     from jointfit_daemon.driver import driver_names
 
     try:
         rig = load_rig(config)
     except ConfigError as fault:
         if json:
-            typer.echo(orjson.dumps({"ok": False, "faults": list(fault.faults)}, default=str))
+            faults = [each.as_dict() for each in fault.faults]
+            typer.echo(orjson.dumps({"ok": False, "faults": faults}, default=str))
         else:
             typer.echo(str(fault), err=True)
         raise typer.Exit(EXIT_MISUSE) from None
+
+    heading = heading_warning(rig.sources)
+    warnings = [*missing_files(rig.mqtt), *([] if heading is None else [heading])]
     if json:
-        typer.echo(orjson.dumps({"ok": True, "rig": rig.table}, default=str))
+        result = {"ok": True, "rig": rig.table, "warnings": warnings}
+        typer.echo(orjson.dumps(result, default=str))
         return
 
     table = Table(title=f"{config}: rig {rig.name!r} is valid", title_justify="left")
@@ -48,6 +54,6 @@ def check(
         f"mqtt://{rig.mqtt.host}:{rig.mqtt.tcp_port}/{rig.mqtt.base}, calibration "
         f"store {rig.calibration_store!r}, method {rig.calibration.method}"
     )
-    if (warning := heading_warning(rig.sources)) is not None:
-        console.print(f"[yellow]warning:[/] {warning}")
+    for warning in warnings:
+        console.print(f"[yellow]warning:[/] {escape(warning)}")
     console.print(f"installed drivers: {', '.join(driver_names())}")

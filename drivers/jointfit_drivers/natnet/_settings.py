@@ -46,6 +46,16 @@ class NatNetSettings(MocapSettings):
     )
     silence_s: float = Field(5.0, gt=0, description="no frame for this long is a lost server, s")
 
+    @field_validator("server")
+    @classmethod
+    def _server_with_a_name(cls, server: str) -> str:
+        """Refuse text that is neither an address nor a host name."""
+        if not server or any(letter.isspace() or letter in "/:" for letter in server):
+            raise ValueError(
+                "expected one address or name without spaces, slashes and port, as 192.168.1.20"
+            )
+        return server
+
     @field_validator("interface")
     @classmethod
     def _interface_that_can_exist(cls, interface: str | None) -> str | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings, ImuSettings, Settings, Wire
@@ -99,24 +99,27 @@ class XcdiSettings(ImuSettings):
         description="its identifiers; required in effect when two sensors share a bus",
     )
     extended_ids: bool = Field(
-        False, description="29-bit identifiers even where the numbers would fit 11 bits"
+        False,
+        validate_default=True,
+        description="29-bit identifiers even where the numbers would fit 11 bits",
     )
     sample_time_unit: Literal["auto", "100us", "1us"] = Field(
         "auto", description="unit of SampleTime; auto decides from ten groups or more"
     )
     byte_order: Literal["big", "little"] = Field("big", description="byte order of the payloads")
 
-    @model_validator(mode="after")
-    def _fits_its_identifiers(self) -> Self:
-        """Refuse 11-bit identifiers out of range."""
-        for name, number in self.ids:
-            if number is not None and number > STANDARD_MAX and not self.extended_ids:
+    @field_validator("extended_ids")
+    @classmethod
+    def _fits_its_identifiers(cls, extended_ids: bool, info: ValidationInfo) -> bool:
+        """Refuse 11-bit identifiers out of range, even if another key has a fault."""
+        for name, number in info.data.get("ids", ()):
+            if number is not None and number > STANDARD_MAX and not extended_ids:
                 raise ValueError(
                     f"ids.{name} = 0x{number:X} is above 0x{STANDARD_MAX:X}, the greatest 11-bit "
                     "identifier: correct it, or set extended_ids = true if the sensor sends 29-bit "
                     "identifiers"
                 )
-        return self
+        return extended_ids
 
     @field_validator("can")
     @classmethod

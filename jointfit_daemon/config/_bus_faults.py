@@ -1,0 +1,61 @@
+"""Replacement of wrong keys in a ``[can.NAME]`` table, so that its other faults are found, too."""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from typing import Any
+
+from pydantic import ValidationError
+
+from jointfit_daemon.driver import CanBusSettings, driver_names, find_driver
+
+_CLOSE = 0.8
+"""Least similarity, 0 to 1, at which a misspelled interface is checked as the one it resembles."""
+
+
+def unknown_interface(interface: str) -> str | None:
+    """Return the reason why all drivers for CAN refuse `interface`; None if one accepts it.
+
+    Drivers know the interfaces that can be opened. They are asked independently of the sensors of
+    the rig, so that a bus without sensors is checked, and one fault is reported for each bus.
+    """
+    reason = None
+    for name in driver_names():
+        try:
+            model = find_driver(name).Settings
+        except Exception:  # noqa: BLE001, S112 - a broken plug-in is a fault of its users only
+            continue
+        if "can" not in model.model_fields:
+            continue
+
+        text = _refusal(model, CanBusSettings(interface=interface, channel="can0"))
+        if text is None:
+            return None
+        reason = reason or text
+    return reason
+
+
+def _refusal(model: Any, bus: CanBusSettings) -> str | None:
+    try:
+        model.model_validate({"can": bus})
+    except ValidationError as error:
+        for detail in error.errors():
+            if detail["loc"] == ("can",):
+                return detail["msg"].removeprefix("Value error, ")
+    return None
+
+
+def likely_interface(interface: str) -> str:
+    """Return the interface that replaces an unknown one: `virtual` accepts every other key."""
+    return next(iter(get_close_matches(interface, ("socketcan", "slcan"), 1, _CLOSE)), "virtual")
+
+
+def complete_bus(partial: CanBusSettings, channel: str) -> CanBusSettings:
+    """Return the bus of a table with faults; its wrong keys, None in `partial`, are replaced.
+
+    The values cause no further fault. `channel` must be unique, because sensors are compared on
+    equal buses only.
+    """
+    valid = dict(CanBusSettings(interface="virtual", channel=channel))
+    wrong = [name for name, value in partial if value is None and name in valid]
+    return partial.model_copy(update={name: valid[name] for name in wrong})

@@ -1,0 +1,170 @@
+"""A fault of rig.toml hides no other fault, and its message has no internals."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import TYPE_CHECKING, Any
+
+import orjson
+import pytest
+from typer.testing import CliRunner
+
+from jointfit_daemon.config import ConfigError, missing_files, parse_rig
+from jointfit_daemon.tools.__main__ import app
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+RIG = """
+[rig]
+name = "bench"
+[chain]
+joints = ["hip", "knee", "ankle"]
+segments = ["thigh", "shank"]
+[[imu]]
+id = "S1"
+segment = "thigh"
+driver = "xbus"
+port = "/dev/ttyUSB0"
+[[imu]]
+id = "S3"
+segment = "shank"
+driver = "xcdi"
+can = "can1"
+[[imu]]
+id = "S4"
+segment = "shank"
+driver = "xcdi"
+can = "can1"
+ids = { sample_time = 0x105, group_counter = 0x106, quaternion = 0x121 }
+[can.can1]
+channel = "can0"
+"""
+MOCAP = '[mocap]\ndriver = "natnet"\nserver = "192.168.1.20"\n'
+
+
+def complaints(text: str) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        parse_rig(tomllib.loads(text))
+    return [fault.text() for fault in caught.value.faults]
+
+
+def check(folder: Path, text: str, *options: str) -> Any:
+    path = folder / "rig.toml"
+    path.write_text(text, encoding="utf-8")
+    return CliRunner().invoke(app, ["check", str(path), *options])
+
+
+def in_bus(text: str, keys: str) -> str:
+    """Return `text` with other keys in the table of the bus."""
+    return text.replace('[can.can1]\nchannel = "can0"\n', f"[can.can1]\n{keys}\n")
+
+
+MISSPELLED = 'interface = "sockettcan"\nchannel = "can0"'
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (in_bus(RIG.replace("0x121", "0x921"), MISSPELLED),
+         ["can.can1.interface = 'sockettcan': no CAN interface", "0x921 is above 0x7FF"]),
+        (in_bus(RIG.replace("ids =", "# ids ="), MISSPELLED),
+         ["can.can1.interface", "imu[S4].ids.sample_time: id 0x5", "imu[S4].ids.group_counter",
+          "imu[S4].ids.quaternion", "imu[S4].ids.status_word", "imu[S4].ids.error"]),
+        (in_bus(RIG, 'interface = "sockettcan"\nchannel = "can 0"'),
+         ["can.can1.interface", "can.can1.channel = 'can 0': expected the name of a network"]),
+        (in_bus(RIG, 'interface = "slcann"\nchannel = "/dev/ttyACM0"\nbitrate = 123456'),
+         ["can.can1.interface", "can.can1.bitrate = 123456: not a bit rate of SLCAN"]),
+        (in_bus(RIG, 'interface = "slcann"\nchannel = "/dev/ttyACM0"'), ["did you mean 'slcan'?"]),
+        (in_bus(RIG, 'interface = "x"\nchannel = "/dev/x"\nbitrate = 123456'),
+         ["can.can1.interface"]),
+    ],
+)  # fmt: skip
+def test_a_misspelled_interface_is_one_fault_and_hides_no_other(
+    text: str, expected: list[str]
+) -> None:
+    found = complaints(text)
+    assert len(found) == len(expected), found
+    for part in expected:
+        assert any(part in line for line in found), found
+
+
+def test_an_empty_port_does_not_hide_an_insufficient_bit_rate() -> None:
+    found = complaints(RIG.replace('"/dev/ttyUSB0"', '""\nbaud = 9600'))
+    assert [line.split(":")[0] for line in found] == ["imu[S1].port = ''", "imu[S1].baud = 9600"]
+
+
+@pytest.mark.parametrize("wrong", ["rate_hz = 99.5", 'transport = "usbb"', "bawd = 921600"])
+def test_the_load_is_not_checked_while_a_key_that_changes_it_is_wrong(wrong: str) -> None:
+    assert len(complaints(RIG.replace('"/dev/ttyUSB0"', f'"/dev/a"\nbaud = 9600\n{wrong}'))) == 1
+
+
+def test_a_wrong_bit_rate_is_one_fault_and_its_bus_exists() -> None:
+    found = complaints(in_bus(RIG, 'channel = "can 0"\nbitrate = 123'))
+    assert [line.split(" =")[0] for line in found] == ["can.can1.channel", "can.can1.bitrate"]
+
+    found = complaints(in_bus(RIG, 'channel = "can0"\nbitrate = 123').replace('"can1"', '"cam1"'))
+    assert "no table [can.cam1]; known: can1; did you mean 'can1'?" in found[1] + found[2]
+
+
+def test_a_wrong_bit_rate_does_not_hide_identifier_collisions() -> None:
+    found = complaints(in_bus(RIG.replace("ids =", "# ids ="), 'channel = "can0"\nbitrate = 123'))
+    assert any("imu[S4].ids.quaternion: id 0x21 on this bus belongs to S3" in s for s in found)
+
+
+def test_sensors_on_different_missing_buses_are_not_compared() -> None:
+    text = RIG.replace("ids =", "# ids =").replace('"can1"', '"a"', 1).replace('"can1"', '"b"')
+    assert [line.split(" =")[0] for line in complaints(text)] == ["imu[S3].can", "imu[S4].can"]
+
+
+def test_a_bus_without_sensors_is_checked() -> None:
+    found = complaints(f'{RIG}[can.spare]\ninterface = "sockettcan"\nchannel = "can 0"\n')
+    assert [line.split(" =")[0] for line in found] == ["can.spare.interface", "can.spare.channel"]
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (RIG + MOCAP.replace("192.168.1.20", ""), "mocap.server = '': expected one address"),
+        (RIG + MOCAP.replace("192.168.1.20", "a b"), "mocap.server = 'a b': expected one address"),
+        (f'{RIG}{MOCAP}plate = ""\n', "mocap.plate = '': "),
+        (f'{RIG}[mqtt]\nhost = "a b"\ninsecure = true\n', "mqtt.host = 'a b': expected one name"),
+        (RIG.replace("0x121", "0x921"),
+         "imu[S4].extended_ids = False: ids.quaternion = 0x921 is above 0x7FF"),
+        (RIG.replace("0x121", "0x106"), "imu[S4].ids: each identifier once: found 0x106"),
+        (RIG.replace("{ sample_time = 0x105, group_counter = 0x106, quaternion = 0x121 }", '"a"'),
+         "imu[S4].ids = 'a': expected a table, such as ids = { sample_time = 5 }"),
+        (RIG.replace('"can1"', "3", 1), "imu[S3].can = 3: expected the name of a [can.NAME] table"),
+    ],
+)  # fmt: skip
+def test_an_impossible_value_is_one_fault_in_plain_words(text: str, line: str) -> None:
+    (found,) = complaints(text)
+    assert found.startswith(line)
+    assert "{'" not in found
+
+
+def test_other_faults_of_a_sensor_do_not_hide_an_identifier_above_11_bits() -> None:
+    found = complaints(RIG.replace("0x121 }", "0x921 }\nrate_hz = -1"))
+    assert [line.split(" =")[0] for line in found] == ["imu[S4].rate_hz", "imu[S4].extended_ids"]
+
+
+def test_faults_in_json_have_plain_values(tmp_path: Path) -> None:
+    text = f"{RIG.replace('0x106', '-1')}[cann]\n"
+    result = check(tmp_path, text, "--json")
+    assert result.exit_code == 2
+    assert "object at" not in result.stdout
+    faults = {fault["key"]: fault for fault in orjson.loads(result.stdout)["faults"]}
+    assert "value" not in faults["cann"]
+    assert faults["cann"]["near"] == "can"
+    assert faults["imu[S4].ids.group_counter"]["value"] == -1
+
+
+def test_a_missing_file_is_a_warning_of_the_check(tmp_path: Path) -> None:
+    (tmp_path / "ca.pem").touch()
+    text = f'{RIG}[mqtt]\npassword_file = "nowhere"\n[mqtt.tls]\nca = "ca.pem"\n'
+    result = check(tmp_path, text)
+    assert result.exit_code == 0
+    assert "no such file" in " ".join(result.stdout.split())
+    (warning,) = orjson.loads(check(tmp_path, text, "--json").stdout)["warnings"]
+    assert warning.startswith(f"mqtt.password_file = '{tmp_path}/nowhere': no such file")
+    assert missing_files(parse_rig(tomllib.loads(RIG)).mqtt) == []
