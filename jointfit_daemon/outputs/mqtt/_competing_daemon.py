@@ -1,8 +1,14 @@
 """Detection of another daemon with the same client id, and the wait for its end.
 
 A broker ends the older of two connections with one client id, so two daemons with the same base
-topic would end each other's connection repeatedly. The daemon with the shorter connection gives
-way: it connects with another client id and waits until the other daemon is gone.
+topic would end each other's connection repeatedly. The daemon that was connected first takes its
+connection back. The newer daemon gives way: it connects with another client id and waits until the
+other daemon is gone.
+
+Neither daemon knows when the other one connected. Each compares the duration of its own first
+connection with a limit that doubles with every further loss. The first connection of the newer
+daemon lasts only until the first daemon reconnects, so the newer daemon is below the limit earlier.
+Only the disconnected daemon decides, while the other is connected, so both never give way together.
 """
 
 from __future__ import annotations
@@ -17,7 +23,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 SHORT_S = 5.0
-"""Connection time below which this daemon gives way, s; longer than any reconnection takes."""
+"""Connection time after which a daemon is established and earlier losses are forgotten, s."""
+NEWCOMER_S = 0.25
+"""First limit of the first connection, s: several times the wait and the handshake of the other
+daemon's reconnection."""
 UNEXPLAINED = 3
 """Short connections in a row, without a reason from the broker, that raise the suspicion: MQTT
 3.1.1 has no reasons, and some MQTT 5 brokers send none."""
@@ -29,24 +38,42 @@ own last connection."""
 
 
 class TakeoverDetector:
-    """Counts short connections that another daemon may have ended."""
+    """Determines from the durations of connections whether this daemon must give way."""
 
     def __init__(self) -> None:
-        self._unexplained = 0
+        self._first_s = 0.0
+        self._losses = 0
 
     def suspects(self, lasted_s: float, *, taken_over: bool) -> bool:
-        """Return whether another daemon probably ended the last connection.
+        """Return whether an older daemon probably ended the last connection.
+
+        The n-th short connection in a row, or the (n + 2)-th without a reason, raises the
+        suspicion if the first one was shorter than ``NEWCOMER_S * 2**(n - 1)``. An established
+        daemon counts as connected for `SHORT_S`, so of two such daemons one gives way, too.
 
         Parameters
         ----------
         lasted_s
-            Duration of the connection, s.
+            Duration of the connection, s; 0 if none was made.
         taken_over
             Whether the broker gave the reason "session taken over".
         """
-        short = 0.0 < lasted_s < SHORT_S
-        self._unexplained = self._unexplained + 1 if short else 0
-        return short and (taken_over or self._unexplained >= UNEXPLAINED)
+        if lasted_s <= 0.0 or lasted_s >= SHORT_S:
+            self._first_s = max(self._first_s, min(lasted_s, SHORT_S))
+            self._losses = 0
+            return False
+
+        # Later connections of a series depend on the waits of both daemons, not on their age.
+        if self._losses == 0:
+            self._first_s = max(self._first_s, lasted_s)
+        self._losses += 1
+
+        doublings = self._losses - (1 if taken_over else UNEXPLAINED)
+        return doublings >= 0 and self._first_s < NEWCOMER_S * 2**doublings
+
+    def give_way(self) -> None:
+        """Count as the newer daemon from now on, also after a restart of the broker."""
+        self._first_s, self._losses = 0.0, 0
 
 
 async def is_publishing(settings: MqttSettings, within_s: float) -> bool:

@@ -11,15 +11,18 @@ import re
 _ERRNO = re.compile(r"\[Errno (-?\d+)\]")
 _CODE = re.compile(r"\[code:(\d+)\]")
 
+CONNECTION_CLOSED = (
+    "the broker closed the connection: check that this port serves MQTT, with or without TLS"
+    " as configured in [mqtt]"
+)
+CONNECTION_LOST = "the connection was lost: check that the broker runs, and the network"
+
 _SYSTEM_ERRORS = {
     errno.ECONNREFUSED: (
         "connection refused: no server listens on this port; start the broker, or correct host and"
         " port in [mqtt]"
     ),
-    errno.ECONNRESET: (
-        "the broker closed the connection: check that this port serves MQTT, with or without TLS"
-        " as configured in [mqtt]"
-    ),
+    errno.ECONNRESET: CONNECTION_CLOSED,
     errno.EHOSTUNREACH: "no route to the host: check host in [mqtt], and the network",
     errno.ENETUNREACH: "network unreachable: check host in [mqtt], and the network",
     errno.ETIMEDOUT: "the host does not answer: check host in [mqtt], the network and firewalls",
@@ -39,15 +42,14 @@ _RIGHTS = (  # mosquitto sends this code for a wrong password, too
     "the broker does not authorize this user: correct username and password_file in [mqtt], or the"
     " broker's ACL"
 )
-_CONNECTION = "the connection was lost: check that the broker runs, and the network"
 _MQTT_ERRORS = {
     1: _VERSION,
     2: _IDENTIFIER,
     3: _UNAVAILABLE,
     4: _CREDENTIALS,
     5: _RIGHTS,
-    7: _CONNECTION,
-    128: _CONNECTION,
+    7: CONNECTION_LOST,
+    128: CONNECTION_LOST,
     132: _VERSION,
     133: _IDENTIFIER,
     134: _CREDENTIALS,
@@ -81,5 +83,5 @@ def session_fault(error: BaseException) -> str:
     if text == "Operation timed out":
         return "the broker does not answer in time: check its log, and the network"
     if (found := _CODE.search(text)) and int(found[1]) in _SESSION_LOST:
-        return _CONNECTION
+        return CONNECTION_LOST
     return text

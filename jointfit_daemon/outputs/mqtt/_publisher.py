@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.mqtt._competing_daemon import (
     GLANCE_S,
+    NEWCOMER_S,
+    SHORT_S,
     TakeoverDetector,
     await_departure,
     is_publishing,
@@ -26,7 +28,8 @@ from jointfit_daemon.outputs.mqtt._connection import (
     Outgoing,
     stop_if_cancelled,
 )
-from jointfit_daemon.outputs.mqtt._secret_files import password_of, security_warnings
+from jointfit_daemon.outputs.mqtt._error_messages import CONNECTION_CLOSED, CONNECTION_LOST
+from jointfit_daemon.outputs.mqtt._secret_files import missing_password, security_warnings
 from jointfit_daemon.outputs.token_bucket import TokenBucket
 from jointfit_daemon.outputs.topics import OFFLINE, ONLINE
 
@@ -143,10 +146,11 @@ class MqttPublisher:
         """Connect and serve, again after each loss, until cancelled."""
         for warning in security_warnings(self._settings):
             log.warning("mqtt: %s", warning)
-        if self._settings.username is not None and password_of(self._settings) is None:
+        if (missing := missing_password(self._settings)) is not None:
             log.warning(
-                "mqtt: no password for user %s: connecting without; set password_file in [mqtt]",
+                "mqtt: no password for user %s: connecting without; %s",
                 self._settings.username,
+                missing,
             )
 
         delay_s = _FIRST_RETRY_S
@@ -165,9 +169,14 @@ class MqttPublisher:
                 reason = str(error)
             stop_if_cancelled()
 
+            # A daemon that was connected takes its connection back at once: see TakeoverDetector.
+            lasted_s, self._lasted_s = self._lasted_s, 0.0
+            if lasted_s >= NEWCOMER_S:
+                delay_s = _FIRST_RETRY_S
+
             try:
-                if not await self._gave_way():
-                    self._report(self._contested if self._taken_over else reason)
+                if not await self._gave_way(lasted_s):
+                    self._report_loss(reason, lasted_s)
             except BrokerLostError as lost:
                 self._report(str(lost))
 
@@ -190,18 +199,33 @@ class MqttPublisher:
             f"{self._base}: stop one of them, or give each rig its own name"
         )
 
-    async def _gave_way(self) -> bool:
+    async def _gave_way(self, lasted_s: float) -> bool:
         """Leave the client id to a daemon that had it before, and wait until that one is gone."""
-        lasted_s, self._lasted_s = self._lasted_s, 0.0
         if not self._takeovers.suspects(lasted_s, taken_over=self._taken_over):
             return False
         if not (self._taken_over or await is_publishing(self._settings, GLANCE_S)):
             return False
 
+        self._takeovers.give_way()
         log.error("mqtt: %s. Publishing is paused until the other client is gone", self._contested)
         await await_departure(self._settings, OFFLINE)
         log.warning("mqtt: the other client with this client id is gone: connecting")
         return True
+
+    def _report_loss(self, reason: str, lasted_s: float) -> None:
+        """Log why the last attempt or connection ended."""
+        if lasted_s >= SHORT_S:
+            self._reported = ""  # short connections in a row have one line
+        if lasted_s > 0.0 and self._taken_over:
+            reason = self._contested
+        elif lasted_s > 0.0 and (CONNECTION_LOST in reason or CONNECTION_CLOSED in reason):
+            # The operation that failed first is accidental, and a takeover has the same error.
+            reason = (
+                f"broker {self._settings.host}:{self._settings.tcp_port}: the connection ended "
+                "without a reason: the broker stopped, the network failed, or another client uses "
+                f"the client id {client_identifier(self._base)!r}"
+            )
+        self._report(reason)
 
     def _report(self, reason: str) -> None:
         if reason != self._reported:  # one line per change, not per attempt
@@ -220,7 +244,7 @@ class MqttPublisher:
             self._settings, name, will=will, farewell=will, admit=self._admit
         ) as connection:
             self._connection = connection
-            self.connects, self.connected, self._reported = self.connects + 1, True, ""
+            self.connects, self.connected = self.connects + 1, True
             log.info("mqtt: connected to %s:%d", self._settings.host, self._settings.tcp_port)
             self._checked_s.clear()
             for echo in self._echoes.values():

@@ -31,17 +31,30 @@ class RequestKeyError(Exception):
 
 def password_of(settings: MqttSettings) -> str | None:
     """Return the password from `password_file` or the systemd credential; None without either."""
-    path = settings.password_file
-    if path is None and (credential := _credential(CREDENTIAL)) is not None:
-        path = str(credential)
+    path = _password_path(settings)
     if path is None:
         return None
-
     try:
-        return Path(path).read_text(encoding="utf-8").rstrip("\r\n") or None
+        return path.read_text(encoding="utf-8").rstrip("\r\n") or None
     except OSError as error:
         log.debug("mqtt: no password: %s", error)
         return None
+
+
+def missing_password(settings: MqttSettings) -> str | None:
+    """Return why the configured user has no password; None if there is one, or no user."""
+    if settings.username is None or password_of(settings) is not None:
+        return None
+    path = _password_path(settings)
+    if path is None:
+        return "set password_file in [mqtt]"
+
+    source = "systemd credential" if settings.password_file is None else "password_file ="
+    try:
+        path.read_bytes()
+    except OSError as error:
+        return f"{source} {path}: {error.strerror}"
+    return f"{source} {path}: the file contains no password"
 
 
 def request_key_of(settings: MqttSettings) -> bytes | None:
@@ -94,6 +107,12 @@ def security_warnings(settings: MqttSettings) -> list[str]:
                     f"{path}"
                 )
     return found
+
+
+def _password_path(settings: MqttSettings) -> Path | None:
+    if settings.password_file is not None:
+        return Path(settings.password_file)
+    return _credential(CREDENTIAL)
 
 
 def _credential(name: str) -> Path | None:

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import random
+from itertools import count
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, MqttPublisher, Outbox
-from jointfit_daemon.outputs.mqtt._competing_daemon import SHORT_S, TakeoverDetector
+from jointfit_daemon.outputs.mqtt._competing_daemon import (
+    NEWCOMER_S,
+    SHORT_S,
+    TakeoverDetector,
+)
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -84,6 +90,31 @@ async def test_newer_daemon_waits_until_the_first_is_gone(
     assert "client id 'jointfitd-jointfit-bench', probably a second jointfitd" in refusal
 
 
+@pytest.mark.system
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+async def test_first_of_two_daemons_that_start_together_continues(
+    broker: Broker, version: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    port = broker.port_of(version)
+    async with daemon_link(port, version) as older:
+        await until(lambda: older.connected)
+        await asyncio.sleep(0.6)
+
+        async with daemon_link(port, version) as newcomer:
+            await until(lambda: bool(refusals(caplog)))
+            await until(lambda: older.connected)
+            connects = older.connects, newcomer.connects
+            await asyncio.sleep(0.7)
+            assert older.connected
+            assert not newcomer.connected
+            assert (older.connects, newcomer.connects) == connects
+
+    losses = [m for m in caplog.messages if "ended without a reason" in m]
+    assert len(losses) == 2  # one line of each daemon
+    assert all("another client uses the client id 'jointfitd-jointfit-bench'" in m for m in losses)
+    assert "check that the broker runs" not in caplog.text
+
+
 CONNACK, TAKEN_OVER = b"\x20\x03\x00\x00\x00", b"\xe0\x02\x8e\x00"
 
 
@@ -108,9 +139,70 @@ async def test_takeover_reason_of_the_broker_suffices(caplog: pytest.LogCaptureF
 
 def test_one_short_connection_raises_suspicion_only_with_a_reason() -> None:
     detector = TakeoverDetector()
-    assert detector.suspects(1.0, taken_over=True)
+    assert detector.suspects(0.1, taken_over=True)
     detector = TakeoverDetector()
-    assert [detector.suspects(1.0, taken_over=False) for _ in range(3)] == [False, False, True]
+    assert [detector.suspects(0.1, taken_over=False) for _ in range(3)] == [False, False, True]
+
+
+def takeovers(first: TakeoverDetector, gap_s: float, handshake_s: float, reason: bool) -> list[int]:
+    """Return which of two daemons lost each connection, until one gives way.
+
+    Daemon 1 connects `gap_s` after daemon 0. Each loss is followed by a wait of the publisher,
+    0.05 s doubled up to 0.6 s, of which a random part of at least one half is used.
+    """
+    waits = random.Random(1)
+    detectors, delays_s, lost = (first, TakeoverDetector()), [0.05, 0.05], []
+    lasted_s = gap_s
+    for loss in count():
+        loser = loss % 2
+        lost.append(loser)
+        if lasted_s >= NEWCOMER_S:
+            delays_s[loser] = 0.05
+        if detectors[loser].suspects(lasted_s, taken_over=reason):
+            return lost
+        lasted_s = handshake_s + delays_s[loser] * waits.uniform(0.5, 1.0)
+        delays_s[loser] = min(2 * delays_s[loser], 0.6)
+    raise AssertionError
+
+
+@pytest.mark.parametrize("reason", [True, False])
+@pytest.mark.parametrize("gap_s", [0.3, 1.6, 4.2, 6.0, 3600.0])
+def test_daemon_that_connected_later_gives_way(gap_s: float, reason: bool) -> None:
+    assert takeovers(TakeoverDetector(), gap_s, 0.02, reason)[-1] == 1
+
+
+@pytest.mark.parametrize("reason", [True, False])
+@pytest.mark.parametrize("gap_s", [1.6, 4.2, 6.0])
+def test_daemon_that_connected_later_gives_way_over_a_slow_network(
+    gap_s: float, reason: bool
+) -> None:
+    assert takeovers(TakeoverDetector(), gap_s, 0.6, reason)[-1] == 1
+
+
+@pytest.mark.parametrize("reason", [True, False])
+@pytest.mark.parametrize("handshake_s", [0.001, 0.02, 0.6, 4.0])
+@pytest.mark.parametrize("gap_s", [0.001, 0.1, 0.24, 0.26, 0.6])
+def test_one_of_two_simultaneous_daemons_gives_way_soon(
+    gap_s: float, handshake_s: float, reason: bool
+) -> None:
+    assert len(takeovers(TakeoverDetector(), gap_s, handshake_s, reason)) <= 16
+
+
+def test_established_daemons_give_way_to_a_client_that_never_does() -> None:
+    detector = TakeoverDetector()
+    assert not detector.suspects(3600.0, taken_over=True)
+    assert any(detector.suspects(0.1, taken_over=False) for _ in range(10))
+
+
+@pytest.mark.parametrize("gap_s", [0.0, 0.1])
+def test_daemon_that_gave_way_does_so_again_after_a_restart_of_the_broker(gap_s: float) -> None:
+    paused, other = TakeoverDetector(), TakeoverDetector()
+    assert not other.suspects(3600.0, taken_over=False)
+    assert not paused.suspects(3600.0, taken_over=False)
+    paused.give_way()
+    assert not other.suspects(0.0, taken_over=False)  # no broker
+    assert takeovers(other, gap_s + 0.01, 0.02, reason=False)[-1] == 1
+    assert paused.suspects(0.1, taken_over=True)
 
 
 def test_first_daemon_reconnects_without_suspicion() -> None:

@@ -17,7 +17,11 @@ import pytest
 from jointfit_daemon.config import ConfigError, MqttSettings, TlsSettings, parse_rig
 from jointfit_daemon.outputs.mqtt import MqttClient, MqttPublisher, Outbox
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection
-from jointfit_daemon.outputs.mqtt._secret_files import password_of, security_warnings
+from jointfit_daemon.outputs.mqtt._secret_files import (
+    missing_password,
+    password_of,
+    security_warnings,
+)
 from tests import fake_drivers
 from tests.broker_fixture import MOSQUITTO_MISSING, MosquittoBroker
 
@@ -185,3 +189,25 @@ def test_a_password_is_taken_from_the_credential(
     (tmp_path / "jointfitd.mqtt-password").write_text("s3cret\n")
     monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
     assert password_of(MqttSettings()) == "s3cret"
+
+
+def test_missing_password_is_named_with_its_source(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("CREDENTIALS_DIRECTORY", raising=False)
+    assert missing_password(MqttSettings()) is None
+    assert missing_password(MqttSettings(username="u")) == "set password_file in [mqtt]"
+
+    secret = tmp_path / "secret"
+    settings = MqttSettings(username="u", password_file=str(secret))
+    assert missing_password(settings) == f"password_file = {secret}: No such file or directory"
+    secret.write_text("\n")
+    assert missing_password(settings) == f"password_file = {secret}: the file contains no password"
+    secret.write_text(PASSWORD)
+    assert missing_password(settings) is None
+
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    credential = tmp_path / "jointfitd.mqtt-password"
+    assert missing_password(MqttSettings(username="u")) == (
+        f"systemd credential {credential}: No such file or directory"
+    )
