@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 from difflib import get_close_matches
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
 from jointfit_daemon.driver import CanBusSettings, driver_names, find_driver
 
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
 _CLOSE = 0.8
 """Least similarity, 0 to 1, at which a misspelled interface is checked as the one it resembles."""
 
 
-def unknown_interface(interface: str) -> str | None:
+def unknown_interface(interface: str, in_use: Iterable[str]) -> str | None:
     """Return the reason why all drivers for CAN refuse `interface`; None if one accepts it.
 
-    Drivers know the interfaces that can be opened. They are asked independently of the sensors of
-    the rig, so that a bus without sensors is checked, and one fault is reported for each bus.
+    Drivers know the interfaces that can be opened. The drivers `in_use` are asked first, so that
+    no other is imported for a valid bus. The others are for a bus that no sensor names.
     """
     reason = None
-    for name in driver_names():
+    for name in dict.fromkeys([*in_use, *driver_names()]):
         try:
             model = find_driver(name).Settings
         except Exception:  # noqa: BLE001, S112 - a broken plug-in is a fault of its users only

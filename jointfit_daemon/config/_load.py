@@ -229,11 +229,16 @@ class _RigReader:
         if not isinstance(tables, dict):
             self.faults.append(Fault("can", "expected tables [can.NAME]", tables))
             return {}
+        imus = self.table.get("imu")
+        tables_of_imus = imus if isinstance(imus, list) else []
+        named = [imu.get("driver") for imu in tables_of_imus if isinstance(imu, dict)]
+        in_use = [name for name in named if isinstance(name, str)]
+
         buses = {}
         for at, name in enumerate(tables):
             key, table = f"can.{name}", tables[name]
             kind = table.get("interface") if isinstance(table, dict) else None
-            if isinstance(kind, str) and (text := unknown_interface(kind)) is not None:
+            if isinstance(kind, str) and (text := unknown_interface(kind, in_use)) is not None:
                 self.faults.append(Fault(f"{key}.interface", text, kind))
                 table = table | {"interface": likely_interface(kind)}
 

@@ -10,6 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from jointfit_daemon.config import ConfigError, missing_files, parse_rig
+from jointfit_daemon.driver import find_driver
 from jointfit_daemon.tools.__main__ import app
 
 if TYPE_CHECKING:
@@ -168,3 +169,16 @@ def test_a_missing_file_is_a_warning_of_the_check(tmp_path: Path) -> None:
     (warning,) = orjson.loads(check(tmp_path, text, "--json").stdout)["warnings"]
     assert warning.startswith(f"mqtt.password_file = '{tmp_path}/nowhere': no such file")
     assert missing_files(parse_rig(tomllib.loads(RIG)).mqtt) == []
+
+
+def test_a_valid_bus_imports_drivers_in_use_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+
+    def find(name: str) -> Any:
+        asked.append(name)
+        return find_driver(name)
+
+    monkeypatch.setattr("jointfit_daemon.config._bus_faults.find_driver", find)
+    parse_rig(tomllib.loads(in_bus(RIG, 'interface = "socketcan"\nchannel = "can0"')))
+    assert set(asked) <= {"xbus", "xcdi"}
+    assert "xcdi" in asked
