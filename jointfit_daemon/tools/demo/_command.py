@@ -44,8 +44,9 @@ def demo(
 
     Starts a broker, two IMUs on pseudo-terminals, two on a CAN adapter, a motion-capture server and
     the daemon, calibrates, and compares the joint angles with ground truth. Exits with 1 if a
-    target is missed: knee flexion error 3 degrees RMS, all samples accounted for, 99 % of frames
-    received within 60 ms. Ctrl-C, SIGTERM and SIGHUP stop the run and print the results so far.
+    step fails or a target is missed: knee flexion error 3 degrees RMS, all samples accounted for,
+    99 % of frames received within 60 ms. Ctrl-C, SIGTERM and SIGHUP stop the run and print the
+    results so far.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"--seconds {seconds:g}: expected a finite number above 0")
@@ -129,8 +130,12 @@ async def _run(
                         await run.run(seconds)
                 if picture is not None:
                     display.save(picture)
-        except (asyncio.CancelledError, Exception):  # Ctrl-C also stops broker and daemon
+        except (asyncio.CancelledError, Exception) as error:  # Ctrl-C also stops broker and daemon
             if stop.number is None:
+                figures = {} if run is None else run.figures()
+                typer.echo(result_line("failed", figures), err=headless)
+                if headless:
+                    typer.echo(orjson.dumps(figures | {"missed": [str(error)]}))
                 raise
         finally:
             truth.close()

@@ -8,6 +8,7 @@ import signal
 import sys
 from typing import TYPE_CHECKING, Any
 
+import orjson
 import pytest
 from typer.testing import CliRunner
 
@@ -55,6 +56,18 @@ def test_a_complete_run_ends_with_its_result_line(
     result = CliRunner().invoke(app, ["demo", *(["--headless"] if headless else [])])
     assert result.exit_code == 0
     assert (result.stderr if headless else result.stdout).splitlines()[-1].startswith("result:")
+
+
+@pytest.mark.system
+def test_failed_step_ends_with_a_result_line_and_its_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("jointfit_daemon.tools.demo._run.CONNECT_S", 0.01)
+    result = CliRunner().invoke(app, ["demo", "--headless"])
+    assert result.exit_code == 1
+    assert "result: failed; " in result.stderr
+    (reason,) = orjson.loads(result.stdout.splitlines()[-1])["missed"]
+    assert "connecting all sources took longer" in reason
 
 
 @pytest.mark.system
