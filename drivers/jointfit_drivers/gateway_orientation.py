@@ -32,9 +32,10 @@ Source: Laidig and Seel 2023, Information Fusion 91, 187-204, and their package 
 
 from __future__ import annotations
 
+from collections import deque
 from importlib import import_module
 from importlib.util import find_spec
-from math import atan2, cos, isfinite, sin
+from math import atan2, ceil, cos, sin
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -56,6 +57,11 @@ FASTEST = 200.0
 """Largest plausible angular rate, rad/s: 11 000 degrees per second."""
 HARDEST = 5000.0
 """Largest plausible specific force, m/s^2: 500 g."""
+STRONGEST = 1e6
+"""Largest plausible component of the magnetic field in any unit: 1 T in microtesla."""
+FIELD_RATIO = 2.0
+"""Largest ratio between the strength of a field and the median, or the reverse, with which a
+reading contributes to the delay of the magnetometer."""
 RIDGE_RATE = 1.0
 """Angular rate, rad/s, below which the delay of the magnetometer is not estimated: 2 % of the field
 in 20 ms."""
@@ -126,7 +132,7 @@ def is_plausible(reading: RawReading) -> bool:
         return False
     if not all(-HARDEST < value < HARDEST for value in reading.force):
         return False
-    return reading.magnetic is None or all(map(isfinite, reading.magnetic))
+    return reading.magnetic is None or all(-STRONGEST < v < STRONGEST for v in reading.magnetic)
 
 
 class GatewayOrientation:
@@ -151,7 +157,7 @@ class GatewayOrientation:
         self._last: RawReading | None = None
         self._period_ns = 0.0  # step for which the filter was created
         self._delay_s = 0.0
-        self._withheld: list[tuple[Vector, Vector, Vector]] = []
+        self._withheld: deque[tuple[Vector, Vector, Vector]] = deque()
         self._passed_ns = self._steps = 0
         self._turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -220,7 +226,8 @@ class GatewayOrientation:
     def _start(self, period_ns: float, t_ns: int) -> None:
         self._period_ns = period_ns
         self._started_ns = t_ns if self._settle_ns else None
-        self._withheld = []
+        # The last readings suffice for the heading, however long the filter settles.
+        self._withheld = deque(maxlen=ceil(SETTLE_S * _NS / period_ns) + MOST_MISSING)
         self._filter = import_module("vqf").VQF(period_ns / _NS)  # an extra
 
     def _update(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
@@ -244,7 +251,8 @@ class GatewayOrientation:
 
     def _refine(self, reading: RawReading) -> FilterOutput:
         """Process the readings since the start again, twice backwards and forwards."""
-        withheld, self._withheld = self._withheld, []
+        withheld = list(self._withheld)
+        self._withheld.clear()
         if not withheld:
             return self._output(reading)
 
@@ -254,7 +262,8 @@ class GatewayOrientation:
         # inclination at the start, and the delay of the magnetometer
         self._run_backwards(*backwards)
         q = self._filter.updateBatch(rates, forces)["quat6D"]
-        self._delay_s = _field_delay(q, rates, np.array([part[2] for part in withheld]))
+        found_s = _field_delay(q, rates, np.array([part[2] for part in withheld]))
+        self._delay_s = self._delay_s if found_s is None else found_s
         fields = np.array([_ahead(field, rate, self._delay_s) for rate, _, field in withheld])
 
         # heading from all readings
@@ -289,16 +298,16 @@ class GatewayOrientation:
 
 def _field_delay(
     q: NDArray[np.float64], rates: NDArray[np.float64], fields: NDArray[np.float64]
-) -> float:
-    r"""Return the delay of the magnetometer behind the gyroscope, s.
+) -> float | None:
+    r"""Return the delay of the magnetometer behind the gyroscope, s; None without enough rotation.
 
     The field is constant in the world. With a delay d the measured field m, rotated to the world,
     is to first order
 
     .. math:: R m = m_w + d\, R (\omega \times m) ,
 
-    a linear regression. The ridge keeps d near zero without rotation: it is the ratio of a
-    disturbance of 2 % of the field to a delay of 20 ms.
+    a linear regression. The ridge is the ratio of a disturbance of 2 % of the field to a delay of
+    20 ms; below it the delay is unknown. Fields of implausible strength are left out.
 
     Parameters
     ----------
@@ -307,15 +316,21 @@ def _field_delay(
     rates, fields : ndarray, shape (n, 3)
         Angular rates, rad/s, and fields in sensor axes; rows of zeros are missing fields.
     """
-    known = fields.any(axis=1)
+    strength = np.linalg.norm(fields, axis=1)
+    known = strength > 0.0
     if not known.any():
-        return 0.0
+        return None
+    usual = float(np.median(strength[known]))
+    known &= (strength < FIELD_RATIO * usual) & (strength > usual / FIELD_RATIO)
     q, rates, fields = q[known], rates[known], fields[known]
 
     world, moved = (_rotated(q, v) for v in (fields, np.cross(rates, fields)))
     world, moved = world - world.mean(axis=0), moved - moved.mean(axis=0)
     ridge = RIDGE_RATE**2 * float(np.sum(fields**2))
-    delay_s = float(np.sum(world * moved)) / (float(np.sum(moved**2)) + ridge)
+    turned = float(np.sum(moved**2))
+    if not turned > ridge:
+        return None
+    delay_s = float(np.sum(world * moved)) / (turned + ridge)
     return min(max(delay_s, 0.0), MOST_DELAY_S)
 
 

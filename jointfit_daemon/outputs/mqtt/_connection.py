@@ -456,7 +456,7 @@ class _Client(aiomqtt.Client):
         4.2.3.2 and 4.2.3.4).
         """
         super()._on_socket_unregister_write(client, userdata, sock)
-        if sock.fileno() >= 0:
+        with contextlib.suppress(OSError):  # closed, or not supported
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
     def _on_publish(  # type: ignore[explicit-override]  # typing.override is Python 3.12's

@@ -30,6 +30,10 @@ WITHHELD = ("unpublished", "duplicates", "late")
 """Counters that a decoder may have for frames that it decoded but did not return."""
 
 
+KEPT_SAMPLES = 1000
+"""Samples and events after a reopening for which the time base of the decoder before is used."""
+
+
 class StampedMeasurement(NamedTuple):
     """A measurement and its instant on the host clock."""
 
@@ -55,7 +59,10 @@ class SourceState:
     _withheld: dict[str, int] = field(default_factory=lambda: dict.fromkeys(WITHHELD, 0))
     _decoder: Decoder | None = None
     _tick_clock: TickClock | None = None
-    """Time base of the decoder before, until the decoder has determined its own."""
+    """Time base of the decoder before, until the decoder has determined its own, at most for the
+    next `KEPT_SAMPLES` samples, or until a restart: then it may be another device."""
+    _kept: int = 0
+    """Samples left for which `_tick_clock` is used."""
 
     @classmethod
     def create(
@@ -104,6 +111,7 @@ class SourceState:
             return []
         items = self._process(decoder.flush(), decoder)
         self._tick_clock = decoder.tick_clock or self._tick_clock
+        self._kept = KEPT_SAMPLES
         for name in WITHHELD:
             self._withheld[name] += getattr(decoder, name, 0)
         return items
@@ -171,7 +179,10 @@ class SourceState:
         items: list[StampedMeasurement | Corrupt | DeviceEvent] = []
         # A new decoder may need seconds to determine the unit of device time. Samples numbered by
         # their counter meanwhile would look like another clock, that is, a restart.
-        clock, tick_clock = self.clock, decoder.tick_clock or self._tick_clock
+        clock, tick_clock = self.clock, decoder.tick_clock
+        if tick_clock is None and self._kept > 0:
+            tick_clock = self._tick_clock
+            self._kept -= len(decoded)
         for item in decoded:
             if isinstance(item, _MEASUREMENTS):
                 stamped = self._stamp(item, tick_clock)
@@ -222,7 +233,10 @@ class SourceState:
         """Return the events of the clock, and count its restarts."""
         events = [DeviceEvent(news.kind, news.text, dict(news.data)) for news in self.clock.news]
         self.clock.news.clear()
-        self.counts.restarts += sum(event.kind == "restart" for event in events)
+        restarts = sum(event.kind == "restart" for event in events)
+        self.counts.restarts += restarts
+        if restarts:
+            self._kept = 0
         return events
 
     def _count(self, item: Corrupt | DeviceEvent) -> None:
@@ -230,6 +244,7 @@ class SourceState:
             self.counts.corrupt += 1
             self.counts.discarded_bytes += item.discarded
         elif item.kind == "restart":
+            self._kept = 0
             self.counts.restarts += 1
             self.clock.feed_restart()
         elif item.kind == "gap":

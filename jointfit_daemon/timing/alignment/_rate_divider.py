@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+_FAR = 10
+"""Periods by which a frame is too early for the grid; less is a frame out of order."""
+
 
 class RateDivider:
     """Selects from frames with increasing stamps those that keep to a lower rate.
@@ -23,7 +26,7 @@ class RateDivider:
     def is_due(self, t_ns: int) -> bool:
         """Return whether the frame with this stamp is selected, and count it if it is."""
         early_ns = self._next_ns - t_ns
-        if 0 < early_ns <= self._period_ns:
+        if 0 < early_ns <= _FAR * self._period_ns:
             return False
         restarts = abs(early_ns) > self._period_ns
         self._next_ns = (t_ns if restarts else self._next_ns) + self._period_ns

@@ -219,6 +219,41 @@ def test_heading_after_a_start_in_fast_motion_is_settled_with_the_inclination(
     assert max(errors) < 6.0  # 7.1 with the field from the start on
 
 
+def delayed_fields(delay_s: float, amplitude: float) -> tuple[np.ndarray, ...]:
+    """Return orientations, angular rates and fields of a sensor that oscillates about x and y."""
+    t_s = np.arange(0.0, 3.0, 0.0025)
+
+    def pose(at_s: np.ndarray) -> np.ndarray:
+        about_x, about_y = np.zeros((2, len(at_s), 3))
+        about_x[:, 0] = amplitude * np.sin(2.0 * np.pi * at_s)
+        about_y[:, 1] = amplitude * np.sin(3.0 * np.pi * at_s)
+        return rotation.multiply(rotation.exp(about_x), rotation.exp(about_y))
+
+    q, step_s = pose(t_s), 1e-5
+    turned = rotation.multiply(rotation.conjugate(q), pose(t_s + step_s))
+    world = np.tile([0.0, 20.0, -44.0], (len(t_s), 1))
+    fields = rotation.rotate(rotation.conjugate(pose(t_s - delay_s)), world)
+    return q, rotation.log(turned) / step_s, fields
+
+
+def test_delay_of_the_magnetometer_is_estimated_in_spite_of_an_absurd_field() -> None:
+    q, rates, fields = delayed_fields(0.013, 1.5)
+    clean = gateway_orientation._field_delay(q, rates, fields)
+    assert clean == pytest.approx(0.013, rel=0.15)
+    fields[500] = (1e5, -1e5, 1e5)
+    found = gateway_orientation._field_delay(q, rates, fields)
+    assert found == pytest.approx(clean, rel=0.01)
+
+
+def test_delay_of_the_magnetometer_is_unknown_at_rest() -> None:
+    assert gateway_orientation._field_delay(*delayed_fields(0.013, 0.0)) is None
+
+
+def test_field_beyond_all_sensors_is_refused() -> None:
+    reading = RawReading(0, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (1e200, 0.0, 0.0))
+    assert not gateway_orientation.is_plausible(reading)
+
+
 def test_after_a_long_gap_in_fast_motion_the_sensor_is_silent_till_it_has_settled() -> None:
     contents = tumbling(1200)
     wires = [message(k, 100 * k, *items) for k, items in enumerate(contents)]

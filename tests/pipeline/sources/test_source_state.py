@@ -24,6 +24,25 @@ def can_source() -> Source:
     return next(source for source in load_rig(EXAMPLE).sources if source.id == "S2")
 
 
+def test_another_unit_of_device_time_after_reopening_is_a_restart_and_settles() -> None:
+    state = SourceState.create(can_source())
+    events: list[str] = []
+    for first, ticks in ((1, 100), (3000, 10_000)):
+        state.start()
+        for k in range(first, first + 1500):
+            t_ns = 5_000_000_000 + k * 10_000_000
+            chunk = group(t_ns, t_ns, k, ticks=ticks * (k - first + 1))
+            events.extend(
+                item.text
+                for item in state.feed(chunk)
+                if isinstance(item, DeviceEvent) and item.kind == "restart"
+            )
+        assert state.clock.state == "passive"
+        assert state.clock.skew_ppm == pytest.approx(0.0, abs=50.0)
+        state.stop()
+    assert len(events) == 1
+
+
 def restarts_after_reopening(pause_s: float, stall_s: float) -> tuple[list[str], int]:
     """Close and reopen a sensor that goes on counting; return restart events and their count.
 
@@ -63,10 +82,11 @@ def test_reopened_sensor_that_continued_counting_has_not_restarted(
     assert restarts_after_reopening(pause_s, stall_s) == ([], 0)
 
 
-def group(t_ns: int, stamp_ns: int, k: int) -> Chunk:
+def group(t_ns: int, stamp_ns: int, k: int, ticks: int | None = None) -> Chunk:
+    ticks = 100 * k if ticks is None else ticks
     quaternion = xcdi.quaternion_counts((1.0, 0.0, 0.0, 0.0))
     frames = [
-        CanFrame(stamp_ns, 0x105, xcdi.encode(xcdi.DataId.SAMPLE_TIME, (100 * k,))),
+        CanFrame(stamp_ns, 0x105, xcdi.encode(xcdi.DataId.SAMPLE_TIME, (ticks,))),
         CanFrame(stamp_ns, 0x106, xcdi.encode(xcdi.DataId.GROUP_COUNTER, (k,))),
         CanFrame(stamp_ns, 0x121, xcdi.encode(xcdi.DataId.QUATERNION, quaternion)),
     ]

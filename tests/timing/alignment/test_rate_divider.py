@@ -30,3 +30,10 @@ def test_one_stamp_far_ahead_excludes_none_of_the_following_frames() -> None:
     stamps = [k * NS // 100 for k in range(200)]
     stamps[50] += 3600 * NS
     assert sum(divider.is_due(t) for t in stamps) == pytest.approx(20, abs=2)
+
+
+def test_frames_out_of_order_are_not_selected_twice() -> None:
+    divider = RateDivider(10.0)
+    stamps = [k * NS // 100 for k in range(100)]
+    stamps += stamps[60:] + [k * NS // 100 for k in range(100, 200)]
+    assert sum(divider.is_due(t) for t in stamps) == pytest.approx(20, abs=1)
