@@ -129,6 +129,7 @@ def coordinate_table(
     state: ChainState,
     covariance: Array,
     coordinates: tuple[JointCoordinates, ...],
+    known: NDArray[np.bool_] | None = None,
 ) -> CoordinateTable:
     """Return the coordinates of a state.
 
@@ -142,10 +143,17 @@ def coordinate_table(
         Covariance of a step, rad^2 and m^2, shape (T, nq, nq).
     coordinates
         One entry for each segment, in the order of the model.
+    known
+        Values that the measurement determines, shape (T, K); None: all. Angles are continuous over
+        these instants, because the others are arbitrary.
     """
-    values, sd, misfit, coupled = [], [], {}, 0
+    values, sd, misfit, coupled, column = [], [], {}, 0, 0
+    count = sum(len(joint.names) for joint in coordinates)
+    known = np.ones((len(state), count), np.bool_) if known is None else known
     for i, (joint, segment) in enumerate(zip(coordinates, model.segments, strict=True)):
         block = covariance[:, model.columns[i], model.columns[i]]
+        determined = np.asarray(known[:, column : column + len(joint.names)].all(axis=1))
+        column += len(joint.names)
         if joint.pose is None and state.couplings is not None:
             values.append(state.couplings[:, coupled, :1])
             sd.append(np.sqrt(block[:, :, 0]))
@@ -156,7 +164,7 @@ def coordinate_table(
         is_free = segment.joint.kind == "free"
         origin = state.origins[:, free] if is_free else np.zeros((len(state), 3))
         found, G, left = _inverted(joint, state.rotations[:, i], origin, is_free=is_free)
-        values.append(_continuous(found, joint.is_angle))
+        values.append(_continuous(found, joint.is_angle, determined))
 
         # a hinge steps about its axis, a ball about three axes, a free joint also along three
         step = np.asarray(segment.joint.axis)[:, None] if segment.joint.kind == "hinge" else None
@@ -183,7 +191,7 @@ def _inverted(
         G = _derivative(joint, values)[:, :rows]
         missing = _difference(joint, values, A, origin)
         step = (_pseudo_inverse(G) @ missing[:, :rows, None])[..., 0]
-        turned = np.abs(step[:, turning]).max(axis=1, keepdims=True)
+        turned = np.abs(step[:, turning]).max(axis=1, keepdims=True, initial=0.0)
         step[:, turning] *= np.minimum(1.0, _LARGEST_STEP / np.maximum(turned, _CONVERGED))
         values = values + step
         if np.abs(step).max(initial=0.0) < _CONVERGED:
@@ -203,6 +211,8 @@ def _start(joint: JointCoordinates, A: Array) -> Array:
     """Return the tried angles whose rotation is nearest to A; translations are zero."""
     turn = np.arange(_TRIED) * (2.0 * np.pi / _TRIED) - np.pi
     turning = np.flatnonzero(joint.is_angle)
+    if not turning.size:
+        return np.zeros((len(A), len(joint.names)))
     half = turn[np.abs(turn) < 0.5 * np.pi - 1e-9]
     is_euler = len(turning) == _THREE_ANGLES
     tried = [half if is_euler and k == joint.middle else turn for k in turning]
@@ -242,11 +252,16 @@ def _pseudo_inverse(G: Array) -> Array:
     return np.asarray(np.linalg.solve(square, G.swapaxes(-1, -2)))
 
 
-def _continuous(values: Array, is_angle: tuple[bool, ...]) -> Array:
-    """Return values without jumps of 360 degrees; the median angle is within 180 degrees."""
+def _continuous(values: Array, is_angle: tuple[bool, ...], known: NDArray[np.bool_]) -> Array:
+    """Return values without jumps of 360 degrees between successive `known` rows, shape (T,).
+
+    The median angle of these rows is within 180 degrees. Other rows are returned unchanged.
+    """
+    if not known.any():
+        return values
     found = values.copy()
-    turning: NDArray[np.intp] = np.flatnonzero(is_angle)
-    angles = np.unwrap(values[:, turning], axis=0)
+    cells = np.ix_(known, np.array(is_angle))
+    angles = np.unwrap(values[cells], axis=0)
     turns = np.round(np.median(angles, axis=0) / (2.0 * np.pi))
-    found[:, turning] = angles - 2.0 * np.pi * turns
+    found[cells] = angles - 2.0 * np.pi * turns
     return found

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -93,6 +94,50 @@ def test_angles_are_continuous_beyond_180_degrees() -> None:
     state = state_of(MODEL, coordinates, turned)
     found = coordinate_table(MODEL, state, no_covariance(MODEL, 50), coordinates)
     assert np.abs(np.diff(found.values[:, 2])).max() < 0.1
+
+
+def test_angles_are_continuous_over_known_instants_only() -> None:
+    turned = np.zeros((50, 10))
+    turned[:, 2] = 0.5
+    turned[20:30, 2] = np.linspace(2.5, 5.7, 10)  # a turn that leads back by another 360 degrees
+    turned[30:, 2] = 0.5 + 2.0 * np.pi
+    coordinates = default_coordinates(MODEL)
+    known = np.ones((50, 10), np.bool_)
+    known[20:30, 2] = False
+    state = state_of(MODEL, coordinates, turned)
+    found = coordinate_table(MODEL, state, no_covariance(MODEL, 50), coordinates, known)
+    np.testing.assert_allclose(np.delete(found.values[:, 2], np.s_[20:30]), 0.5, atol=1e-7)
+
+
+def test_a_table_without_known_instants_has_values() -> None:
+    coordinates = default_coordinates(MODEL)
+    state = state_of(MODEL, coordinates, np.full((3, 10), 0.2))
+    known = np.zeros((3, 10), np.bool_)
+    found = coordinate_table(MODEL, state, no_covariance(MODEL, 3), coordinates, known)
+    np.testing.assert_allclose(found.values, 0.2, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["SliderJoint", "CustomJoint"])
+def test_a_segment_that_only_slides_has_its_translations(tmp_path: Path, kind: str) -> None:
+    names = ["x"] if kind == "SliderJoint" else ["x", "y", "z"]
+    unit = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    fixed = [("", axis, ZERO) for axis in unit]
+    moving = [(name, axis, LINEAR) for name, axis in zip(names, unit, strict=False)]
+    sliding = Hung(
+        "base",
+        "ground",
+        kind,
+        [(name, -9.0, 9.0) for name in names],
+        axes=[*fixed, *moving] if kind == "CustomJoint" else [],
+    )
+    markers = [(f"m{k}", "base", axis, False) for k, axis in enumerate(unit)]
+    read = read_osim(write_osim(tmp_path / "m.osim", [sliding], markers))
+    assert read.coordinates[0].names == tuple(names)
+    values = np.random.default_rng(2).uniform(-2.0, 2.0, (5, len(names)))
+    state = state_of(read.model, read.coordinates, values)
+    found = coordinate_table(read.model, state, no_covariance(read.model, 5), read.coordinates)
+    np.testing.assert_allclose(found.values, values, atol=1e-9)
+    assert found.misfit["base"] < 1e-9
 
 
 def test_oblique_axes_of_an_opensim_joint_are_inverted(tmp_path: Path) -> None:
