@@ -5,6 +5,7 @@ Invariant: a model file is a calibration of the daemon, and `apply` runs the dae
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -200,9 +201,13 @@ def apply(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Fuse the sensors of a trial as the daemon does: angles and positions with uncertainty."""
+    """Fuse the sensors of a trial as the daemon does: angles and positions with uncertainty.
+
+    Exits with 1 if no frame of a .mot or .sto file is complete.
+    """
     from jointfit_daemon.tools.fuse import _lengths, _output
     from jointfit_daemon.tools.fuse._trial import read_available_sensors
+    from jointfit_daemon.tools.opensim_tables import report_written, table_notes
 
     check_output("--out", out, _output.ENDINGS)
     check_choice("--up", up, "yz")
@@ -216,14 +221,15 @@ def apply(
     )
     table = read_available_sensors(sensors, chain, axis, without or ())
     found = _output.fuse_trial(calibration, table, chain)
-    files = _output.write_fused(out, found, table, axis)
+    tables = _output.write_fused(out, found, table, axis)
+    found = replace(found, notes=(*found.notes, *table_notes(tables)))
     if json:
         shares = {"known": found.known, "flags": dict(found.flags)}
-        written = {"notes": found.notes, "files": [str(file) for file in files]}
-        echo_json({"frames": len(found.t_s), **shares, **written})
+        files = [str(written.path) for written in tables if written.frames]
+        echo_json({"frames": len(found.t_s), **shares, "notes": found.notes, "files": files})
     else:
         typer.echo(_report.fusion_summary(found))
-        typer.echo(f"wrote {', '.join(map(str, files))}", err=True)
+    report_written(tables)
 
 
 def _read_model(path: Path) -> Calibration:

@@ -18,14 +18,17 @@ from jointfit_daemon.files.orientations import (
     OrientationTrial,
     TimeTable,
     write_orientations_npz,
-    write_orientations_sto,
-    write_sto,
 )
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics.joint_angles import read_patent
 from jointfit_daemon.limb_model import configured_length, visible
 from jointfit_daemon.model import Chain
 from jointfit_daemon.tools.fuse._lengths import left_out_positions
+from jointfit_daemon.tools.opensim_tables import (
+    WrittenTable,
+    write_known_orientations,
+    write_known_values,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -186,8 +189,10 @@ def _joint_over_time(states: Sequence[LimbState], number: int) -> FusedAngles:
     )
 
 
-def write_fused(path: Path, found: FusedTrial, table: OrientationRecording, up: Axis) -> list[Path]:
-    """Write a fused trial in the format of the file extension; return the files written.
+def write_fused(
+    path: Path, found: FusedTrial, table: OrientationRecording, up: Axis
+) -> list[WrittenTable]:
+    """Write a fused trial in the format of the file extension; return an outcome for each file.
 
     ``.sto``: orientations, joint angles in a second file ``NAME_angles.sto`` (degrees) and, where
     known, joint positions in a third file ``NAME_positions.sto`` (m).
@@ -195,6 +200,8 @@ def write_fused(path: Path, found: FusedTrial, table: OrientationRecording, up: 
     one number, so orientations are left out.
     ``.npz``: readable by `read_orientations_npz`; joint quantities by name, rad and m.
     ``.csv``: all columns in one table.
+
+    STO and MOT files contain the known part of their table, see `tools.opensim_tables`.
     """
     kind = path.suffix.lower()
     if kind in {".npz", ".csv"}:
@@ -202,7 +209,7 @@ def write_fused(path: Path, found: FusedTrial, table: OrientationRecording, up: 
             _write_npz(path, found, table)
         else:
             _write_csv(path, found)
-        return [path]
+        return [WrittenTable(path, len(found.t_s))]
 
     angles, positions = _angle_columns(found), _position_columns(found, up)
     if kind == ".mot":
@@ -212,10 +219,8 @@ def write_fused(path: Path, found: FusedTrial, table: OrientationRecording, up: 
     rate_hz = float(np.round(1.0 / np.median(np.diff(found.t_s)), 6))
     q = np.stack(list(found.segments.values()), axis=1)
     turned = q[..., [0, 2, 3, 1]] if up == "y" else q
-    write_orientations_sto(
-        path, OrientationTable(tuple(found.segments), found.t_s, turned, rate_hz)
-    )
-    files = [path]
+    fused = OrientationTable(tuple(found.segments), found.t_s, turned, rate_hz)
+    files = [write_known_orientations(path, fused)]
     second = path.with_name(f"{path.stem}_angles.sto")
     files.append(_write_numbers(second, found.t_s, angles, in_degrees=True, name="joint angles"))
     if positions:
@@ -282,7 +287,7 @@ def _write_csv(path: Path, found: FusedTrial) -> None:
 
 def _write_numbers(
     path: Path, t_s: Array, columns: Mapping[str, Array], *, in_degrees: bool, name: str
-) -> Path:
+) -> WrittenTable:
     values = np.column_stack(list(columns.values()))
-    write_sto(path, TimeTable(tuple(columns), t_s, values, in_degrees=in_degrees, name=name))
-    return path
+    table = TimeTable(tuple(columns), t_s, values, in_degrees=in_degrees, name=name)
+    return write_known_values(path, table)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -68,12 +69,13 @@ def ik(
     """Compute the joint coordinates of a marker trial by inverse kinematics.
 
     Compares the marker errors with the limits that OpenSim recommends. Exits with 1 if the trial
-    does not fit the model.
+    does not fit the model, or if no frame of a .mot or .sto file is complete.
     """
     from jointfit_daemon.calibration.marker_refinement import RefinementError
-    from jointfit_daemon.tools.ik._output import ENDINGS, write_coordinates, write_errors
+    from jointfit_daemon.tools.ik._output import ENDINGS, write_tables
     from jointfit_daemon.tools.ik._report import as_json, as_text
     from jointfit_daemon.tools.ik._solution import IkRequest, solve_trial
+    from jointfit_daemon.tools.opensim_tables import report_written, table_notes
 
     check_choice("--up", up, "xyz")
     for path in out or ():
@@ -96,13 +98,10 @@ def ik(
         typer.echo(f"jointfit ik: refused: {refused}", err=True)
         raise typer.Exit(EXIT_FAILED) from None
 
+    tables = write_tables(found, out or (), errors, with_sd=sd, in_degrees=not radians)
+    found = replace(found, notes=(*found.notes, *table_notes(tables)))
     if json:
         echo_json(as_json(found))
     else:
         typer.echo(as_text(found))
-    for path in out or ():
-        write_coordinates(path, found, with_sd=sd, in_degrees=not radians)
-        typer.echo(f"wrote {path}", err=True)
-    if errors is not None:
-        write_errors(errors, found)
-        typer.echo(f"wrote {errors}", err=True)
+    report_written(tables)

@@ -1,7 +1,7 @@
 """Writes joint coordinates and marker errors: OpenSim's MOT and STO tables, and CSV.
 
-OpenSim reads no empty cells. A MOT or STO file therefore contains only the frames in which all of
-its columns are known; a CSV file contains all frames.
+OpenSim reads no empty cells: a MOT or STO file contains the known part of the table, see
+`tools.opensim_tables`. A CSV file contains all columns and frames.
 """
 
 from __future__ import annotations
@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.files.orientations import TimeTable, write_sto
+from jointfit_daemon.files.orientations import TimeTable
 from jointfit_daemon.files.text import written
+from jointfit_daemon.tools.opensim_tables import WrittenTable, write_known_values
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
@@ -24,7 +26,25 @@ ERROR_COLUMNS = ("total_squared_error", "marker_error_RMS", "marker_error_max")
 """Column names of OpenSim's file of marker errors; m^2 and m."""
 
 
-def write_coordinates(path: Path, found: TrialSolution, *, with_sd: bool, in_degrees: bool) -> None:
+def write_tables(
+    found: TrialSolution,
+    coordinates: Sequence[Path],
+    errors: Path | None,
+    *,
+    with_sd: bool,
+    in_degrees: bool,
+) -> list[WrittenTable]:
+    """Write coordinates and marker errors to the files asked for; return an outcome for each."""
+    tables = [
+        write_coordinates(path, found, with_sd=with_sd, in_degrees=in_degrees)
+        for path in coordinates
+    ]
+    return tables if errors is None else [*tables, write_errors(errors, found)]
+
+
+def write_coordinates(
+    path: Path, found: TrialSolution, *, with_sd: bool, in_degrees: bool
+) -> WrittenTable:
     """Write the coordinates, angles in degrees or rad, translations in m.
 
     With `with_sd` a column ``NAME_sd`` follows the coordinates for each of them.
@@ -34,10 +54,10 @@ def write_coordinates(path: Path, found: TrialSolution, *, with_sd: bool, in_deg
     if with_sd:
         names = (*names, *(f"{name}_sd" for name in names))
         values = np.concatenate((values, found.sd * unit), axis=1)
-    _write(path, TimeTable(names, found.t_s, values, in_degrees, "Coordinates"))
+    return _write(path, TimeTable(names, found.t_s, values, in_degrees, "Coordinates"))
 
 
-def write_errors(path: Path, found: TrialSolution) -> None:
+def write_errors(path: Path, found: TrialSolution) -> WrittenTable:
     """Write sum of squares, RMS and maximum of the marker errors of each frame, m^2 and m."""
     square, seen = found.distances**2, np.isfinite(found.distances)
     total = np.where(seen, square, 0.0).sum(axis=1)
@@ -46,20 +66,14 @@ def write_errors(path: Path, found: TrialSolution) -> None:
     most = np.where(seen, found.distances, 0.0).max(axis=1)
     values = np.stack((total, rms, most), axis=1)
     values[~found.solved] = np.nan
-    _write(path, TimeTable(ERROR_COLUMNS, found.t_s, values, False, "ModelMarkerErrors"))
+    return _write(path, TimeTable(ERROR_COLUMNS, found.t_s, values, False, "ModelMarkerErrors"))
 
 
-def _write(path: Path, table: TimeTable) -> None:
+def _write(path: Path, table: TimeTable) -> WrittenTable:
     if path.suffix.lower() == ".csv":
         _write_csv(path, table.columns, np.column_stack((table.t_s, table.values)))
-        return
-    whole = np.isfinite(table.values).all(axis=1)
-    write_sto(
-        path,
-        TimeTable(
-            table.columns, table.t_s[whole], table.values[whole], table.in_degrees, table.name
-        ),
-    )
+        return WrittenTable(path, len(table.t_s))
+    return write_known_values(path, table)
 
 
 def _write_csv(path: Path, columns: tuple[str, ...], rows: Array) -> None:

@@ -28,6 +28,7 @@ from jointfit_daemon.kinematics.inverse_kinematics import (
     solve_frames,
 )
 from jointfit_daemon.tools.marker_model import load_model, motion_trial, require_marker
+from jointfit_daemon.tools.text_output import list_names
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,8 +48,6 @@ _FEWEST_MARKERS = 3
 """Markers of a frame with a solution: fewer do not determine the position of the first segment."""
 _MISFIT_RAD = 0.0017
 """Rotation outside of the model's coordinates that is reported, rad: 0.1 degrees."""
-_SHOWN = 8
-"""Most names in a note."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,9 +132,9 @@ def _weights(asked: IkRequest, setup: IkSetup, model: ChainModel) -> tuple[Array
         weights = np.array([setup.weights.get(name, 0.0) for name in index])
         unknown = [name for name in setup.weights if name not in index]
         if unknown:
-            notes.append(f"{asked.setup}: tasks of unknown markers ignored: {_listed(unknown)}")
+            notes.append(f"{asked.setup}: tasks of unknown markers ignored: {list_names(unknown)}")
         if setup.ignored:
-            notes.append(f"{asked.setup}: coordinate tasks ignored: {_listed(setup.ignored)}")
+            notes.append(f"{asked.setup}: coordinate tasks ignored: {list_names(setup.ignored)}")
 
     for text in asked.weights:
         name, _, number = text.rpartition("=")
@@ -179,15 +178,15 @@ def _check(
     if not seen.any():
         raise RefinementError(
             f"{asked.trial} has none of the {int((weights > 0).sum())} tracked markers of"
-            f" {asked.model}: found {_listed(trial.trajectories.names)}, expected"
-            f" {_listed(model.marker_names)}: rename the markers, or use the model of this marker"
-            " set"
+            f" {asked.model}: found {list_names(trial.trajectories.names)}, expected"
+            f" {list_names(model.marker_names)}: rename the markers, or use the model of this"
+            " marker set"
         )
     faults = find_trial_faults(model, motion, fewest_frames=1)
     if faults:
         raise RefinementError("; ".join(faults))
     absent = [m.name for m, s, w in zip(model.markers, seen, weights, strict=True) if not s and w]
-    return [f"not in the trial: {_listed(absent)}"] if absent else []
+    return [f"not in the trial: {list_names(absent)}"] if absent else []
 
 
 def _check_fit(motion: MotionTrial, found: IkResult, model: ChainModel) -> list[str]:
@@ -216,17 +215,16 @@ def _described(
 ) -> TrialSolution:
     found, improved, notes = result
     model = loaded.chain
+    seen = np.isfinite(found.residuals).all(axis=-1)
+    solved = found.converged & (seen.sum(axis=1) >= _FEWEST_MARKERS)
     covariance, determined = pose_covariance(model, found)
-    table = coordinate_table(model, found.state, covariance, loaded.coordinates)
+    known = _known(loaded, determined) & solved[:, None]
+    table = coordinate_table(model, found.state, covariance, loaded.coordinates, known)
     notes += [
         f"{segment}: rotates by up to {np.degrees(most):.1f}° outside of its coordinates"
         for segment, most in table.misfit.items()
         if most > _MISFIT_RAD
     ]
-
-    seen = np.isfinite(found.residuals).all(axis=-1)
-    solved = found.converged & (seen.sum(axis=1) >= _FEWEST_MARKERS)
-    known = _known(loaded, determined) & solved[:, None]
 
     ever = known.any(axis=0)
     if not ever.any():
@@ -236,7 +234,7 @@ def _described(
         )
     never = [name for name, some in zip(table.names, ever, strict=True) if not some]
     if never:
-        notes.append(f"no markers determine, left out: {_listed(never)}")
+        notes.append(f"no markers determine, left out: {list_names(never)}")
 
     tracked = seen.any(axis=0)
     return TrialSolution(
@@ -264,8 +262,3 @@ def _known(loaded: LoadedModel, determined: NDArray[np.bool_]) -> NDArray[np.boo
         for _ in joint.names
     ]
     return np.stack(whole, axis=1)
-
-
-def _listed(names: tuple[str, ...] | list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more

@@ -223,6 +223,58 @@ def test_no_position_is_written_without_the_first_length(files: Path, tmp_path: 
     assert found["files"] == [str(tmp_path / "r.sto"), str(tmp_path / "r_angles.sto")]
 
 
+def write_gap(path: Path, shank: slice, thigh: slice) -> Path:
+    """Write the trial without the sensors of each segment in some frames."""
+    trial = movement(1)
+    for name in "ABCD":
+        trial.sensors[name][thigh if name in "AB" else shank] = np.nan
+    write_orientations_npz(path, trial)
+    return path
+
+
+@pytest.mark.parametrize("ending", ["sto", "mot"])
+def test_frames_with_unknown_values_are_left_out_of_opensim_files(
+    files: Path, tmp_path: Path, ending: str
+) -> None:
+    opensim = pytest.importorskip("opensim", reason="opensim is not installed")
+    opensim.Logger.setLevelString("off")
+    # the fusion holds an orientation for 10 frames, 0.2 s
+    gap = write_gap(tmp_path / "gap.npz", np.s_[50:80], np.s_[60:90])
+    out = tmp_path / f"r.{ending}"
+    result = run("apply", files / "model.json", gap, "--out", out, *LENGTHS)
+    assert result.exit_code == 0, result.output
+    names = [path.name for path in sorted(tmp_path.glob("r*"))]
+    assert len(names) == (3 if ending == "sto" else 1)
+    for name in names:
+        kind = opensim.TimeSeriesTable
+        kind = opensim.TimeSeriesTableQuaternion if name == "r.sto" else kind
+        read = kind(str(tmp_path / name))
+        assert read.getNumRows() == N - 30
+        assert f"{name}: {N - 30} of {N} frames written" in result.stdout
+
+
+def test_a_segment_without_sensors_is_left_out_of_opensim_files(
+    files: Path, tmp_path: Path
+) -> None:
+    gap = write_gap(tmp_path / "gap.npz", np.s_[:], np.s_[:10])
+    out = tmp_path / "r.mot"
+    result = run("apply", files / "model.json", gap, "--out", out, "--json")
+    assert result.exit_code == 0, result.output
+    found = read_sto(out)
+    assert found.columns == ("thigh_sd",)
+    assert len(found.t_s) == N - 10
+    assert "left out: knee_flexion, knee_adduction" in json.loads(result.stdout)["notes"][-2]
+
+
+def test_a_table_without_a_complete_frame_is_a_failure(files: Path, tmp_path: Path) -> None:
+    gap = write_gap(tmp_path / "gap.npz", np.s_[:140], np.s_[50:])
+    out = tmp_path / "r.sto"
+    result = run("apply", files / "model.json", gap, "--out", out)
+    assert result.exit_code == 1
+    assert f"{out}: 0 of {N} frames written" in result.stderr
+    assert not out.exists()
+
+
 def test_a_calibration_stored_by_the_daemon_is_a_model_with_its_lengths(
     files: Path, tmp_path: Path
 ) -> None:

@@ -244,6 +244,38 @@ def test_unknown_coordinates_are_left_out_of_opensim_files_and_empty_in_csv(fold
     assert (found_json["without_solution"], found_json["with_unknown_coordinates"]) == (1, 1)
 
 
+def test_a_coordinate_known_in_few_frames_does_not_empty_the_table(folder: Path) -> None:
+    def hidden(y: Array) -> Array:
+        y[1:, 8:] = np.nan  # the shank, except in the first frame
+        y[25:] = np.nan
+        return y
+
+    write_trial(folder, hidden)
+    out = folder / "out.sto"
+    notes = answer(folder, "--out", str(out))["notes"]
+    found = read_sto(out)
+    assert found.columns == NAMES[:-1]
+    assert np.isfinite(found.values).all()
+    np.testing.assert_allclose(found.t_s, np.arange(25) / 50.0)
+    assert "out.sto: columns known in less than half of the frames left out: knee" in notes
+    assert "out.sto: 25 of 40 frames written, the others have unknown values" in notes
+
+
+def test_a_table_without_a_complete_frame_is_a_failure(folder: Path) -> None:
+    def hidden(y: Array) -> Array:
+        y[::2, 8:] = np.nan  # the shank
+        y[1::2, :4] = np.nan  # the pelvis
+        return y
+
+    write_trial(folder, hidden)
+    out = [folder / "out.mot", folder / "out.csv"]
+    code, text = fault(asked(folder, *(word for path in out for word in ("--out", str(path)))))
+    assert code == 1
+    assert "out.mot: 0 of 40 frames written" in text
+    assert f"wrote {out[1]}" in text
+    assert [path.exists() for path in out] == [False, True]
+
+
 def test_a_trial_with_other_markers_is_refused_with_both_lists(folder: Path) -> None:
     trial = read_trc(folder / "walk.trc")
     names = tuple(f"other{k}" for k in range(len(trial.names)))
