@@ -24,6 +24,7 @@ from jointfit_daemon.kinematics.joint_angles import read_patent
 from jointfit_daemon.limb_model import configured_length, visible
 from jointfit_daemon.model import Chain
 from jointfit_daemon.tools.fuse._lengths import left_out_positions
+from jointfit_daemon.tools.fuse._notes import calibration_notes
 from jointfit_daemon.tools.opensim_tables import (
     WrittenTable,
     write_known_orientations,
@@ -166,7 +167,7 @@ def fuse_trial(calibration: Calibration, table: OrientationRecording, chain: Cha
             for i, name in enumerate(placed)
         },
         {flag: count / len(states) for flag, count in sorted(flags.items())},
-        () if note is None else (note,),
+        (*calibration_notes(calibration, table.q, left=chain.left_side), *filter(None, [note])),
     )
 
 

@@ -275,6 +275,39 @@ def test_a_table_without_a_complete_frame_is_a_failure(files: Path, tmp_path: Pa
     assert not out.exists()
 
 
+def test_lags_and_side_that_a_stored_calibration_does_not_determine_are_noted(
+    files: Path, tmp_path: Path
+) -> None:
+    lags_ns = {"A": 12_000_000, "B": -3_000_000, "C": 0, "D": 500_000}
+    fitted = mean_model()
+    stored = replace(
+        fitted,
+        sensor={name: replace(s, lag_ns=lags_ns[name]) for name, s in fitted.sensor.items()},
+        quality={},
+    )
+    store = CalibrationStore(tmp_path, "leg")
+    path = store.path(store.save(stored))
+
+    def notes(*options: object) -> str:
+        out = tmp_path / "r.csv"
+        result = run("apply", path, files / "m1.npz", "--out", out, "--json", *options)
+        assert result.exit_code == 0, result.output
+        return " ".join(json.loads(result.stdout)["notes"])
+
+    assert "differ by 15.0 ms and are not applied (A 12.0, B -3.0, C 0.0, D 0.5 ms)" in notes()
+    assert "interpolate each sensor at t + lag" in notes()
+    assert "side assumed to be right" in notes()
+    one_lag = notes("--left", "--without", "A", "--without", "B")
+    assert "lag" not in one_lag
+    assert "side" not in one_lag
+
+
+def test_a_fitted_model_has_no_notes_on_lags_or_side(files: Path, tmp_path: Path) -> None:
+    text = apply(files, tmp_path / "r.csv").stdout
+    assert "lag" not in text
+    assert "side" not in text
+
+
 def test_a_calibration_stored_by_the_daemon_is_a_model_with_its_lengths(
     files: Path, tmp_path: Path
 ) -> None:
