@@ -186,11 +186,12 @@ class CalibrationStore:
         notes: list[str] = []
         for version in reversed(self.versions()):
             try:
-                return StoredCalibration(self.load(version), version, tuple(notes))
+                used = tuple(f"{note}; version {version} is used" for note in notes)
+                return StoredCalibration(self.load(version), version, used)
             except _DamagedFileError as error:
-                notes.append(f"{error}; {self._set_aside(version)}; the previous version is used")
+                notes.append(f"{error}; {self._set_aside(version)}")
             except CalibrationFileError as error:
-                notes.append(f"{error}; the previous version is used")
+                notes.append(str(error))
         if notes:
             raise CalibrationFileError("; ".join(notes))
         return None

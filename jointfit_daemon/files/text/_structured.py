@@ -137,7 +137,15 @@ def parse_json(text: str) -> Any:
     RecursionError
         Nested too deeply.
     """
-    return json.loads(text, parse_constant=_refuse_constant)
+    try:
+        return json.loads(text, parse_constant=_refuse_constant)
+    except json.JSONDecodeError as error:
+        fault = error.msg.replace("Expecting", "expected")
+        raise ValueError(
+            f"line {error.lineno}, column {error.colno}: {fault[:1].lower()}{fault[1:]}"
+        ) from error
+    except RecursionError as error:
+        raise RecursionError(f"nested more than {MAX_NESTING} levels deep") from error
 
 
 def _refuse_constant(name: str) -> float:

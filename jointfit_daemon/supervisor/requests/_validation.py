@@ -128,7 +128,8 @@ def _parse_table(payload: bytes) -> tuple[dict[str, Any], Fault | None]:
     try:
         table = orjson.loads(payload or b"{}")
     except orjson.JSONDecodeError as error:
-        return {}, Fault("payload", f"is not JSON: {error}")
+        place = f"line {error.lineno}, column {error.colno}"
+        return {}, Fault("payload", f"is not JSON in UTF-8 ({place}), expected a JSON object")
     if not isinstance(table, dict):
         return {}, Fault("payload", "expected a JSON object", table)
     if len(table) > MOST_KEYS:

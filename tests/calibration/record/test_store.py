@@ -71,7 +71,7 @@ def test_a_damaged_version_is_named_and_the_one_before_is_used(
     assert latest is not None
     assert latest.version == 1
     assert "0002.json" in latest.notes[0]
-    assert "renamed to 0002.json.bad" in latest.notes[0]
+    assert latest.notes[0].endswith("renamed to 0002.json.bad; version 1 is used")
     assert store.save(numbered("next")) == 3
     assert store.path(2).with_name("0002.json.bad").read_bytes() == damage
     again = store.latest()
