@@ -35,7 +35,7 @@ CAN_MODULES = (
     "drivers/net/can/vcan",
 )
 HIDDEN = ("/tmp", "/run", "/var/tmp", "/mnt")
-"""Folders that the guest gets empty ones for; what it needs of them is mounted back."""
+"""Folders that are empty in the guest; needed parts of them are mounted back."""
 
 INIT = """\
 #!/bin/sh

@@ -1,9 +1,9 @@
 """Fail when a test that CI must run was skipped: `no_skips.py [--minimal] JUNIT.xml ...`.
 
 Two kinds of test may be skipped in that step. Those of tests/vm: a later step runs them on a kernel
-that has vcan, and fails if one is skipped there. And those that need what nobody can install: the
-real recordings beside the project, a network interface that carries multicast. On the minimal
-system tests that need a Debian package may be skipped, too: on this one they run.
+that has vcan, and fails if one is skipped there. And those that need something that cannot be
+installed: recordings that are not part of the project, a network interface that carries multicast.
+On the minimal system tests that need a Debian package may be skipped as well; here they run.
 """
 
 import sys
@@ -20,7 +20,7 @@ NOT_INSTALLABLE = (
 NOT_IN_MINIMAL = tuple(
     f"(Debian: apt install {package})" for package in ("mosquitto", "systemd", "groff-base")
 )
-"""Reasons of tests that the minimal system may skip, besides."""
+"""Further reasons of tests that the minimal system may skip."""
 
 
 def skipped(cases: list[ET.Element]) -> list[tuple[str, str]]:

@@ -1,4 +1,4 @@
-"""Online learning: subjects calibrated on walking who then squat and sit in view of the cameras.
+"""Online learning: subjects calibrated on walking then squat and sit in view of the cameras.
 
 Simulated subjects with the settings of the demo. Ground truth are the bones, which no fit receives.
 Circles and walking are calibrated; squats and sit-to-stand are learned in three rounds. The

@@ -1,8 +1,8 @@
 """Prior that a subject stands upright in the static pose, combined with joint centers.
 
 A center from skin markers over a short arc has an uncertainty of centimeters across the limb, the
-ankle most of all. A subject who was asked to stand upright does so within a few degrees. Both are
-combined by their covariances; the model is linear and Gaussian.
+ankle most of all. Subjects stand upright within a few degrees when asked to. Center
+and posture are combined by their covariances; the model is linear and Gaussian.
 """
 
 from __future__ import annotations

@@ -126,7 +126,6 @@ class DemoRun:
 
     def _evaluate(self) -> None:
         """Compare the poses whose ground truth is available."""
-        self.truth.read()
         mature = time.monotonic_ns() - MATURE_NS
         while self._poses and self._poses[0][0] < mature:
             t_ns, pose = self._poses.pop(0)
