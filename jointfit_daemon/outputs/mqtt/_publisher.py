@@ -60,9 +60,6 @@ _FIRST_RETRY_S = 0.05
 """Wait before the first retry, s: a broker that reset one connection may accept the next."""
 _LAST_RETRY_S = 0.6
 """Longest wait before a retry, s: a refused attempt is cheap, and a user waits for the broker."""
-_MOST_TAKEOVERS = 10
-"""Short connections in a row after which the waits grow: takeovers are settled by then, so a broker
-that ends every connection is retried less often."""
 _HEALTHY_S = 5.0
 """Duration of a connection that resets the wait, s."""
 
@@ -156,7 +153,7 @@ class MqttPublisher:
                 missing,
             )
 
-        delay_s, short = _FIRST_RETRY_S, 0
+        delay_s = _FIRST_RETRY_S
         while True:
             began_s = self._loop.time()
             # reason: see _serve
@@ -174,8 +171,7 @@ class MqttPublisher:
 
             # A daemon that was connected takes its connection back at once: see TakeoverDetector.
             lasted_s, self._lasted_s = self._lasted_s, 0.0
-            short = short + 1 if 0.0 < lasted_s < SHORT_S else 0
-            if lasted_s >= NEWCOMER_S and short <= _MOST_TAKEOVERS:
+            if lasted_s >= NEWCOMER_S:
                 delay_s = _FIRST_RETRY_S
 
             try:
