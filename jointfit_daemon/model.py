@@ -168,6 +168,28 @@ Decoded = ImuSample | MocapFrame | ClockEcho | SyncPulse | Corrupt | DeviceEvent
 # --- the body ---------------------------------------------------------------------------------
 
 
+class AngleConvention(StrEnum):
+    """Definition of the three angles of a joint, see docs/kinematics.md."""
+
+    FLEXION = "flexion"
+    """Flexion, adduction, axial rotation: hip, knee, ankle, elbow, wrist."""
+    ELEVATION = "elevation"
+    """Plane of elevation, elevation, axial rotation: shoulder."""
+    TILT_TORSION = "tilt_torsion"
+    """Flexion and adduction as components of the tilt of the distal long axis, and torsion."""
+    TRUNK = "trunk"
+    """Flexion, lateral bending and axial rotation of the upper segment on the lower one."""
+
+
+ANGLE_NAMES = {
+    AngleConvention.FLEXION: ("flexion", "adduction", "rotation"),
+    AngleConvention.ELEVATION: ("plane", "elevation", "rotation"),
+    AngleConvention.TILT_TORSION: ("flexion", "adduction", "rotation"),
+    AngleConvention.TRUNK: ("flexion", "bending", "rotation"),
+}
+"""Names of the three angles in outputs, in the order of `JointAngles`."""
+
+
 @dataclass(frozen=True, slots=True)
 class Chain:
     """A limb: joints O1 to On+1 from proximal to distal, and the n segments between them."""
@@ -188,10 +210,15 @@ class Chain:
     """Body part distal of the last joint (foot), with markers only; None without one."""
     static_axes: bool = False
     """Segment axes equal the world in the static pose; otherwise joint centres define them."""
+    conventions: tuple[AngleConvention | None, ...] = ()
+    """Configured angle conventions of the joints; None if the name of the joint selects it."""
 
 
 class JointAngles(NamedTuple):
-    """Anatomical joint angles, rad; signs in CONVENTIONS.md."""
+    """Three angles of a joint, rad, in the order of its `AngleConvention`.
+
+    The fields have the names of the convention ``flexion``; signs in CONVENTIONS.md.
+    """
 
     flexion: float
     adduction: float
@@ -220,9 +247,11 @@ class JointState(NamedTuple):
     inner: float | None = None
     """Included angle between the two segments, rad; π when straight."""
     angle_sd: float | None = None
-    """Standard deviation of the flexion angle, rad."""
+    """Standard deviation of flexion, or of elevation in the convention ``elevation``, rad."""
     rates: JointAngles | None = None
     """Rates of change of the angles over the last 50 ms, rad/s."""
+    convention: AngleConvention = AngleConvention.FLEXION
+    """Definition of `angles` and `rates`."""
 
 
 class FusionMode(StrEnum):
@@ -315,6 +344,8 @@ class OpticalJoint(NamedTuple):
     """Differences of the angles, rad, within half a turn."""
     residual_rms: JointAngles | None = None
     """RMS of `residual` over the last seconds, rad."""
+    convention: AngleConvention = AngleConvention.FLEXION
+    """Definition of `angles` and `residual`."""
 
 
 class OpticalState(NamedTuple):

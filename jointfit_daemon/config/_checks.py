@@ -101,11 +101,20 @@ def check_chain(table: ChainTable) -> Iterator[Fault]:
             yield from check_topic_name(f"chain.{key}", name)
             if name in (table.segments or ()):
                 yield Fault(f"chain.{key}", "is already a segment", name)
+    yield from _check_values_by_name(table)
+
+
+def _check_values_by_name(table: ChainTable) -> Iterator[Fault]:
+    """Check the lengths of segments and the angle conventions of joints."""
     for name, length in (table.lengths_m or {}).items():
         if table.segments:
             yield from check_known_name(f"chain.lengths_m.{name}", name, table.segments, "segment")
         if not 0 < length < _LONGEST_M:
             yield Fault(f"chain.lengths_m.{name}", "expected a length in metres", length)
+    for name in table.angles or {}:
+        if inner := (table.joints or ())[1:-1]:  # only joints between two segments have angles
+            key = f"chain.angles.{name}"
+            yield from check_known_name(key, name, inner, "joint between two segments")
 
 
 def check_known_name(

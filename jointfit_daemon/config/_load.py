@@ -369,4 +369,5 @@ def _chain(table: ChainTable, sources: Sequence[Source]) -> Chain:
         proximal=table.proximal,
         distal=table.distal,
         static_axes=table.axes == "static",
+        conventions=tuple(table.angles.get(joint) for joint in table.joints),
     )

@@ -13,6 +13,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from jointfit_daemon.driver import Settings
 from jointfit_daemon.limb_model import Method  # noqa: TC001 - pydantic reads it at run time
+from jointfit_daemon.model import AngleConvention  # noqa: TC001 - as above
 
 _PLAIN, _TLS = 1883, 8883
 """Default ports without and with TLS (IANA: mqtt, secure-mqtt)."""
@@ -55,6 +56,11 @@ class ChainTable(Settings):
     lengths_m: dict[str, float] = Field(
         default_factory=dict,
         description="known segment lengths, m; calibration estimates the others",
+    )
+    angles: dict[str, AngleConvention] = Field(
+        default_factory=dict,
+        description="angle conventions of joints; default by the name of the joint: `elevation` "
+        "for shoulders, `trunk` for spine and neck, `flexion` for all others",
     )
 
 

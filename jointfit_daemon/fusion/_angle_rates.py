@@ -60,7 +60,7 @@ class AngleRates:
         per_s = 1e9 / (t_ns - start_ns)
         return JointAngles(
             _wrapped(angles.flexion - start.flexion) * per_s,
-            (angles.adduction - start.adduction) * per_s,
+            _wrapped(angles.adduction - start.adduction) * per_s,
             _wrapped(angles.rotation - start.rotation) * per_s,
         )
 

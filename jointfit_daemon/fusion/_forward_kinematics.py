@@ -7,11 +7,12 @@ contains no more.
 
 from __future__ import annotations
 
-from math import cos, hypot, sqrt
+from math import hypot, isfinite, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.kinematics.joint_angles import read_joint
 from jointfit_daemon.kinematics.rotation_scalar import rotate_z_one
+from jointfit_daemon.model import AngleConvention
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,8 +34,9 @@ class JointAngleEstimate(NamedTuple):
     angles: JointAngles
     inner: float
     """Angle between the two segments, rad; pi if straight."""
-    flexion_sd: float | None
-    """Standard deviation of flexion, rad; None at gimbal lock."""
+    main_sd: float | None
+    """Standard deviation of the main angle (flexion or elevation), rad; None where the angle is not
+    defined."""
     gimbal: bool
     """Whether the joint is at gimbal lock."""
 
@@ -74,16 +76,19 @@ def joint_angle_estimate(
     sign: float,
     left: bool,
     correlation: float = 0.0,
+    convention: AngleConvention = AngleConvention.FLEXION,
 ) -> JointAngleEstimate | None:
     r"""Return the angles of one joint, or None if an orientation is unknown.
 
     With isotropic errors, :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, where E
-    maps the rates of the Grood and Suntay angles to angular velocity. Its first entry gives the
-    standard deviation of flexion, :math:`\sqrt{\sigma_1^2 + \sigma_2^2} / \cos\theta` with
-    adduction :math:`\theta`, to first order.
+    maps the rates of the angles to angular velocity. Its entry of the main angle gives the standard
+    deviation :math:`f \sqrt{\sigma_1^2 + \sigma_2^2}`, to first order. The factor f is
+    :math:`1 / \cos\theta` for flexion with adduction (or bending) :math:`\theta`, 1 for elevation,
+    and that of ``read_joint`` for a tilt.
 
-    If the standard deviation of a segment about its x axis is known, it replaces the isotropic one,
-    because flexion hardly depends on the other axes. If it is known for both segments,
+    If the standard deviation of a segment about its x axis is known, it replaces the isotropic one
+    in the conventions ``flexion`` and ``trunk``, whose flexion hardly depends on the other axes. If
+    it is known for both segments,
     :math:`2 \rho \sigma_1 \sigma_2` is subtracted, where :math:`\rho` is the correlation of the
     model errors about x. Errors of held, uncorrected or inconsistent segments are treated as
     independent.
@@ -98,15 +103,21 @@ def joint_angle_estimate(
         Whether the limb is on the left side.
     correlation : float
         :math:`\rho`.
+    convention : AngleConvention
+        Definition of the angles.
     """
     if proximal.q is None or distal.q is None or proximal.sd is None or distal.sd is None:
         return None
-    angles, inner, gimbal = read_joint(proximal.q, distal.q, flexion_sign=sign, left=left)
+    angles, inner, gimbal, factor = read_joint(
+        proximal.q, distal.q, flexion_sign=sign, left=left, convention=convention
+    )
 
     first, second = proximal.flexion_sd, distal.flexion_sd
+    if convention in {AngleConvention.ELEVATION, AngleConvention.TILT_TORSION}:
+        first = second = None  # their main axis is not the x axis of a segment
     total = (proximal.sd if first is None else hypot(first, proximal.fault_sd)) ** 2
     total += (distal.sd if second is None else hypot(second, distal.fault_sd)) ** 2
     if first is not None and second is not None:
         total -= 2.0 * correlation * first * second
-    sd = None if gimbal else sqrt(total) / cos(angles.adduction)
+    sd = sqrt(total) * factor if isfinite(factor) else None
     return JointAngleEstimate(angles, inner, sd, gimbal)

@@ -19,7 +19,12 @@ from jointfit_daemon.fusion._heading_uncertainty import add_heading_sd
 from jointfit_daemon.fusion._segment_fuser import FusedSegment, SegmentFuser
 from jointfit_daemon.fusion.faults import ConsistencyMonitor, SensorMonitor
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
-from jointfit_daemon.limb_model import configured_length, flexion_sign, neighbor
+from jointfit_daemon.limb_model import (
+    angle_convention,
+    configured_length,
+    flexion_sign,
+    neighbor,
+)
 from jointfit_daemon.model import (
     FrameFlag,
     FusionMode,
@@ -76,6 +81,11 @@ class LimbFuser:
         """Sensor, q_optical_world and q_sensor_segment."""
         self.consistency: ConsistencyMonitor | None = None
         self._rates = AngleRates()
+        self._conventions = [angle_convention(chain, i) for i in range(len(chain.joints))]
+        self._unknown_joints = tuple(
+            JointState(name, None, None, convention=convention)
+            for name, convention in zip(chain.joints, self._conventions, strict=True)
+        )
         if calibration is None or not usable:
             return
 
@@ -146,7 +156,7 @@ class LimbFuser:
                 sync,
                 self._base_flags,
                 tuple(SegmentState(name, None, None, ()) for name in self._chain.segments),
-                tuple(JointState(name, None, None) for name in self._chain.joints),
+                self._unknown_joints,
             )
 
         # Chain of rotations: optical world, world, sensor, segment.
@@ -263,21 +273,22 @@ class LimbFuser:
                 joints.append(JointState(name, position, sd))
                 continue
 
-            proximal, distal = fused[i - 1], fused[i]
+            proximal, distal, convention = fused[i - 1], fused[i], self._conventions[i]
             estimate = joint_angle_estimate(
                 proximal,
                 distal,
                 sign=self._signs[i],
                 left=chain.left_side,
                 correlation=self._correlations[i],
+                convention=convention,
             )
             if estimate is None:
-                joints.append(JointState(name, position, sd))
+                joints.append(JointState(name, position, sd, convention=convention))
                 continue
             if estimate.gimbal and FrameFlag.GIMBAL not in flags:
                 flags.append(FrameFlag.GIMBAL)
-            angles, inner, flexion_sd, gimbal = estimate
+            angles, inner, main_sd, gimbal = estimate
             measured = angles if proximal.used and distal.used else None  # not while held
             rates = self._rates.update(t_ns, name, measured, gimbal=gimbal)
-            joints.append(JointState(name, position, sd, angles, inner, flexion_sd, rates))
+            joints.append(JointState(name, position, sd, angles, inner, main_sd, rates, convention))
         return tuple(joints)

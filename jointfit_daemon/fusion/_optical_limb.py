@@ -13,7 +13,7 @@ import numpy as np
 from jointfit_daemon.fusion._cluster_pose import ClusterPose
 from jointfit_daemon.kinematics.joint_angles import read_joint
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
-from jointfit_daemon.limb_model import flexion_sign, restore_cluster
+from jointfit_daemon.limb_model import angle_convention, flexion_sign, restore_cluster
 
 if TYPE_CHECKING:
     from jointfit_daemon.kinematics.joint_angles import JointReading
@@ -56,6 +56,7 @@ class OpticalLimb:
         """Cluster of each body part, from proximal to distal, with the joints fixed in it."""
         self._static = [calibration.segment[name].q_static for name in chain.segments]
         self._signs = [flexion_sign(joint) for joint in chain.joints]
+        self._conventions = [angle_convention(chain, i) for i in range(len(chain.joints))]
         self._layout: MocapLayout | None = None
         self._poses: list[ClusterPose | None] = []
 
@@ -117,7 +118,9 @@ class OpticalLimb:
         if proximal is None or distal is None:
             return None
         sign, left = self._signs[joint], self._chain.left_side
-        return read_joint(proximal, distal, flexion_sign=sign, left=left)
+        return read_joint(
+            proximal, distal, flexion_sign=sign, left=left, convention=self._conventions[joint]
+        )
 
 
 def _mean(points: list[Vector]) -> Vector | None:

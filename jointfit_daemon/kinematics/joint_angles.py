@@ -3,21 +3,21 @@ r"""Joint angles from the rotation between two segments.
 .. math:: q_j = q_{proximal}^* \otimes q_{distal}
 
 with matrix R, indices from 0. Segment axes and signs are those of CONVENTIONS.md (x to the right, y
-anterior, z proximal); angles in rad; q and -q give the same result. Where the middle angle of a
-sequence reaches 90 degrees, the outer two rotate about one line. The last one is then 0, the first
-one contains the whole rotation, and the frame is flagged as gimbal-locked.
+anterior, z proximal); angles in rad; q and -q give the same result. `AngleConvention` selects the
+three angles of a joint. Where two axes of a sequence coincide, one of the two angles is 0, the
+other one contains the whole rotation, and the frame is flagged as gimbal-locked.
 """
 
 from __future__ import annotations
 
-from math import asin, atan2, hypot, pi
+from math import asin, atan2, hypot, inf, pi, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import between_one
-from jointfit_daemon.model import JointAngles
+from jointfit_daemon.model import AngleConvention, JointAngles
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 GIMBAL_SINE = 0.9999
 """Sine of the middle angle above which the outer two are not separated."""
+LOCKED_SINE = sqrt(1.0 - GIMBAL_SINE**2)
+"""Sine of the elevation below which plane and axial rotation are not separated: within 0.8°."""
+_SMALL_TILT = 1e-6
+"""Sine of half the tilt below which the tilt is twice that sine."""
 
 
 def joint_rotation(q_proximal: ArrayLike, q_distal: ArrayLike) -> Array:
@@ -75,19 +79,32 @@ class JointReading(NamedTuple):
     inner: float
     """Angle between the segments, rad: pi when straight."""
     gimbal: bool
+    sd_factor: float
+    """Standard deviation of the main angle over that of the rotation per axis, to first order.
+
+    The main angle is elevation in the convention ``elevation``, otherwise flexion. Infinite where
+    the main angle is not defined."""
 
 
 def read_joint(
-    q_proximal: Quaternion, q_distal: Quaternion, *, flexion_sign: float, left: bool
+    q_proximal: Quaternion,
+    q_distal: Quaternion,
+    *,
+    flexion_sign: float,
+    left: bool,
+    convention: AngleConvention = AngleConvention.FLEXION,
 ) -> JointReading:
-    r"""Return anatomical and inner angle of one frame of plain tuples.
+    r"""Return the angles of a convention and the inner angle of one frame of plain tuples.
 
-    .. math:: R = R_x(\phi) R_y(\theta) R_z(\psi): \quad
+    .. math:: \text{flexion: } R = R_x(\phi) R_y(\theta) R_z(\psi): \quad
               \phi = \mathrm{atan2}(-R_{12}, R_{22}),\; \theta = \arcsin R_{02},\;
               \psi = \mathrm{atan2}(-R_{01}, R_{00})
 
-    Source: Grood and Suntay 1983, doi 10.1115/1.3138397, in the axes of CONVENTIONS.md. The inner
-    angle does not depend on the choice of the flexion axis.
+    The other conventions are those of ``_elevation``, ``_tilt_torsion`` and ``_trunk``. The inner
+    angle is the same in all of them.
+
+    Source: Grood and Suntay 1983, doi 10.1115/1.3138397, in the axes of CONVENTIONS.md; Wu et al.
+    2002, doi 10.1016/S0021-9290(01)00222-6, and 2005, doi 10.1016/j.jbiomech.2004.05.042.
 
     Parameters
     ----------
@@ -96,9 +113,24 @@ def read_joint(
     flexion_sign : float
         +1 for hip and ankle, -1 for the knee, where flexion moves the heel back.
     left : bool
-        Left limb: adduction and rotation change sign, so that both sides agree.
+        Left limb: it is mirrored at its sagittal plane, so that both sides agree. Not used for the
+        trunk.
+    convention : AngleConvention
+        Definition of the three angles.
     """
+    if convention is AngleConvention.TRUNK:
+        return _trunk(between_one(q_distal, q_proximal))
     w, x, y, z = between_one(q_proximal, q_distal)
+    if left:
+        y, z = -y, -z
+    if convention is AngleConvention.ELEVATION:
+        return _elevation(w, x, y, z)
+    if convention is AngleConvention.TILT_TORSION:
+        return _tilt_torsion(w, x, y, z, flexion_sign)
+    return _flexion(w, x, y, z, flexion_sign)
+
+
+def _flexion(w: float, x: float, y: float, z: float, sign: float) -> JointReading:
     r02 = 2.0 * (x * z + w * y)
     minus_r12 = 2.0 * (w * x - y * z)
     r22 = 1.0 - 2.0 * (x * x + y * y)
@@ -111,9 +143,69 @@ def read_joint(
         psi = atan2(2.0 * (w * z - x * y), 1.0 - 2.0 * (y * y + z * z))
     theta = asin(min(max(r02, -1.0), 1.0))
 
-    side = -1.0 if left else 1.0
-    angles = JointAngles(flexion_sign * phi, side * theta, side * psi)
-    return JointReading(angles, pi - atan2(hypot(r02, minus_r12), r22), gimbal)
+    cosine = hypot(minus_r12, r22)
+    inner = pi - atan2(hypot(r02, minus_r12), r22)
+    angles = JointAngles(sign * phi, theta, psi)
+    return JointReading(angles, inner, gimbal, inf if gimbal else 1.0 / cosine)
+
+
+def _trunk(q_lower_upper: Quaternion) -> JointReading:
+    """Return forward flexion, bending to the right and rotation to the left of the upper segment.
+
+    The sequence is that of flexion, of the upper segment relative to the lower one. Chains list the
+    upper segment first.
+    """
+    return _flexion(*q_lower_upper, -1.0)
+
+
+def _elevation(w: float, x: float, y: float, z: float) -> JointReading:
+    r"""Return plane of elevation, elevation and axial rotation of the ISB (Y-X-Y in its axes).
+
+    .. math:: R = R_z(\gamma) R_y(-\epsilon) R_z(\psi), \quad
+              \epsilon = 2\,\mathrm{atan2}(\sqrt{x^2 + y^2}, \sqrt{w^2 + z^2}), \quad
+              \gamma, \psi = \mathrm{atan2}(z, w) \pm \mathrm{atan2}(x, -y)
+
+    The plane is 0 in abduction and 90 degrees in forward flexion. Plane and axial rotation are not
+    separable where the elevation is 0 or 180 degrees: the plane is then 0.
+    """
+    swing, twist = hypot(x, y), hypot(w, z)
+    elevation = 2.0 * atan2(swing, twist)
+    half_sum, half_difference = atan2(z, w), atan2(x, -y)
+
+    gimbal = 2.0 * swing * twist < LOCKED_SINE
+    if gimbal:
+        plane, rotated = 0.0, 2.0 * (half_sum if twist > swing else -half_difference)
+    else:
+        plane, rotated = _wrapped_one(half_sum + half_difference), half_sum - half_difference
+    angles = JointAngles(plane, elevation, _wrapped_one(rotated))
+    return JointReading(angles, pi - elevation, gimbal, 1.0)
+
+
+def _tilt_torsion(w: float, x: float, y: float, z: float, sign: float) -> JointReading:
+    r"""Return the tilt of the long axis as flexion and adduction, and the torsion about it.
+
+    .. math:: R = \exp(v_x, v_y, 0)\, R_z(\tau), \quad \tau = 2\,\mathrm{atan2}(z, w)
+
+    The tilt :math:`|v|` equals the elevation, and its direction the plane of elevation. In a
+    sagittal or frontal movement, :math:`v` is the flexion or adduction of the convention
+    ``flexion``. Only a tilt of 180 degrees is singular.
+
+    A rotation error across the tilt is magnified by :math:`|v| / \sin|v|`.
+    """
+    swing, twist = hypot(x, y), hypot(w, z)
+    tilt = 2.0 * atan2(swing, twist)
+    scale = tilt / swing if swing > _SMALL_TILT else 2.0
+
+    gimbal = twist < swing and 2.0 * swing * twist < LOCKED_SINE
+    c, s = (1.0, 0.0) if gimbal else (w / twist, z / twist)
+    v_x, v_y = scale * (x * c - y * s), scale * (x * s + y * c)
+    torsion = 0.0 if gimbal else _wrapped_one(2.0 * atan2(z, w))
+    angles = JointAngles(sign * v_x, v_y, torsion)
+    if gimbal or swing <= _SMALL_TILT:
+        return JointReading(angles, pi - tilt, gimbal, inf if gimbal else 1.0)
+
+    across = tilt / (2.0 * swing * twist)
+    return JointReading(angles, pi - tilt, gimbal, hypot(v_x, across * v_y) / tilt)
 
 
 class PatentReading(NamedTuple):

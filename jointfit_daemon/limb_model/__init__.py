@@ -14,6 +14,7 @@ from jointfit_daemon.limb_model._calibration import (
     model_key,
 )
 from jointfit_daemon.limb_model._chain_conventions import (
+    angle_convention,
     body_parts,
     configured_length,
     flexion_sign,
@@ -86,6 +87,7 @@ __all__ = [
     "SensorCalibration",
     "SensorLink",
     "StoredCluster",
+    "angle_convention",
     "as_rows",
     "axis_heading_one",
     "body_parts",

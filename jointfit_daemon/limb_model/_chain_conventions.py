@@ -7,14 +7,33 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.model import AngleConvention
+
 if TYPE_CHECKING:
     from jointfit_daemon.model import Chain
 
 
-FLEXES_FORWARD = ("hip", "ankle", "elbow", "shoulder", "wrist")
+TRUNK_JOINTS = ("trunk", "spine", "lumb", "neck", "cervic")
+"""Parts of the names of joints of the trunk, whose upper segment comes first in the chain."""
+SHOULDER_JOINTS = ("shoulder", "glenohumeral", "humerothoracic", "thoracohumeral")
+"""Parts of the names of joints whose angles are plane of elevation, elevation and rotation."""
+FLEXES_FORWARD = ("hip", "ankle", "elbow", "wrist", *SHOULDER_JOINTS, *TRUNK_JOINTS)
 """Parts of the names of joints whose flexion is a positive rotation about x (distal end forward).
 
 Knees and joints with other names flex with a negative rotation."""
+
+
+def angle_convention(chain: Chain, i: int) -> AngleConvention:
+    """Return the angle convention of joint i: the configured one, or that of its name."""
+    configured = chain.conventions[i] if i < len(chain.conventions) else None
+    if configured is not None:
+        return configured
+    name = chain.joints[i].casefold()
+    if any(word in name for word in SHOULDER_JOINTS):
+        return AngleConvention.ELEVATION
+    if any(word in name for word in TRUNK_JOINTS):
+        return AngleConvention.TRUNK
+    return AngleConvention.FLEXION
 
 
 def body_parts(chain: Chain) -> list[str | None]:

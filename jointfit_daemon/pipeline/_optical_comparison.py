@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.fusion import OpticalLimb
 from jointfit_daemon.kinematics.joint_angles import read_joint
 from jointfit_daemon.kinematics.rotation_scalar import angle_between_one, interpolate_one
-from jointfit_daemon.limb_model import flexion_sign
+from jointfit_daemon.limb_model import angle_convention, flexion_sign
 from jointfit_daemon.model import (
     FrameFlag,
     FusionMode,
@@ -78,6 +78,7 @@ class OpticalComparison:
         self._chain = chain
         self._limb = OpticalLimb(chain, calibration) if usable and calibration else None
         self._signs = [flexion_sign(joint) for joint in chain.joints]
+        self._conventions = [angle_convention(chain, i) for i in range(len(chain.joints))]
         self._rate = RateDivider(rate_hz if usable else 1.0)  # nothing is compared if not usable
         self._waiting: deque[tuple[int, int, bool, OpticalReading]] = deque(maxlen=_WAITING)
         """Instant, frame number, whether the stamp is synchronized, and the limb in the frame."""
@@ -153,7 +154,10 @@ class OpticalComparison:
             distance = dist(position, p_imu)
             distance_rms = self._add(t_ns, distance, "position", name)
 
-        joint = OpticalJoint(name, position, reading.gaps[number], distance, distance_rms)
+        convention = self._conventions[number]
+        joint = OpticalJoint(
+            name, position, reading.gaps[number], distance, distance_rms, convention=convention
+        )
         optical = reading.joints[number]
         if optical is None:
             return joint
@@ -163,7 +167,7 @@ class OpticalComparison:
             return joint
 
         sign, left = self._signs[number], self._chain.left_side
-        measured = read_joint(proximal, distal, flexion_sign=sign, left=left)
+        measured = read_joint(proximal, distal, flexion_sign=sign, left=left, convention=convention)
         if optical.gimbal or measured.gimbal:  # the angles are not comparable one by one
             return joint
         pairs = zip(measured.angles, optical.angles, strict=True)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.config import ConfigError, MqttSettings, load_rig, parse_rig, rig_schema
 from jointfit_daemon.driver import _SLCAN_BITRATES, CanBusSettings
+from jointfit_daemon.model import AngleConvention
 from jointfit_drivers.ports._python_can_bus import PythonCanBus
 from jointfit_drivers.ports._slcan_bus import SlcanBus
 from jointfit_protocols.can.slcan import BITRATES
@@ -32,10 +33,12 @@ def complaints(table: Table) -> list[str]:
 
 def test_valid_rig_is_converted_to_si(table: Table) -> None:
     table["chain"] |= {"side": "left", "lengths_m": {"shank": 0.4}, "distal": "foot"}
+    table["chain"]["angles"] = {"knee": "tilt_torsion"}
     rig = parse_rig(table)
     assert rig.chain.sensors == (("S1", "S2"), ("S3", "S4"))
     assert rig.chain.left_side
     assert rig.chain.lengths == (None, 0.4)
+    assert rig.chain.conventions == (None, AngleConvention.TILT_TORSION, None)
     assert [source.id for source in rig.sources] == ["S1", "S2", "S3", "S4", "mocap"]
     assert rig.mqtt.base == "jointfit/bench-1"
     assert rig.mqtt.tcp_port == 1883
@@ -148,6 +151,17 @@ def test_ten_faults_are_reported_together(
         (("imu", 3, "ids", "quaternoin"), 5, "did you mean 'quaternion'?"),
         (("chain", "segments"), ["thigh", "thigh"], "named 2 times"),
         (("chain", "lengths_m"), {"shank": 420}, "expected a length in metres"),
+        (("chain", "angles"), {"kne": "trunk"}, "did you mean 'knee'?"),
+        (
+            ("chain", "angles"),
+            {"hip": "flexion"},
+            "unknown joint between two segments; known: knee",
+        ),
+        (
+            ("chain", "angles"),
+            {"knee": "euler"},
+            "should be 'flexion', 'elevation', 'tilt_torsion'",
+        ),
         (("chain", "proximal"), "shank", "is already a segment"),
         (("mocap", "markers", "shak"), ["A", "B", "C"], "did you mean 'shank'?"),
         (("mocap", "markers", "shank"), ["T1", "B", "C"], "is a marker of 'thigh' already"),

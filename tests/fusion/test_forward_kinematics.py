@@ -65,7 +65,7 @@ def test_flexion_standard_deviation_matches_monte_carlo() -> None:
         for r, sd in ((above, 0.02), (below, 0.03))
     ]
     flexion = -(noisy[0].inv() * noisy[1]).as_euler("XYZ")[:, 0]
-    assert state.flexion_sd == pytest.approx(flexion.std(), rel=0.03)
+    assert state.main_sd == pytest.approx(flexion.std(), rel=0.03)
 
 
 def test_left_limb_mirrors_the_right_and_gimbal_lock_is_flagged() -> None:
@@ -81,7 +81,7 @@ def test_left_limb_mirrors_the_right_and_gimbal_lock_is_flagged() -> None:
         rest, fused(Rotation.from_euler("XYZ", [0.3, np.pi / 2, 0.1]), 0.01), sign=1.0, left=False
     )
     assert locked is not None
-    assert (locked.gimbal, locked.flexion_sd) == (True, None)
+    assert (locked.gimbal, locked.main_sd) == (True, None)
     assert (
         joint_angle_estimate(rest, FusedSegment(None, None, (), ()), sign=1.0, left=False) is None
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 from unittest.mock import patch
 
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jointfit_daemon.fusion import LimbFuser
-from jointfit_daemon.model import Chain
+from jointfit_daemon.fusion import LimbFuser, OpticalLimb
+from jointfit_daemon.kinematics.joint_angles import read_joint
+from jointfit_daemon.model import AngleConvention, Chain
 from tests.calibration import synthetic_limb
 from tests.calibration.synthetic_limb import (
     Imperfections,
@@ -110,3 +112,25 @@ def test_sensor_loss_and_slip_on_three_sensors(
     assert states[-1].segments[1].used == ("E",)
     assert "one_sensor:shank" in states[-1].flags
     assert all(j.position is not None for j in states[-1].joints)
+
+
+def test_configured_convention_reaches_the_state_and_its_optical_reference(
+    fuser: LimbFuser, walk: tuple[Motion, Frames]
+) -> None:
+    tilt = AngleConvention.TILT_TORSION
+    chain = replace(CHAIN, conventions=(None, tilt, None, None))
+    calibration = fuser._calibration
+    assert calibration is not None
+    state = play(LimbFuser(chain, calibration), walk[1][:200])[-1]
+    assert state.joints[1].convention is tilt
+    plain = play(LimbFuser(CHAIN, calibration), walk[1][:200])[-1]
+    assert plain.joints[1].convention is AngleConvention.FLEXION
+    thigh, shank = (segment.q_world_segment for segment in state.segments[:2])
+    assert thigh is not None
+    assert shank is not None
+    expected = read_joint(thigh, shank, flexion_sign=-1.0, left=False, convention=tilt)
+    assert state.joints[1].angles == expected.angles
+    assert state.joints[1].angles != plain.joints[1].angles
+    limb = OpticalLimb(chain, calibration)
+    seen = limb._angles(1, [thigh, shank, None])
+    assert seen == expected

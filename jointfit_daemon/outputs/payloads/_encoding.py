@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import orjson
 
 from jointfit_daemon.kinematics.joint_angles import read_patent
+from jointfit_daemon.model import ANGLE_NAMES
 from jointfit_daemon.outputs.topics import PAYLOAD_VERSION
 
 if TYPE_CHECKING:
@@ -31,6 +32,12 @@ _HUNDREDTHS = 100.0 * 180.0 / pi
 """Hundredths of a degree in one radian."""
 _EXACT = 2**53 - 1
 """Largest integer that every JSON reader represents exactly."""
+_ANGLE_KEYS = {
+    convention: tuple(f"{name}_deg" for name in names) for convention, names in ANGLE_NAMES.items()
+}
+_RATE_KEYS = {
+    convention: tuple(f"{key}_s" for key in keys) for convention, keys in _ANGLE_KEYS.items()
+}
 _NO_ANGLES = (None, None, None)
 _NO_PATENT: dict[str, float | bool | None] = dict.fromkeys(
     ("alpha_deg", "beta_deg", "gamma_deg", "joint_deg", "gimbal")
@@ -131,17 +138,17 @@ def _optical_joint(joint: OpticalJoint, *, inner: bool) -> dict[str, Any]:
     }
     if not inner:
         return shown
+    keys, errors, rms = _ANGLE_KEYS[joint.convention], joint.residual, joint.residual_rms
     return shown | {
-        **_angles(joint.angles),
+        **_angles(keys, joint.angles),
         "inner_deg": _degrees(joint.inner),
-        "residual": None if joint.residual is None else _angles(joint.residual),
-        "residual_rms": None if joint.residual_rms is None else _angles(joint.residual_rms),
+        "residual": None if errors is None else _angles(keys, errors),
+        "residual_rms": None if rms is None else _angles(keys, rms),
     }
 
 
-def _angles(angles: JointAngles | None) -> dict[str, float | None]:
-    names = ("flexion_deg", "adduction_deg", "rotation_deg")
-    return dict(zip(names, map(_degrees, angles or _NO_ANGLES), strict=True))
+def _angles(keys: tuple[str, ...], angles: JointAngles | None) -> dict[str, float | None]:
+    return dict(zip(keys, map(_degrees, angles or _NO_ANGLES), strict=True))
 
 
 def _metres(length: float | None) -> float | None:
@@ -165,17 +172,11 @@ def _joint(state: LimbState, number: int) -> dict[str, Any]:
     inner = 0 < number < len(state.joints) - 1
     if not inner and joint.angles is None:
         return shown  # the ends of the chain have no angles
-    flexion, adduction, rotation = joint.angles or _NO_ANGLES
-    rates = joint.rates or _NO_ANGLES
     return shown | {
-        "flexion_deg": _degrees(flexion),
-        "adduction_deg": _degrees(adduction),
-        "rotation_deg": _degrees(rotation),
+        **_angles(_ANGLE_KEYS[joint.convention], joint.angles),
         "inner_deg": _degrees(joint.inner),
         "sd_deg": _degrees(joint.angle_sd),
-        "flexion_deg_s": _degrees(rates[0]),
-        "adduction_deg_s": _degrees(rates[1]),
-        "rotation_deg_s": _degrees(rates[2]),
+        **_angles(_RATE_KEYS[joint.convention], joint.rates),
         "patent": _patent(state, number) if inner else None,
     }
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import orjson
 
 from jointfit_daemon import __version__
+from jointfit_daemon.limb_model import angle_convention
 from jointfit_daemon.model import LimbState, OpticalState
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import printable, printable_data
@@ -201,6 +202,10 @@ def _info(rig: Rig) -> dict[str, Any]:
         "output_rate_hz": rig.output_rate_hz,
         "side": "left" if rig.chain.left_side else "right",
         "joints": rig.chain.joints,
+        "angles": {
+            joint: angle_convention(rig.chain, i)
+            for i, joint in enumerate(rig.chain.joints[1:-1], 1)
+        },
         "segments": rig.chain.segments,
         "sensors": dict(zip(rig.chain.segments, rig.chain.sensors, strict=True)),
         "devices": {

@@ -22,7 +22,7 @@ from jointfit_daemon.files.orientations import (
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics.joint_angles import read_patent
 from jointfit_daemon.limb_model import configured_length, visible
-from jointfit_daemon.model import Chain
+from jointfit_daemon.model import ANGLE_NAMES, AngleConvention, Chain
 from jointfit_daemon.tools.fuse._lengths import left_out_positions
 from jointfit_daemon.tools.fuse._notes import calibration_notes
 from jointfit_daemon.tools.opensim_tables import (
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.fuse._tables import OrientationRecording
 
 
-ANGLES = ("flexion", "adduction", "rotation")
 PATENT_ANGLES = ("alpha", "beta", "gamma", "joint")
 ENDINGS = (".sto", ".mot", ".npz", ".csv")
 _UNKNOWN = (float("nan"),) * 5
@@ -53,15 +52,22 @@ class FusedAngles:
     """Angles of one joint over time, rad; NaN where unknown."""
 
     anatomical: Array
-    """Flexion, adduction, internal rotation, shape (n, 3)."""
-    flexion_sd: Array
-    """Standard deviation of flexion, shape (n,)."""
+    """Angles of the convention, shape (n, 3)."""
+    main_sd: Array
+    """Standard deviation of flexion, or of elevation, shape (n,)."""
     inner: Array
     """Angle between the two segments, shape (n,)."""
     patent: Array
     """`PATENT_ANGLES` of `read_patent`, shape (n, 4)."""
     patent_gimbal: Array
     """1 in gimbal lock of the patent's angles, else 0, shape (n,)."""
+    convention: AngleConvention
+    """Definition of `anatomical`."""
+
+    @property
+    def main_angle(self) -> str:
+        """Name of the angle of `main_sd`."""
+        return "elevation" if self.convention is AngleConvention.ELEVATION else "flexion"
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +193,7 @@ def _joint_over_time(states: Sequence[LimbState], number: int) -> FusedAngles:
         np.array([joint.inner for joint in joints], np.float64),
         patent[:, :-1],
         patent[:, -1],
+        joints[0].convention,
     )
 
 
@@ -235,10 +242,12 @@ def _angle_columns(found: FusedTrial) -> dict[str, Array]:
     """Return angles and standard deviations as columns, degrees; a gimbal flag is 0 or 1."""
     columns: dict[str, Array] = {}
     for joint, angles in found.angles.items():
-        anatomical = zip(ANGLES, np.rad2deg(angles.anatomical.T), strict=True)
+        anatomical = zip(
+            ANGLE_NAMES[angles.convention], np.rad2deg(angles.anatomical.T), strict=True
+        )
         patent = zip(PATENT_ANGLES, np.rad2deg(angles.patent.T), strict=True)
         columns |= {f"{joint}_{name}": column for name, column in anatomical}
-        columns[f"{joint}_flexion_sd"] = np.rad2deg(angles.flexion_sd)
+        columns[f"{joint}_{angles.main_angle}_sd"] = np.rad2deg(angles.main_sd)
         columns[f"{joint}_inner"] = np.rad2deg(angles.inner)
         columns |= {f"{joint}_patent_{name}": column for name, column in patent}
         columns[f"{joint}_patent_gimbal"] = angles.patent_gimbal
@@ -262,7 +271,7 @@ def _write_npz(path: Path, found: FusedTrial, table: OrientationRecording) -> No
         all_arrays = {name: arrays[name] for name in arrays.files}
     for joint, angles in found.angles.items():
         all_arrays[f"angles_{joint}"] = angles.anatomical
-        all_arrays[f"sd_flexion_{joint}"] = angles.flexion_sd
+        all_arrays[f"sd_{angles.main_angle}_{joint}"] = angles.main_sd
         all_arrays[f"inner_{joint}"] = angles.inner
         all_arrays[f"patent_{joint}"] = angles.patent
         all_arrays[f"patent_gimbal_{joint}"] = angles.patent_gimbal

@@ -81,8 +81,8 @@ def test_opposite_errors_make_a_joint_less_sure_and_like_ones_surer() -> None:
     def sd(alike: float) -> float:
         state = joint_angle_estimate(above, below, sign=-1.0, left=False, correlation=alike)
         assert state is not None
-        assert state.flexion_sd is not None
-        return state.flexion_sd
+        assert state.main_sd is not None
+        return state.main_sd
 
     assert sd(0.0) == pytest.approx(hypot(0.03, 0.04))
     assert sd(-0.5) == pytest.approx(sqrt(0.0025 + 0.0012))
@@ -97,8 +97,8 @@ def test_errors_of_held_or_inconsistent_segments_are_independent() -> None:
     def sd(one: FusedSegment, other: FusedSegment) -> float:
         state = joint_angle_estimate(one, other, sign=-1.0, left=False, correlation=0.9)
         assert state is not None
-        assert state.flexion_sd is not None
-        return state.flexion_sd
+        assert state.main_sd is not None
+        return state.main_sd
 
     assert sd(above, below) == pytest.approx(hypot(0.03, 0.4))
     assert sd(below, below) == pytest.approx(hypot(0.4, 0.4))

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import (
+    AngleConvention,
     FusionMode,
     JointAngles,
     JointState,
@@ -76,6 +77,42 @@ STATE = LimbState(
     ),
     joints=(JointState("hip", (0.0, 0.0, 0.912), 0.006), KNEE, JointState("ankle", None, None)),
 )
+
+
+@pytest.mark.parametrize(
+    ("convention", "names"),
+    [
+        (AngleConvention.FLEXION, ("flexion", "adduction", "rotation")),
+        (AngleConvention.ELEVATION, ("plane", "elevation", "rotation")),
+        (AngleConvention.TILT_TORSION, ("flexion", "adduction", "rotation")),
+        (AngleConvention.TRUNK, ("flexion", "bending", "rotation")),
+    ],
+)
+def test_angles_have_the_names_of_their_convention(
+    convention: AngleConvention, names: tuple[str, ...]
+) -> None:
+    hip, _, ankle = STATE.joints
+    state = STATE._replace(joints=(hip, KNEE._replace(convention=convention), ankle))
+    joint = json.loads(encode_pose(state, 0, 0))["joints"]["knee"]
+    assert [joint[f"{name}_deg"] for name in names] == [28.31, -1.92, 3.4]
+    assert [joint[f"{name}_deg_s"] for name in names] == [120.0, -3.0, 0.0]
+    unknown = state._replace(
+        joints=(hip, JointState("knee", None, None, convention=convention), ankle)
+    )
+    flat = json.loads(encode_joint(unknown, 1, 0))
+    assert [flat[f"{name}_deg"] for name in names] == [None] * 3
+    end = OpticalJoint("hip", None, None, None, None)
+    optical = end._replace(
+        name="knee",
+        angles=KNEE.angles,
+        residual=KNEE.angles,
+        residual_rms=KNEE.angles,
+        convention=convention,
+    )
+    limb = OpticalState(1, 0, (), (end, optical, end._replace(name="ankle")))
+    seen = json.loads(encode_optical(limb, 0))["joints"]["knee"]
+    for angles in (seen, seen["residual"], seen["residual_rms"]):
+        assert [angles[f"{name}_deg"] for name in names] == [28.31, -1.92, 3.4]
 
 
 def bent(alpha_deg: float, beta_deg: float, gamma_deg: float) -> LimbState:
@@ -297,6 +334,7 @@ async def test_outputs_are_published_on_their_topics(table: dict[str, Any], outb
     }  # fmt: skip
     assert found["bridge/log"][0]["suppressed"] == 2
     assert found["bridge/info"][0]["joints"] == ["hip", "knee", "ankle"]
+    assert found["bridge/info"][0]["angles"] == {"knee": "flexion"}
     for payloads in found.values():
         for payload in payloads:
             for key, _ in numbers(payload):
