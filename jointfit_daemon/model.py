@@ -281,6 +281,7 @@ class FrameFlag(StrEnum):
     ORIGIN_FIXED = "origin_fixed"
     HEADING_UNSEEN = "heading_unseen"
     GIMBAL = "gimbal"
+    UNCORRECTED = "uncorrected"
 
     # Flags of one sensor, segment or joint.
     STUCK = "stuck"

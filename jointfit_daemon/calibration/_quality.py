@@ -150,6 +150,8 @@ class HoldoutQuality:
     """Errors of the orientation of each segment."""
     flexion: Mapping[str, MethodErrors]
     """Errors of the flexion of each inner joint."""
+    procedure: str = "corrected"
+    """Procedure of the calibration: ``corrected`` or ``patent``."""
     meaning: str = (
         "RMS distance from the optical reference on the last part of the trial, after a fit to the"
         " first part; the stored models were then fitted to all of it"

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.limb_model import Method
+    from jointfit_daemon.limb_model import Method, Procedure
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +60,9 @@ class CalibrationSettings:
     """
 
     method: Method = "anchored"
+    procedure: Procedure = "corrected"
+    """``patent``: component mean in the static pose, markers without refinement, and the regression
+    that was verified on the held-out part."""
     static_s: float = 5.0
     align_s: float = 30.0
     functional_s: float = 60.0

@@ -8,19 +8,20 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel
 
 from jointfit_daemon.config._fault_messages import Fault
 from jointfit_daemon.config._rig import MOCAP
+from jointfit_daemon.limb_model import PatentReading
 from jointfit_daemon.nearest_name import nearest_name
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from jointfit_daemon.config._rig import Source
-    from jointfit_daemon.config._tables import ChainTable, MqttSettings
+    from jointfit_daemon.config._tables import CalibrationTable, ChainTable, MqttSettings
     from jointfit_daemon.driver import CanBusSettings, MocapSettings
 
 _FORBIDDEN = "+#/"
@@ -115,6 +116,22 @@ def _check_values_by_name(table: ChainTable) -> Iterator[Fault]:
         if inner := (table.joints or ())[1:-1]:  # only joints between two segments have angles
             key = f"chain.angles.{name}"
             yield from check_known_name(key, name, inner, "joint between two segments")
+
+
+def check_procedure(calibration: CalibrationTable, chain: ChainTable) -> Iterator[Fault]:
+    """Check that method and segment axes are those of the patent, if its procedure is chosen."""
+    if calibration.procedure != "patent":
+        return
+    if calibration.method not in get_args(PatentReading):
+        regressions = " or ".join(f'"{name}"' for name in get_args(PatentReading))
+        text = f'expected {regressions} with procedure = "patent": the patent is a regression'
+        yield Fault("calibration.method", text, calibration.method)
+    if chain.axes != "static":
+        text = (
+            'expected "static" with calibration.procedure = "patent": the patent defines every '
+            "segment as unrotated in the static pose"
+        )
+        yield Fault("chain.axes", text, chain.axes)
 
 
 def check_known_name(

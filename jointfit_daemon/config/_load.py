@@ -170,6 +170,8 @@ class _RigReader:
         self.faults += self._names()
         if limb is not None:
             self.faults += _checks.check_chain(limb)
+        if chain is not None and calibration is not None:
+            self.faults += _checks.check_procedure(calibration, chain)
         if head is None or chain is None or calibration is None or mqtt is None or self.faults:
             return None
 

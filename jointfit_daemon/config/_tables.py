@@ -12,7 +12,7 @@ from typing import Literal
 from pydantic import Field, ValidationInfo, field_validator
 
 from jointfit_daemon.driver import Settings
-from jointfit_daemon.limb_model import Method  # noqa: TC001 - pydantic reads it at run time
+from jointfit_daemon.limb_model import Method, Procedure  # noqa: TC001 - pydantic reads them
 from jointfit_daemon.model import AngleConvention  # noqa: TC001 - as above
 
 _PLAIN, _TLS = 1883, 8883
@@ -71,6 +71,12 @@ class CalibrationTable(Settings):
         "default", description="name of the calibration folder below $STATE_DIRECTORY"
     )
     method: Method = Field("anchored", description="method that combines redundant sensors")
+    procedure: Procedure = Field(
+        "corrected",
+        description="`patent`: the steps of the patent alone, with a method patent12 or patent6 "
+        'and `axes = "static"`; sensors are not corrected, and a segment with a missing sensor is '
+        "lost",
+    )
     static_s: float = Field(5.0, gt=0, le=120, description="duration of the static pose, s")
     align_s: float = Field(30.0, gt=0, le=600, description="duration of the align phase, s")
     functional_s: float = Field(

@@ -16,6 +16,7 @@ from jointfit_daemon.fusion._forward_kinematics import (
     joint_positions,
 )
 from jointfit_daemon.fusion._heading_uncertainty import add_heading_sd
+from jointfit_daemon.fusion._patent_segment_fuser import PatentSegmentFuser
 from jointfit_daemon.fusion._segment_fuser import FusedSegment, SegmentFuser
 from jointfit_daemon.fusion.faults import ConsistencyMonitor, SensorMonitor
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
@@ -71,6 +72,8 @@ class LimbFuser:
         self._chain, self._drifting = chain, drifting
         self.sensor_monitor = sensor_monitor or SensorMonitor(chain)
         usable = calibration is not None and calibration.fits(chain)
+        self._uncorrected = calibration is not None and calibration.procedure == "patent"
+        """Whether the sensors are used as they are, also with faults."""
         self._calibration = calibration if usable else None
         self._base_flags: tuple[str, ...] = (FrameFlag.UNCALIBRATED,)
         if calibration is not None and not usable:
@@ -89,7 +92,10 @@ class LimbFuser:
         if calibration is None or not usable:
             return
 
-        self._base_flags = calibration.flags
+        self._base_flags, fuser = calibration.flags, SegmentFuser
+        if self._uncorrected:
+            self._base_flags += (FrameFlag.UNCORRECTED,)
+            fuser = PatentSegmentFuser
         self.consistency = ConsistencyMonitor(chain, calibration, drifting)
         self._alignments = [
             (name, item.q_optical_world, item.q_sensor_segment)
@@ -97,7 +103,7 @@ class LimbFuser:
         ]
         for i, segment in enumerate(chain.segments):
             stored = calibration.segment[segment]
-            self._fusers.append(SegmentFuser(segment, chain.sensors[i], stored))
+            self._fusers.append(fuser(segment, chain.sensors[i], stored))
             length = configured_length(chain, i)  # rig.toml overrides the calibration
             length = stored.length if length is None else length
             self._lengths.append(SegmentLength(length, stored.length_sd or 0.0))
@@ -144,9 +150,11 @@ class LimbFuser:
         not visible, so the configured origin is used), ``stuck:SENSOR``, ``slipped:SENSOR`` or
         ``pair_disagrees:SEGMENT``, ``heading_disagrees:JOINT``, ``heading_unseen``, and per segment
         ``one_sensor:``, ``untrained:`` (outside the training range), ``held:``, ``lost:``;
-        ``gimbal`` is last.
+        ``gimbal`` is last. In the procedure of the patent, ``uncorrected`` follows the flags of the
+        calibration; flags of faults are then reports, and the sensors are used as they are.
         """
-        orientations, stuck = self.sensor_monitor.update(t_ns, completed_ns, orientations)
+        working, stuck = self.sensor_monitor.update(t_ns, completed_ns, orientations)
+        orientations = orientations if self._uncorrected else working
         if self._calibration is None:
             return LimbState(
                 seq,
@@ -172,8 +180,7 @@ class LimbFuser:
             flags.append(FrameFlag.EXTRAPOLATING)
         if optical_origin is None and mode == FusionMode.IMU_AND_MOCAP:
             flags.append(FrameFlag.ORIGIN_FIXED)
-        if stuck:
-            flags += [FrameFlag.STUCK.of(name) for name in stuck]
+        flags += [FrameFlag.STUCK.of(name) for name in stuck]
         flags += fault_flags
         for segment in fused:
             flags += segment.flags
@@ -214,6 +221,8 @@ class LimbFuser:
         poses = [{n: s.q_static for n, s in one.segment.items()} for one in (old, new)]
         if (poses[0], old.sensor, old.links) != (poses[1], new.sensor, new.links):
             return
+        if old.procedure != new.procedure:
+            return
         if set(before._drifting) != set(self._drifting):
             return
 
@@ -236,6 +245,7 @@ class LimbFuser:
         """Return the fused segments and the flags of inconsistent sensors."""
         spread: tuple[float, ...] = ()
         flags: tuple[str, ...] = ()
+        measured = inputs
         if self.consistency is not None:
             inputs = self.consistency.correct_headings(inputs)
             spread, slipped, flags = self.consistency.update(t_ns, inputs)
@@ -243,6 +253,8 @@ class LimbFuser:
             if slipped:
                 inputs = {name: q for name, q in inputs.items() if name not in slipped}
 
+        if self._uncorrected:
+            inputs = measured
         fused = [
             fuser.fuse(t_ns, inputs, near)
             for fuser, near in zip(self._fusers, self._neighbors, strict=True)

@@ -162,13 +162,7 @@ class SegmentFuser:
         self._change_sensors(t_ns, alive, near, inputs, prediction.q)
         q = self._blended(t_ns, inputs, prediction.q)
 
-        # Variance of the model, and of the heading for one axis of three: it grows with time.
-        if self._calibrated_ns is None:
-            self._calibrated_ns = t_ns
-        minutes = (t_ns - self._calibrated_ns) / MINUTE_NS
-        heading = _HEADING_VAR + _WALK_VAR * max(minutes, 0.0)
-        sd = max(prediction.sd, MIN_SD)
-        sd = sqrt(sd * sd + heading / 3.0)
+        sd = self._with_heading_sd(t_ns, prediction.sd)
         flexion_sd = None if prediction.axis_sd is None else max(prediction.axis_sd[0], MIN_SD)
         self._last, self._before = (t_ns, q, sd), (alive, near, inputs)
         self._history.append((inputs, q))
@@ -179,6 +173,15 @@ class SegmentFuser:
         if prediction.extrapolating:
             flags += (FrameFlag.UNTRAINED.of(self._name),)
         return FusedSegment(q, sd, alive, flags, flexion_sd)
+
+    def _with_heading_sd(self, t_ns: int, sd: float) -> float:
+        """Add the variance of the heading, for one axis of three; it grows with time."""
+        if self._calibrated_ns is None:
+            self._calibrated_ns = t_ns
+        minutes = (t_ns - self._calibrated_ns) / MINUTE_NS
+        heading = _HEADING_VAR + _WALK_VAR * max(minutes, 0.0)
+        sd = max(sd, MIN_SD)
+        return sqrt(sd * sd + heading / 3.0)
 
     def _hold(self, t_ns: int) -> FusedSegment:
         if self._last is None or t_ns - self._last[0] > HOLD_NS:

@@ -25,6 +25,12 @@ Method = Literal["anchored", "patent12", "patent6", "markley", "mean", "single"]
 
 `calibration.soft_tissue.fit_segment` fits them, and `tools.fuse` names them in its help."""
 
+Procedure = Literal["corrected", "patent"]
+"""Steps of a calibration and of the fusion that uses it.
+
+``patent``: the published steps of the patent alone, with its regression; no correction of sensors.
+"""
+
 SCHEMA = 1
 """Version of the JSON form; other versions are rejected."""
 
@@ -104,6 +110,8 @@ class Calibration:
     memory: str = ""
     """Training frames, encoded by ``calibration.soft_tissue.pack``; the basis of online
     learning."""
+    procedure: Procedure = "corrected"
+    """With ``patent``, every segment has one model, for all of its sensors."""
 
     @property
     def lag_ns(self) -> dict[str, int]:
@@ -186,6 +194,7 @@ def _from_dict(data: Mapping[str, Any]) -> Calibration:
         links=tuple(SensorLink.from_dict(link) for link in data.get("links", ())),
         correlations=correlations,
         memory=str(data.get("memory", "")),
+        procedure=cast("Procedure", data.get("procedure", "corrected")),
     )
 
 

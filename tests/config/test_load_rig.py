@@ -47,6 +47,21 @@ def test_valid_rig_is_converted_to_si(table: Table) -> None:
     assert rig.table == table
 
 
+def test_procedure_of_the_patent_needs_its_regression_and_its_axes(table: Table) -> None:
+    table["calibration"] = {"procedure": "patent", "method": "patent6"}
+    table["chain"]["axes"] = "static"
+    assert parse_rig(table).calibration.procedure == "patent"
+
+    table["calibration"] = {"procedure": "patent"}
+    del table["chain"]["axes"]
+    assert complaints(table) == [
+        'calibration.method = \'anchored\': expected "patent12" or "patent6" with procedure = '
+        '"patent": the patent is a regression',
+        'chain.axes = \'anatomical\': expected "static" with calibration.procedure = "patent": the '
+        "patent defines every segment as unrotated in the static pose",
+    ]
+
+
 def test_bus_name_is_replaced_by_its_table(table: Table) -> None:
     assert parse_rig(table).sources[2].settings.can == CanBusSettings(channel="can0")
 

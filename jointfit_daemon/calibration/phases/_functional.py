@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration._errors import CalibrationError
-from jointfit_daemon.calibration._quality import CalibrationQuality, quality_table, sensor_rotations
+from jointfit_daemon.calibration._quality import (
+    CalibrationQuality,
+    HoldoutQuality,
+    quality_table,
+    sensor_rotations,
+)
 from jointfit_daemon.calibration.anatomy import (
     SKIN_SD_M,
     Anatomy,
@@ -48,6 +53,7 @@ from jointfit_daemon.calibration.soft_tissue import (
     evenly,
     fit_links,
     fit_models,
+    fit_verified_models,
     joint_error_correlations,
     pack,
     regression_quality,
@@ -133,9 +139,8 @@ def fit_calibration(
     sensors = _sensors(chain, pose, alignment, anatomy, lags)
 
     # Segment models.
-    training, raw, missing = limb_training(chain, functional, tracks, anatomy, sensors)
-    models = fit_models(chain, training, settings.method)
-    headings = _heading_notes(chain, raw, training) if alignment is None else []
+    training, notes = _training(chain, functional, tracks, anatomy, sensors, alignment=alignment)
+    models, holdout = _models(chain, training, settings)
     quality = CalibrationQuality(
         static=pose.quality,
         sensors=sensor_rotations(sensors),
@@ -143,7 +148,7 @@ def fit_calibration(
         lag={name: lag_quality(moving.get(name), lags.get(name, NO_LAG)) for name in sensors},
         markers=refined.figures,
         anatomy=anatomy_quality(anatomy, joints),
-        holdout=evaluate_methods(chain, training, settings.method, settings.holdout_share),
+        holdout=holdout,
         regression=regression_quality(chain, training, models, settings.holdout_share),
     )
     return Calibration(
@@ -156,13 +161,14 @@ def fit_calibration(
         joint=joints,
         clusters={name: cluster_record(cluster) for name, cluster in refined.clusters.items()},
         flags=(*anatomy.flags, *([FrameFlag.HEADINGS_FROM_STATIC] if alignment is None else [])),
-        notes=(*refined.notes, *anatomy.notes, *lag_notes(moving, lags), *missing, *headings),
+        notes=(*refined.notes, *anatomy.notes, *lag_notes(moving, lags), *notes),
         quality=quality_table(quality),
         digest=trials_digest(None if isinstance(static, StaticPose) else static, functional),
         software=software,
         links=fit_links(chain, training.sensors, anatomy.q_static),
         correlations=joint_error_correlations(chain, training, settings.method),
         memory=pack(chain, evenly(chain, training)) if settings.method == "anchored" else "",
+        procedure=settings.procedure,
     )
 
 
@@ -206,8 +212,12 @@ def refined_tracks(
     functional: CalibrationTrial,
     settings: CalibrationSettings,
 ) -> tuple[RefinedClusters, dict[str, ClusterTrack]]:
-    """Refine the markers, if configured, and return the poses of the refined body parts."""
-    if not settings.refine_markers or functional.optical is None:
+    """Refine the markers, if configured, and return the poses of the refined body parts.
+
+    The reference of the patent is the measured markers.
+    """
+    refine = settings.refine_markers and settings.procedure == "corrected"
+    if not refine or functional.optical is None:
         return RefinedClusters(pose.clusters, None), tracks
     refined = refine_clusters(pose.clusters, tracks, settings.holdout_share)
     if refined.figures is None:
@@ -285,6 +295,32 @@ def _sensors(
             lag_ns = lags.get(s, NO_LAG).lag_ns
             out[s] = sensor_calibration(pose.sensors[s], world, q_static, lag_ns)
     return out
+
+
+def _training(
+    chain: Chain,
+    functional: CalibrationTrial,
+    tracks: Mapping[str, ClusterTrack],
+    anatomy: Anatomy,
+    sensors: Mapping[str, SensorCalibration],
+    *,
+    alignment: PlateAlignment | None,
+) -> tuple[LimbTraining, list[str]]:
+    """Return the training frames, and notes about missing data and rotated worlds."""
+    training, raw, missing = limb_training(chain, functional, tracks, anatomy, sensors)
+    headings = _heading_notes(chain, raw, training) if alignment is None else []
+    return training, [*missing, *headings]
+
+
+def _models(
+    chain: Chain, training: LimbTraining, settings: CalibrationSettings
+) -> tuple[Mapping[str, Mapping[str, SegmentModel]], HoldoutQuality]:
+    """Return the models by the procedure, and the errors of all methods on the held-out part."""
+    method, share = settings.method, settings.holdout_share
+    holdout = evaluate_methods(chain, training, method, share, settings.procedure)
+    if settings.procedure == "patent":
+        return fit_verified_models(chain, training, method, share), holdout
+    return fit_models(chain, training, method), holdout
 
 
 def _heading_notes(chain: Chain, raw: Mapping[str, Array], training: LimbTraining) -> list[str]:

@@ -18,6 +18,7 @@ from jointfit_daemon.calibration.record import trials_digest
 from jointfit_daemon.calibration.registration import (
     RobustMean,
     StaticLimits,
+    component_mean,
     robust_mean,
     static_problems,
 )
@@ -86,7 +87,8 @@ def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Ch
         if sensor not in present
     ]
 
-    means = {s: robust_mean(trial.sensors[s].q_world_sensor) for s in present}
+    average = component_mean if settings.procedure == "patent" else robust_mean
+    means = {s: average(trial.sensors[s].q_world_sensor) for s in present}
     stamps = [trial.sensors[s].t_ns for s in present]
     still_s = min((float(t_ns[-1] - t_ns[0]) / 1e9 for t_ns in stamps), default=0.0)
 
@@ -179,8 +181,8 @@ def with_new_static(
     """Return the calibration after sensors were re-donned: with new alignments.
 
     If cameras see the markers of a segment at their earlier places on the body, they determine its
-    current orientation. Otherwise it is assumed to stand as in the earlier pose, with the same
-    heading (flag ``same_pose_assumed``).
+    current orientation. Otherwise, and in the procedure of the patent, it is assumed to stand as in
+    the earlier pose, with the same heading (flag ``same_pose_assumed``).
 
     Parameters
     ----------
@@ -201,7 +203,9 @@ def with_new_static(
     q_now: dict[str, Quaternion] = {}
     assumed = False
     for name, segment in calibration.segment.items():
-        turned = _turned(calibration.clusters.get(name), pose.clusters.get(name))
+        turned = None
+        if calibration.procedure == "corrected":
+            turned = _turned(calibration.clusters.get(name), pose.clusters.get(name))
         assumed |= turned is None and bool(calibration.clusters)
         q = segment.q_static if turned is None else rotation.multiply(turned, segment.q_static)
         q_now[name] = as_quaternion(q)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from jointfit_daemon.limb_model import Method, PatentReading
+from jointfit_daemon.limb_model import Method, PatentReading, Procedure
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -48,6 +48,9 @@ def content_faults(calibration: Calibration) -> list[str]:
 def _faults(c: Calibration) -> Iterator[str]:
     if c.method not in get_args(Method):
         yield f"method {c.method!r}, expected one of {', '.join(get_args(Method))}"
+
+    if c.procedure not in get_args(Procedure):
+        yield f"procedure {c.procedure!r}, expected one of {', '.join(get_args(Procedure))}"
 
     texts = (*c.flags, *c.notes, c.digest, c.software, c.created_utc, c.memory)
     if not all(isinstance(text, str) for text in texts):

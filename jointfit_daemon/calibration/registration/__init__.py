@@ -16,6 +16,7 @@ from jointfit_daemon.calibration.registration._sensor_mount import (
 from jointfit_daemon.calibration.registration._static_mean import (
     RobustMean,
     StaticLimits,
+    component_mean,
     redonning_notes,
     robust_mean,
     static_mount,
@@ -30,6 +31,7 @@ __all__ = [
     "SensorLag",
     "StaticLimits",
     "StillnessMonitor",
+    "component_mean",
     "fit_observable_alignment",
     "fit_sensor_alignment",
     "orientations_at",

@@ -86,6 +86,34 @@ def robust_mean(q: ArrayLike, weights: ArrayLike | None = None) -> RobustMean:
     return RobustMean(mean, scale)
 
 
+def component_mean(q: ArrayLike) -> RobustMean:
+    r"""Return the normalized mean of the components of orientations, as the patent averages them.
+
+    .. math:: \bar q = \sum s_i q_i \,/\, \lVert \sum s_i q_i \rVert, \qquad s_i = \pm 1
+
+    with signs that give every quaternion a non-negative product with the first. The mean bias of
+    step S2, :math:`\overline{q_i^* \otimes q_O}`, equals :math:`\bar q^* \otimes q_O`, because the
+    product is linear. Its norm has no effect on the regression that follows.
+
+    Parameters
+    ----------
+    q : array_like, shape (n, 4)
+        Unit quaternions; rows with NaN are ignored.
+
+    Raises
+    ------
+    ValueError
+        No row is finite.
+    """
+    q = np.asarray(q, dtype=np.float64)
+    good = q[np.isfinite(q).all(axis=1)]
+    if len(good) == 0:
+        raise ValueError("no finite orientation to average")
+    mean = rotation.normalize(rotation.align_hemisphere(good, good[0]).mean(axis=0))
+    mean = rotation.align_hemisphere(mean, rotation.IDENTITY)
+    return RobustMean(mean, robust_scale(rotation.angle_between(mean, good)))
+
+
 def static_mount(
     q_world_sensor: ArrayLike, q_world_segment: ArrayLike = rotation.IDENTITY
 ) -> RobustMean:

@@ -6,7 +6,7 @@ last part. The stored models are then fitted to the whole trial.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from math import isfinite
 from typing import TYPE_CHECKING, get_args
@@ -20,6 +20,7 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import (
     Method,
     PatentModel,
+    Procedure,
     equal_weights,
     fuse,
     model_key,
@@ -98,15 +99,42 @@ def fit_models(
     return out
 
 
-def evaluate_methods(
+def fit_verified_models(
     chain: Chain, training: LimbTraining, method: Method, share: float
+) -> dict[str, dict[str, SegmentModel]]:
+    """Fit one model of each segment, for all its sensors, to the first part of a trial.
+
+    Source: step S4 of the patent, which substitutes the coefficients that were fitted to one part
+    of the data and verified on the rest. It defines no output for a part of the sensors.
+    """
+    first, _ = _parts(training, share)
+    return {
+        segment: {
+            model_key(chain.sensors[i], None): fit_segment(
+                method,
+                [first.sensors[s] for s in chain.sensors[i]],
+                None,
+                first.reference[segment],
+                first.trials,
+            )
+        }
+        for i, segment in enumerate(chain.segments)
+    }
+
+
+def evaluate_methods(
+    chain: Chain,
+    training: LimbTraining,
+    method: Method,
+    share: float,
+    procedure: Procedure = "corrected",
 ) -> HoldoutQuality:
     """Evaluate every method and every single sensor on the last `share` of the trial.
 
     Parameters
     ----------
-    method : Method
-        Method of the calibration; it is named in the result.
+    method, procedure
+        Those of the calibration; they are named in the result.
     """
     first, last = _parts(training, share)
     truth = [last.reference[segment] for segment in chain.segments]
@@ -141,7 +169,14 @@ def evaluate_methods(
         )
         for i, joint in enumerate(chain.joints[1:-1])
     }
-    return HoldoutQuality(method, share, len(last), segments, joints)
+    found = HoldoutQuality(method, share, len(last), segments, joints)
+    if procedure == "corrected":
+        return found
+    meaning = (
+        "RMS distance from the optical reference on the last part of the trial, after a fit to the"
+        " first part; the stored models are those of this fit"
+    )
+    return replace(found, procedure=procedure, meaning=meaning)
 
 
 def regression_quality(
@@ -153,12 +188,13 @@ def regression_quality(
     """Return the coefficients of every segment for all its sensors; None for other methods.
 
     The patent fits one part of the data and verifies the coefficients on the rest. These verified
-    coefficients are those of `evaluate_methods`; the stored ones are fitted to all data.
+    coefficients are those of `evaluate_methods`; the stored ones are fitted to all data, except in
+    the procedure of the patent.
 
     Parameters
     ----------
     models : mapping
-        The stored models of `fit_models`.
+        The stored models of `fit_models` or `fit_verified_models`.
     share : float
         Held-out part of the trial.
     """
