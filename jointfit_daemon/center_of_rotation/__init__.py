@@ -1,6 +1,7 @@
 """Centers of rotation estimated from markers, body poses and joint angles."""
 
 from jointfit_daemon.center_of_rotation._fused_estimate import fuse_centers
+from jointfit_daemon.center_of_rotation._hinge_axis import hinge_axis_sd
 from jointfit_daemon.center_of_rotation._joint_trajectory import (
     JointSide,
     JointTrajectory,
@@ -19,6 +20,7 @@ __all__ = [
     "Movement",
     "estimate_center",
     "fuse_centers",
+    "hinge_axis_sd",
     "joint_trajectory",
     "refusal",
 ]

@@ -50,6 +50,8 @@ class CenterEstimate:
     """Unit directions in which nothing was observed, shape (u, d)."""
     axis: Array | None = None
     """Unit axis of a hinge in the parent's coordinates, shape (3,); None if there is no hinge."""
+    axis_sd: float | None = None
+    """Standard deviation of the axis in each direction across it, rad; None if not computed."""
     leverage: Array | None = None
     """Covariance of the center per m² of radial soft-tissue artefact, shape (d, d); None if not
     computed. The artefact repeats with posture, so more frames do not reduce it."""
