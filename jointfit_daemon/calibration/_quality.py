@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jointfit_daemon.limb_model import SensorCalibration
-    from jointfit_daemon.model import Quaternion
+    from jointfit_daemon.model import Quaternion, Vector
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +107,47 @@ class JointQuality:
 
 
 @dataclass(frozen=True, slots=True)
+class CenterCoordinates:
+    """One center of rotation in coordinates of one body part.
+
+    The origin is the mean of its markers in the static pose. The axes are those of the segment; a
+    part without IMU has those of the optical world in the static pose.
+    """
+
+    center_m: Vector
+    covariance_m2: tuple[Vector, Vector, Vector]
+    """Random error and soft-tissue artefact; 0 along the directions in `unseen`."""
+    unseen: tuple[Vector, ...]
+    """Unit directions along which the movement did not determine the center."""
+    axis: Vector | None = None
+    """Unit axis of a hinge."""
+
+
+@dataclass(frozen=True, slots=True)
+class CenterQuality:
+    """Center of rotation of one joint from the movement, before the prior of the static pose."""
+
+    method: str
+    frames: int
+    effective_frames: float
+    """Number of independent frames."""
+    predicted_error_m: float
+    """Root mean variance of the observed directions, with soft-tissue artefact."""
+    noise_error_m: float
+    """The part of it that decreases with more movement."""
+    bound_m: float | None
+    """Cramér-Rao bound of the RMS error; None if a direction is unobserved."""
+    residual_rms_m: float
+    arc_rad: float
+    conditioning: float
+    flags: tuple[str, ...]
+    segments: Mapping[str, CenterCoordinates]
+    """By body part: the two sides of the joint."""
+    axis_sd_rad: float | None = None
+    """Standard deviation of the axis in each direction across it."""
+
+
+@dataclass(frozen=True, slots=True)
 class AxisQuality:
     """Quality of one flexion axis."""
 
@@ -123,6 +164,8 @@ class AnatomyQuality:
     length_sd_m: Mapping[str, float | None]
     length_sources: Mapping[str, str]
     flexion_axes: Mapping[str, AxisQuality]
+    centers: Mapping[str, CenterQuality]
+    """Centers of rotation of the joints with markers on both sides."""
 
 
 @dataclass(frozen=True, slots=True)

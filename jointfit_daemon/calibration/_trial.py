@@ -6,7 +6,7 @@ All time stamps are host CLOCK_MONOTONIC nanoseconds, already mapped by the devi
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,6 +16,16 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.limb_model import Method, Procedure
+
+CenterMethod = Literal["sphere", "score", "sara", "geometric", "oriented", "grid", "three_frames"]
+"""Estimators of the joint centers that rig.toml can name, see ``center_of_rotation.METHODS``.
+
+``sphere`` is the fit for skin markers of `calibration.anatomy`, the others are those of the
+library."""
+ONE_AXIS: frozenset[CenterMethod] = frozenset(
+    ("sara", "geometric", "oriented", "grid", "three_frames")
+)
+"""Estimators that need a movement about one axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +84,10 @@ class CalibrationSettings:
     """Random error of the joint centers, m, below which the movement is sufficient.
 
     It is the part of the predicted error that decreases with more movement."""
+    center_method: CenterMethod = "sphere"
+    """Estimator of the joint centers."""
+    joint_center_methods: Mapping[str, CenterMethod] = field(default_factory=dict)
+    """Estimator of single joints instead of `center_method`, by joint."""
     markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Marker names, by segment or adjacent body part (pelvis, foot)."""
     rigid_bodies: Mapping[str, str] = field(default_factory=dict)
@@ -86,6 +100,10 @@ class CalibrationSettings:
     """Whether marker positions on the body parts are refined from the movement."""
     learn_online: bool = True
     """Whether the models are refitted while the cameras see the limb."""
+
+    def center_method_of(self, joint: str) -> CenterMethod:
+        """Return the estimator of one joint center."""
+        return self.joint_center_methods.get(joint, self.center_method)
 
 
 PLATE = "plate"

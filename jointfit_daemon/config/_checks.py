@@ -197,6 +197,42 @@ def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator
                 yield Fault(f"mocap.markers.{part}", f"is a marker of {owner!r} already", name)
 
 
+def check_center_methods(
+    table: CalibrationTable, chain: ChainTable | None, mocap: MocapSettings | None
+) -> Iterator[Fault]:
+    """Check that the joints with an estimator of their own exist and can be measured.
+
+    Keys of `table` and `chain` that had faults are None; `mocap` is None without cameras.
+    """
+    chosen = table.joint_center_methods or {}
+    explicit = {f"calibration.joint_center_methods.{joint}": joint for joint in chosen}
+    if mocap is None:
+        keys = [*explicit] if table.center_method == "sphere" else ["calibration.center_method"]
+        for key in keys:
+            yield Fault(key, "joint centers need cameras: add [mocap], or remove this key")
+        return
+    if chain is None or not chain.joints or not chain.segments:
+        return
+
+    marked = {*(mocap.markers or ()), *(mocap.rigid_body or ())}
+    parts = [chain.proximal, *chain.segments, chain.distal]
+    for key, joint in explicit.items():
+        if faults := check_known_name(key, joint, chain.joints, "joint", chosen):
+            yield from faults
+            continue
+        at = chain.joints.index(joint)
+        ends = {"proximal": parts[at]} if at == 0 else {}
+        ends |= {"distal": parts[at + 1]} if at == len(chain.segments) else {}
+        for end, part in ends.items():
+            if part is None:
+                text = f"needs markers on both sides of the joint: add chain.{end} and its markers"
+                yield Fault(key, text, chosen[joint])
+        for part in parts[at : at + 2]:
+            if part is not None and part not in marked:
+                text = f"needs markers on both sides of the joint: add mocap.markers.{part}"
+                yield Fault(key, text, chosen[joint])
+
+
 def check_ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) -> Iterator[Fault]:
     """Check that no serial port is used twice."""
     users = [

@@ -172,6 +172,10 @@ class _RigReader:
             self.faults += _checks.check_chain(limb)
         if chain is not None and calibration is not None:
             self.faults += _checks.check_procedure(calibration, chain)
+        table = calibration or self.partial.get("calibration")
+        cameras = self.partial.get(MOCAP) if mocap is None else mocap.settings
+        if table is not None and (cameras is not None or "mocap" not in self.table):
+            self.faults += _checks.check_center_methods(table, limb, cameras)
         if head is None or chain is None or calibration is None or mqtt is None or self.faults:
             return None
 

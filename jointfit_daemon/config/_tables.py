@@ -11,6 +11,7 @@ from typing import Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
+from jointfit_daemon.calibration import CenterMethod  # noqa: TC001 - pydantic reads it
 from jointfit_daemon.driver import Settings
 from jointfit_daemon.limb_model import Method, Procedure  # noqa: TC001 - pydantic reads them
 from jointfit_daemon.model import AngleConvention  # noqa: TC001 - as above
@@ -95,6 +96,15 @@ class CalibrationTable(Settings):
         le=100,
         description="random error of the joint centers, mm, at which the movement suffices; the "
         "error caused by soft-tissue artefact is reported separately",
+    )
+    center_method: CenterMethod = Field(
+        "sphere",
+        description="estimator of the joint centers; all but `sphere` and `score` need a movement "
+        "about one axis, and refuse others",
+    )
+    joint_center_methods: dict[str, CenterMethod] = Field(
+        default_factory=dict,
+        description='estimator of single joints, instead of center_method: { knee = "sara" }',
     )
     holdout_share: float = Field(
         0.4,

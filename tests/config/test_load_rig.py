@@ -200,6 +200,49 @@ def test_fault_names_key_value_and_expectation(
     assert any(said in line for line in complaints(table)), complaints(table)
 
 
+@pytest.mark.parametrize(
+    ("calibration", "said"),
+    [
+        ({"center_method": "spere"}, "expected 'sphere', 'score', 'sara', 'geometric', "),
+        ({"center_method": "spere"}, "did you mean 'sphere'?"),
+        ({"joint_center_methods": {"knee": "halvorsen"}}, "calibration.joint_center_methods.knee"),
+        (
+            {"joint_center_methods": {"kene": "sara"}},
+            "calibration.joint_center_methods.kene = 'kene': unknown joint; known: hip, knee, ankle"
+            "; did you mean 'knee'?",
+        ),
+        (
+            {"joint_center_methods": {"knee": "sara"}},
+            "calibration.joint_center_methods.knee = 'sara': needs markers on both sides of the "
+            "joint: add mocap.markers.shank",
+        ),
+        (
+            {"joint_center_methods": {"hip": "score"}},
+            "calibration.joint_center_methods.hip = 'score': needs markers on both sides of the "
+            "joint: add chain.proximal and its markers",
+        ),
+    ],
+)
+def test_an_estimator_that_the_rig_cannot_serve_is_a_fault(
+    table: Table, calibration: Table, said: str
+) -> None:
+    table["calibration"] = calibration
+    assert any(said in line for line in complaints(table)), complaints(table)
+
+
+def test_estimators_of_joint_centers_need_cameras(table: Table) -> None:
+    table["calibration"] = {"center_method": "oriented"}
+    assert parse_rig(table).calibration.center_method_of("knee") == "oriented"
+    table["calibration"] = {"center_method": "score", "joint_center_methods": {"knee": "sara"}}
+    table["mocap"]["markers"]["shank"] = ["C1", "C2", "C3"]
+    settings = parse_rig(table).calibration
+    assert [settings.center_method_of(joint) for joint in ("hip", "knee")] == ["score", "sara"]
+
+    del table["mocap"]
+    (line,) = complaints(table)
+    assert line.startswith("calibration.center_method: joint centers need cameras: add [mocap]")
+
+
 def test_links_to_one_port_are_the_same_port(table: Table, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to("/dev/nowhere-S1")
     table["imu"][1]["port"] = str(tmp_path / "link")

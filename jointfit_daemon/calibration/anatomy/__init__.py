@@ -1,5 +1,6 @@
 """Marker clusters, joint centers and segment frames."""
 
+from jointfit_daemon.calibration.anatomy._chosen_center import CenterChoice
 from jointfit_daemon.calibration.anatomy._joint_center import (
     MIN_DIRECTION_RAD,
 )
@@ -18,6 +19,7 @@ from jointfit_daemon.calibration.anatomy._segment_frames import (
     SKIN_SD_M,
     Anatomy,
     JointCenter,
+    artefact_covariance,
     find_anatomy,
     on_skin,
     place_unobserved,
@@ -29,9 +31,11 @@ __all__ = [
     "MIN_DIRECTION_RAD",
     "SKIN_SD_M",
     "Anatomy",
+    "CenterChoice",
     "ClusterTrack",
     "JointCenter",
     "apply_standing_prior",
+    "artefact_covariance",
     "body_column",
     "columns",
     "find_anatomy",

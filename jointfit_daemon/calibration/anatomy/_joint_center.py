@@ -92,10 +92,41 @@ def _objection(found: CenterEstimate) -> str | None:
         return found.refused
     if (basic := objection(found.arc, float(np.median(found.radii)), np.inf, LIMITS)) is not None:
         return basic
+    return too_uncertain(found)
+
+
+def too_uncertain(found: CenterEstimate) -> str | None:
+    """Return the reason why a center has too large an error, with the remedy."""
     sd = float(np.sqrt(np.linalg.norm(found.covariance, 2)))
     if sd > MAX_SD_M:
         return f"uncertain to {1000 * sd:.0f} mm: move this joint further, and in other directions"
     return None
+
+
+def artefact_leverage(points: Array, center: Array, unseen: Array) -> Array:
+    r"""Return the covariance of a center per m² of radial soft-tissue artefact, shape (3, 3).
+
+    .. math:: L = \Big[ \mathrm{mean}_{tj}\,(d_{tj} - \bar d_j)(d_{tj} - \bar d_j)^T \Big]^+,
+              \qquad d_{tj} = (v_{tj} - m) / |v_{tj} - m|
+
+    within the observed directions. It is the inverse information of a sphere fit with one
+    observation of unit variance, so the artefact of a posture counts once.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, k, 3)
+        Markers of the distal part in coordinates of the proximal part, m; NaN if not visible.
+    center : ndarray, shape (3,)
+        m.
+    unseen : ndarray, shape (u, 3)
+        Unobserved unit directions.
+    """
+    away = points - center
+    direction = away / np.linalg.norm(away, axis=-1, keepdims=True)
+    spread = (direction - np.nanmean(direction, axis=0))[visible(points)]
+    across = np.eye(3) - unseen.T @ unseen
+    information = across @ (spread.T @ spread / max(len(spread), 1)) @ across
+    return np.asarray(across @ np.linalg.pinv(information, rcond=1e-9) @ across)
 
 
 def align_vertically(found: CenterEstimate, above: Array | None) -> CenterEstimate:

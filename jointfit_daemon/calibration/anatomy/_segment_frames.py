@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration._errors import CalibrationError
+from jointfit_daemon.calibration.anatomy._chosen_center import CenterChoice, chosen_center
 from jointfit_daemon.calibration.anatomy._joint_center import (
     UNSEEN_SD_M,
     align_vertically,
@@ -24,6 +25,7 @@ from jointfit_daemon.calibration.anatomy._joint_center import (
     joint_center,
 )
 from jointfit_daemon.calibration.anatomy._standing_prior import apply_standing_prior
+from jointfit_daemon.center_of_rotation import hinge_axis_sd
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import body_parts, configured_length, flexion_sign, visible
 from jointfit_daemon.model import FrameFlag
@@ -110,7 +112,9 @@ class Anatomy:
     notes: tuple[str, ...] = field(default=())
 
 
-def find_anatomy(chain: Chain, tracks: Mapping[str, ClusterTrack]) -> Anatomy:
+def find_anatomy(
+    chain: Chain, tracks: Mapping[str, ClusterTrack], choice: CenterChoice | None = None
+) -> Anatomy:
     """Determine joint centers, lengths and axes.
 
     Parameters
@@ -119,13 +123,16 @@ def find_anatomy(chain: Chain, tracks: Mapping[str, ClusterTrack]) -> Anatomy:
         Joints, segments, configured lengths and adjacent body parts.
     tracks : mapping of str to ClusterTrack
         The functional trial; body parts without markers are absent.
+    choice : CenterChoice, optional
+        Estimators of the centers; the sphere fit if None.
 
     Raises
     ------
     CalibrationError
-        No joint flexed enough for a flexion axis, or the axis is along a segment.
+        No joint flexed enough for a flexion axis, the axis is along a segment, or a chosen
+        estimator refused the movement of its joint.
     """
-    fits, notes = _fit_centers(chain, tracks)
+    fits, notes = _fit_centers(chain, tracks, choice or CenterChoice())
 
     joints = _with_lengths(chain, fits)
     if unknown := [name for name, found in joints.items() if found is None]:
@@ -171,16 +178,29 @@ def _jointed(
 
 
 def _fit_centers(
-    chain: Chain, tracks: Mapping[str, ClusterTrack]
+    chain: Chain, tracks: Mapping[str, ClusterTrack], choice: CenterChoice
 ) -> tuple[dict[str, JointCenter | None], list[str]]:
     found: dict[str, CenterEstimate] = {}
-    notes, jointed = [], _jointed(chain, tracks)
+    notes, faults, jointed = [], [], _jointed(chain, tracks)
+    turned = [choice.turned.get(part) if part else None for part in body_parts(chain)]
     for joint, (above, below) in jointed.items():
-        fit = joint_center(above, below, (above.origin + below.origin) / 2)
-        if fit.refused is None:
-            found[joint] = fit
+        start = (above.origin + below.origin) / 2
+        method = choice.methods.get(joint, "sphere")
+        if method == "sphere":
+            fit = joint_center(above, below, start)
         else:
+            i = chain.joints.index(joint)
+            fit = chosen_center(method, above, below, start, (turned[i], turned[i + 1]))
+
+        if fit.refused is None:
+            points = above.to_static(below.points)
+            found[joint] = replace(fit, axis_sd=hinge_axis_sd(points, fit.axis))
+        elif method == "sphere":
             notes.append(f"{joint}: no center: {fit.refused}")
+        else:  # an explicit choice is not replaced by another estimator
+            faults.append(f"{joint}: center_method {method}: {fit.refused}")
+    if faults:
+        raise CalibrationError(*faults)
 
     settled = place_unobserved(chain, found)
 
@@ -233,8 +253,14 @@ def on_skin(fit: CenterEstimate) -> Array:
     with the unobserved directions U (rows) and L = ``fit.leverage``, the covariance per m² of
     radial soft-tissue artefact.
     """
-    whole = fit.covariance + UNSEEN_SD_M**2 * fit.unseen.T @ fit.unseen
-    return whole if fit.leverage is None else whole + RADIAL_ARTEFACT_SD_M**2 * fit.leverage
+    return artefact_covariance(fit) + UNSEEN_SD_M**2 * np.asarray(fit.unseen.T @ fit.unseen)
+
+
+def artefact_covariance(fit: CenterEstimate) -> Array:
+    r"""Return :math:`C + \sigma_r^2 L`, 0 along unobserved directions, m², shape (3, 3)."""
+    if fit.leverage is None:
+        return fit.covariance
+    return fit.covariance + RADIAL_ARTEFACT_SD_M**2 * fit.leverage
 
 
 def _with_lengths(

@@ -18,12 +18,16 @@ from math import degrees, isfinite
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.calibration._errors import CalibrationError
+from jointfit_daemon.calibration._trial import ONE_AXIS
 from jointfit_daemon.calibration.anatomy import marked_parts, static_cluster
 from jointfit_daemon.calibration.guidance._live_joint_centers import (
     LiveJointCenter,
     LiveJointCenters,
 )
-from jointfit_daemon.calibration.guidance._movement_instructions import instructions_for
+from jointfit_daemon.calibration.guidance._movement_instructions import (
+    JointInstructions,
+    instructions_for,
+)
 from jointfit_daemon.calibration.guidance._movement_progress import MovementProgress
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.limb_model import configured_length
@@ -86,6 +90,7 @@ class MovementGuide:
     ) -> None:
         self._chain, self._target = chain, settings.center_target_m
         optical = None if standing is None else standing.optical
+        self._one_axis = {j for j in chain.joints if settings.center_method_of(j) in ONE_AXIS}
         clusters, self._faults = _clusters(chain, settings, optical)
         self._centers = LiveJointCenters(chain, clusters)
 
@@ -130,8 +135,11 @@ class MovementGuide:
             figures_of_joint: dict[str, object] = {}
             lacking: str | None = None
             if (center := centers.get(joint)) is not None:
-                lacking = _missing_movement(center, self._target)
-                figures_of_joint = _figures(center, lacking)
+                words = instructions_for(joint)
+                if joint in self._one_axis:
+                    words = words._replace(hinge=True)
+                lacking = _missing_movement(center, words, self._target)
+                figures_of_joint = _figures(center, words, lacking)
             if center is None or center.center is None:
                 figures_of_joint = self._figures_without_center(
                     joint, guessed.get(joint), arcs.get(joint)
@@ -200,9 +208,8 @@ def _fault(name: str, part: ClusterVisibility) -> str | None:
     return None
 
 
-def _missing_movement(one: LiveJointCenter, target: float) -> str | None:
+def _missing_movement(one: LiveJointCenter, words: JointInstructions, target: float) -> str | None:
     """Return the movement that a joint center still needs; None if it is complete."""
-    words = instructions_for(one.joint)
     if one.frames == 0:
         return "its markers were not visible yet: move both sides of it into view of the cameras"
     if one.center is None or one.unseen > 1:
@@ -210,22 +217,24 @@ def _missing_movement(one: LiveJointCenter, target: float) -> str | None:
     if one.unseen == 1 and not words.hinge:
         return f"no circumduction, movement about one axis only: {words.sideways}"
 
-    noise = _noise(one)
+    noise = _noise(one, words)
     if noise <= target:
         return one.refused
     more = words.bend if words.hinge else f"{words.bend}, and {words.sideways}"
     return f"error of {1e3 * noise:.1f} mm, target {1e3 * target:g} mm: {more}"
 
 
-def _noise(one: LiveJointCenter) -> float:
-    return one.noise_across if instructions_for(one.joint).hinge else one.noise
+def _noise(one: LiveJointCenter, words: JointInstructions) -> float:
+    return one.noise_across if words.hinge else one.noise
 
 
-def _figures(one: LiveJointCenter, lacking: str | None) -> dict[str, object]:
+def _figures(
+    one: LiveJointCenter, words: JointInstructions, lacking: str | None
+) -> dict[str, object]:
     return {
         "source": "markers" if one.unseen == 0 else "markers, static pose",
         "predicted_error_mm": _mm(one.total),
-        "noise_error_mm": _mm(_noise(one)),
+        "noise_error_mm": _mm(_noise(one, words)),
         "arc_deg": round(degrees(one.arc), 1),
         "conditioning": round(one.conditioning, 1),
         "frames": one.frames,

@@ -18,16 +18,17 @@ from jointfit_daemon.calibration._quality import (
     sensor_rotations,
 )
 from jointfit_daemon.calibration.anatomy import (
-    SKIN_SD_M,
     Anatomy,
+    CenterChoice,
     ClusterTrack,
-    JointCenter,
     find_anatomy,
     track_clusters,
 )
 from jointfit_daemon.calibration.phases._cluster_refinement import RefinedClusters, refine_clusters
+from jointfit_daemon.calibration.phases._inertial_rotations import inertial_rotations
 from jointfit_daemon.calibration.phases._quality_figures import (
     anatomy_quality,
+    joint_record,
     lag_notes,
     lag_quality,
 )
@@ -44,6 +45,7 @@ from jointfit_daemon.calibration.registration import (
     SensorLag,
     fit_sensor_alignment,
     segment_lags,
+    sensor_at,
     sensor_lags,
     tracked_lags,
 )
@@ -62,17 +64,17 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.limb_model import (
     Calibration,
-    JointCalibration,
     SegmentCalibration,
     SensorCalibration,
     cluster_record,
-    vector,
     visible,
 )
 from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+
+    from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration._trial import CalibrationSettings, CalibrationTrial
@@ -128,14 +130,14 @@ def fit_calibration(
     """
     pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
 
-    # Reference: body parts, joint centers and segment axes.
+    # Reference: body parts, and lags of the sensors behind them.
     refined, tracks = refined_tracks(_tracks(pose, functional, chain), pose, functional, settings)
-    anatomy = find_anatomy(chain, tracks)
-    joints = {name: _joint(found) for name, found in anatomy.joints.items()}
-
-    # Lags and mounts of the sensors.
     moving = _lags(chain, functional, tracks, lag_ns or {})
     lags = _lags_in_use(chain, moving, alignment, _earlier_lags(previous, tracked), lag_ns or {})
+
+    # Joint centers, segment axes, and mounts of the sensors.
+    raw = _sensors_at(next(iter(tracks.values())).t_ns, functional, pose, lags)
+    anatomy = find_anatomy(chain, tracks, _center_choice(chain, raw, pose, alignment, settings))
     sensors = _sensors(chain, pose, alignment, anatomy, lags)
 
     # Segment models.
@@ -147,7 +149,7 @@ def fit_calibration(
         alignment=None if alignment is None else alignment.quality,
         lag={name: lag_quality(moving.get(name), lags.get(name, NO_LAG)) for name in sensors},
         markers=refined.figures,
-        anatomy=anatomy_quality(anatomy, joints),
+        anatomy=anatomy_quality(chain, anatomy, tracks),
         holdout=holdout,
         regression=regression_quality(chain, training, models, settings.holdout_share),
     )
@@ -158,7 +160,7 @@ def fit_calibration(
         chain_sensors=chain.sensors,
         sensor=sensors,
         segment=_segments(anatomy, models),
-        joint=joints,
+        joint={name: joint_record(found) for name, found in anatomy.joints.items()},
         clusters={name: cluster_record(cluster) for name, cluster in refined.clusters.items()},
         flags=(*anatomy.flags, *([FrameFlag.HEADINGS_FROM_STATIC] if alignment is None else [])),
         notes=(*refined.notes, *anatomy.notes, *lag_notes(moving, lags), *notes),
@@ -237,6 +239,32 @@ def _lags(
         unknown = {s: functional.sensors[s] for s in group if s not in known}
         out |= sensor_lags(track.t_ns, track.q, unknown, SKIN)
     return out
+
+
+def _sensors_at(
+    t_ns: NDArray[np.int64],
+    functional: CalibrationTrial,
+    pose: StaticPose,
+    lags: Mapping[str, SensorLag],
+) -> dict[str, Array]:
+    """Return the orientation of every sensor at instants of the optical system."""
+    return {
+        name: sensor_at(functional.sensors[name], t_ns, lags.get(name, NO_LAG).lag_ns)
+        for name in pose.sensors
+    }
+
+
+def _center_choice(
+    chain: Chain,
+    raw: Mapping[str, Array],
+    pose: StaticPose,
+    alignment: PlateAlignment | None,
+    settings: CalibrationSettings,
+) -> CenterChoice:
+    methods = {joint: settings.center_method_of(joint) for joint in chain.joints}
+    needs_imus = "oriented" in methods.values()
+    turned = inertial_rotations(chain, raw, pose, alignment) if needs_imus else {}
+    return CenterChoice(methods, turned)
 
 
 def _earlier_lags(
@@ -345,11 +373,3 @@ def _segments(
         name: SegmentCalibration(as_quaternion(q), *anatomy.lengths[name], models[name])
         for name, q in anatomy.q_static.items()
     }
-
-
-def _joint(found: JointCenter | None) -> JointCalibration:
-    if found is None:
-        return JointCalibration(None, None, "unknown")
-    sd = float(np.sqrt(np.trace(found.covariance) / 3.0 + SKIN_SD_M**2))
-    residual = None if found.fit is None else found.fit.residual
-    return JointCalibration(vector(found.center), sd, found.source, residual, found.gap_rms)

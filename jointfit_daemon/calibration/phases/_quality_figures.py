@@ -2,23 +2,33 @@
 
 from __future__ import annotations
 
+from math import isfinite, sqrt
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from jointfit_daemon.calibration._quality import (
     AnatomyQuality,
     AxisQuality,
+    CenterCoordinates,
+    CenterQuality,
     JointQuality,
     LagQuality,
     MeasuredLag,
 )
+from jointfit_daemon.calibration.anatomy import SKIN_SD_M, artefact_covariance
 from jointfit_daemon.calibration.registration import NO_LAG
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import JointCalibration, body_parts, vector
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.calibration.anatomy import Anatomy
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.anatomy import Anatomy, ClusterTrack, JointCenter
     from jointfit_daemon.calibration.registration import SensorLag
-    from jointfit_daemon.limb_model import JointCalibration
+    from jointfit_daemon.center_of_rotation import CenterEstimate
+    from jointfit_daemon.model import Chain
     from jointfit_daemon.timing.lag import LagEstimate
 
 
@@ -47,24 +57,84 @@ def lag_notes(moving: Mapping[str, LagEstimate], used: Mapping[str, SensorLag]) 
     ]
 
 
-def anatomy_quality(anatomy: Anatomy, joints: Mapping[str, JointCalibration]) -> AnatomyQuality:
+def joint_record(found: JointCenter | None) -> JointCalibration:
+    """Return the stored form of a joint center."""
+    if found is None:
+        return JointCalibration(None, None, "unknown")
+    sd = sqrt(float(np.trace(found.covariance)) / 3.0 + SKIN_SD_M**2)
+    residual = None if found.fit is None else found.fit.residual
+    return JointCalibration(vector(found.center), sd, found.source, residual, found.gap_rms)
+
+
+def anatomy_quality(
+    chain: Chain, anatomy: Anatomy, tracks: Mapping[str, ClusterTrack]
+) -> AnatomyQuality:
     """Return the figures of joint centers, segment lengths and flexion axes."""
-    centers = {}
+    joints = {}
     for name, found in anatomy.joints.items():
-        fit = None if found is None else found.fit
-        centers[name] = JointQuality(
+        fit, record = None if found is None else found.fit, joint_record(found)
+        joints[name] = JointQuality(
             source="unknown" if found is None else found.source_text,
-            sd_m=joints[name].sd,
-            residual_rms_m=joints[name].residual_rms,
-            gap_rms_m=joints[name].gap_rms,
+            sd_m=record.sd,
+            residual_rms_m=record.residual_rms,
+            gap_rms_m=record.gap_rms,
             arc_rad=None if fit is None else fit.arc,
             unseen_directions=0 if fit is None else len(fit.unseen),
         )
 
     return AnatomyQuality(
-        centers,
+        joints,
         {name: length for name, (length, _) in anatomy.lengths.items()},
         {name: sd for name, (_, sd) in anatomy.lengths.items()},
         anatomy.length_sources,
         {name: AxisQuality(axis.rms, axis.off) for name, axis in anatomy.axes.items()},
+        _center_quality(chain, anatomy, tracks),
+    )
+
+
+def _center_quality(
+    chain: Chain, anatomy: Anatomy, tracks: Mapping[str, ClusterTrack]
+) -> dict[str, CenterQuality]:
+    """Return the center of every joint from the movement, in coordinates of both body parts."""
+    parts, centers = body_parts(chain), {}
+    for i, joint in enumerate(chain.joints):
+        found = anatomy.joints[joint]
+        if found is None or found.fit is None:
+            continue
+        fit = found.fit
+        covariance = artefact_covariance(fit)
+        sides = {
+            part: _coordinates(fit, covariance, tracks[part].origin, anatomy.q_static.get(part))
+            for part in parts[i : i + 2]
+            if part is not None
+        }
+        observed = 3 - len(fit.unseen)
+        centers[joint] = CenterQuality(
+            method=fit.method,
+            frames=fit.frames,
+            effective_frames=fit.effective_frames,
+            predicted_error_m=sqrt(float(np.trace(covariance)) / observed),
+            noise_error_m=sqrt(float(np.trace(fit.covariance)) / observed),
+            bound_m=fit.bound if isfinite(fit.bound) else None,
+            residual_rms_m=fit.residual,
+            arc_rad=fit.arc,
+            conditioning=fit.conditioning,
+            flags=fit.flags,
+            segments=sides,
+            axis_sd_rad=fit.axis_sd,
+        )
+    return centers
+
+
+def _coordinates(
+    fit: CenterEstimate, covariance: Array, origin: Array, q_static: Array | None
+) -> CenterCoordinates:
+    """Transform a center from the static world to one body part."""
+    R = np.eye(3) if q_static is None else rotation.to_matrix(q_static).T
+    rows = R @ covariance @ R.T
+    return CenterCoordinates(
+        vector(R @ (fit.center - origin)),
+        (vector(rows[0]), vector(rows[1]), vector(rows[2])),
+        tuple(vector(R @ direction) for direction in fit.unseen),
+        None if fit.axis is None else vector(R @ fit.axis),
     )

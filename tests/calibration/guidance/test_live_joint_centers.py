@@ -29,7 +29,7 @@ from tests.calibration.synthetic_limb import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from jointfit_daemon.calibration import CalibrationTrial, OpticalTrack
+    from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, OpticalTrack
     from jointfit_daemon.calibration.guidance import MovementStatus
 
 EVERY = 24
@@ -54,9 +54,14 @@ def frames(track: OpticalTrack, positions: np.ndarray | None = None) -> Iterator
         )
 
 
-def watched(static: CalibrationTrial, track: OpticalTrack, positions: np.ndarray) -> MovementStatus:
+def watched(
+    static: CalibrationTrial,
+    track: OpticalTrack,
+    positions: np.ndarray,
+    settings: CalibrationSettings = SETTINGS,
+) -> MovementStatus:
     """Return the last look at a movement; no payload on the way holds NaN or infinity."""
-    guide = MovementGuide(CHAIN, SETTINGS, static)
+    guide = MovementGuide(CHAIN, settings, static)
     look = guide.look({}, 0.0)
     for i, frame in enumerate(frames(track, positions)):
         guide.add_mocap(frame)
@@ -177,6 +182,12 @@ def test_sideways_movement_is_requested_of_a_hip_that_moves_about_one_axis() -> 
     look = watched(static, track, track.positions)
     assert "no circumduction" in str(look.joints["hip"]["unseen"])
     assert "sideways" in str(look.joints["hip"]["unseen"])
+
+    # an estimator of one axis would refuse a movement sideways
+    one_axis = replace(SETTINGS, joint_center_methods={"hip": "three_frames"})
+    look = watched(static, track, track.positions, one_axis)
+    assert "sideways" not in str(look.missing)
+    assert look.joints["hip"]["met"] is True
 
 
 def test_a_frame_without_markers_or_with_other_names_is_no_frame() -> None:

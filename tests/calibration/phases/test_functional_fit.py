@@ -24,9 +24,11 @@ from jointfit_daemon.calibration.record._content_check import content_faults
 from jointfit_daemon.calibration.soft_tissue import METHODS
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import Calibration, CalibrationSchemaError
+from jointfit_daemon.outputs.payloads._quality_units import quality_payload
 from tests.calibration.synthetic_limb import (
     CHAIN,
     LENGTH,
+    LOCAL,
     MARKERS,
     OWNER,
     SETTINGS,
@@ -89,21 +91,71 @@ def test_json_is_exact_through_text(clean: tuple[Subject, Calibration]) -> None:
     assert len(again.digest) == 64
 
 
+@pytest.fixture(scope="module")
+def regressed() -> Calibration:
+    """Return a calibration by regression, with a knee center from markers and IMUs."""
+    subject = Subject(11, flaws=Imperfections(heading_deg=0.0))
+    static, functional, _ = static_and_functional(subject, 12.0)
+    settings = replace(
+        SETTINGS, method="patent12", joint_center_methods={"knee": "oriented", "hip": "score"}
+    )
+    return fit_calibration(static, functional, None, settings, CHAIN)
+
+
 def test_rotations_and_regression_coefficients_in_use_are_published(
-    clean: tuple[Subject, Calibration],
+    clean: tuple[Subject, Calibration], regressed: Calibration
 ) -> None:
     published = clean[1].quality["sensors"]
     for name, item in clean[1].sensor.items():
         assert tuple(published[name]["q_sensor_segment"]) == item.q_sensor_segment
     assert "regression" not in clean[1].quality  # anchored
 
-    static, functional, _ = static_and_functional(Subject(11), 12.0)
-    settings = replace(SETTINGS, method="patent12")
-    found = fit_calibration(static, functional, None, settings, CHAIN)
+    found = regressed
     for segment, figures in found.quality["regression"].items():
         stored = found.segment[segment].models[f"{'+'.join(figures['sensors'])}|"].to_dict()
         assert figures["stored"] == [list(row) for row in stored["coefficients"]]
         assert figures["verified"] != figures["stored"]
+
+
+def test_centers_are_published_in_coordinates_of_both_segments(
+    clean: tuple[Subject, Calibration],
+) -> None:
+    centers = clean[1].quality["anatomy"]["centers"]
+    assert centers.keys() == {"hip", "knee", "ankle"}
+    for joint, above, below in (("hip", "pelvis", "thigh"), ("knee", "thigh", "shank")):
+        found = centers[joint]
+        assert found["method"] == "sphere"
+        assert found["frames"] >= found["effective_frames"] > 100
+        assert 0.0 < found["noise_error_m"] < 0.001 < found["predicted_error_m"]
+        assert found["segments"].keys() == {above, below}
+
+        # the joint is the origin of its distal segment, and the markers have a mean
+        in_distal = found["segments"][below]
+        expected = -np.mean(LOCAL[below], axis=0)
+        assert np.linalg.norm(np.subtract(in_distal["center_m"], expected)) < 0.015
+        for side in found["segments"].values():
+            covariance = np.array(side["covariance_m2"])
+            assert np.linalg.eigvalsh(covariance)[0] > -1e-12
+            assert np.trace(covariance) == pytest.approx(
+                (3 - len(side["unseen"])) * found["predicted_error_m"] ** 2
+            )
+
+    # a hinge: the position along the axis is unobserved, and the axis points to the right
+    knee = centers["knee"]["segments"]["thigh"]
+    assert knee["unseen"] == [knee["axis"]]
+    assert abs(knee["axis"][0]) > 0.99
+    assert 0.0 < centers["knee"]["axis_sd_rad"] < 0.01
+    assert "axis_sd_rad" not in centers["hip"]
+    told = quality_payload(clean[1].quality)["anatomy"]["centers"]["knee"]
+    assert told["axis_sd_deg"] == pytest.approx(np.degrees(centers["knee"]["axis_sd_rad"]), 1e-3)
+
+
+def test_the_configured_estimators_determine_the_stored_centers(regressed: Calibration) -> None:
+    centers = regressed.quality["anatomy"]["centers"]
+    assert [centers[joint]["method"] for joint in ("hip", "knee", "ankle")] == [
+        "score", "oriented", "sphere",
+    ]  # fmt: skip
+    assert regressed.segment["thigh"].length == pytest.approx(LENGTH["thigh"], abs=0.008)
 
 
 @pytest.mark.parametrize("damage", [{"schema": 99}, {"sensor": {"S1": {}}}, {"segments": None}])
