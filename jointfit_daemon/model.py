@@ -314,6 +314,27 @@ class LimbState(NamedTuple):
     joints: tuple[JointState, ...]
 
 
+class SensorOrientation(NamedTuple):
+    """One sensor in one frame, before any correction."""
+
+    name: str
+    q_world_sensor: Quaternion | None
+    """Orientation in the sensor's own world, at the instant of the frame; None without data."""
+    q_world_segment: Quaternion | None
+    """Orientation of its segment from this sensor alone; None without data or calibration."""
+
+
+class SensorStates(NamedTuple):
+    """The sensors of one frame, and the rotations of the joints."""
+
+    seq: int
+    """Frame number of the limb state."""
+    t_ns: int
+    sensors: tuple[SensorOrientation, ...]
+    joints: tuple[tuple[str, Quaternion | None], ...]
+    """q_proximal_distal of every joint between two segments, from the fused segments."""
+
+
 class OpticalSegment(NamedTuple):
     """One segment according to the cameras."""
 

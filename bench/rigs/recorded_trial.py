@@ -3,7 +3,8 @@
 Invariant: three processes exchange only bytes: `jointfit-sim play --trial`, the daemon, and a
 broker. The `pose` messages are compared with the simulator's ground truth at the instants of the
 poses. The daemon calibrates itself on a static pose and the first 60 % of the squats; the last 40 %
-are evaluated.
+are evaluated. The regressions of the patent run in its procedure: they get the whole trial, fit the
+first 60 % and verify on the rest.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import time
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from bench.subjects.recorded_knee import FOLDER, Judge, KneeTrial, load, trainin
 from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import PatentReading
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.tools.child_processes import daemon, simulator
 from tests.broker_fixture import chosen_broker
@@ -46,6 +48,8 @@ SEGMENTS = ("thigh", "shank")
 TRUTH_NS, MATCH_NS = 10_000_000, 1_000_000
 """Truth and poses refer to multiples of 10 ms of one clock; the rest is rounding."""
 CONNECT_S = PATIENCE_S = 40.0
+REGRESSIONS: tuple[str, ...] = get_args(PatentReading)
+"""Methods that run in the procedure of the patent."""
 ENDS = {"static": "posed", "functional": "calibrated"}
 """State that ends each phase successfully."""
 
@@ -60,14 +64,21 @@ class Gateway:
     poses: list[dict[str, Any]] = field(default_factory=list)
     online: set[str] = field(default_factory=set)
     health: dict[str, Any] = field(default_factory=dict)
+    sensors: dict[int, dict[str, Any]] = field(default_factory=dict)
+    """Sensors of `sensors/pose` by frame number."""
+    regression: dict[str, Any] = field(default_factory=dict)
+    """Coefficients of `calibration` by segment; empty if the method is no regression."""
     _phases: asyncio.Queue[dict[str, Any]] = field(default_factory=asyncio.Queue)
 
     async def listen(self) -> None:
         async for topic, payload in self.client.messages():
             if topic == "pose":
                 self.poses.append(payload)
+            elif topic == "sensors/pose":
+                self.sensors[payload["seq"]] = payload["sensors"]
             elif topic == "calibration":
                 self._phases.put_nowait(payload)
+                self.regression = payload["quality"].get("regression") or {}
             elif topic == "bridge/health":
                 self.health = payload
             elif topic.endswith("/availability"):
@@ -105,6 +116,7 @@ class Gateway:
     async def live(self, motion: str, seconds: float) -> None:
         """Play a motion of `seconds` and record the messages."""
         self.poses.clear()
+        self.sensors.clear()
         await self.play(motion)
         await asyncio.sleep(BLEND_S + seconds + SPARE_S)
 
@@ -126,7 +138,9 @@ async def gateway(folder: Path, port: int, options: Sequence[str]) -> AsyncItera
         MqttClient(settings) as client,
     ):
         ready = await sim.ready()
-        await client.subscribe("pose", "calibration", "bridge/health", "device/+/availability")
+        await client.subscribe(
+            "pose", "sensors/pose", "calibration", "bridge/health", "device/+/availability"
+        )
         found = Gateway(folder, sim, client)
         listening = asyncio.create_task(found.listen(), name="listener")
         try:
@@ -155,20 +169,25 @@ def _options(files: Sequence[Path], rate_hz: float, method: Method) -> list[str]
         *("--trial", *map(str, files), "--perfect", "--rate", f"{rate_hz:g}"),
         *(word for name, value in knobs.items() for word in ("--set", f"{name}={value:g}")),
         *("--output-rate-hz", f"{rate_hz:g}", "--method", method, "--axes", "static"),
-        *("--static-s", f"{STATIC_S:g}"),
+        *("--static-s", f"{STATIC_S:g}", "--sensors-hz", f"{rate_hz:g}"),
+        *("--procedure", "patent" if method in REGRESSIONS else "corrected"),
     ]
 
 
 async def squats(data: Path, folder: Path, port: int, method: Method) -> Played:
-    """Calibrate on the first 60 % of the squats, evaluate the rest live."""
+    """Calibrate on the first 60 % of the squats, evaluate the rest live.
+
+    The daemon holds out the last 40 % of its trial itself for the regressions of the patent.
+    """
     files = [data / FOLDER / name for name in ("squats1.npz", "static_bias.json")]
     whole = load(data, "squats1")
     cut, last = training_frames(whole), len(whole) - 1
+    end = last if method in REGRESSIONS else cut - 1
     async with gateway(folder, port, _options(files, SQUATS_HZ, method)) as running:
         await running.connected()
         await running.phase("static", STATIC_S)
-        await running.play(f"trial@0-{(cut - 1) / SQUATS_HZ:g}")
-        await running.phase("functional", BLEND_S + (cut - 1) / SQUATS_HZ + SPARE_S)
+        await running.play(f"trial@0-{end / SQUATS_HZ:g}")
+        await running.phase("functional", BLEND_S + end / SQUATS_HZ + SPARE_S)
         await running.live(f"trial@{cut / SQUATS_HZ:g}-", (last - cut) / SQUATS_HZ)
     return _judged(running, data)
 
@@ -198,6 +217,9 @@ class Played:
     calibration: Calibration
     health: dict[str, Any]
     """Devices of the daemon's last health message."""
+    repeated_deg: float | None
+    """Largest angle between a segment of `pose` and the regression of the patent, evaluated from
+    `sensors/pose` and the coefficients of `calibration`; None without a regression."""
 
     def of(self, recorded: KneeTrial) -> KneeTrial:
         """Return the evaluated frames of the recording: those with the nearest posture."""
@@ -240,7 +262,27 @@ def _judged(running: Gateway, data: Path) -> Played:
     whole = load(data, "squats1")
     judge = Judge.of(whole.part(slice(0, training_frames(whole))))
     errors = judge.errors((thigh, shank), KneeTrial((femur,) * 4, femur, tibia))
-    return Played(len(rows), (femur, tibia), errors, calibration, running.health)
+    repeated = _repeated_deg(running)
+    return Played(len(rows), (femur, tibia), errors, calibration, running.health, repeated)
+
+
+def _repeated_deg(running: Gateway) -> float | None:
+    """Evaluate step S4 of the patent from the messages alone, see `Played.repeated_deg`."""
+    largest = None
+    for pose in running.poses:
+        sensors = running.sensors.get(pose["seq"], {})
+        for segment, fit in running.regression.items():
+            said = pose["segments"][segment]["q"]
+            inputs = [sensors.get(name, {}).get("q_segment") for name in fit["sensors"]]
+            if said is None or None in inputs:
+                continue
+            table = np.array(fit["stored"])
+            y = table[:, -1].copy()
+            for k, q in enumerate(np.array(inputs)):
+                y += table[:, k] * (q if q @ fit["q_sign"] >= 0.0 else -q)
+            apart = float(np.degrees(rotation.angle_between(rotation.normalize(y), said)))
+            largest = apart if largest is None else max(largest, apart)
+    return largest
 
 
 def _recorded_truth(path: Path) -> dict[int, list[list[float]]]:

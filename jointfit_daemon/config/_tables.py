@@ -179,6 +179,9 @@ class MqttSettings(Settings):
     optical_hz: float = Field(
         25.0, ge=0, le=1000, description="greatest rate of the topic optical/pose, Hz; 0: none"
     )
+    sensors_hz: float = Field(
+        0.0, ge=0, le=1000, description="greatest rate of the topic sensors/pose, Hz; 0: none"
+    )
     joint_hz: float = Field(1.0, gt=0, le=1, description="rate of the topics joint/NAME, Hz")
     health_s: float = Field(10.0, gt=0, le=60, description="interval of the topic bridge/health, s")
 

@@ -4,6 +4,7 @@ from jointfit_daemon.fusion._limb_fuser import LimbFuser
 from jointfit_daemon.fusion._optical_limb import OpticalLimb, OpticalReading
 from jointfit_daemon.fusion._optical_origin import OpticalOrigin
 from jointfit_daemon.fusion._segment_fuser import HEADING_SD
+from jointfit_daemon.fusion._sensor_states import sensor_states
 from jointfit_daemon.fusion.faults import SensorMonitor, SensorReport
 
 __all__ = [
@@ -14,4 +15,5 @@ __all__ = [
     "OpticalReading",
     "SensorMonitor",
     "SensorReport",
+    "sensor_states",
 ]

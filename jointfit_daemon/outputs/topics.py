@@ -45,11 +45,12 @@ DEVICE_INFO = Topic("device/ID/info", 1, retained=True)
 POSE = Topic("pose", 0)
 POSE_UI = Topic("pose/ui", 0)
 OPTICAL_POSE = Topic("optical/pose", 0)
+SENSORS_POSE = Topic("sensors/pose", 0)
 JOINT = Topic("joint/NAME", 0)
 
 TOPICS = (
     BRIDGE_STATE, BRIDGE_INFO, BRIDGE_HEALTH, BRIDGE_EVENT, BRIDGE_LOG, REQUEST, RESPONSE,
     CALIBRATION, CALIBRATION_PROGRESS, DEVICE_AVAILABILITY, DEVICE_INFO, POSE, POSE_UI,
-    OPTICAL_POSE, JOINT,
+    OPTICAL_POSE, SENSORS_POSE, JOINT,
 )  # fmt: skip
 """All topics, in the order of docs/mqtt.md."""

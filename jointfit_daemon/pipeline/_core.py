@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import drifting_imus, heading_warning
-from jointfit_daemon.fusion import LimbFuser, SensorMonitor
+from jointfit_daemon.fusion import LimbFuser, SensorMonitor, sensor_states
 from jointfit_daemon.model import Corrupt, DeviceEvent, FusionMode, ImuSample, SyncState
 from jointfit_daemon.pipeline._frame_grid import FrameGrid
 from jointfit_daemon.pipeline._mocap_router import MocapRouter
@@ -41,11 +41,13 @@ from jointfit_daemon.pipeline.sources import (
     SyncLines,
     known_lags,
 )
+from jointfit_daemon.timing.alignment import RateDivider
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner
@@ -85,6 +87,9 @@ class Core:
         self._lags: LagMonitor | None = None
         self._collector: OnlineFrameCollector
         self._comparison: OpticalComparison
+        self._usable: Calibration | None = None
+        """The calibration in force, if it belongs to the chain of the rig."""
+        self._sensors_rate: RateDivider | None = None
         self._handlers: dict[type, Callable[[Any], list[Output]]] = {
             Configured: self._configure,
             SourceOpened: self._open_source,
@@ -206,6 +211,9 @@ class Core:
         self._lag_ns = dict(calibration.lag_ns) if calibration is not None else {}
         self._lag_ns |= self._lags.known_ns()
         self._comparison = OpticalComparison(rig.chain, usable, rig.mqtt.optical_hz)
+        self._usable = usable
+        rate_hz = rig.mqtt.sensors_hz
+        self._sensors_rate = RateDivider(rate_hz) if rate_hz > 0.0 else None
         wanted = rig.calibration.learn_online
         self._collector = OnlineFrameCollector(rig.chain, usable, wanted=wanted)
 
@@ -325,6 +333,9 @@ class Core:
         for frame in frames:
             state = self._fuse(frame)
             outputs += (state, *self._comparison.add_state(state))
+            if self._sensors_rate is not None and self._sensors_rate.is_due(frame.t_ns):
+                chain, usable = self._rig.chain, self._usable
+                outputs.append(sensor_states(chain, usable, frame.orientations, state))
         if outputs and self._lags is not None:
             outputs += self._lags.step(now_ns)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from jointfit_daemon.model import LimbState, OpticalState
+from jointfit_daemon.model import LimbState, OpticalState, SensorStates
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -288,6 +288,7 @@ class Reply:
 Output = (
     LimbState
     | OpticalState
+    | SensorStates
     | Notice
     | DeviceStatus
     | DeviceInfo

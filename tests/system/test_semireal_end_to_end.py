@@ -45,6 +45,11 @@ def test_recorded_squats_through_the_daemon_match_the_offline_errors(
         same = live.of(knee.held)
         offline = knee.judge.errors(models.predict(same), same)
         assert live.errors == pytest.approx(offline, abs=0.1), method
+        if method == "patent12":  # in the procedure of the patent
+            assert live.repeated_deg is not None
+            assert live.repeated_deg < 0.01
+        else:
+            assert live.repeated_deg is None
         devices = live.health["devices"]
         assert {name: device["lost"] for name, device in devices.items()} == dict.fromkeys(
             devices, 0

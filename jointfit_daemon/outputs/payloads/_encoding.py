@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         OpticalJoint,
         OpticalState,
         SegmentState,
+        SensorStates,
     )
 
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_STRICT_INTEGER | orjson.OPT_NON_STR_KEYS
@@ -125,6 +126,25 @@ def encode_optical(state: OpticalState, offset_ns: int) -> bytes:
                 joint.name: _optical_joint(joint, inner=0 < i < len(state.joints) - 1)
                 for i, joint in enumerate(state.joints)
             },
+        }
+    )
+
+
+def encode_sensors(states: SensorStates, offset_ns: int) -> bytes:
+    """Return the payload of ``sensors/pose``; `offset_ns` as for `encode_pose`."""
+    return encode(
+        {
+            "v": PAYLOAD_VERSION,
+            "seq": states.seq,
+            "t_us": (states.t_ns + offset_ns) // _NS_PER_US,
+            "sensors": {
+                sensor.name: {
+                    "q": _rounded(sensor.q_world_sensor, 6),
+                    "q_segment": _rounded(sensor.q_world_segment, 6),
+                }
+                for sensor in states.sensors
+            },
+            "joints": {name: {"q": _rounded(q, 6)} for name, q in states.joints},
         }
     )
 

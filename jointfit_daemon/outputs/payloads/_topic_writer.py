@@ -13,7 +13,7 @@ import orjson
 
 from jointfit_daemon import __version__
 from jointfit_daemon.limb_model import angle_convention
-from jointfit_daemon.model import LimbState, OpticalState
+from jointfit_daemon.model import LimbState, OpticalState, SensorStates
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import printable, printable_data
 from jointfit_daemon.outputs.payloads._encoding import (
@@ -21,6 +21,7 @@ from jointfit_daemon.outputs.payloads._encoding import (
     encode_joint,
     encode_optical,
     encode_pose,
+    encode_sensors,
 )
 from jointfit_daemon.outputs.payloads._health_encoding import health_payload
 from jointfit_daemon.outputs.payloads._quality_units import quality_payload
@@ -93,6 +94,9 @@ class TopicWriter:
             case OpticalState():
                 offset_ns = self._clock.offset_ns()
                 self._publish(topics.OPTICAL_POSE, encode_optical(output, offset_ns))
+            case SensorStates():
+                offset_ns = self._clock.offset_ns()
+                self._publish(topics.SENSORS_POSE, encode_sensors(output, offset_ns))
             case Notice():
                 self.publish_notice(output)
             case DeviceStatus(name, online):

@@ -19,7 +19,9 @@ class RigOptions:
     mqtt_port: int = 1883
     mqtt_base: str = "jointfit/demo"
     mqtt_version: str = "5"
+    sensors_hz: float = 0.0
     method: str = "anchored"
+    procedure: str = "corrected"
     axes: str = "anatomical"
     store: str = "demo"
     align_s: float = 30.0
@@ -84,11 +86,13 @@ def rig_toml(
 
     tables.append(
         f'[calibration]\nstore = "{options.store}"\nmethod = "{options.method}"\n'
+        f'procedure = "{options.procedure}"\n'
         f"align_s = {options.align_s:g}\nstatic_s = {options.static_s:g}\n"
         f"functional_s = {options.functional_s:g}\n"
     )
     tables.append(
         f'[mqtt]\nhost = "{options.mqtt_host}"\nport = {options.mqtt_port}\n'
         f'base = "{options.mqtt_base}"\nversion = "{options.mqtt_version}"\n'
+        f"sensors_hz = {options.sensors_hz:g}\n"
     )
     return "\n".join(tables)

@@ -25,6 +25,8 @@ from jointfit_daemon.model import (
     OpticalSegment,
     OpticalState,
     SegmentState,
+    SensorOrientation,
+    SensorStates,
     SyncState,
 )
 from jointfit_daemon.outputs.mqtt import LinkHealth, Outbox
@@ -35,7 +37,12 @@ from jointfit_daemon.outputs.payloads import (
     TopicWriter,
     encode_pose,
 )
-from jointfit_daemon.outputs.payloads._encoding import encode, encode_joint, encode_optical
+from jointfit_daemon.outputs.payloads._encoding import (
+    encode,
+    encode_joint,
+    encode_optical,
+    encode_sensors,
+)
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import (
     CalibrationPhase,
@@ -357,6 +364,28 @@ async def test_reply_is_published_on_the_requested_topic(
         "error": None,
     }  # fmt: skip
     assert (own.topic, own.correlation, own.expiry_s) == ("my/answers", b"9", 30)
+
+
+def test_sensors_have_their_own_orientation_and_that_of_their_segment() -> None:
+    state = SensorStates(
+        42,
+        5_000_123_000,
+        (
+            SensorOrientation("S1", (0.70710678, 0.0, -0.70710678, 0.0), (1.0, 0.0, 0.0, 0.0)),
+            SensorOrientation("S2", None, None),
+        ),
+        (("knee", (0.96592583, -0.25881905, 0.0, 0.0)),),
+    )
+    assert json.loads(encode_sensors(state, 1_000_000)) == {
+        "v": 1,
+        "seq": 42,
+        "t_us": 5_001_123,
+        "sensors": {
+            "S1": {"q": [0.707107, 0.0, -0.707107, 0.0], "q_segment": [1.0, 0.0, 0.0, 0.0]},
+            "S2": {"q": None, "q_segment": None},
+        },
+        "joints": {"knee": {"q": [0.965926, -0.258819, 0.0, 0.0]}},
+    }
 
 
 def test_optical_pose_has_residuals_beside_what_the_cameras_see() -> None:
