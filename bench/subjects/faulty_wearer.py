@@ -82,7 +82,7 @@ def live(seed: int, seconds: float, rate_hz: float, begin_s: float = BEGIN_S) ->
         for name, q in zip(SENSORS, seen.sensors, strict=True)
     }
     bones = {name: to_wxyz(world * seen.truth.orientations[name]) for name in SEGMENTS}
-    return Worn(t_s - begin_s, said, bones, seen.truth.knee[:, 0])
+    return Worn(t_s - begin_s, said, bones, seen.truth.angles[:, 0])
 
 
 def stuck(person: Worn, name: str, at_s: float) -> Worn:

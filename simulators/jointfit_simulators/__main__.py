@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 import orjson
 
 from jointfit_simulators.body import (
-    MOTIONS,
+    LIMBS,
     SENSORS,
     RecordedSubject,
     SimulatedSubject,
@@ -77,13 +77,14 @@ COMMANDS = """commands, one per line on standard input:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="jointfit-sim",
-        description="Simulate the sensors and cameras of a moving leg on real ports.",
+        description="Simulate the sensors and cameras of a moving limb on real ports.",
         epilog="Exit codes: 0 stopped normally, 1 bug, 2 wrong options, files or ports.",
     )
 
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("knobs", help="list every knob with its default")
-    commands.add_parser("motions", help="list every motion")
+    motions = commands.add_parser("motions", help="list every motion of a limb")
+    motions.add_argument("--limb", choices=[*LIMBS], default="leg", help="default: leg")
 
     sample = commands.add_parser("sample", help="write sample trials, a model, captures and a rig")
     sample.add_argument("folder", type=Path, help="output folder; created if absent")
@@ -102,6 +103,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_play_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--directory", type=Path, required=True, help="output folder")
+    play.add_argument("--limb", choices=[*LIMBS], default="leg",
+                      help="leg: thigh and shank; arm: thorax to hand; trunk: thorax and pelvis "
+                      "(default leg)")  # fmt: skip
     play.add_argument("--programme", help="NAME:SECONDS,…; the last one continues (default stand)")
     play.add_argument("--set", dest="settings", action="append", default=[], metavar="KNOB=VALUE")
     play.add_argument("--knobs", type=Path, help="TOML file of knobs")
@@ -153,11 +157,15 @@ def _knobs(options: argparse.Namespace) -> Knobs:
 
 def _subject(options: argparse.Namespace, knobs: Knobs) -> InstrumentedSubject:
     steps = parse_motion_script(options.programme or "stand")
+    if options.limb != "leg" and (options.trial or options.motion):
+        raise ValueError(
+            f"--limb {options.limb}: --trial and --motion contain angles of a leg: leave them out"
+        )
     if options.trial:
         recording = read_recorded_trial(options.trial)
         return RecordedSubject(recording, SENSORS, steps, transition_s=knobs.transition_s)
     files = {name: Path(path) for name, path in _pairs("--motion", options.motion)}
-    return SimulatedSubject(knobs, steps, motion_files=files)
+    return SimulatedSubject(knobs, steps, motion_files=files, limb=options.limb)
 
 
 def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:
@@ -255,10 +263,10 @@ async def _play(options: argparse.Namespace) -> None:
         now_ns = time.monotonic_ns() // ORIGIN_NS * ORIGIN_NS
         scene = Scene(knobs, subject, hardware, now_ns=now_ns)
         directory.store_command_port(scene.command_port)
-        await _run_scene(scene, rig if options.follow else None)
+        await _run_scene(scene, rig if options.follow else None, options.limb)
 
 
-async def _run_scene(scene: Scene, followed: RigOptions | None) -> None:
+async def _run_scene(scene: Scene, followed: RigOptions | None, limb: str) -> None:
     """Run a scene with commands from stdin and, if given, the phases of the rig's daemon."""
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, scene.stop)
@@ -273,7 +281,7 @@ async def _run_scene(scene: Scene, followed: RigOptions | None) -> None:
     async with asyncio.TaskGroup() as tasks:
         others = [tasks.create_task(_run_commands(scene), name="commands")]
         if followed is not None:
-            follower = PhaseFollower(followed, play, report)
+            follower = PhaseFollower(followed, play, report, limb)
             others.append(tasks.create_task(follower.run(), name="phase follower"))
         await scene.run(_print_json)
         for other in others:
@@ -291,7 +299,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.command == "knobs":
         _print_json(dataclasses.asdict(Knobs()))
     elif options.command == "motions":
-        _print_json({"motions": list(MOTIONS)})
+        _print_json({"motions": list(LIMBS[options.limb].motions)})
     else:
         try:
             if options.command == "sample":

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from jointfit_daemon.tools.embedded_broker import embedded_broker, free_port
-from jointfit_simulators.body import MOTIONS
+from jointfit_simulators.body import LIMBS
 from jointfit_simulators.devices import LOOPBACK
 from jointfit_simulators.scene import PhaseFollower, RigOptions, play_directory
 from jointfit_simulators.scene._phase_follower import MOTIONS_OF_PHASES
@@ -152,16 +152,17 @@ async def test_motion_follows_the_phase_published_by_the_daemon(tmp_path: Path) 
                     await simulator.say("status")
 
 
-def test_all_motions_of_phases_exist() -> None:
-    played = {name for motions in MOTIONS_OF_PHASES.values() for name, _ in motions}
-    assert played <= set(MOTIONS)
+@pytest.mark.parametrize("limb", LIMBS)
+def test_all_motions_of_phases_exist(limb: str) -> None:
+    played = {name for motions in MOTIONS_OF_PHASES[limb].values() for name, _ in motions}
+    assert played <= set(LIMBS[limb].motions)
 
 
 async def test_phase_with_several_motions_repeats_them_until_the_next_phase(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     short = {"functional": (("functional", 0.05), ("walk", 0.05)), "align": (("plate", 0.05),)}
-    monkeypatch.setattr("jointfit_simulators.scene._phase_follower.MOTIONS_OF_PHASES", short)
+    monkeypatch.setitem(MOTIONS_OF_PHASES, "leg", short)
     played: list[str] = []
     follower = PhaseFollower(RigOptions(mqtt_port=free_port()), played.append, lambda _: None)
     following = asyncio.create_task(follower.run())

@@ -49,7 +49,7 @@ def test_recorded_subject_reproduces_sensors_bones_and_markers_of_the_files(
         measured = Rotation.from_quat(q, scalar_first=True)
         expected = Rotation.from_quat(recorded.sensors[name], scalar_first=True)
         assert np.degrees((measured.inv() * expected).magnitude()).max() < 1e-4
-    knee = np.degrees(found.truth.knee[:, 0])
+    knee = np.degrees(found.truth.angles[:, 0])
     assert (knee.min(), knee.max()) == pytest.approx((7.3, 104.5), abs=0.06)
     np.testing.assert_allclose(found.truth.joints["knee"], recorded.origins["tibia_r"], atol=1e-6)
     assert np.all(np.isnan(found.truth.joints["ankle"]))

@@ -121,7 +121,7 @@ def person(seed: int) -> Person:
         frames.body_orientations,
     )
     bones = {name: to_wxyz(cameras.world * seen.truth.orientations[name]) for name in SEGMENTS}
-    return Person(t_s, said, optical, bones, seen.truth.knee[:, 0])
+    return Person(t_s, said, optical, bones, seen.truth.angles[:, 0])
 
 
 @cache

@@ -99,7 +99,7 @@ def wear_live(seed: int) -> Live:
         np.round(t_s * NS).astype(int).tolist(),
         said,
         {name: to_wxyz(world * seen.truth.orientations[name]) for name in SEGMENTS},
-        seen.truth.knee[:, 0],
+        seen.truth.angles[:, 0],
         {name: world.apply(center.mean(axis=0)) for name, center in still.truth.joints.items()},
     )
 

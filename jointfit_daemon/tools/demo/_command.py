@@ -6,7 +6,7 @@ import asyncio
 import math
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import orjson
 import typer
@@ -19,8 +19,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 
-TARGETS = {"knee_flexion_rmse_deg": 3.0, "unaccounted": 0, "latency_p99_ms": 60.0}
-"""Largest accepted values; docs/simulator.md lists the simulated imperfections."""
+FLEXION_RMSE_DEG = {"knee": 3.0, "elbow": 3.0, "lumbar": 3.0}
+"""Largest accepted flexion error of the compared joint, RMS, degrees."""
+TARGETS = {"unaccounted": 0, "latency_p99_ms": 60.0}
+"""Largest other accepted values; docs/simulator.md lists the simulated imperfections."""
+_ERROR_KEY = "_flexion_rmse_deg"
+"""End of the key of the flexion error; the name of the joint comes first."""
 BASE = "jointfit/demo"
 """Topic prefix of the demo."""
 
@@ -31,6 +35,10 @@ def demo(
     headless: Annotated[
         bool, typer.Option("--headless", help="No display; print the result as one JSON line.")
     ] = False,
+    limb: Annotated[
+        Literal["leg", "arm", "trunk"],
+        typer.Option(help="Simulated limb: leg (knee), arm (thorax to hand) or trunk."),
+    ] = "leg",
     seed: Annotated[int, typer.Option(help="Random seed: selects the simulated subject.")] = 1,
     knob: Annotated[
         list[str] | None, typer.Option("--set", help="Simulator setting, NAME=VALUE; repeatable.")
@@ -42,9 +50,10 @@ def demo(
 ) -> None:
     """Run the daemon on simulated hardware; needs no device, broker or root access.
 
-    Starts a broker, two IMUs on pseudo-terminals, two on a CAN adapter, a motion-capture server and
-    the daemon, calibrates, and compares the joint angles with ground truth. Exits with 1 if a
-    step fails or a target is missed: knee flexion error 3 degrees RMS, all samples accounted for,
+    Starts a broker, two IMUs on pseudo-terminals, two on a CAN adapter (of an arm three each), a
+    motion-capture server and the daemon, calibrates, and compares the joint angles with ground
+    truth. Exits with 1 if a step fails or a target is missed: flexion error of the knee (elbow,
+    lumbar joint) 3 degrees RMS, all samples accounted for,
     99 % of frames received within 60 ms. Ctrl-C, SIGTERM and SIGHUP stop the run and print the
     results so far.
     """
@@ -54,8 +63,14 @@ def demo(
     with tempfile.TemporaryDirectory(prefix="jointfit-demo-") as temporary:
         folder = keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        options = ["--seed", str(seed), *(w for k in knob or [] for w in ("--set", k))]
-        run = _run(folder.resolve(), seconds, options, headless=headless, picture=picture)
+        options = [
+            "--limb",
+            limb,
+            "--seed",
+            str(seed),
+            *(w for k in knob or [] for w in ("--set", k)),
+        ]
+        run = _run(folder.resolve(), seconds, limb, options, headless=headless, picture=picture)
         figures, stopped = asyncio.run(run)
 
     missed = missed_targets(figures)
@@ -78,18 +93,24 @@ def demo(
 def result_line(outcome: str, figures: Mapping[str, Any]) -> str:
     """Return outcome, errors, latency and sample counts in one line."""
     latency, samples = figures.get("latency_ms", {}), figures.get("samples", {})
+    joint = _compared_joint(figures)
 
     def known(key: str, unit: str = "", values: Mapping[str, Any] = figures) -> str:
         return "unknown" if values.get(key) is None else f"{values[key]}{unit}"
 
     return (
-        f"result: {outcome}; knee flexion error {known('knee_flexion_rmse_deg', '°')} RMS over"
-        f" {figures.get('frames', 0)} frames; joint center error"
+        f"result: {outcome}; {joint} flexion error {known(f'{joint}{_ERROR_KEY}', '°')} RMS"
+        f" over {figures.get('frames', 0)} frames; joint center error"
         f" {known('joint_center_error_mm', ' mm')}; latency {known('p50', ' ms', latency)} median,"
         f" {known('p99', ' ms', latency)} p99; samples: {known('sent')} sent,"
         f" {samples.get('received', 0)} received, {known('unaccounted')} unaccounted for,"
         f" {figures.get('corrupt', 0)} corrupt"
     )
+
+
+def _compared_joint(figures: Mapping[str, Any]) -> str:
+    """Return the joint whose flexion error a result contains; the knee without one."""
+    return next((name for name in FLEXION_RMSE_DEG if f"{name}{_ERROR_KEY}" in figures), "knee")
 
 
 HINTS = {"latency_p99_ms": ": check the load of this machine"}
@@ -98,21 +119,29 @@ HINTS = {"latency_p99_ms": ": check the load of this machine"}
 def missed_targets(figures: dict[str, Any]) -> list[str]:
     """Return one line for each target that the result misses."""
     values = {**figures, "latency_p99_ms": figures.get("latency_ms", {}).get("p99")}
+    joint = _compared_joint(figures)
+    targets = {f"{joint}{_ERROR_KEY}": FLEXION_RMSE_DEG[joint]} | TARGETS
     return [
         f"{name} is {found}, expected at most {target:g}{HINTS.get(name, '')}"
-        for name, target in TARGETS.items()
+        for name, target in targets.items()
         if (found := values.get(name)) is None or not found <= target
     ]
 
 
 async def _run(
-    folder: Path, seconds: float, options: list[str], *, headless: bool, picture: Path | None
+    folder: Path,
+    seconds: float,
+    name: str,
+    options: list[str],
+    *,
+    headless: bool,
+    picture: Path | None,
 ) -> tuple[dict[str, Any], StopRequest | None]:
     """Return the result, and the stop signal if one was received."""
     from jointfit_daemon.config import load_rig
     from jointfit_daemon.tools.child_processes import daemon, simulator
     from jointfit_daemon.tools.demo._display import DemoDisplay
-    from jointfit_daemon.tools.demo._run import DemoRun
+    from jointfit_daemon.tools.demo._run import LIMBS, DemoRun
     from jointfit_daemon.tools.demo._truth import TruthReader
     from jointfit_daemon.tools.embedded_broker import embedded_broker
 
@@ -122,11 +151,11 @@ async def _run(
         try:
             with embedded_broker(folder) as port, DemoDisplay(headless=headless) as display:
                 display.step("connect", 0.0, "")
-                async with simulator(folder, port, BASE, options) as limb:
-                    rig_file = Path((await limb.ready())["rig"])
+                async with simulator(folder, port, BASE, options) as simulated:
+                    rig_file = Path((await simulated.ready())["rig"])
                     rig = load_rig(rig_file)
                     async with daemon(folder, rig_file) as process:
-                        run = DemoRun(folder, rig, limb, process, truth, display)
+                        run = DemoRun(folder, rig, simulated, process, truth, display, LIMBS[name])
                         await run.run(seconds)
                 if picture is not None:
                     display.save(picture)

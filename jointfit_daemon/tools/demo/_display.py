@@ -44,7 +44,7 @@ _DESCRIPTIONS = {
     "connect": "start simulated sensors, cameras and the daemon",
     "align": "all sensors on one plate, rotated by hand",
     "static": "sensors on the body, standing still",
-    "functional": "moving all joints: walk, squat, sit down, circle the hip",
+    "functional": "moving all joints widely, as the instructions ask",
     "live": "joint angles from the IMUs only",
 }
 
@@ -101,7 +101,7 @@ class DemoDisplay:
         """Show a pose with the ground truth at the same time."""
         self._pose, self._truth, self._figures = pose, truth, figures
         self._frame += 1
-        flexion = _knee(pose).get("flexion_deg")
+        flexion = _main_joint(pose)[1].get("flexion_deg")
         if self._frame % SPARSE == 0 and isinstance(flexion, int | float) and truth is not None:
             self._estimated.append(float(flexion))
             self._true.append(math.degrees(truth.flexion))
@@ -120,7 +120,7 @@ class DemoDisplay:
 
     def render(self) -> Group:
         """Return the complete display."""
-        return Group(self._steps(), self._knee_panel()) if self._pose else Group(self._steps())
+        return Group(self._steps(), self._joint_panel()) if self._pose else Group(self._steps())
 
     def _steps(self) -> Panel:
         now = STEPS.index(self._step) if self._step in STEPS else 0
@@ -152,18 +152,19 @@ class DemoDisplay:
 
         return table
 
-    def _knee_panel(self) -> Panel:
-        knee, truth = _knee(self._pose), self._truth
+    def _joint_panel(self) -> Panel:
+        (joint, angles), truth = _main_joint(self._pose), self._truth
         table = Table(box=None, padding=(0, 1))
-        for column in ("knee", "daemon", "truth", "difference"):
-            table.add_column(column, justify="right" if column != "knee" else "left", no_wrap=True)
+        for column in (joint, "daemon", "truth", "difference"):
+            table.add_column(column, justify="right" if column != joint else "left", no_wrap=True)
 
-        flexion, sd = knee.get("flexion_deg"), knee.get("sd_deg")
+        flexion, sd = angles.get("flexion_deg"), angles.get("sd_deg")
         true = None if truth is None else math.degrees(truth.flexion)
         difference = None if true is None or flexion is None else flexion - true
         table.add_row("flexion", f"{_deg(flexion)} ± {_deg(sd)}", _deg(true), _deg(difference, "+"))
-        for name in ("adduction", "rotation", "inner"):
-            table.add_row(name, _deg(knee.get(f"{name}_deg")), "", "")
+        second = "bending" if "bending_deg" in angles else "adduction"
+        for name in (second, "rotation", "inner"):
+            table.add_row(name, _deg(angles.get(f"{name}_deg")), "", "")
 
         curves = Group(
             _Curve("daemon", self._estimated, "cyan"), _Curve("truth", self._true, "green")
@@ -204,9 +205,11 @@ class _Curve:
         yield Text(label + curve, style=self.style, no_wrap=True)
 
 
-def _knee(pose: Mapping[str, Any]) -> dict[str, Any]:
+def _main_joint(pose: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Return name and payload of the first joint with a flexion: knee, elbow or lumbar joint."""
     joints: dict[str, dict[str, Any]] = pose.get("joints") or {}
-    return next((joint for joint in joints.values() if "flexion_deg" in joint), {})
+    found = ((name, joint) for name, joint in joints.items() if "flexion_deg" in joint)
+    return next(found, ("joint", {}))
 
 
 def _deg(value: object, sign: str = "") -> str:

@@ -10,7 +10,7 @@ import gc
 import math
 import time
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.outputs.mqtt import MqttClient
@@ -31,13 +31,36 @@ CONNECT_S, FINISH_S = 30.0, 15.0
 """Time limits for connecting all sources and for counting the last samples, s."""
 SETTLE_S = 3.0
 """Time for the device clocks to converge and for a new motion to begin, s."""
-PHASES = (
-    ("align", (("plate", 20.0),)),
-    ("static", (("stand", 5.0),)),
-    ("functional", (("functional", 20.0), ("walk", 9.0), ("squat", 9.0), ("sit_to_stand", 9.0))),
-)
-"""Calibration phases, each with the motions of the subject and their durations, s."""
-MOTIONS = ("walk", "squat", "sit_to_stand")
+
+
+class DemoLimb(NamedTuple):
+    """Movements of the simulated subject, and the joint that is compared with ground truth."""
+
+    joint: str
+    functional: tuple[tuple[str, float], ...]
+    """Motions of the functional phase and their durations, s."""
+    live: tuple[str, ...]
+    """Motions of the live phase, `MOTION_S` each."""
+
+
+LIMBS = {
+    "leg": DemoLimb(
+        "knee",
+        (("functional", 20.0), ("walk", 9.0), ("squat", 9.0), ("sit_to_stand", 9.0)),
+        ("walk", "squat", "sit_to_stand"),
+    ),
+    "arm": DemoLimb(
+        "elbow",
+        (("functional", 20.0), ("elbow_flexion", 9.0), ("wrist_circles", 9.0), ("reach", 9.0)),
+        ("reach", "elbow_flexion", "abduction"),
+    ),
+    "trunk": DemoLimb(
+        "lumbar",
+        (("functional", 20.0), ("bend", 9.0), ("twist", 9.0), ("side_bend", 9.0)),
+        ("bend", "twist", "side_bend"),
+    ),
+}
+"""Limbs of the demo."""
 MOTION_S = 8.0
 """Duration of each motion in the live phase, s."""
 TRUTH_S = 0.1
@@ -59,6 +82,7 @@ class DemoRun:
     daemon: ChildProcess
     truth: TruthReader
     display: DemoDisplay
+    limb: DemoLimb = LIMBS["leg"]
     score: DemoScore = field(default_factory=DemoScore)
     latencies_ms: list[float] = field(default_factory=list)
     online: set[str] = field(default_factory=set)
@@ -130,7 +154,7 @@ class DemoRun:
         while self._poses and self._poses[0][0] < mature:
             t_ns, pose = self._poses.pop(0)
             if (truth := self.truth.track.at(t_ns)) is not None:
-                self.score.add(pose, truth, self.rig.chain.joints[1])
+                self.score.add(pose, truth, self.limb.joint)
                 rms, p50 = self.score.flexion.rms, percentile(self.latencies_ms[-500:], 0.5)
                 shown = {
                     "frames": self.score.frames,
@@ -154,7 +178,12 @@ class DemoRun:
 
     async def _calibrate(self, client: MqttClient) -> None:
         self._tracker = PhaseTracker(self.display.step, self.display.figures)
-        for phase, motions in PHASES:
+        phases = (
+            ("align", (("plate", 20.0),)),
+            ("static", (("stand", 5.0),)),
+            ("functional", self.limb.functional),
+        )
+        for phase, motions in phases:
             await self.simulator.say(f"play {motions[0][0]}")
             await asyncio.sleep(SETTLE_S)
             self._tracker.begin()
@@ -186,7 +215,8 @@ class DemoRun:
             self.daemon.check()
             if int(elapsed / MOTION_S) > played:
                 played = int(elapsed / MOTION_S)
-                await self.simulator.say(f"play {MOTIONS[played % len(MOTIONS)]}")
+                motions = self.limb.live
+                await self.simulator.say(f"play {motions[played % len(motions)]}")
             self.display.step("live", elapsed / seconds, f"{seconds - elapsed:.0f} s to go")
             await asyncio.sleep(0.1)
             self._evaluate()
@@ -225,7 +255,7 @@ class DemoRun:
 
         return {
             "frames": self.score.frames,
-            "knee_flexion_rmse_deg": _rounded(self.score.flexion.rms),
+            f"{self.limb.joint}_flexion_rmse_deg": _rounded(self.score.flexion.rms),
             **{
                 f"{name}_rmse_deg": _rounded(error.rms)
                 for name, error in self.score.segments.items()

@@ -26,7 +26,7 @@ class TrueLimbState:
     centers: Mapping[str, Vector]
     """Joint centres in the optical world, m."""
     flexion: float
-    """Knee flexion, rad; positive moves the heel backwards."""
+    """Flexion of the main joint, rad: knee (heel back), elbow or lumbar joint (forward)."""
 
 
 class TruthTrack:
@@ -96,7 +96,7 @@ class DemoScore:
     segments: dict[str, RmsAccumulator] = field(default_factory=dict)
     frames: int = 0
     covered: int = 0
-    """Frames with a knee flexion error within two published standard deviations."""
+    """Frames with a flexion error within two published standard deviations."""
 
     def add(self, pose: Mapping[str, object], truth: TrueLimbState, joint: str) -> None:
         """Compare one ``pose`` payload with the ground truth at its time."""
@@ -108,8 +108,8 @@ class DemoScore:
                 error = angle_between_one((w, x, y, z), truth.orientations[name])
                 self.segments.setdefault(name, RmsAccumulator()).add(math.degrees(error))
 
-        knee = _table(pose, "joints").get(joint, {})
-        flexion, sd = knee.get("flexion_deg"), knee.get("sd_deg")
+        angles = _table(pose, "joints").get(joint, {})
+        flexion, sd = angles.get("flexion_deg"), angles.get("sd_deg")
         if not isinstance(flexion, int | float):
             return
 

@@ -20,6 +20,7 @@ class TruthReader:
         self._path = path
         self._file: BinaryIO | None = None
         self._rest = b""
+        self._joint = "knee"
         self.track = TruthTrack()
 
     def read(self) -> None:
@@ -32,14 +33,15 @@ class TruthReader:
         *lines, self._rest = (self._rest + self._file.read()).split(b"\n")
         for line in lines:
             row = orjson.loads(line)
-            if "truth" in row:
-                continue  # the header
+            if "truth" in row:  # the header
+                self._joint = row.get("joint", self._joint)
+                continue
 
             centers = {
                 name: tuple(math.nan if x is None else x for x in center)
                 for name, center in row["joint_m"].items()
             }
-            flexion = row["knee"]["flexion"]
+            flexion = row[self._joint]["flexion"]
             self.track.add(
                 TrueLimbState(
                     row["t_ns"],

@@ -17,14 +17,10 @@ from scipy.interpolate import CubicSpline
 
 from jointfit_simulators.body._limb import (
     ANKLE,
-    COORDINATES,
     HIP,
     KNEE,
     LEG_ANGLES,
-    ON_PLATE,
     PELVIS_TURN,
-    PLATE_POSITION,
-    PLATE_TURN,
 )
 from jointfit_simulators.body._posture import (
     ADDUCTION,
@@ -37,7 +33,8 @@ from jointfit_simulators.body._posture import (
     column,
     couple_knee,
     ground,
-    smootherstep,
+    in_turn,
+    on_plate,
     upright,
     vary,
 )
@@ -223,37 +220,15 @@ def turn(style: MovementStyle, t: Array) -> Array:
 
 def plate(style: MovementStyle, t: Array) -> Array:
     """Stand and rotate the plate with all sensors by hand, about every axis."""
-    coordinates = stand(style, t)
-    coordinates[:, ON_PLATE] = 1.0
-    rates_hz, phases = np.array([0.31, 0.23, 0.17]), np.array([0.0, 1.1, 2.3])
-    turns = np.sin(2 * np.pi * t[:, None] * rates_hz + phases)
-    coordinates[:, PLATE_TURN] = np.radians([62.0, 55.0, 58.0]) * turns
-    coordinates[:, PLATE_POSITION] += np.array([0.06, 0.05, 0.08]) * turns + np.array([0, 0.1, 0.2])
-    return coordinates
+    return on_plate(stand(style, t), t)
 
 
 _MIX: tuple[StyledMotion, ...] = (walk, hip_circles, squat, knee_swings, ankle_circles)
-_MIX_S = 4.0
-"""Duration of each motion of the functional calibration, s."""
-_MIX_BLEND_S = 1.0
-"""Duration of the blend between two of them, s."""
 
 
 def functional(style: MovementStyle, t: Array) -> Array:
     """Repeat walking, hip circles, squats, knee swings and ankle circles, 4 s each."""
-    coordinates = np.zeros((len(t), COORDINATES))
-    place = (t / _MIX_S) % len(_MIX)
-
-    # the weights of all motions add up to 1 at every instant
-    for index, part in enumerate(_MIX):
-        since = ((place - index) % len(_MIX)) * _MIX_S
-        weight = smootherstep(since / _MIX_BLEND_S) * smootherstep(
-            (_MIX_S + _MIX_BLEND_S - since) / _MIX_BLEND_S
-        )
-        active = weight > 0
-        if np.any(active):
-            coordinates[active] += weight[active, None] * part(style, t[active])
-    return coordinates
+    return in_turn(_MIX, style, t)
 
 
 MOTIONS: Mapping[str, StyledMotion] = {
@@ -263,9 +238,11 @@ MOTIONS: Mapping[str, StyledMotion] = {
         functional, plate, turn,
     )
 }  # fmt: skip
-"""All built-in motions by name."""
+"""All built-in motions of the leg by name."""
 
 
-def motions_of(style: MovementStyle) -> dict[str, Motion]:
-    """Return all built-in motions in the movement style of a subject."""
-    return {name: partial(motion, style) for name, motion in MOTIONS.items()}
+def motions_of(
+    style: MovementStyle, motions: Mapping[str, StyledMotion] = MOTIONS
+) -> dict[str, Motion]:
+    """Return the motions of a limb, by default of the leg, in the style of a subject."""
+    return {name: partial(motion, style) for name, motion in motions.items()}

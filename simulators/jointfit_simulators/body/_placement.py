@@ -9,17 +9,21 @@ import numpy as np
 from jointfit_simulators.body._orientation import Rotation
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
     from jointfit_daemon.arrays import Array
     from jointfit_simulators.body._limb import LegGeometry
 
+PLATE_MARKERS: dict[str, tuple[str, ...]] = {"plate": ("R1", "R2", "R3", "R4", "R5")}
+"""Markers of the rigid plate."""
 CLUSTERS: dict[str, tuple[str, ...]] = {
     "pelvis": ("P1", "P2", "P3", "P4"),
     "thigh": ("T1", "T2", "T3", "T4"),
     "shank": ("C1", "C2", "C3", "C4"),
     "foot": ("F1", "F2", "F3", "F4"),
-    "plate": ("R1", "R2", "R3", "R4", "R5"),
+    **PLATE_MARKERS,
 }
-"""Markers by body part; C is for calf (S is a sensor), R for the rigid plate."""
+"""Markers of leg and plate by body part; C is for calf (S is a sensor), R for the rigid plate."""
 
 PLATE_TEMPLATE = np.array(
     [
@@ -75,7 +79,13 @@ def marker_templates(random: np.random.Generator, geometry: LegGeometry) -> dict
         ],
     }
 
-    # placement errors of the operator
+    return place_markers(nominal, random)
+
+
+def place_markers(
+    nominal: Mapping[str, Sequence[tuple[float, float, float]]], random: np.random.Generator
+) -> dict[str, Array]:
+    """Return marker positions with the placement errors of an operator, m, shape (markers, 3)."""
     return {
         part: np.array(points) + random.normal(0.0, _PLACEMENT_M, (len(points), 3))
         for part, points in nominal.items()

@@ -1,4 +1,4 @@
-"""Functions common to all motions: posture coordinates from joint angles.
+"""Functions common to all motions: posture coordinates from joint angles, motions in turn.
 
 Invariant: all functions have two continuous derivatives.
 """
@@ -14,18 +14,26 @@ from jointfit_simulators.body._limb import (
     COORDINATES,
     KNEE,
     LEG_ANGLES,
+    ON_PLATE,
     PELVIS_POSITION,
     PLATE_POSITION,
+    PLATE_TURN,
     LegGeometry,
     leg_pose,
 )
 from jointfit_simulators.body._random_signal import RandomSignal
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from jointfit_daemon.arrays import Array
 
 PLATE_ON_TABLE = (0.55, 0.35, 0.90)
 """Position of the plate on its table, m."""
+_MIX_S = 4.0
+"""Duration of each motion in turn, s."""
+_MIX_BLEND_S = 1.0
+"""Duration of the blend between two of them, s."""
 FLEXION, ADDUCTION, ROTATION = 0, 1, 2
 """Columns of a joint."""
 HEADING, TILT, LIST = 0, 1, 2
@@ -59,9 +67,43 @@ def draw_style(geometry: LegGeometry, random: np.random.Generator) -> MovementSt
 
 def upright(style: MovementStyle, t: Array) -> Array:
     """Return upright stance over the origin, with the plate on its table."""
+    return rest(t, style.geometry.standing_pelvis)
+
+
+def rest(t: Array, base: tuple[float, float, float]) -> Array:
+    """Return zero angles with the base of the limb at a position (m), the plate on its table."""
     coordinates = np.zeros((len(t), COORDINATES))
-    coordinates[:, PELVIS_POSITION] = style.geometry.standing_pelvis
+    coordinates[:, PELVIS_POSITION] = base
     coordinates[:, PLATE_POSITION] = PLATE_ON_TABLE
+    return coordinates
+
+
+def on_plate(coordinates: Array, t: Array) -> Array:
+    """Move the sensors to the plate, rotated by hand about every axis; return `coordinates`."""
+    coordinates[:, ON_PLATE] = 1.0
+    rates_hz, phases = np.array([0.31, 0.23, 0.17]), np.array([0.0, 1.1, 2.3])
+    turns = np.sin(2 * np.pi * t[:, None] * rates_hz + phases)
+    coordinates[:, PLATE_TURN] = np.radians([62.0, 55.0, 58.0]) * turns
+    coordinates[:, PLATE_POSITION] += np.array([0.06, 0.05, 0.08]) * turns + np.array([0, 0.1, 0.2])
+    return coordinates
+
+
+def in_turn(
+    parts: Sequence[Callable[[MovementStyle, Array], Array]], style: MovementStyle, t: Array
+) -> Array:
+    """Repeat motions in turn, `_MIX_S` each, with smooth blends."""
+    coordinates = np.zeros((len(t), COORDINATES))
+    place = (t / _MIX_S) % len(parts)
+
+    # the weights of all motions add up to 1 at every instant
+    for index, part in enumerate(parts):
+        since = ((place - index) % len(parts)) * _MIX_S
+        weight = smootherstep(since / _MIX_BLEND_S) * smootherstep(
+            (_MIX_S + _MIX_BLEND_S - since) / _MIX_BLEND_S
+        )
+        active = weight > 0
+        if np.any(active):
+            coordinates[active] += weight[active, None] * part(style, t[active])
     return coordinates
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_simulators.body._limb import included_angle
+from jointfit_simulators.body._limb_kinds import LEG_CHAIN
 from jointfit_simulators.body._motion_script import Step, UnknownMotionError
 from jointfit_simulators.body._orientation import Rotation, from_wxyz, to_wxyz
 from jointfit_simulators.body._posture import smootherstep
@@ -71,6 +72,8 @@ class RecordedSubject:
 
     templates: Mapping[str, Array] = {}
     """Empty: the reference of a recording is its bones."""
+    chain = LEG_CHAIN
+    """Recordings are of legs."""
 
     def __init__(
         self,

@@ -10,26 +10,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_simulators.body._limb import (
-    KNEE,
     ON_PLATE,
-    PARTS,
     PLATE_POSITION,
     PLATE_TURN,
     LegGeometry,
     LegPose,
     included_angle,
-    leg_pose,
 )
+from jointfit_simulators.body._limb_kinds import LIMBS, leg
 from jointfit_simulators.body._motion import motions_of
 from jointfit_simulators.body._motion_file import motion_from_file
 from jointfit_simulators.body._motion_script import MotionScript, Step
 from jointfit_simulators.body._orientation import Rotation, to_wxyz
-from jointfit_simulators.body._placement import (
-    CLUSTERS,
-    PLATE_TEMPLATE,
-    marker_templates,
-    random_misalignment,
-)
+from jointfit_simulators.body._placement import PLATE_TEMPLATE, random_misalignment
 from jointfit_simulators.body._posture import draw_style
 from jointfit_simulators.body._soft_tissue import SoftTissue
 from jointfit_simulators.body._subject import GroundTruth, Observation
@@ -39,14 +32,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
+    from jointfit_simulators.body._limb_kind import RigChain
     from jointfit_simulators.settings import Knobs
-
-SENSORS = {"S1": "thigh", "S2": "thigh", "S3": "shank", "S4": "shank"}
-"""Default sensor ids and their segments."""
 
 
 class SimulatedSubject:
-    """Right leg that performs a sequence of motions.
+    """Limb that performs a sequence of motions.
 
     Parameters
     ----------
@@ -55,11 +46,13 @@ class SimulatedSubject:
     steps
         Motions from `start_s` on.
     geometry
-        Bone lengths and joint centres.
+        Bone lengths and joint centres of the leg.
     motion_files
         Additional motions by name (`motion_from_file`).
     sensors
-        Sensor ids and their segments.
+        Sensor ids and their segments; default: those of the limb.
+    limb
+        ``leg``, ``arm`` or ``trunk``.
     """
 
     visible_bones: tuple[str, ...] = ()
@@ -74,21 +67,23 @@ class SimulatedSubject:
         geometry: LegGeometry | None = None,
         motion_files: Mapping[str, Path] | None = None,
         sensors: Mapping[str, str] | None = None,
+        limb: str = "leg",
     ) -> None:
         self.geometry = geometry or LegGeometry()
-        self.sensors = sensors or SENSORS
-        self.clusters = CLUSTERS
+        self._limb = leg(self.geometry) if limb == "leg" else LIMBS[limb]
+        self.sensors = sensors or self._limb.sensors
+        self.clusters = self._limb.clusters
         style = draw_style(self.geometry, knobs.random("style"))
-        motions = motions_of(style)
+        motions = motions_of(style, self._limb.motions)
         for name, path in (motion_files or {}).items():
             motions[name] = motion_from_file(path, style)
         self._script = MotionScript(
             motions, steps, start_s=start_s, transition_s=knobs.transition_s
         )
 
-        # the RMS values of the settings hold for a minute of walking and squats
+        # the RMS values of the settings hold for a minute of these motions (walking and squats)
         t_s = np.arange(0.0, 30.0, 0.04)
-        reference = np.concatenate([motions["walk"](t_s), motions["squat"](t_s)])
+        reference = np.concatenate([motions[name](t_s) for name in self._limb.reference])
         self._place_sensors(knobs, reference)
         self._place_markers(knobs, reference)
 
@@ -97,10 +92,10 @@ class SimulatedSubject:
         single = np.radians(knobs.soft_tissue_sensor_deg)
         parts = sorted(set(self.sensors.values()))
         self._common = {
-            part: _soft_tissue(knobs, reference, "soft tissue", part, common) for part in parts
+            part: self._soft_tissue(knobs, reference, "soft tissue", part, common) for part in parts
         }
         self._single = {
-            sensor: _soft_tissue(knobs, reference, f"soft tissue {sensor}", part, single)
+            sensor: self._soft_tissue(knobs, reference, f"soft tissue {sensor}", part, single)
             for sensor, part in self.sensors.items()
         }
 
@@ -114,31 +109,56 @@ class SimulatedSubject:
         )
 
     def _place_markers(self, knobs: Knobs, reference: Array) -> None:
-        templates = marker_templates(knobs.random("markers"), self.geometry)
+        templates = self._limb.templates(knobs.random("markers"))
         self.templates = {**templates, "plate": PLATE_TEMPLATE}
         self._marker_artefacts = {
-            part: _soft_tissue(
+            part: self._soft_tissue(
                 knobs,
                 reference,
                 "markers",
                 part,
                 knobs.marker_soft_tissue_mm / 1e3,
-                vectors=len(CLUSTERS[part]),
+                vectors=len(self.clusters[part]),
                 common_share=knobs.marker_common_share,
             )
-            for part in PARTS
+            for part in self._limb.adjacent
         }
+
+    def _soft_tissue(
+        self,
+        knobs: Knobs,
+        reference: Array,
+        purpose: str,
+        part: str,
+        rms: float,
+        *,
+        vectors: int = 1,
+        common_share: float = 0.0,
+    ) -> SoftTissue:
+        """Return the artefact of `vectors` points on `part` with an RMS in m or rad."""
+        return SoftTissue(
+            knobs.random(f"{purpose} {part}"),
+            part,
+            vectors,
+            rms=rms,
+            random_share=knobs.soft_tissue_random_share,
+            knee_share=knobs.soft_tissue_knee_share,
+            reference=reference,
+            common_share=common_share,
+            adjacent=self._limb.adjacent,
+        )
+
+    @property
+    def chain(self) -> RigChain:
+        """The limb as rig.toml describes it."""
+        return self._limb.chain
 
     @property
     def facts(self) -> Mapping[str, object]:
         """Geometry and sensor alignment, for the ground-truth log."""
         return {
-            "lengths_m": {"thigh": self.geometry.thigh_m, "shank": self.geometry.shank_m},
-            "joint_centers_m": {  # each in the frame of the proximal part
-                "hip_in_pelvis": list(self.geometry.hip_in_pelvis),
-                "knee_in_thigh": [0.0, 0.0, -self.geometry.thigh_m],
-                "ankle_in_shank": [0.0, 0.0, -self.geometry.shank_m],
-            },
+            **self._limb.facts,
+            "joint": self._limb.main.name,
             "q_segment_sensor": {s: to_wxyz(m).tolist() for s, m in self._mounts.items()},
             "q_plate_sensor": {s: to_wxyz(m).tolist() for s, m in self._plate_mounts.items()},
             "markers_m": {part: points.tolist() for part, points in self.templates.items()},
@@ -162,7 +182,7 @@ class SimulatedSubject:
         streams = [*sensors, cameras, truth]
         t_s = np.concatenate(streams)
         coordinates = self._script.coordinates(t_s)
-        pose = leg_pose(self.geometry, coordinates)
+        pose = self._limb.pose(coordinates)
         ends = np.cumsum([len(stream) for stream in streams])
         cuts = [slice(end - len(stream), end) for stream, end in zip(streams, ends, strict=True)]
 
@@ -174,15 +194,13 @@ class SimulatedSubject:
         markers = self._markers(t_s[cut], coordinates[cut], _part_of(pose, cut))
         cut = cuts[-1]
         bones = _part_of(pose, cut)
+        main = self._limb.main
         ground_truth = GroundTruth(
             bones.orientations,
-            {
-                "hip": bones.origins["thigh"],
-                "knee": bones.origins["shank"],
-                "ankle": bones.origins["foot"],
-            },
-            coordinates[cut][:, KNEE],
-            included_angle(bones.orientations["thigh"], bones.orientations["shank"]),
+            {joint: bones.origins[part] for joint, part in self._limb.joints.items()},
+            coordinates[cut][:, main.columns],
+            included_angle(bones.orientations[main.proximal], bones.orientations[main.distal]),
+            main.name,
         )
         return Observation(orientations, markers, {}, ground_truth)
 
@@ -204,43 +222,20 @@ class SimulatedSubject:
 
     def _markers(self, t_s: Array, coordinates: Array, pose: LegPose) -> Array:
         if not len(t_s):
-            return np.empty((0, sum(map(len, CLUSTERS.values())), 3))
+            return np.empty((0, sum(map(len, self.clusters.values())), 3))
         markers = [
             _to_world(
                 pose.orientations[part],
                 pose.origins[part],
                 self.templates[part] + self._marker_artefacts[part].at(t_s, coordinates),
             )
-            for part in PARTS
+            for part in self._limb.adjacent
         ]
 
         plate = Rotation.from_rotvec(coordinates[:, PLATE_TURN])
         template = np.broadcast_to(PLATE_TEMPLATE, (len(t_s), *PLATE_TEMPLATE.shape))
         markers.append(_to_world(plate, coordinates[:, PLATE_POSITION], template))
         return np.concatenate(markers, axis=1)
-
-
-def _soft_tissue(
-    knobs: Knobs,
-    reference: Array,
-    purpose: str,
-    part: str,
-    rms: float,
-    *,
-    vectors: int = 1,
-    common_share: float = 0.0,
-) -> SoftTissue:
-    """Return the artefact of `vectors` points on `part` with an RMS in m or rad."""
-    return SoftTissue(
-        knobs.random(f"{purpose} {part}"),
-        part,
-        vectors,
-        rms=rms,
-        random_share=knobs.soft_tissue_random_share,
-        knee_share=knobs.soft_tissue_knee_share,
-        reference=reference,
-        common_share=common_share,
-    )
 
 
 def _to_world(turn: Rotation, origin: Array, points: Array) -> Array:

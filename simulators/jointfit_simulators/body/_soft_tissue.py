@@ -17,6 +17,8 @@ from jointfit_simulators.body._limb import ANKLE, HIP, KNEE
 from jointfit_simulators.body._random_signal import random_vector_signal
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from jointfit_daemon.arrays import Array
 
 ADJACENT: dict[str, tuple[slice, ...]] = {
@@ -25,7 +27,7 @@ ADJACENT: dict[str, tuple[slice, ...]] = {
     "shank": (KNEE, ANKLE),
     "foot": (ANKLE,),
 }
-"""Joints adjacent to each part, as columns of a coordinate array."""
+"""Joints adjacent to each part of the leg, as columns of a coordinate array."""
 
 _NOISE_HZ = (0.3, 3.0)
 """Frequency band of the random part, Hz."""
@@ -82,7 +84,7 @@ class SoftTissue:
     random
         Source of the directions and the noise.
     part
-        Body part, a key of ADJACENT.
+        Body part, a key of `adjacent`.
     vectors
         Number of points (or sensors).
     rms
@@ -90,12 +92,15 @@ class SoftTissue:
     random_share
         Share of the variance in the noise.
     knee_share
-        Share of the repeatable variance driven by the knee, for parts with two joints.
+        Share of the repeatable variance driven by the second joint of the limb (the knee), for
+        parts with two joints.
     reference
-        Coordinates of walking and squats, shape (n, COORDINATES).
+        Coordinates of the reference motions of the limb, shape (n, COORDINATES).
     common_share
         Share of the variance in the displacement of the mean of all points; the remainder moves
         the points relative to their mean.
+    adjacent
+        Joints adjacent to each part.
     """
 
     def __init__(
@@ -109,8 +114,9 @@ class SoftTissue:
         knee_share: float,
         reference: Array,
         common_share: float = 0.0,
+        adjacent: Mapping[str, tuple[slice, ...]] = ADJACENT,
     ) -> None:
-        self._joints = ADJACENT[part]
+        self._joints = adjacent[part]
         one_joint = len(self._joints) == 1
         shares = [
             1.0 if one_joint else knee_share if j is KNEE else 1 - knee_share for j in self._joints

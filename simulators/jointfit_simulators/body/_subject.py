@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from jointfit_daemon.arrays import Array
+    from jointfit_simulators.body._limb_kind import RigChain
     from jointfit_simulators.body._orientation import Rotation
 
 
@@ -18,10 +19,12 @@ class GroundTruth(NamedTuple):
     """Orientation of each segment: segment coordinates to base world."""
     joints: Mapping[str, Array]
     """Centre of each joint, m, shape (n, 3); NaN if unknown."""
-    knee: Array
-    """Flexion (heel back), adduction, internal rotation, rad, shape (n, 3)."""
+    angles: Array
+    """Flexion, adduction (or bending) and rotation of the main joint, rad, shape (n, 3)."""
     included: Array
-    """Inner angle of the knee, rad, shape (n,): pi when straight."""
+    """Inner angle of the main joint, rad, shape (n,): pi when straight."""
+    joint: str = "knee"
+    """Name of the main joint."""
 
 
 class Observation(NamedTuple):
@@ -54,6 +57,10 @@ class InstrumentedSubject(Protocol):
     @property
     def visible_bones(self) -> tuple[str, ...]:
         """Segments whose bones the cameras stream as bodies: the reference of a recording."""
+
+    @property
+    def chain(self) -> RigChain:
+        """The limb as rig.toml describes it."""
 
     @property
     def facts(self) -> Mapping[str, object]:

@@ -1,7 +1,8 @@
 """Virtual devices of a scene and their tables in rig.toml.
 
-By default two sensors use UARTs (Xbus, one pty each) and two use CAN (XCDI, behind one SLCAN
-adapter on a pty or on a python-can bus). The optical system is a NatNet server on loopback.
+By default every other sensor uses a UART (Xbus, one pty each) and the others use CAN (XCDI, behind
+one SLCAN adapter on a pty or on a python-can bus). The optical system is a NatNet server on
+loopback.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ if TYPE_CHECKING:
     from jointfit_simulators.devices import SampleTiming
     from jointfit_simulators.settings import Knobs
 
-WIRES = {"S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi"}
+WIRES = {
+    "S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi", "S5": "xbus", "S6": "xcdi",
+}  # fmt: skip
 """Default protocol of each sensor."""
 BUS = "can0"
 """Name of the CAN bus in rig.toml and in commands."""

@@ -18,13 +18,25 @@ if TYPE_CHECKING:
 
     from jointfit_simulators.scene._rig_file import RigOptions
 
-MOTIONS_OF_PHASES: dict[str, tuple[tuple[str, float], ...]] = {
-    "align": (("plate", 20.0),),
-    "static": (("stand", 5.0),),
-    "functional": (("functional", 20.0), ("walk", 9.0), ("squat", 9.0), ("sit_to_stand", 9.0)),
-    "calibrated": (("walk", 20.0),),
+_Motions = tuple[tuple[str, float], ...]
+_FUNCTIONAL: dict[str, _Motions] = {
+    "leg": (("functional", 20.0), ("walk", 9.0), ("squat", 9.0), ("sit_to_stand", 9.0)),
+    "arm": (("functional", 20.0), ("elbow_flexion", 9.0), ("wrist_circles", 9.0), ("reach", 9.0)),
+    "trunk": (("functional", 20.0), ("bend", 9.0), ("twist", 9.0), ("side_bend", 9.0)),
 }
-"""Motions of each phase, in turn, and their durations in s; in other phases the subject stands."""
+_CALIBRATED = {"leg": "walk", "arm": "reach", "trunk": "bend"}
+MOTIONS_OF_PHASES: dict[str, dict[str, _Motions]] = {
+    limb: {
+        "align": (("plate", 20.0),),
+        "static": (("stand", 5.0),),
+        "functional": motions,
+        "calibrated": ((_CALIBRATED[limb], 20.0),),
+    }
+    for limb, motions in _FUNCTIONAL.items()
+}
+"""Motions of each limb in each phase, in turn, and their durations in s.
+
+In other phases the subject stands."""
 _OTHER_PHASES = (("stand", 5.0),)
 _RETRY_S = 1.0
 """Delay before the next connection to the broker, s."""
@@ -41,12 +53,19 @@ class PhaseFollower:
         Called with the name of the motion to start.
     report
         Called with a message when the broker connection is lost or restored.
+    limb
+        ``leg``, ``arm`` or ``trunk``.
     """
 
     def __init__(
-        self, rig: RigOptions, play: Callable[[str], None], report: Callable[[str], None]
+        self,
+        rig: RigOptions,
+        play: Callable[[str], None],
+        report: Callable[[str], None],
+        limb: str = "leg",
     ) -> None:
         self._rig, self._play, self._report = rig, play, report
+        self._motions_of_phases = MOTIONS_OF_PHASES[limb]
         self._phase: str | None = None
         self._motions: asyncio.Task[None] | None = None
 
@@ -95,7 +114,7 @@ class PhaseFollower:
         self._phase = phase
         if self._motions is not None:
             self._motions.cancel()
-        motions = MOTIONS_OF_PHASES.get(phase, _OTHER_PHASES)
+        motions = self._motions_of_phases.get(phase, _OTHER_PHASES)
         self._play(motions[0][0])
         self._motions = asyncio.create_task(
             self._play_in_turn(motions), name="motions of the phase"

@@ -5,8 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from jointfit_simulators.body import LEG_CHAIN
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from jointfit_simulators.body import RigChain
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +41,7 @@ def rig_toml(
     clusters: Mapping[str, tuple[str, ...]],
     bones: Sequence[str],
     plate: bool,
+    chain: RigChain = LEG_CHAIN,
 ) -> str:
     """Return the text of a rig.toml.
 
@@ -54,24 +59,28 @@ def rig_toml(
         Segments with a rigid body as reference instead of markers.
     plate
         Whether the optical system tracks the plate.
+    chain
+        Joints and segments.
     """
     ends = [
         f'{end} = "{part}"'
-        for end, part in (("proximal", "pelvis"), ("distal", "foot"))
+        for end, part in (("proximal", chain.proximal), ("distal", chain.distal))
         if part in clusters and mocap
     ]
+    lengths = ", ".join(f"{segment} = {length:g}" for segment, length in chain.lengths_m.items())
 
-    chain = [
+    limb = [
         "[chain]",
-        'joints = ["hip", "knee", "ankle"]',
-        'segments = ["thigh", "shank"]',
+        f"joints = {_names(chain.joints)}",
+        f"segments = {_names(chain.segments)}",
         'side = "right"',
         f'axes = "{options.axes}"',
         *ends,
+        *([f"lengths_m = {{ {lengths} }}"] if lengths else []),
     ]
     tables = [
         f'[rig]\nname = "{options.name}"\noutput_rate_hz = {options.output_rate_hz:g}\n',
-        "\n".join([*chain, ""]),
+        "\n".join([*limb, ""]),
         *devices,
     ]
 
@@ -79,8 +88,7 @@ def rig_toml(
         lines = ['plate = "Plate"'] if plate else []
         for part, names in clusters.items():
             if part not in {"plate", "other", *bones}:
-                listed = ", ".join(f'"{name}"' for name in names)
-                lines.append(f"markers.{part} = [{listed}]")
+                lines.append(f"markers.{part} = {_names(names)}")
         lines += [f'rigid_body.{bone} = "{bone.capitalize()}"' for bone in bones]
         tables.append("\n".join([mocap, *lines, ""]))
 
@@ -96,3 +104,9 @@ def rig_toml(
         f"sensors_hz = {options.sensors_hz:g}\n"
     )
     return "\n".join(tables)
+
+
+def _names(names: Sequence[str]) -> str:
+    """Return a TOML array of strings."""
+    listed = ", ".join(f'"{name}"' for name in names)
+    return f"[{listed}]"

@@ -248,6 +248,7 @@ class Scene:
             clusters=self._subject.clusters,
             bones=self._subject.visible_bones,
             plate="plate" in self._subject.templates,
+            chain=self._subject.chain,
         )
         path.write_text(text, encoding="utf-8")
         return path

@@ -4,7 +4,7 @@ Values are true, not measured: optical world, z up; m, rad; quaternions (w, x, y
 
 Invariant: a line is written after its instant and is in the file within 0.2 s.
 
-First line: ``{"truth": 1, "t_ns": …, "knobs": {…}, "lengths_m": {…}, "q_segment_sensor": {…}, …}``.
+First line: ``{"truth": 1, "t_ns": …, "knobs": {…}, "lengths_m": {…}, "joint": "knee", …}``.
 Then, at 100 Hz::
 
     {"t_ns": host CLOCK_MONOTONIC, "motion": "walk",
@@ -12,8 +12,10 @@ Then, at 100 Hz::
      "joint_m": {"hip": [x, y, z], "knee": …, "ankle": …},
      "knee": {"flexion": …, "adduction": …, "rotation": …}, "included": …}
 
-Knee flexion is positive with the heel back, adduction with the foot towards the midline, rotation
-with the toes towards the midline; the included angle is pi when straight. Unknown is null.
+The angles are those of the main joint: ``knee``, ``elbow`` or ``lumbar``. Knee flexion is positive
+with the heel back, adduction with the foot towards the midline, rotation with the toes towards the
+midline. Lumbar flexion is positive forward, ``adduction`` is bending to the right, and rotation is
+positive to the left. The included angle is pi when straight. Unknown is null.
 """
 
 from __future__ import annotations
@@ -76,13 +78,13 @@ class TruthLog:
         joints = {joint: world.apply(center).tolist() for joint, center in truth.joints.items()}
 
         for i, (at, motion) in enumerate(zip(t_ns.tolist(), motions, strict=True)):
-            flexion, adduction, rotation = truth.knee[i].tolist()
+            flexion, adduction, rotation = truth.angles[i].tolist()
             line = {
                 "t_ns": at,
                 "motion": motion,
                 "q_world_segment": {part: turn[i] for part, turn in turns.items()},
                 "joint_m": {joint: center[i] for joint, center in joints.items()},
-                "knee": {"flexion": flexion, "adduction": adduction, "rotation": rotation},
+                truth.joint: {"flexion": flexion, "adduction": adduction, "rotation": rotation},
                 "included": float(truth.included[i]),
             }
             self._queued.append((at, orjson.dumps(line, option=_OPTIONS)))

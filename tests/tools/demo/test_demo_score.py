@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.tools.demo._command import TARGETS, missed_targets
+from jointfit_daemon.tools.demo._command import FLEXION_RMSE_DEG, missed_targets, result_line
 from jointfit_daemon.tools.demo._score import (
     DemoScore,
     RmsAccumulator,
@@ -74,7 +74,7 @@ def test_figures_within_all_promises_miss_none() -> None:
 @pytest.mark.parametrize(
     "worse",
     [
-        {"knee_flexion_rmse_deg": TARGETS["knee_flexion_rmse_deg"] + 0.01},
+        {"knee_flexion_rmse_deg": FLEXION_RMSE_DEG["knee"] + 0.01},
         {"knee_flexion_rmse_deg": None},
         {"knee_flexion_rmse_deg": math.nan},
         {"unaccounted": 1},
@@ -84,6 +84,17 @@ def test_figures_within_all_promises_miss_none() -> None:
 )
 def test_a_promise_that_is_broken_or_unknown_is_named(worse: dict[str, object]) -> None:
     assert len(missed_targets(figures(**worse))) == 1
+
+
+@pytest.mark.parametrize("joint", ["elbow", "lumbar"])
+def test_an_arm_or_a_trunk_is_judged_by_its_own_joint(joint: str) -> None:
+    good = figures()
+    del good["knee_flexion_rmse_deg"]
+    key = f"{joint}_flexion_rmse_deg"
+    assert missed_targets(good | {key: 1.0}) == []
+    (missed,) = missed_targets(good | {key: FLEXION_RMSE_DEG[joint] + 0.01})
+    assert missed.startswith(key)
+    assert f"{joint} flexion error 1.0°" in result_line("passed", good | {key: 1.0})
 
 
 def test_percentiles_of_an_empty_list_are_unknown() -> None:
