@@ -36,6 +36,14 @@ _INSTRUCTIONS = {
         "bend and stretch the arm", "turn the palm up and down", hinge=True, arc=radians(60.0)
     ),
     "wrist": JointInstructions("bend the hand up and down", "circle the hand", hinge=True),
+    **dict.fromkeys(
+        ("trunk", "spine", "lumb"),
+        JointInstructions("bend forward and straighten up", "bend and turn to both sides"),
+    ),
+    **dict.fromkeys(
+        ("neck", "cervic"),
+        JointInstructions("nod: bend the head forward and back", "turn and bend the head sideways"),
+    ),
 }
 
 

@@ -32,7 +32,13 @@ from jointfit_daemon.calibration.soft_tissue import (
     unpack,
 )
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import model_key, neighbor, restore_cluster, rigid_fit
+from jointfit_daemon.limb_model import (
+    angle_convention,
+    model_key,
+    neighbor,
+    restore_cluster,
+    rigid_fit,
+)
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -222,9 +228,11 @@ def _figures(chain: Chain, models: Models, frames: LimbTraining) -> dict[str, fl
     """Return the RMS error of every segment and of the flexion of every inner joint, rad."""
     estimates, truth = _predictions(chain, models, frames), frames.reference
     found = {n: rms(rotation.angle_between(estimates[n], truth[n])) for n in chain.segments}
-    for joint, (above, below) in zip(chain.joints[1:-1], pairwise(chain.segments), strict=True):
-        found[joint] = flexion_error(
-            (estimates[above], estimates[below]), (truth[above], truth[below])
+    for i, (above, below) in enumerate(pairwise(chain.segments), 1):
+        found[chain.joints[i]] = flexion_error(
+            (estimates[above], estimates[below]),
+            (truth[above], truth[below]),
+            angle_convention(chain, i),
         )
     return found
 

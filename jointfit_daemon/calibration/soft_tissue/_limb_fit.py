@@ -21,11 +21,13 @@ from jointfit_daemon.limb_model import (
     Method,
     PatentModel,
     Procedure,
+    angle_convention,
     equal_weights,
     fuse,
     model_key,
     neighbor,
 )
+from jointfit_daemon.model import AngleConvention
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -150,7 +152,8 @@ def evaluate_methods(
         return _finite(rms(rotation.angle_between(q, truth[i])))
 
     def joint_error(i: int, above: Array, below: Array) -> float | None:
-        return _finite(flexion_error((above, below), (truth[i], truth[i + 1])))
+        convention = angle_convention(chain, i + 1)
+        return _finite(flexion_error((above, below), (truth[i], truth[i + 1]), convention))
 
     segments = {
         segment: MethodErrors(
@@ -246,9 +249,19 @@ def mean_of(training: LimbTraining, sensors: Sequence[str]) -> Array:
     return fuse([training.sensors[s] for s in sensors], equal_weights(len(sensors)))
 
 
-def flexion_error(estimate: tuple[Array, Array], truth: tuple[Array, Array]) -> float:
-    """Return the RMS flexion error of a joint, rad, from its proximal and distal segments."""
-    off = _flexion(*estimate) - _flexion(*truth)
+def flexion_error(
+    estimate: tuple[Array, Array],
+    truth: tuple[Array, Array],
+    convention: AngleConvention = AngleConvention.FLEXION,
+) -> float:
+    """Return the RMS flexion error of a joint, rad, from its proximal and distal segments.
+
+    In the conventions ``elevation`` and ``tilt_torsion``, it is the error of the elevation: the
+    flexion of a shoulder is not defined at 90 degrees of abduction.
+    """
+    raised = convention in {AngleConvention.ELEVATION, AngleConvention.TILT_TORSION}
+    angle = _elevation if raised else _flexion
+    off = angle(*estimate) - angle(*truth)
     return rms(np.arctan2(np.sin(off), np.cos(off)))
 
 
@@ -257,6 +270,13 @@ def _flexion(q_above: Array, q_below: Array) -> Array:
     w, x, y, z = rotation.multiply(rotation.conjugate(q_above), q_below).T
     phi: Array = np.arctan2(2.0 * (w * x - y * z), 1.0 - 2.0 * (x * x + y * y))
     return phi
+
+
+def _elevation(q_above: Array, q_below: Array) -> Array:
+    """Return the angle between the long axes of two segments, rad, shape (n,)."""
+    w, x, y, z = rotation.multiply(rotation.conjugate(q_above), q_below).T
+    elevation: Array = 2.0 * np.arctan2(np.hypot(x, y), np.hypot(w, z))
+    return elevation
 
 
 def _finite(error: float) -> float | None:
