@@ -370,6 +370,49 @@ class OpticalJoint(NamedTuple):
     """Definition of `angles` and `residual`."""
 
 
+class RunningCenter(NamedTuple):
+    """Center of rotation of one joint from the last frames of the cameras.
+
+    Coordinates are those of the proximal body part: origin at the mean of its markers, axes of the
+    segment, or of the static pose for a part without sensors.
+    """
+
+    joint: str
+    segment: str
+    """Proximal body part."""
+    arc: float
+    """Range of the marker directions about the center, rad."""
+    refused: str | None
+    """Reason for which there is no center."""
+    center: Vector | None = None
+    """m."""
+    covariance: tuple[Vector, Vector, Vector] | None = None
+    """m²; 0 along unobserved directions."""
+    unseen: tuple[Vector, ...] = ()
+    """Unit directions along which the center was not observed."""
+    axis: Vector | None = None
+    """Unit axis of a hinge."""
+    effective_frames: float | None = None
+    """Number of independent frames."""
+    position: Vector | None = None
+    """Current position in the optical world, m; None while the body part is not visible."""
+    shift: Vector | None = None
+    """Distance from the calibrated center along the directions that both observed, m."""
+    p_value: float | None = None
+    """Probability of a shift of this size by chance."""
+    moved: bool | None = None
+    """Whether the center differs from the calibrated one."""
+
+
+class RunningCenters(NamedTuple):
+    """Running centers of rotation of all joints with markers on both sides."""
+
+    t_ns: int
+    memory_s: float
+    """Time constant of the weights, s."""
+    joints: tuple[RunningCenter, ...]
+
+
 class OpticalState(NamedTuple):
     """The limb according to the cameras in one frame, and the errors of the IMUs relative to it."""
 

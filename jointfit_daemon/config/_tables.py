@@ -182,6 +182,13 @@ class MqttSettings(Settings):
     sensors_hz: float = Field(
         0.0, ge=0, le=1000, description="greatest rate of the topic sensors/pose, Hz; 0: none"
     )
+    centers_memory_s: float = Field(
+        0.0,
+        ge=0,
+        le=3600,
+        description="time constant of the running joint centers of the topic optical/centers, s; "
+        "0: none",
+    )
     joint_hz: float = Field(1.0, gt=0, le=1, description="rate of the topics joint/NAME, Hz")
     health_s: float = Field(10.0, gt=0, le=60, description="interval of the topic bridge/health, s")
 

@@ -5,6 +5,7 @@ The models are fitted in `jointfit_daemon.calibration` and evaluated in `jointfi
 
 from jointfit_daemon.limb_model._aligned_model import AlignedModel
 from jointfit_daemon.limb_model._calibration import (
+    CalibratedCenter,
     Calibration,
     CalibrationSchemaError,
     JointCalibration,
@@ -70,6 +71,7 @@ __all__ = [
     "UNREFERENCED_SD",
     "WITHIN",
     "AlignedModel",
+    "CalibratedCenter",
     "Calibration",
     "CalibrationSchemaError",
     "JointCalibration",

@@ -67,6 +67,18 @@ class SegmentCalibration:
 
 
 @dataclass(frozen=True, slots=True)
+class CalibratedCenter:
+    """Center of rotation of one joint from the calibration movement alone, in the static world."""
+
+    center: Vector
+    """m."""
+    covariance: tuple[Vector, Vector, Vector]
+    """m²; persistent residuals count once per posture. 0 along `unseen`."""
+    unseen: tuple[Vector, ...]
+    """Unit directions along which the movement did not determine the center."""
+
+
+@dataclass(frozen=True, slots=True)
 class JointCalibration:
     """Calibration of one joint center."""
 
@@ -80,6 +92,8 @@ class JointCalibration:
     """RMS residual of the distances between the markers and the center, m."""
     gap_rms: float | None = None
     """RMS distance between the centers fixed in the two adjacent body parts, m."""
+    rotation: CalibratedCenter | None = None
+    """Reference of the running centers; None without markers on both sides."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,6 +219,16 @@ def _joint(item: Mapping[str, Any]) -> JointCalibration:
         item["source"],
         item["residual_rms"],
         item["gap_rms"],
+        None if item.get("rotation") is None else _center(item["rotation"]),
+    )
+
+
+def _center(item: Mapping[str, Any]) -> CalibratedCenter:
+    a, b, c = item["covariance"]
+    return CalibratedCenter(
+        vector(item["center"]),
+        (vector(a), vector(b), vector(c)),
+        tuple(vector(direction) for direction in item["unseen"]),
     )
 
 

@@ -46,11 +46,12 @@ POSE = Topic("pose", 0)
 POSE_UI = Topic("pose/ui", 0)
 OPTICAL_POSE = Topic("optical/pose", 0)
 SENSORS_POSE = Topic("sensors/pose", 0)
+OPTICAL_CENTERS = Topic("optical/centers", 0)
 JOINT = Topic("joint/NAME", 0)
 
 TOPICS = (
     BRIDGE_STATE, BRIDGE_INFO, BRIDGE_HEALTH, BRIDGE_EVENT, BRIDGE_LOG, REQUEST, RESPONSE,
     CALIBRATION, CALIBRATION_PROGRESS, DEVICE_AVAILABILITY, DEVICE_INFO, POSE, POSE_UI,
-    OPTICAL_POSE, SENSORS_POSE, JOINT,
+    OPTICAL_POSE, SENSORS_POSE, OPTICAL_CENTERS, JOINT,
 )  # fmt: skip
 """All topics, in the order of docs/mqtt.md."""

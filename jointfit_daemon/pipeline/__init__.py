@@ -1,6 +1,7 @@
 """The core of the daemon: input events to limb states, notices and calibration jobs."""
 
 from jointfit_daemon.pipeline._core import Core
+from jointfit_daemon.pipeline._moving_centers import MovingCenters
 from jointfit_daemon.pipeline._replay import replay, replay_states
 
-__all__ = ["Core", "replay", "replay_states"]
+__all__ = ["Core", "MovingCenters", "replay", "replay_states"]

@@ -13,6 +13,7 @@ from jointfit_daemon.fusion import LimbFuser, SensorMonitor, sensor_states
 from jointfit_daemon.model import Corrupt, DeviceEvent, FusionMode, ImuSample, SyncState
 from jointfit_daemon.pipeline._frame_grid import FrameGrid
 from jointfit_daemon.pipeline._mocap_router import MocapRouter
+from jointfit_daemon.pipeline._moving_centers import MovingCenters
 from jointfit_daemon.pipeline._notice_limiter import NoticeLimiter, unix_step_notices
 from jointfit_daemon.pipeline._optical_comparison import OpticalComparison
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
@@ -90,6 +91,7 @@ class Core:
         self._usable: Calibration | None = None
         """The calibration in force, if it belongs to the chain of the rig."""
         self._sensors_rate: RateDivider | None = None
+        self._moving_centers: MovingCenters
         self._handlers: dict[type, Callable[[Any], list[Output]]] = {
             Configured: self._configure,
             SourceOpened: self._open_source,
@@ -214,6 +216,7 @@ class Core:
         self._usable = usable
         rate_hz = rig.mqtt.sensors_hz
         self._sensors_rate = RateDivider(rate_hz) if rate_hz > 0.0 else None
+        self._moving_centers = MovingCenters(rig.chain, usable, rig.mqtt.centers_memory_s)
         wanted = rig.calibration.learn_online
         self._collector = OnlineFrameCollector(rig.chain, usable, wanted=wanted)
 
@@ -290,6 +293,7 @@ class Core:
                 self._mocap.add(self._now_ns, item, self._session, self._lags, self._collector)
                 if measurement.live:
                     self._comparison.add_frame(stamp.t_ns, measurement, synced=stamp.synced)
+                    outputs += self._moving_centers.add_frame(stamp.t_ns, measurement)
         return outputs
 
     def _report(self, source: str, state: SourceState, item: Corrupt | DeviceEvent) -> list[Output]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from jointfit_daemon.model import LimbState, OpticalState, SensorStates
+from jointfit_daemon.model import LimbState, OpticalState, RunningCenters, SensorStates
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -289,6 +289,7 @@ Output = (
     LimbState
     | OpticalState
     | SensorStates
+    | RunningCenters
     | Notice
     | DeviceStatus
     | DeviceInfo

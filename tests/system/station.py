@@ -228,6 +228,8 @@ class Station:
     options: tuple[str, ...] = ()
     more_toml: str = ""
     """Appended to the rig.toml of the simulator."""
+    mqtt_toml: str = ""
+    """Added to its table ``[mqtt]``."""
 
     @property
     def rig(self) -> Path:
@@ -242,7 +244,7 @@ class Station:
     def write_rig(self, *changes: tuple[str, str]) -> None:
         """Write the rig of the daemon: that of the simulator with each (old, new) replaced once."""
         text = (self.folder / "rig.toml").read_text(encoding="utf-8") + self.more_toml
-        text = text.replace("[mqtt]\n", "[mqtt]\nhealth_s = 0.5\n")
+        text = text.replace("[mqtt]\n", f"[mqtt]\nhealth_s = 0.5\n{self.mqtt_toml}")
         for old, new in changes:
             assert text.count(old) == 1, (old, text)
             text = text.replace(old, new)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import re
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +31,8 @@ SETTLE_S = 1.7
 """A motion blends into the next for 1.5 s; s."""
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "mqtt.md"
 TOPICS = (
-    "pose/ui", "optical/pose", "joint/+", "calibration/progress", "bridge/log", "device/+/info",
+    "pose/ui", "optical/pose", "optical/centers", "joint/+", "calibration/progress", "bridge/log",
+    "device/+/info",
 )  # fmt: skip
 """Topics beside those of the listener."""
 NAMES = {
@@ -52,18 +54,24 @@ class CalibratedRun:
     """Keys of all payloads, by topic."""
     optical: list[dict[str, Any]]
     """Payloads of `optical/pose`."""
+    centers: list[dict[str, Any]]
+    """Payloads of `optical/centers`."""
 
 
 async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
-    station = Station(folder, port, more_toml="[recording]\n")
+    mqtt_toml = "centers_memory_s = 5.0\n"
+    station = Station(folder, port, more_toml="[recording]\n", mqtt_toml=mqtt_toml)
     found: dict[str, set[str]] = {}
     optical: list[dict[str, Any]] = []
+    centers: list[dict[str, Any]] = []
     take = Listener._take
 
     def note(self: Listener, topic: str, payload: Any) -> None:
         found.setdefault(topic, set()).update(keys(payload))
         if topic == "optical/pose":
             optical.append(payload)
+        if topic == "optical/centers":
+            centers.append(payload)
         take(self, topic, payload)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -78,6 +86,7 @@ async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
             await listener.until(lambda: listener.latest["calibration"]["version"])
             assert listener.latest["calibration"]["phase"] == "calibrated"
             await listener.more_poses(120)
+            await listener.until(lambda: centers and centers[-1]["joints"]["knee"]["shift_m"])
 
             await reconnect(simulator, listener, "S1")
             await reload(station, daemon, listener)
@@ -86,7 +95,7 @@ async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
             assert code == 0, station.log
 
     (recording,) = (folder / "state" / "recordings").iterdir()
-    return CalibratedRun(station.log, recording, found, optical)
+    return CalibratedRun(station.log, recording, found, optical, centers)
 
 
 async def calibrate(simulator: Simulator, listener: Listener) -> None:
@@ -155,6 +164,8 @@ async def test_payloads_log_and_replay_of_a_calibrated_run(
         count_phases_in_the_log(run)
     with subtests.test("cameras and IMUs are compared at one instant"):
         judge_the_optical_reference(run)
+    with subtests.test("running centers agree with the calibrated ones"):
+        judge_the_running_centers(run)
     with subtests.test("the event log replays to byte-identical limb states"):
         replay_the_recording(run)
 
@@ -191,6 +202,15 @@ def judge_the_optical_reference(run: CalibratedRun) -> None:
     assert 0.0 < compared[-1]["residual_rms"]["flexion_deg"] < 8.0
     assert 0.0 < compared[-1]["residual_rms_m"] < 0.05
     assert 0.0 < compared[-1]["gap_m"] < 0.03
+
+
+def judge_the_running_centers(run: CalibratedRun) -> None:
+    stamps = [payload["t_us"] for payload in run.centers]
+    assert all(b - a > 0.8e6 for a, b in pairwise(stamps))
+    knees = [payload["joints"]["knee"] for payload in run.centers]
+    compared = [knee for knee in knees if knee["shift_m"] is not None]
+    assert not any(knee["moved"] for knee in compared)
+    assert max(map(abs, compared[-1]["shift_m"])) < 0.05
 
 
 def replay_the_recording(run: CalibratedRun) -> None:

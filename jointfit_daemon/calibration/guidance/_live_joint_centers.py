@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.center_of_rotation import CenterEstimate
+    from jointfit_daemon.center_of_rotation.spatial import SphereLimits
     from jointfit_daemon.limb_model import MarkerCluster
     from jointfit_daemon.model import Chain, MocapFrame
 
@@ -82,9 +83,18 @@ class LiveJointCenters:
         Joints, segments and adjacent body parts.
     clusters : mapping of str to MarkerCluster
         Body parts in the static pose; parts without markers are absent.
+    forgetting, limits
+        See `RunningSphere`.
     """
 
-    def __init__(self, chain: Chain, clusters: Mapping[str, MarkerCluster]) -> None:
+    def __init__(
+        self,
+        chain: Chain,
+        clusters: Mapping[str, MarkerCluster],
+        *,
+        forgetting: float = 1.0,
+        limits: SphereLimits | None = None,
+    ) -> None:
         self._chain = chain
         self.parts = LiveClusters(clusters)
         place = {name: i for i, name in enumerate(self.parts.names)}
@@ -102,7 +112,8 @@ class LiveJointCenters:
 
         starts = (self.parts.origins[self._parents] + self.parts.origins[self._children]) / 2
         self._spheres = [
-            RunningSphere(size, near=start) for size, start in zip(self._sizes, starts, strict=True)
+            RunningSphere(size, near=start, forgetting=forgetting, limits=limits)
+            for size, start in zip(self._sizes, starts, strict=True)
         ]
         self._frames = np.zeros(len(pairs), dtype=np.int64)
         self._latest: dict[str, tuple[LiveJointCenter, CenterEstimate | None]] = {
@@ -129,16 +140,21 @@ class LiveJointCenters:
             if some[k]:
                 sphere.feed(v[k, : self._sizes[k]])
 
+    def estimate_next(self) -> tuple[LiveJointCenter, CenterEstimate | None]:
+        """Estimate the next joint in turn; without an observed plane there is no estimate."""
+        k = self._turn = (self._turn + 1) % len(self.joints)
+        with np.errstate(all="ignore"):  # markers at rest leave zeros
+            estimate = self._spheres[k].estimate()
+        found = self._latest[self.joints[k]] = self._observed_estimate(k, estimate)
+        return found
+
     def estimate_centers(self) -> dict[str, LiveJointCenter]:
         """Return the current estimates; call a few times per second, not in every frame.
 
         An estimate costs a thousand times a frame, so each call updates one joint in turn.
         """
         if self.joints:
-            k = self._turn = (self._turn + 1) % len(self.joints)
-            with np.errstate(all="ignore"):  # markers at rest leave zeros
-                estimate = self._spheres[k].estimate()
-            self._latest[self.joints[k]] = self._observed_estimate(k, estimate)
+            self.estimate_next()
 
         # Unobserved directions and the standing prior need all joints together.
         fits = {joint: fit for joint, (_, fit) in self._latest.items() if fit is not None}

@@ -13,6 +13,7 @@ from jointfit_daemon.calibration.phases._offline import (
 from jointfit_daemon.calibration.phases._offline_checks import trial_warnings, unmoved_joint
 from jointfit_daemon.calibration.phases._online import refit_models
 from jointfit_daemon.calibration.phases._plate_alignment import PlateAlignment, fit_plate_alignment
+from jointfit_daemon.calibration.phases._quality_figures import joint_record
 from jointfit_daemon.calibration.phases._static_pose import StaticPose, fit_static, with_new_static
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "fit_offline",
     "fit_plate_alignment",
     "fit_static",
+    "joint_record",
     "mounts_of",
     "refit_models",
     "run_job",

@@ -19,7 +19,7 @@ from jointfit_daemon.calibration._quality import (
 from jointfit_daemon.calibration.anatomy import SKIN_SD_M, artefact_covariance
 from jointfit_daemon.calibration.registration import NO_LAG
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import JointCalibration, body_parts, vector
+from jointfit_daemon.limb_model import CalibratedCenter, JointCalibration, body_parts, vector
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.anatomy import Anatomy, ClusterTrack, JointCenter
     from jointfit_daemon.calibration.registration import SensorLag
     from jointfit_daemon.center_of_rotation import CenterEstimate
-    from jointfit_daemon.model import Chain
+    from jointfit_daemon.model import Chain, Vector
     from jointfit_daemon.timing.lag import LagEstimate
 
 
@@ -62,8 +62,16 @@ def joint_record(found: JointCenter | None) -> JointCalibration:
     if found is None:
         return JointCalibration(None, None, "unknown")
     sd = sqrt(float(np.trace(found.covariance)) / 3.0 + SKIN_SD_M**2)
-    residual = None if found.fit is None else found.fit.residual
-    return JointCalibration(vector(found.center), sd, found.source, residual, found.gap_rms)
+    fit, center = found.fit, vector(found.center)
+    if fit is None:
+        return JointCalibration(center, sd, found.source, None, found.gap_rms)
+
+    covariance = fit.covariance
+    if fit.leverage is not None and "residuals_persist" in fit.flags:
+        covariance = covariance + fit.noise**2 * fit.leverage
+    unseen = tuple(vector(direction) for direction in fit.unseen)
+    reference = CalibratedCenter(vector(fit.center), _rows(covariance), unseen)
+    return JointCalibration(center, sd, found.source, fit.residual, found.gap_rms, reference)
 
 
 def anatomy_quality(
@@ -131,10 +139,14 @@ def _coordinates(
 ) -> CenterCoordinates:
     """Transform a center from the static world to one body part."""
     R = np.eye(3) if q_static is None else rotation.to_matrix(q_static).T
-    rows = R @ covariance @ R.T
     return CenterCoordinates(
         vector(R @ (fit.center - origin)),
-        (vector(rows[0]), vector(rows[1]), vector(rows[2])),
+        _rows(R @ covariance @ R.T),
         tuple(vector(R @ direction) for direction in fit.unseen),
         None if fit.axis is None else vector(R @ fit.axis),
     )
+
+
+def _rows(matrix: Array) -> tuple[Vector, Vector, Vector]:
+    a, b, c = matrix
+    return vector(a), vector(b), vector(c)

@@ -173,6 +173,11 @@ def _joints(c: Calibration) -> Iterator[str]:
     for name, joint in c.joint.items():
         if joint.center is not None:
             yield from _finite(f"joint.{name}.center", joint.center, (3,))
+        if (found := joint.rotation) is not None:
+            key = f"joint.{name}.rotation"
+            yield from _finite(f"{key}.center", found.center, (3,))
+            yield from _finite(f"{key}.covariance", found.covariance, (3, 3))
+            yield from _finite(f"{key}.unseen", found.unseen, (len(found.unseen), 3))
         if not _is_text(joint.source):
             yield f"joint.{name}.source: {joint.source!r}"
         yield from _bounded(f"joint.{name}", joint, ("sd", "residual_rms", "gap_rms"), _LARGEST_SD)

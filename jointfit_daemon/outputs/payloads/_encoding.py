@@ -23,6 +23,8 @@ if TYPE_CHECKING:
         LimbState,
         OpticalJoint,
         OpticalState,
+        RunningCenter,
+        RunningCenters,
         SegmentState,
         SensorStates,
     )
@@ -147,6 +149,36 @@ def encode_sensors(states: SensorStates, offset_ns: int) -> bytes:
             "joints": {name: {"q": _rounded(q, 6)} for name, q in states.joints},
         }
     )
+
+
+def encode_centers(state: RunningCenters, offset_ns: int) -> bytes:
+    """Return the payload of ``optical/centers``; `offset_ns` as for `encode_pose`."""
+    return encode(
+        {
+            "v": PAYLOAD_VERSION,
+            "t_us": (state.t_ns + offset_ns) // _NS_PER_US,
+            "memory_s": state.memory_s,
+            "joints": {center.joint: _running_center(center) for center in state.joints},
+        }
+    )
+
+
+def _running_center(found: RunningCenter) -> dict[str, Any]:
+    covariance, frames, p_value = found.covariance, found.effective_frames, found.p_value
+    return {
+        "segment": found.segment,
+        "center_m": _rounded(found.center, 5),
+        "covariance_m2": covariance and [[float(f"{x:.4g}") for x in row] for row in covariance],
+        "unseen": [_rounded(direction, 4) for direction in found.unseen],
+        "axis": _rounded(found.axis, 4),
+        "p_m": _rounded(found.position, 4),
+        "arc_deg": _degrees(found.arc),
+        "effective_frames": None if frames is None else round(frames, 1),
+        "shift_m": _rounded(found.shift, 5),
+        "p_value": None if p_value is None else float(f"{p_value:.3g}"),
+        "moved": found.moved,
+        "refused": found.refused,
+    }
 
 
 def _optical_joint(joint: OpticalJoint, *, inner: bool) -> dict[str, Any]:

@@ -13,11 +13,12 @@ import orjson
 
 from jointfit_daemon import __version__
 from jointfit_daemon.limb_model import angle_convention
-from jointfit_daemon.model import LimbState, OpticalState, SensorStates
+from jointfit_daemon.model import LimbState, OpticalState, RunningCenters, SensorStates
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import printable, printable_data
 from jointfit_daemon.outputs.payloads._encoding import (
     encode,
+    encode_centers,
     encode_joint,
     encode_optical,
     encode_pose,
@@ -38,7 +39,7 @@ from jointfit_daemon.pipeline.events import (
 from jointfit_daemon.timing.alignment import RateDivider
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import Outbox
@@ -46,6 +47,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.topics import Topic
     from jointfit_daemon.outputs.unix_clock import UnixClock
     from jointfit_daemon.pipeline.events import Event, Output
+
+_STREAMS: dict[type, tuple[Topic, Callable[[Any, int], bytes]]] = {
+    OpticalState: (topics.OPTICAL_POSE, encode_optical),
+    SensorStates: (topics.SENSORS_POSE, encode_sensors),
+    RunningCenters: (topics.OPTICAL_CENTERS, encode_centers),
+}
+"""Topic and encoder of the outputs with a payload of their own instant."""
 
 
 class TopicWriter:
@@ -91,12 +99,9 @@ class TopicWriter:
         match output:
             case LimbState():
                 self._publish_limb_state(output)
-            case OpticalState():
-                offset_ns = self._clock.offset_ns()
-                self._publish(topics.OPTICAL_POSE, encode_optical(output, offset_ns))
-            case SensorStates():
-                offset_ns = self._clock.offset_ns()
-                self._publish(topics.SENSORS_POSE, encode_sensors(output, offset_ns))
+            case OpticalState() | SensorStates() | RunningCenters():
+                topic, encoder = _STREAMS[type(output)]
+                self._publish(topic, encoder(output, self._clock.offset_ns()))
             case Notice():
                 self.publish_notice(output)
             case DeviceStatus(name, online):

@@ -1,0 +1,167 @@
+"""Running joint centers after calibration, with a test of their shift from the calibrated ones.
+
+Invariant: only live mocap frames change the estimates, and limb states do not depend on them.
+"""
+
+from __future__ import annotations
+
+from math import erfc, exp, pi, sqrt
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.guidance import LiveJointCenters
+from jointfit_daemon.center_of_rotation.spatial import SphereLimits
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import body_parts, restore_cluster, vector
+from jointfit_daemon.model import RunningCenter, RunningCenters
+from jointfit_daemon.timing.alignment import RateDivider
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.guidance import LiveJointCenter
+    from jointfit_daemon.center_of_rotation import CenterEstimate
+    from jointfit_daemon.limb_model import CalibratedCenter, Calibration
+    from jointfit_daemon.model import Chain, MocapFrame, Vector
+
+RATE_HZ = 20.0
+"""Camera frames used per second: joints turn by a few degrees between two of them."""
+PUBLISHED_HZ = 1.0
+MOVED_P = 1e-4
+"""Probability of the shift by chance below which a center has moved.
+
+In an hour with a time constant of 20 s, 180 independent estimates are tested."""
+_UNSEEN_SD_M = 1.0
+"""Standard deviation along an unobserved direction, m: larger than any limb."""
+_SAME_DIRECTION = 0.3
+"""Singular value below which the unobserved directions of both centers are one direction."""
+
+
+class MovingCenters:
+    r"""Estimates the center of every joint from the last frames, and tests its shift.
+
+    Frames have the weight :math:`e^{-(t - t_k)/T}`. The shift δ between the running center and the
+    calibrated one is tested with the covariances of both,
+
+    .. math:: D^2 = \delta^T (C + C_{calibrated})^{-1} \delta \sim \chi^2_r,
+
+    over the r directions that both movements observed. Residuals that persist, as those of
+    soft-tissue artefact do, are counted once per posture in both covariances.
+
+    Parameters
+    ----------
+    chain : Chain
+        The limb.
+    calibration : Calibration or None
+        The calibration in force; there are no estimates without one.
+    memory_s : float
+        Time constant T, s; 0 disables the estimates.
+    """
+
+    def __init__(self, chain: Chain, calibration: Calibration | None, memory_s: float) -> None:
+        self._memory_s = memory_s
+        self._centers: LiveJointCenters | None = None
+        if calibration is None or not calibration.fits(chain) or not memory_s > 0.0:
+            return
+        self._calibration = calibration
+        clusters = {name: restore_cluster(name, c) for name, c in calibration.clusters.items()}
+        self._centers = LiveJointCenters(
+            chain, clusters, forgetting=exp(-1.0 / (RATE_HZ * memory_s)), limits=SphereLimits()
+        )
+        above = dict(zip(chain.joints, body_parts(chain), strict=False))
+        self._segments = [above[joint] or "" for joint in self._centers.joints]
+        self._frames = RateDivider(RATE_HZ)
+        self._turns = RateDivider(PUBLISHED_HZ * max(len(self._segments), 1))
+        self._latest: list[tuple[RunningCenter, CenterEstimate | None]] = []
+
+    def add_frame(self, t_ns: int, frame: MocapFrame) -> list[RunningCenters]:
+        """Add one live mocap frame with its stamp; return the centers about once a second.
+
+        Each call estimates one joint at most, so that no frame of the limb waits for all of them.
+        """
+        centers = self._centers
+        if centers is None or not centers.joints or not self._frames.is_due(t_ns):
+            return []
+        centers.feed(frame)
+        if not self._turns.is_due(t_ns):
+            return []
+        live, fit = centers.estimate_next()
+        self._latest.append((self._compare(centers, live, fit), fit))
+        if len(self._latest) < len(self._segments):
+            return []
+        found = tuple(self._placed(centers, one, fit) for one, fit in self._latest)
+        self._latest = []
+        return [RunningCenters(t_ns, self._memory_s, found)]
+
+    @staticmethod
+    def _placed(
+        centers: LiveJointCenters, found: RunningCenter, fit: CenterEstimate | None
+    ) -> RunningCenter:
+        """Add the position in the newest frame."""
+        parts = centers.parts
+        number = parts.names.index(found.segment)
+        if fit is None or found.center is None or not parts.placed[number]:
+            return found
+        away = fit.center - parts.origins[number]
+        return found._replace(position=vector(parts.R[number] @ away + parts.p[number]))
+
+    def _compare(
+        self, centers: LiveJointCenters, live: LiveJointCenter, fit: CenterEstimate | None
+    ) -> RunningCenter:
+        segment = self._segments[centers.joints.index(live.joint)]
+        found = RunningCenter(live.joint, segment, live.arc, live.refused)
+        if fit is None or fit.refused is not None:
+            return found._replace(refused=live.refused or "the joint has hardly turned")
+
+        # Coordinates of the segment: origin at the mean of its markers, axes of the calibration.
+        parts = centers.parts
+        item = self._calibration.segment.get(segment)
+        turn = np.eye(3) if item is None else rotation.to_matrix(np.array(item.q_static)).T
+        found = found._replace(
+            center=vector(turn @ (fit.center - parts.origins[parts.names.index(segment)])),
+            covariance=_rows(turn @ fit.covariance @ turn.T),
+            unseen=tuple(vector(turn @ direction) for direction in fit.unseen),
+            axis=None if fit.axis is None else vector(turn @ fit.axis),
+            effective_frames=fit.effective_frames,
+        )
+        reference = self._calibration.joint[live.joint].rotation
+        if reference is None:
+            return found
+        shift, chance = _shift_test(fit, reference)
+        if shift is None:
+            return found
+        return found._replace(shift=vector(turn @ shift), p_value=chance, moved=chance < MOVED_P)
+
+
+def _rows(matrix: Array) -> tuple[Vector, Vector, Vector]:
+    a, b, c = matrix
+    return vector(a), vector(b), vector(c)
+
+
+def _shift_test(fit: CenterEstimate, reference: CalibratedCenter) -> tuple[Array | None, float]:
+    """Return the shift in the directions that both observed, m, and its probability by chance."""
+    unseen = np.concatenate((fit.unseen.reshape(-1, 3), np.reshape(reference.unseen, (-1, 3))))
+    size, axes = np.linalg.svd(unseen, full_matrices=False)[1:]
+    hidden = axes[size > _SAME_DIRECTION]
+    if (observed := 3 - len(hidden)) == 0:
+        return None, 1.0
+
+    shift = fit.center - np.array(reference.center)
+    covariance = fit.covariance + np.array(reference.covariance)
+    covariance = covariance + _UNSEEN_SD_M**2 * unseen.T @ unseen
+    square = float(shift @ np.linalg.solve(covariance, shift))
+    return shift - hidden.T @ (hidden @ shift), chance_of(square, observed)
+
+
+def chance_of(square: float, freedom: int) -> float:
+    r"""Return the probability that chi-squared with 1 to 3 degrees of freedom exceeds a value.
+
+    .. math:: p_1 = \mathrm{erfc}\sqrt{x/2}, \quad p_2 = e^{-x/2}, \quad
+              p_3 = p_1 + \sqrt{2x/\pi}\, e^{-x/2}
+    """
+    x = max(square, 0.0)
+    tail = exp(-x / 2.0)
+    if freedom == len("xy"):
+        return tail
+    single = erfc(sqrt(x / 2.0))
+    return single if freedom == 1 else min(1.0, single + sqrt(2.0 * x / pi) * tail)
