@@ -47,7 +47,12 @@ def report(quality: Mapping[str, Any]) -> list[str]:
     for name, joint in (anatomy.get("joints") or {}).items():
         sd_m = joint.get("sd_m")
         spread = "" if sd_m is None else f", sd {1000 * sd_m:.0f} mm"
-        lines.append(f"{name}: center from {joint.get('source')}{spread}")
+        center: Mapping[str, Any] = (anatomy.get("centers") or {}).get(name) or {}
+        method = center.get("method", "sphere")
+        by = "" if method == "sphere" else f" by {method}"
+        axis = center.get("axis_sd_deg")
+        hinge = "" if axis is None else f", axis ± {axis:.1f}°"
+        lines.append(f"{name}: center from {joint.get('source')}{by}{spread}{hinge}")
 
     sources: Mapping[str, Any] = anatomy.get("length_sources") or {}
     for name, length_m in (anatomy.get("lengths_m") or {}).items():

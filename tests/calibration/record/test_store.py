@@ -16,6 +16,7 @@ from jointfit_daemon.calibration.record import CalibrationFileError, Calibration
 from jointfit_daemon.calibration.record._content_check import content_faults
 from jointfit_daemon.calibration.record._store import checksum
 from jointfit_daemon.limb_model import (
+    CalibratedCenter,
     Calibration,
     JointCalibration,
     SegmentCalibration,
@@ -35,7 +36,14 @@ PLAIN = Calibration(
     sensor={"S1": SensorCalibration((1.0, 0.0, 0.0, 0.0), (0.6, 0.0, 0.8, 0.0), 7, 0.1 + 0.2)},
     segment={"thigh": SegmentCalibration((1.0, 0.0, 0.0, 0.0), 0.42, None)},
     joint={
-        "hip": JointCalibration((0.0, 0.1, 0.9), 1 / 3, "fit"),
+        "hip": JointCalibration(
+            (0.0, 0.1, 0.9),
+            1 / 3,
+            "fit",
+            rotation=CalibratedCenter(
+                (0.0, 0.1, 1 / 7), ((1e-6, 0.0, 0.0),) * 3, ((0.6, 0.0, 0.8),)
+            ),
+        ),
         "knee": JointCalibration(None, None, "unknown"),
     },
 )

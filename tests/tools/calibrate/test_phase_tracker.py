@@ -81,7 +81,14 @@ def test_report_contains_errors_centers_and_missing_align_phase() -> None:
                 "flexion_deg": {"knee": {"anchored": None}},
             },
             "anatomy": {
-                "joints": {"knee": {"source": "markers", "sd_m": 0.024}},
+                "joints": {
+                    "hip": {"source": "markers", "sd_m": 0.011},
+                    "knee": {"source": "markers", "sd_m": 0.024},
+                },
+                "centers": {
+                    "hip": {"method": "sphere"},
+                    "knee": {"method": "oriented", "axis_sd_deg": 0.46},
+                },
                 "lengths_m": {"thigh": 0.41, "shank": None},
                 "length_sources": {"thigh": "configured", "shank": "unknown"},
             },
@@ -90,7 +97,8 @@ def test_report_contains_errors_centers_and_missing_align_phase() -> None:
     assert lines == [
         "thigh: orientation error 2.1°; sensor mean 4.1°",
         "knee: flexion error unknown",
-        "knee: center from markers, sd 24 mm",
+        "hip: center from markers, sd 11 mm",
+        "knee: center from markers by oriented, sd 24 mm, axis ± 0.5°",
         "thigh: 0.410 m long, from configured",
         "no align phase: sensor headings are estimated from the static pose",
     ]
