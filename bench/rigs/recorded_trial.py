@@ -47,7 +47,7 @@ SQUATS_HZ, WALKING_HZ = 50.0, 100.0
 SEGMENTS = ("thigh", "shank")
 TRUTH_NS, MATCH_NS = 10_000_000, 1_000_000
 """Truth and poses refer to multiples of 10 ms of one clock; the rest is rounding."""
-CONNECT_S = PATIENCE_S = 40.0
+CONNECT_S, PATIENCE_S = 40.0, 90.0
 REGRESSIONS: tuple[str, ...] = get_args(PatentReading)
 """Methods that run in the procedure of the patent."""
 ENDS = {"static": "posed", "functional": "calibrated"}
@@ -305,18 +305,13 @@ async def _everything(
     broker = chosen_broker()(folder)
     broker.start()
     found: dict[tuple[str, Method], Played] = {}
-
-    async def one(method: Method) -> None:
-        home = folder / method
-        home.mkdir()
-        found["squats", method] = await squats(data, home, broker.port, method)
-        if method in walkers:
-            found["walking", method] = await walking(data, home, broker.port, method)
-
     try:
-        async with asyncio.TaskGroup() as tasks:
-            for method in methods:
-                tasks.create_task(one(method), name=method)
+        for method in methods:
+            home = folder / method
+            home.mkdir()
+            found["squats", method] = await squats(data, home, broker.port, method)
+            if method in walkers:
+                found["walking", method] = await walking(data, home, broker.port, method)
     finally:
         broker.stop()
     return found
@@ -325,10 +320,10 @@ async def _everything(
 def run(
     data: Path, methods: Sequence[Method], walkers: Sequence[Method] = ()
 ) -> dict[tuple[str, Method], Played]:
-    """Play the squats with all methods in parallel, each with its own simulator and daemon.
+    """Play the squats with one method after the other; `walkers` then walk.
 
-    `walkers` then walk. The run takes about 35 s, and 10 s more for walking, because trials run in
-    real time.
+    A method takes about 35 s, and 10 s more for walking, because trials run in real time. Methods
+    in parallel would delay each other, and late samples enter the training.
     """
     with tempfile.TemporaryDirectory() as folder:
         return asyncio.run(_everything(data, Path(folder), methods, walkers))

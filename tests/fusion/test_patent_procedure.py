@@ -5,6 +5,7 @@ The oracle evaluates the equations of the patent with NumPy and SciPy from the r
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING
@@ -18,7 +19,10 @@ from scipy.spatial.transform import Rotation
 from jointfit_daemon.calibration.phases import fit_calibration, fit_static, with_new_static
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics.joint_angles import read_patent
+from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.model import FrameFlag
+from jointfit_daemon.tools.fuse._output import chain_of, fuse_trial
+from jointfit_daemon.tools.fuse._tables import OrientationRecording
 from tests.calibration.synthetic_limb import (
     CHAIN,
     OWNER,
@@ -34,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.limb_model import Calibration, PatentReading, Procedure
+    from jointfit_daemon.limb_model import PatentReading, Procedure
     from jointfit_daemon.model import LimbState, Quaternion
 
 STATIC_CHAIN = replace(CHAIN, static_axes=True)
@@ -168,6 +172,21 @@ def test_positions_and_angles_follow_from_the_regression_by_steps_s5_to_s7() -> 
         assert angles[:4] == pytest.approx(wanted, abs=np.radians(SAME_DEG))
 
 
+def test_fuse_apply_gives_the_same_orientations_for_the_stored_calibration() -> None:
+    used = Calibration.from_dict(json.loads(json.dumps(calibration().to_dict())))
+    frames = drifting(recorded())
+    frames["S3"] = np.where(np.arange(COUNT)[:, None] == 50, np.nan, frames["S3"])
+    trial = OrientationRecording(0.01 * np.arange(COUNT, dtype=np.float64), frames, {})
+    found = fuse_trial(used, trial, chain_of(used, left=False))
+    thigh, shank = steps_once(drift=True)
+    rest = np.arange(COUNT) != 50
+    for name, expected in (("thigh", thigh), ("shank", shank)):
+        apart = rotations(found.segments[name][rest]).inv() * expected[rest]
+        assert np.degrees(apart.magnitude()).max() < SAME_DEG
+    assert np.isnan(found.segments["shank"][50]).all()
+    assert found.flags["uncorrected"] == 1.0
+
+
 def test_segment_is_lost_while_a_sensor_is_missing_and_exact_before_and_after() -> None:
     used, gap = calibration(), range(100, 130)
     states = play(LimbFuser(STATIC_CHAIN, used), recorded(), lost=gap)
@@ -242,5 +261,5 @@ def test_every_frame_depends_on_itself_alone(seed: int) -> None:
 
 
 @cache
-def steps_once() -> list[Rotation]:
-    return steps(calibration(), recorded())
+def steps_once(*, drift: bool = False) -> list[Rotation]:
+    return steps(calibration(), drifting(recorded()) if drift else recorded())
