@@ -421,3 +421,52 @@ class OpticalState(NamedTuple):
     t_ns: int
     segments: tuple[OpticalSegment, ...]
     joints: tuple[OpticalJoint, ...]
+
+
+class ModelCoordinate(NamedTuple):
+    """One joint coordinate of a chain model, from inverse kinematics of the markers."""
+
+    name: str
+    is_angle: bool
+    """Angle, rad, or else translation, m."""
+    value: float | None
+    """None if the visible markers do not determine it."""
+    sd: float | None
+
+
+class MarkerFitErrors(NamedTuple):
+    """Distances of markers from their places in a chain model, m."""
+
+    rms: float
+    maximum: float
+    accepted: bool
+    """Whether both are within the limits that the field accepts."""
+
+
+class ChainModelState(NamedTuple):
+    """A chain model fitted to the markers of one frame."""
+
+    number: int
+    """Frame number of the camera server."""
+    t_ns: int
+    model: str
+    """Name of the chain model."""
+    coordinates: tuple[ModelCoordinate, ...]
+    errors: Mapping[str, float | None]
+    """Distance of each marker from its place in the model, m; None if it is not visible."""
+    fit: MarkerFitErrors | None
+    """Errors of the markers in use; None if fewer than three are visible."""
+    recent: MarkerFitErrors | None
+    """The same over the last seconds."""
+    flags: tuple[str, ...]
+    """`MarkerFlag` with the names of markers."""
+
+
+class MarkerFlag(StrEnum):
+    """A limitation of a chain model state; docs/mqtt.md explains each."""
+
+    LOST = "lost"
+    EXCHANGED = "exchanged"
+    MISPLACED = "misplaced"
+    MISFIT = "misfit"
+    UNDETERMINED = "undetermined"

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.driver import Driver
+    from jointfit_daemon.files.models import LoadedModel
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -51,7 +52,7 @@ SECTIONS = ("rig", "chain", "imu", "can", "mocap", "calibration", "mqtt", "recor
 def load_rig(path: Path) -> Rig:
     """Read and check the rig.toml at `path`.
 
-    File names in ``[mqtt]`` are relative to the folder of `path`.
+    File names in ``[mqtt]`` and ``[chain]`` are relative to the folder of `path`.
 
     Raises
     ------
@@ -60,6 +61,7 @@ def load_rig(path: Path) -> Rig:
     """
     table, syntax = read_table(path)
     mqtt, folder = table.get("mqtt"), path.absolute().parent
+    _anchor(table.get("chain"), ("model",), folder)
     if isinstance(mqtt, dict):
         _anchor(mqtt, ("password_file", "request_key_file"), folder)
         _anchor(mqtt.get("tls"), ("ca", "cert", "key"), folder)
@@ -168,14 +170,9 @@ class _RigReader:
         ]
         self.faults += [fault for fault in loads if fault.key not in reported]
         self.faults += self._names()
-        if limb is not None:
-            self.faults += _checks.check_chain(limb)
-        if chain is not None and calibration is not None:
-            self.faults += _checks.check_procedure(calibration, chain)
-        table = calibration or self.partial.get("calibration")
         cameras = self.partial.get(MOCAP) if mocap is None else mocap.settings
-        if table is not None and (cameras is not None or "mocap" not in self.table):
-            self.faults += _checks.check_center_methods(table, limb, cameras)
+        self._check_limb(chain, calibration, cameras)
+        model = None if limb is None else self._chain_model(limb, cameras)
         if head is None or chain is None or calibration is None or mqtt is None or self.faults:
             return None
 
@@ -185,6 +182,7 @@ class _RigReader:
             output_rate_hz=head.output_rate_hz,
             align_mode=head.align_mode,
             chain=_chain(chain, sources),
+            chain_model=model,
             sources=(*sources, mocap) if mocap is not None else tuple(sources),
             calibration=CalibrationSettings(
                 **calibration.model_dump(exclude={"store", "center_target_mm"}),
@@ -198,6 +196,40 @@ class _RigReader:
             recording=recording,
             table=self.table,
         )
+
+    def _check_limb(
+        self,
+        chain: ChainTable | None,
+        calibration: CalibrationTable | None,
+        cameras: MocapSettings | None,
+    ) -> None:
+        """Check the limb and its calibration; tables with faults are partial."""
+        limb = chain or self.partial.get("chain")
+        if limb is not None:
+            self.faults += _checks.check_chain(limb)
+        if chain is not None and calibration is not None:
+            self.faults += _checks.check_procedure(calibration, chain)
+        table = calibration or self.partial.get("calibration")
+        if table is not None and (cameras is not None or "mocap" not in self.table):
+            self.faults += _checks.check_center_methods(table, limb, cameras)
+
+    def _chain_model(self, chain: ChainTable, cameras: MocapSettings | None) -> LoadedModel | None:
+        """Return the chain model, and put its content in the place of the file name.
+
+        A recording of the table is then sufficient for a replay.
+        """
+        if chain.model is None:
+            return None
+        from jointfit_daemon.config._chain_model import (  # noqa: PLC0415 - it loads scipy
+            content_of,
+            load_chain_model,
+        )
+
+        model, faults = load_chain_model(chain.model, chain, cameras)
+        self.faults += faults
+        if model is not None and not faults:
+            self.table["chain"]["model"] = content_of(model)
+        return model
 
     def _names(self) -> list[Fault]:
         """Check the names of topics and folders, even if another key of their table is wrong."""

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration import CalibrationSettings
     from jointfit_daemon.config._tables import MqttSettings, RecordingSettings
     from jointfit_daemon.driver import Driver
+    from jointfit_daemon.files.models import LoadedModel
     from jointfit_daemon.model import Chain
 
 MOCAP = "mocap"
@@ -47,5 +48,8 @@ class Rig:
     calibration_store: str
     mqtt: MqttSettings
     recording: RecordingSettings | None
+    chain_model: LoadedModel | None
+    """Chain model for inverse kinematics from the markers; None without one."""
     table: Mapping[str, Any]
-    """The parsed rig.toml, for the event log; it contains no secrets (passwords are in files)."""
+    """The parsed rig.toml, for the event log, with the content of the chain model; it contains no
+    secrets (passwords are in files)."""

@@ -7,7 +7,7 @@ Invariant: unknown keys are refused, and the description of every field states i
 from __future__ import annotations
 
 import ipaddress
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
@@ -63,6 +63,18 @@ class ChainTable(Settings):
         description="angle conventions of joints; default by the name of the joint: `elevation` "
         "for shoulders, `trunk` for spine and neck, `flexion` for all others",
     )
+    model: str | dict[str, Any] | None = Field(
+        None,
+        description="chain model for inverse kinematics from the markers: an OpenSim model or a "
+        "TOML or JSON file, relative to the folder of rig.toml, or a table with the same keys",
+    )
+
+    @field_validator("model", mode="before")
+    @classmethod
+    def _check_model(cls, model: object) -> object:
+        if model is None or isinstance(model, str | dict):
+            return model
+        raise ValueError("expected the name of a file")
 
 
 class CalibrationTable(Settings):
@@ -178,6 +190,12 @@ class MqttSettings(Settings):
     pose_ui_hz: float = Field(10.0, gt=0, le=30, description="rate of the topic pose/ui, Hz")
     optical_hz: float = Field(
         25.0, ge=0, le=1000, description="greatest rate of the topic optical/pose, Hz; 0: none"
+    )
+    chain_hz: float = Field(
+        10.0,
+        ge=0,
+        le=100,
+        description="greatest rate of the topic optical/chain, Hz; 0: no inverse kinematics",
     )
     sensors_hz: float = Field(
         0.0, ge=0, le=1000, description="greatest rate of the topic sensors/pose, Hz; 0: none"

@@ -45,6 +45,7 @@ DEVICE_INFO = Topic("device/ID/info", 1, retained=True)
 POSE = Topic("pose", 0)
 POSE_UI = Topic("pose/ui", 0)
 OPTICAL_POSE = Topic("optical/pose", 0)
+OPTICAL_CHAIN = Topic("optical/chain", 0)
 SENSORS_POSE = Topic("sensors/pose", 0)
 OPTICAL_CENTERS = Topic("optical/centers", 0)
 JOINT = Topic("joint/NAME", 0)
@@ -52,6 +53,6 @@ JOINT = Topic("joint/NAME", 0)
 TOPICS = (
     BRIDGE_STATE, BRIDGE_INFO, BRIDGE_HEALTH, BRIDGE_EVENT, BRIDGE_LOG, REQUEST, RESPONSE,
     CALIBRATION, CALIBRATION_PROGRESS, DEVICE_AVAILABILITY, DEVICE_INFO, POSE, POSE_UI,
-    OPTICAL_POSE, SENSORS_POSE, OPTICAL_CENTERS, JOINT,
+    OPTICAL_POSE, OPTICAL_CHAIN, SENSORS_POSE, OPTICAL_CENTERS, JOINT,
 )  # fmt: skip
 """All topics, in the order of docs/mqtt.md."""

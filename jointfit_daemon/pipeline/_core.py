@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
+    from jointfit_daemon.pipeline.chain_tracking import ChainTracker
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner
     from jointfit_daemon.timing.clock import Stamp
@@ -92,6 +93,7 @@ class Core:
         """The calibration in force, if it belongs to the chain of the rig."""
         self._sensors_rate: RateDivider | None = None
         self._moving_centers: MovingCenters
+        self._chain_tracker: ChainTracker | None = None
         self._handlers: dict[type, Callable[[Any], list[Output]]] = {
             Configured: self._configure,
             SourceOpened: self._open_source,
@@ -167,6 +169,7 @@ class Core:
         else:
             self._grid.reload(rig)
         self._aligner = self._grid.aligner
+        self._chain_tracker = _chain_tracker(rig)
         if before is None or before.chain != rig.chain:
             self._sensor_monitor = SensorMonitor(rig.chain)
 
@@ -294,6 +297,8 @@ class Core:
                 if measurement.live:
                     self._comparison.add_frame(stamp.t_ns, measurement, synced=stamp.synced)
                     outputs += self._moving_centers.add_frame(stamp.t_ns, measurement)
+                    if self._chain_tracker is not None:
+                        outputs += self._chain_tracker.add_frame(stamp.t_ns, measurement)
         return outputs
 
     def _report(self, source: str, state: SourceState, item: Corrupt | DeviceEvent) -> list[Output]:
@@ -395,6 +400,16 @@ class Core:
         elif after is not before:
             self._use_calibration()
         return outputs
+
+
+def _chain_tracker(rig: Rig) -> ChainTracker | None:
+    if rig.chain_model is None or rig.mqtt.chain_hz <= 0.0:
+        return None
+    from jointfit_daemon.pipeline.chain_tracking import (  # noqa: PLC0415 - it loads scipy
+        ChainTracker,
+    )
+
+    return ChainTracker(rig.chain_model, rig.mqtt.chain_hz)
 
 
 def _calibration_inputs(rig: Rig) -> tuple[object, ...]:

@@ -10,7 +10,13 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from jointfit_daemon.model import LimbState, OpticalState, RunningCenters, SensorStates
+from jointfit_daemon.model import (
+    ChainModelState,
+    LimbState,
+    OpticalState,
+    RunningCenters,
+    SensorStates,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -155,6 +161,7 @@ class NoticeKind(StrEnum):
 
     DEVICE = "device"
     SENSOR = "sensor"
+    MARKER = "marker"
     CLOCK = "clock"
     WIRE = "wire"
     CALIBRATION = "calibration"
@@ -288,6 +295,7 @@ class Reply:
 Output = (
     LimbState
     | OpticalState
+    | ChainModelState
     | SensorStates
     | RunningCenters
     | Notice

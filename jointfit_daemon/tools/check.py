@@ -54,6 +54,16 @@ def check(
         f"mqtt://{rig.mqtt.host}:{rig.mqtt.tcp_port}/{rig.mqtt.base}, calibration "
         f"store {rig.calibration_store!r}, method {rig.calibration.method}"
     )
+    if (model := rig.chain_model) is not None:
+        chain = model.chain
+        console.print(
+            escape(
+                f"chain model {chain.name!r}: {len(chain.segments)} segments, {chain.nq} degrees "
+                f"of freedom, {len(chain.markers)} markers"
+            )
+        )
+        for remark in model.remarks:
+            console.print(f"[dim]note:[/] {escape(remark)}")
     for warning in warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}")
     console.print(f"installed drivers: {', '.join(driver_names())}")

@@ -1,24 +1,8 @@
-"""Marker errors of inverse kinematics that the field accepts.
-
-Source: OpenSim documentation, "Simulation with OpenSim: Best Practices", checklist of inverse
-kinematics: RMS error below about 2 cm, largest marker error below 4 cm, of bony landmarks below
-2 cm. Hicks et al. 2015, doi 10.1115/1.4029304, describe the same practice.
-"""
+"""Comparison of marker errors with the limits of `kinematics.accepted_errors`, as text."""
 
 from __future__ import annotations
 
-ACCEPTED_RMS_M = 0.02
-"""Largest accepted RMS over markers and frames, m."""
-ACCEPTED_MAXIMUM_M = 0.04
-"""Largest accepted error of a single marker in a single frame, m."""
-BONY_MAXIMUM_M = 0.02
-"""The same for markers on bony landmarks, m."""
 SOURCE = "OpenSim best practices"
-
-
-def is_accepted(rms: float, maximum: float) -> bool:
-    """Return whether RMS and largest marker error, m, are within the accepted limits."""
-    return rms < ACCEPTED_RMS_M and maximum < ACCEPTED_MAXIMUM_M
 
 
 def comparison(name: str, error: float, limit: float) -> str:

@@ -1,52 +1,21 @@
-"""Input that commands on marker trials share: chain models, and trials in their marker order.
+"""Input that commands on marker trials share: marker names, and trials in a model's marker order.
 
 Markers that a trial lacks are NaN there.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jointfit_daemon.calibration.marker_refinement import MotionTrial
 from jointfit_daemon.files.mocap import UnknownMarkerError
-from jointfit_daemon.files.models import read_model, read_osim
-from jointfit_daemon.kinematics.chain_coordinates import JointCoordinates, default_coordinates
 from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from jointfit_daemon.files.mocap import MarkerTrial
     from jointfit_daemon.kinematics.chains import ChainModel
-
-
-@dataclass(frozen=True, slots=True)
-class LoadedModel:
-    """Chain model of a file."""
-
-    chain: ChainModel
-    coordinates: tuple[JointCoordinates, ...]
-    """Coordinates of each segment; named by an OpenSim model, else by the segment."""
-    remarks: tuple[str, ...] = ()
-    """Differences from an OpenSim model."""
-
-
-def load_model(path: Path) -> LoadedModel:
-    """Return the chain model of a ``.toml``, ``.json`` or ``.osim`` file.
-
-    Raises
-    ------
-    MalformedFileError
-        Damaged file, or a model that is not supported.
-    """
-    if path.suffix.lower() == ".osim":
-        imported = read_osim(path)
-        return LoadedModel(imported.model, imported.coordinates, imported.remarks)
-    chain = read_model(path)
-    return LoadedModel(chain, default_coordinates(chain))
 
 
 def require_marker(chain: ChainModel, name: str, option: str) -> None:

@@ -130,6 +130,9 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
                       help="connect the cameras' sync output to every UART sensor")  # fmt: skip
     play.add_argument("--ptp", action="store_true",
                       help="send PTP precision timestamps with the camera frames")  # fmt: skip
+    play.add_argument("--chain-model", action="store_true",
+                      help="write leg.toml, a chain model of the subject, and name it in "
+                      "rig.toml")  # fmt: skip
     play.add_argument("--sample-log", action="store_true",
                       help="write samples.jsonl with the true time of each sample")  # fmt: skip
     play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
@@ -250,10 +253,13 @@ async def _play(options: argparse.Namespace) -> None:
         script=_schedule(options.at),
         sync_line=options.sync_line,
         ptp=options.ptp,
+        chain_model=options.chain_model,
         sample_log=options.sample_log,
     )
     if options.follow and options.trial:
         raise ValueError("--follow needs the motions of the simulator: leave out --trial")
+    if options.chain_model and (options.trial or options.no_mocap or options.limb != "leg"):
+        raise ValueError("--chain-model is for the simulated leg and its markers: leave it out")
     subject = _subject(options, knobs)
 
     with play_directory(hardware.directory) as directory:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from jointfit_daemon.model import FrameFlag
+from jointfit_daemon.model import FrameFlag, MarkerFlag
 from jointfit_daemon.outputs.topics import DEVICE_INFO, POSE, TOPICS
 from jointfit_daemon.pipeline.events import NoticeKind
 
@@ -27,6 +27,14 @@ def test_flags_of_frames_equal_the_table_of_the_documentation() -> None:
     cells = [line.split(" | ")[0] for line in table.splitlines()]
     documented = [flag for cell in cells for flag in re.findall(r"`(\w+)(?::[A-Z]+)?`", cell)]
     assert sorted(documented) == sorted(FrameFlag)
+
+
+def test_flags_of_the_chain_model_equal_the_table_of_the_documentation() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    table = page.partition("| in `flags` | meaning |\n|---|---|\n")[2].partition("\n\n")[0]
+    cells = [line.split(" | ")[0] for line in table.splitlines()]
+    documented = [flag for cell in cells for flag in re.findall(r"`(\w+)(?::[A-Z~]+)?`", cell)]
+    assert sorted(documented) == sorted(MarkerFlag)
 
 
 def test_every_kind_of_event_is_documented() -> None:

@@ -31,15 +31,17 @@ SETTLE_S = 1.7
 """A motion blends into the next for 1.5 s; s."""
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "mqtt.md"
 TOPICS = (
-    "pose/ui", "optical/pose", "optical/centers", "joint/+", "calibration/progress", "bridge/log",
-    "device/+/info",
+    "pose/ui", "optical/pose", "optical/chain", "optical/centers", "sensors/pose", "joint/+",
+    "calibration/progress", "bridge/log", "device/+/info",
 )  # fmt: skip
 """Topics beside those of the listener."""
 NAMES = {
     *SENSORS, *(f"{a}{mark}{b}" for a in SENSORS for b in SENSORS for mark in "~+"),
-    "mocap", "hip", "knee", "ankle", "thigh", "shank", "pelvis", "foot",
+    "mocap", "hip", "knee", "ankle", "thigh", "shank", "pelvis", "foot", "shank_angle",
+    *(f"{part}_{axis}" for part in ("pelvis", "thigh", "foot") for axis in ("rx", "ry", "rz")),
+    *(f"pelvis_{axis}" for axis in ("tx", "ty", "tz")), "P1", "T1", "T2", "C1",
 }  # fmt: skip
-"""Keys that are names of devices, segments, joints or pairs of sensors."""
+"""Keys that are names of devices, segments, joints, coordinates, markers or pairs of sensors."""
 FREE = re.compile(r"device/\w+/info|bridge/log")
 """Topics whose keys depend on the device, or that are not published in every run."""
 
@@ -56,14 +58,18 @@ class CalibratedRun:
     """Payloads of `optical/pose`."""
     centers: list[dict[str, Any]]
     """Payloads of `optical/centers`."""
+    chain: list[dict[str, Any]]
+    """Payloads of `optical/chain`."""
 
 
 async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
+    options = ("--chain-model", "--sensors-hz", "5")
     mqtt_toml = "centers_memory_s = 5.0\n"
-    station = Station(folder, port, more_toml="[recording]\n", mqtt_toml=mqtt_toml)
+    station = Station(folder, port, options, more_toml="[recording]\n", mqtt_toml=mqtt_toml)
     found: dict[str, set[str]] = {}
     optical: list[dict[str, Any]] = []
     centers: list[dict[str, Any]] = []
+    chain: list[dict[str, Any]] = []
     take = Listener._take
 
     def note(self: Listener, topic: str, payload: Any) -> None:
@@ -72,6 +78,8 @@ async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
             optical.append(payload)
         if topic == "optical/centers":
             centers.append(payload)
+        if topic == "optical/chain":
+            chain.append(payload)
         take(self, topic, payload)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -87,6 +95,7 @@ async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
             assert listener.latest["calibration"]["phase"] == "calibrated"
             await listener.more_poses(120)
             await listener.until(lambda: centers and centers[-1]["joints"]["knee"]["shift_m"])
+            await lose_and_exchange_markers(simulator, listener)
 
             await reconnect(simulator, listener, "S1")
             await reload(station, daemon, listener)
@@ -95,7 +104,26 @@ async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
             assert code == 0, station.log
 
     (recording,) = (folder / "state" / "recordings").iterdir()
-    return CalibratedRun(station.log, recording, found, optical, centers)
+    return CalibratedRun(station.log, recording, found, optical, centers, chain)
+
+
+async def lose_and_exchange_markers(simulator: Simulator, listener: Listener) -> None:
+    """Hide a marker and exchange two labels until both are flagged, then end both faults."""
+
+    def flags() -> list[str]:
+        found: list[str] = listener.latest["optical/chain"]["flags"]
+        return found
+
+    await simulator.say("play walk")
+    await simulator.say("hide F2")
+    await simulator.say("exchange T1 T3")
+    await listener.until(lambda: {"lost:F2", "exchanged:T1~T3"} <= set(flags()))
+    await listener.event("T1", "T1 and T3 look exchanged")
+
+    await simulator.say("show F2")
+    await simulator.say("exchange T1 T3")
+    await listener.until(lambda: not flags())
+    await listener.event("T1", "in use")
 
 
 async def calibrate(simulator: Simulator, listener: Listener) -> None:
@@ -166,6 +194,8 @@ async def test_payloads_log_and_replay_of_a_calibrated_run(
         judge_the_optical_reference(run)
     with subtests.test("running centers agree with the calibrated ones"):
         judge_the_running_centers(run)
+    with subtests.test("the chain model is fitted to the markers without those that are faulty"):
+        judge_the_chain_model(run)
     with subtests.test("the event log replays to byte-identical limb states"):
         replay_the_recording(run)
 
@@ -211,6 +241,29 @@ def judge_the_running_centers(run: CalibratedRun) -> None:
     compared = [knee for knee in knees if knee["shift_m"] is not None]
     assert not any(knee["moved"] for knee in compared)
     assert max(map(abs, compared[-1]["shift_m"])) < 0.05
+
+
+def judge_the_chain_model(run: CalibratedRun) -> None:
+    rate_hz = (len(run.chain) - 1) / (run.chain[-1]["t_us"] - run.chain[0]["t_us"]) * 1e6
+    assert 4 < rate_hz <= 10.5
+
+    faulty = [p for p in run.chain if "exchanged:T1~T3" in p["flags"] and "lost:F2" in p["flags"]]
+    for payload in (run.chain[-1], faulty[-1]):
+        assert payload["fit"]["accepted"]
+        assert 0.0 < payload["fit"]["rms_m"] < 0.02
+        coordinates = payload["coordinates"]
+        assert list(coordinates["pelvis_tx"]) == ["value_m", "sd_m"]
+        assert 0.5 < coordinates["pelvis_tz"]["value_m"] < 1.3
+        assert 0.0 < coordinates["shank_angle"]["sd_deg"] < 10.0
+    assert faulty[-1]["error_m"]["F2"] is None
+    assert faulty[-1]["error_m"]["T1"] > 0.06
+
+    # x points to the right, so that knee flexion is a negative angle of the shank
+    knees = [p["coordinates"]["shank_angle"]["value_deg"] for p in run.chain]
+    known = [angle for angle in knees if angle is not None]
+    assert len(known) > 0.9 * len(knees)
+    assert min(known) < -40.0
+    assert max(known) < 25.0
 
 
 def replay_the_recording(run: CalibratedRun) -> None:

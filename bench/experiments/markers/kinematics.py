@@ -11,14 +11,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.baselines.live_inverse_kinematics import LiveInverseKinematics
 from bench.framework.experiment import Experiment, Result, near
 from bench.framework.material import LOWER_LIMBS
 from bench.framework.measurement import cpu_s
 from bench.subjects.adult_lower_limbs import FOLDER, TRIALS, measured, oc4_lower
 from bench.subjects.two_segments import swing, two_segments
 from jointfit_daemon.kinematics.chains import apply_step, jacobian, marker_positions, step_between
-from jointfit_daemon.kinematics.inverse_kinematics import solve_frames, tracking_error
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    LiveInverseKinematics,
+    solve_frames,
+    tracking_error,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path

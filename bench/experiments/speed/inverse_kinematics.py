@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from bench.baselines.live_inverse_kinematics import LiveInverseKinematics
 from bench.framework.experiment import DATA, Result
 from bench.framework.measurement import per_item, speed_experiment
 from bench.subjects.adult_lower_limbs import FOLDER, measured, oc4_lower
 from bench.subjects.two_segments import swing, two_segments
-from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
+from jointfit_daemon.kinematics.inverse_kinematics import LiveInverseKinematics, solve_frames
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -55,19 +55,39 @@ def read_model(path: Path) -> ChainModel:
         or lengths that cannot be metres.
     """
     data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
+    return model_of(data, str(path), path.stem)
+
+
+def model_of(data: Any, source: str, name: str = "chain") -> ChainModel:
+    """Return the chain model of parsed data; the inverse of `as_data`.
+
+    Parameters
+    ----------
+    data
+        Content of a file, or a table of another file.
+    source
+        Its name in error messages.
+    name
+        Name of a model that has none.
+
+    Raises
+    ------
+    MalformedFileError
+        As `read_model`.
+    """
     wrong = _wrong(data)
     if wrong:
-        raise MalformedFileError(f"{path}: {'; '.join(wrong)}")
+        raise MalformedFileError(f"{source}: {'; '.join(wrong)}")
     try:
         model = ChainModel(
             tuple(_segment(s) for s in data.get("segment", ())),
             tuple(_marker(m) for m in data.get("marker", ())),
-            data.get("name", path.stem),
+            data.get("name", name),
         )
     except InvalidChainModelError as error:
-        raise MalformedFileError(f"{path}: {error}") from error
+        raise MalformedFileError(f"{source}: {error}") from error
 
-    return require_metres(path, model)
+    return require_metres(source, model)
 
 
 def write_model(path: Path, model: ChainModel) -> None:

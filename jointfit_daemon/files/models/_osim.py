@@ -97,7 +97,7 @@ def read_osim(path: Path, *, markers: Collection[str] | None = None) -> Imported
     except InvalidChainModelError as error:
         raise MalformedFileError(f"{path}: {error}") from error
     coordinates = tuple(tree.coordinates(segment) for segment in segments)
-    return ImportedModel(require_metres(path, model), tuple(tree.remarks), coordinates)
+    return ImportedModel(require_metres(str(path), model), tuple(tree.remarks), coordinates)
 
 
 class _Tree:

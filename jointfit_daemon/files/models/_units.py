@@ -14,15 +14,13 @@ import numpy as np
 from jointfit_daemon.files.text import MalformedFileError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from jointfit_daemon.kinematics.chains import ChainModel
 
 FARTHEST_M = 10.0
 """Largest distance of a point from the origin of its segment, m."""
 
 
-def require_metres(path: Path, model: ChainModel) -> ChainModel:
+def require_metres(source: str, model: ChainModel) -> ChainModel:
     """Return the model if its lengths are plausible in metres.
 
     Raises
@@ -41,7 +39,7 @@ def require_metres(path: Path, model: ChainModel) -> ChainModel:
     what = max(far, key=lambda name: far[name])
     if far[what] > FARTHEST_M:
         raise MalformedFileError(
-            f"{path}: {what} is {far[what]:.3g} m away from its segment; lengths must be metres: is"
-            " the file in millimetres?"
+            f"{source}: {what} is {far[what]:.3g} m away from its segment; lengths must be metres:"
+            " is the file in millimetres?"
         )
     return model

@@ -9,6 +9,11 @@ from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
     marker_slots,
 )
 from jointfit_daemon.kinematics.inverse_kinematics._pose_covariance import pose_covariance
+from jointfit_daemon.kinematics.inverse_kinematics._sequential_solver import (
+    LiveInverseKinematics,
+    LiveOptions,
+    LivePose,
+)
 from jointfit_daemon.kinematics.inverse_kinematics._solver import (
     OPEN_M2,
     IkOptions,
@@ -22,6 +27,9 @@ __all__ = [
     "Band",
     "IkOptions",
     "IkResult",
+    "LiveInverseKinematics",
+    "LiveOptions",
+    "LivePose",
     "MarkerFit",
     "limits_of",
     "lower_equations",

@@ -19,8 +19,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from jointfit_daemon.model import (
+        ChainModelState,
         JointAngles,
         LimbState,
+        MarkerFitErrors,
+        ModelCoordinate,
         OpticalJoint,
         OpticalState,
         RunningCenter,
@@ -149,6 +152,39 @@ def encode_sensors(states: SensorStates, offset_ns: int) -> bytes:
             "joints": {name: {"q": _rounded(q, 6)} for name, q in states.joints},
         }
     )
+
+
+def encode_chain(state: ChainModelState, offset_ns: int) -> bytes:
+    """Return the payload of ``optical/chain``; `offset_ns` as for `encode_pose`."""
+    return encode(
+        {
+            "v": PAYLOAD_VERSION,
+            "t_us": (state.t_ns + offset_ns) // _NS_PER_US,
+            "frame": state.number,
+            "model": state.model,
+            "coordinates": {one.name: _coordinate(one) for one in state.coordinates},
+            "error_m": {name: _metres(error) for name, error in state.errors.items()},
+            "fit": _fit_errors(state.fit),
+            "recent": _fit_errors(state.recent),
+            "flags": state.flags,
+        }
+    )
+
+
+def _coordinate(one: ModelCoordinate) -> dict[str, float | None]:
+    if one.is_angle:
+        return {"value_deg": _degrees(one.value), "sd_deg": _degrees(one.sd)}
+    return {"value_m": _metres(one.value), "sd_m": _metres(one.sd)}
+
+
+def _fit_errors(errors: MarkerFitErrors | None) -> dict[str, Any] | None:
+    if errors is None:
+        return None
+    return {
+        "rms_m": _metres(errors.rms),
+        "maximum_m": _metres(errors.maximum),
+        "accepted": errors.accepted,
+    }
 
 
 def encode_centers(state: RunningCenters, offset_ns: int) -> bytes:

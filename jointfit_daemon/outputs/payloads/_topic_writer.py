@@ -13,12 +13,19 @@ import orjson
 
 from jointfit_daemon import __version__
 from jointfit_daemon.limb_model import angle_convention
-from jointfit_daemon.model import LimbState, OpticalState, RunningCenters, SensorStates
+from jointfit_daemon.model import (
+    ChainModelState,
+    LimbState,
+    OpticalState,
+    RunningCenters,
+    SensorStates,
+)
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import printable, printable_data
 from jointfit_daemon.outputs.payloads._encoding import (
     encode,
     encode_centers,
+    encode_chain,
     encode_joint,
     encode_optical,
     encode_pose,
@@ -50,6 +57,7 @@ if TYPE_CHECKING:
 
 _STREAMS: dict[type, tuple[Topic, Callable[[Any, int], bytes]]] = {
     OpticalState: (topics.OPTICAL_POSE, encode_optical),
+    ChainModelState: (topics.OPTICAL_CHAIN, encode_chain),
     SensorStates: (topics.SENSORS_POSE, encode_sensors),
     RunningCenters: (topics.OPTICAL_CENTERS, encode_centers),
 }
@@ -99,7 +107,7 @@ class TopicWriter:
         match output:
             case LimbState():
                 self._publish_limb_state(output)
-            case OpticalState() | SensorStates() | RunningCenters():
+            case OpticalState() | ChainModelState() | SensorStates() | RunningCenters():
                 topic, encoder = _STREAMS[type(output)]
                 self._publish(topic, encoder(output, self._clock.offset_ns()))
             case Notice():

@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.tools.marker_limits import (
+from jointfit_daemon.kinematics.accepted_errors import (
     ACCEPTED_MAXIMUM_M,
     ACCEPTED_RMS_M,
-    SOURCE,
-    comparison,
     is_accepted,
 )
+from jointfit_daemon.tools.marker_limits import SOURCE, comparison
 from jointfit_daemon.tools.text_output import align_columns
 
 if TYPE_CHECKING:

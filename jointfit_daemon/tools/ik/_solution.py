@@ -19,7 +19,7 @@ from jointfit_daemon.calibration.marker_refinement import (
     find_trial_faults,
 )
 from jointfit_daemon.files.mocap import read_marker_trial
-from jointfit_daemon.files.models import IkSetup, read_ik_setup
+from jointfit_daemon.files.models import IkSetup, load_model, read_ik_setup
 from jointfit_daemon.kinematics.chain_coordinates import coordinate_table
 from jointfit_daemon.kinematics.inverse_kinematics import (
     IkOptions,
@@ -27,7 +27,7 @@ from jointfit_daemon.kinematics.inverse_kinematics import (
     restart_local_minima,
     solve_frames,
 )
-from jointfit_daemon.tools.marker_model import load_model, motion_trial, require_marker
+from jointfit_daemon.tools.marker_model import motion_trial, require_marker
 from jointfit_daemon.tools.text_output import list_names
 
 if TYPE_CHECKING:
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.files.axes import Axis
     from jointfit_daemon.files.mocap import MarkerTrial
+    from jointfit_daemon.files.models import LoadedModel
     from jointfit_daemon.kinematics.chains import ChainModel
     from jointfit_daemon.kinematics.inverse_kinematics import IkResult
-    from jointfit_daemon.tools.marker_model import LoadedModel
 
 _LIMIT_M2 = 1.0
 """Weight of the excess over joint limits, m^2/rad^2, as in `jointfit markers`."""

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 from jointfit_daemon.files.mocap import read_marker_trial
-from jointfit_daemon.tools.marker_model import load_model, motion_trial, require_marker
+from jointfit_daemon.files.models import load_model
+from jointfit_daemon.tools.marker_model import motion_trial, require_marker
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -1,5 +1,11 @@
 """Moving limbs of known geometry: joints, motions, soft tissue, sensor and marker placement."""
 
+from jointfit_simulators.body._chain_model import (
+    leg_parts,
+    misplaced_markers,
+    model_osim,
+    model_toml,
+)
 from jointfit_simulators.body._limb import PARTS, LegGeometry
 from jointfit_simulators.body._limb_kind import RigChain
 from jointfit_simulators.body._limb_kinds import LEG_CHAIN, LIMBS, SENSORS
@@ -32,6 +38,10 @@ __all__ = [
     "UnknownMotionError",
     "from_wxyz",
     "heading",
+    "leg_parts",
+    "misplaced_markers",
+    "model_osim",
+    "model_toml",
     "parse_motion_script",
     "random_vector_signal",
     "read_recorded_trial",

@@ -80,6 +80,22 @@ class Cameras:
         self._hidden = self._random.random(len(self.markers)) < knobs.occlusion
         self.covered = False
         """Whether everything is occluded."""
+        self._absent: set[str] = set()
+        self._labels = list(range(len(self.markers)))
+        """Marker whose position each label has."""
+
+    def hide(self, marker: str) -> None:
+        """Occlude one marker."""
+        self._absent.add(marker)
+
+    def show(self, marker: str) -> None:
+        """End the occlusion of one marker."""
+        self._absent.discard(marker)
+
+    def exchange(self, one: str, other: str) -> None:
+        """Exchange the labels of two markers."""
+        i, j = self.markers.index(one), self.markers.index(other)
+        self._labels[i], self._labels[j] = self._labels[j], self._labels[i]
 
     def capture(self, observation: Observation) -> CameraFrames:
         """Return the camera frames of one block."""
@@ -87,6 +103,8 @@ class Cameras:
         markers: Array = observation.markers @ self.world.as_matrix().T
         markers = markers + self._random.standard_normal(markers.shape) * self._noise_m
         markers[self._occluded(n)] = np.nan
+        markers[:, [self.markers.index(name) for name in self._absent]] = np.nan
+        markers = markers[:, self._labels]
 
         bodies = [
             _fit(self._templates[part], markers[:, columns])

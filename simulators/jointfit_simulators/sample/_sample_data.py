@@ -20,16 +20,19 @@ from jointfit_daemon.files.orientations import (
     write_orientations_sto,
 )
 from jointfit_protocols.xcdi import XcdiIds
-from jointfit_simulators.body import PARTS, SimulatedSubject, Step, to_wxyz
-from jointfit_simulators.devices import Cameras, OrientationSensor, XcdiDevice, XcdiDeviceOptions
-from jointfit_simulators.sample._c3d_file import c3d_bytes
-from jointfit_simulators.sample._sample_captures import candump_text, natnet_pcap, xbus_bytes
-from jointfit_simulators.sample._sample_model import (
+from jointfit_simulators.body import (
+    PARTS,
+    SimulatedSubject,
+    Step,
     leg_parts,
     misplaced_markers,
     model_osim,
     model_toml,
+    to_wxyz,
 )
+from jointfit_simulators.devices import Cameras, OrientationSensor, XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.sample._c3d_file import c3d_bytes
+from jointfit_simulators.sample._sample_captures import candump_text, natnet_pcap, xbus_bytes
 from jointfit_simulators.scene import RigOptions, ids_toml, rig_toml
 from jointfit_simulators.settings import Knobs
 

@@ -42,6 +42,7 @@ def rig_toml(
     bones: Sequence[str],
     plate: bool,
     chain: RigChain = LEG_CHAIN,
+    chain_model: str | None = None,
 ) -> str:
     """Return the text of a rig.toml.
 
@@ -61,6 +62,8 @@ def rig_toml(
         Whether the optical system tracks the plate.
     chain
         Joints and segments.
+    chain_model
+        File name of the chain model; None without one.
     """
     ends = [
         f'{end} = "{part}"'
@@ -77,6 +80,7 @@ def rig_toml(
         f'axes = "{options.axes}"',
         *ends,
         *([f"lengths_m = {{ {lengths} }}"] if lengths else []),
+        *([] if chain_model is None else [f'model = "{chain_model}"']),
     ]
     tables = [
         f'[rig]\nname = "{options.name}"\noutput_rate_hz = {options.output_rate_hz:g}\n',
@@ -98,12 +102,16 @@ def rig_toml(
         f"align_s = {options.align_s:g}\nstatic_s = {options.static_s:g}\n"
         f"functional_s = {options.functional_s:g}\n"
     )
-    tables.append(
+    tables.append(_mqtt_table(options))
+    return "\n".join(tables)
+
+
+def _mqtt_table(options: RigOptions) -> str:
+    return (
         f'[mqtt]\nhost = "{options.mqtt_host}"\nport = {options.mqtt_port}\n'
         f'base = "{options.mqtt_base}"\nversion = "{options.mqtt_version}"\n'
         f"sensors_hz = {options.sensors_hz:g}\n"
     )
-    return "\n".join(tables)
 
 
 def _names(names: Sequence[str]) -> str:

@@ -9,7 +9,14 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from jointfit_simulators.body import UnknownMotionError, to_wxyz
+from jointfit_simulators.body import (
+    SimulatedSubject,
+    UnknownMotionError,
+    leg_parts,
+    misplaced_markers,
+    model_toml,
+    to_wxyz,
+)
 from jointfit_simulators.devices import NS, Cameras, SampleTiming
 from jointfit_simulators.scene._hardware import (
     BUS,
@@ -36,6 +43,8 @@ if TYPE_CHECKING:
     from jointfit_simulators.wires import CanWire
 
 RIG_FILE = "rig.toml"
+MODEL_FILE = "leg.toml"
+"""Chain model of the subject, with marker position errors of about 1 cm."""
 TRUTH_FILE = "truth.jsonl"
 SAMPLES_FILE = "samples.jsonl"
 OPTICAL = "mocap"
@@ -65,6 +74,8 @@ class SceneOptions:
     """Whether cameras and host are synchronized by PTP."""
     command_port: int = 0
     """UDP port of the motion-capture server; 0 selects a free port."""
+    chain_model: bool = False
+    """Whether a chain model of the simulated subject is written and named in rig.toml."""
     sample_log: bool = False
     """Whether the true sampling time of each sample sent is logged."""
 
@@ -94,6 +105,7 @@ class Scene:
         self._options, self._subject = options, subject
         _check_clocks(options.clocks, (*subject.sensors, OPTICAL))
         options.directory.mkdir(parents=True, exist_ok=True)
+        self._knobs = knobs
         self._hardware = create_hardware(
             knobs,
             subject.sensors,
@@ -154,6 +166,11 @@ class Scene:
             "slip": self._slip,
             "drift": self._drift,
             "occlude": lambda word: setattr(cameras, "covered", _switch(word)),
+            "hide": lambda name: cameras.hide(_marker(cameras, name)),
+            "show": lambda name: cameras.show(_marker(cameras, name)),
+            "exchange": lambda words: cameras.exchange(
+                *(_marker(cameras, name) for name in _two_names(words, "exchange T1 T3"))
+            ),
             "mocap": self._mocap,
             "pause": lambda word: setattr(self._player, "paused", _switch(word or "on")),
             "quit": lambda _: self._quit.set(),
@@ -249,9 +266,22 @@ class Scene:
             bones=self._subject.visible_bones,
             plate="plate" in self._subject.templates,
             chain=self._subject.chain,
+            chain_model=self._write_model(),
         )
         path.write_text(text, encoding="utf-8")
         return path
+
+    def _write_model(self) -> str | None:
+        """Write the chain model, if wanted, and return the name of its file."""
+        subject = self._subject
+        if not self._options.chain_model or not isinstance(subject, SimulatedSubject):
+            return None
+        parts = leg_parts(subject.geometry)
+        random = self._knobs.random("model")
+        markers = misplaced_markers(random, subject.clusters, subject.templates, parts)
+        text = model_toml(parts, markers)
+        (self._options.directory / MODEL_FILE).write_text(text, encoding="utf-8")
+        return MODEL_FILE
 
     @property
     def command_port(self) -> int | None:
@@ -358,6 +388,19 @@ def _check_clocks(clocks: Iterable[str], known: tuple[str, ...]) -> None:
     for name in clocks:
         if name not in known:
             raise InvalidCommandError(f"no clock {name!r}; there are: {', '.join(known)}")
+
+
+def _marker(cameras: Cameras, name: str) -> str:
+    if name not in cameras.markers:
+        raise InvalidCommandError(f"no marker {name!r}; there are: {', '.join(cameras.markers)}")
+    return name
+
+
+def _two_names(words: str, example: str) -> list[str]:
+    names = words.split()
+    if len(names) != 2:  # noqa: PLR2004 - a pair
+        raise InvalidCommandError(f"{words!r}: expected two markers, such as {example}")
+    return names
 
 
 def _switch(word: str) -> bool:

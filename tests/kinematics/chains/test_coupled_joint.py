@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from bench.baselines.live_inverse_kinematics import LiveInverseKinematics
 from jointfit_daemon.kinematics.chains import (
     ChainModel,
     CoupledCurve,
@@ -28,6 +27,7 @@ from jointfit_daemon.kinematics.chains import (
 )
 from jointfit_daemon.kinematics.inverse_kinematics import (
     IkOptions,
+    LiveInverseKinematics,
     marker_fit,
     marker_slots,
     solve_frames,

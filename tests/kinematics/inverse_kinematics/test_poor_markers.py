@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.baselines.live_inverse_kinematics import LiveInverseKinematics
 from jointfit_daemon.kinematics.chains import (
     ChainModel,
     ChainState,
@@ -19,7 +18,11 @@ from jointfit_daemon.kinematics.chains import (
     rest_state,
     step_between,
 )
-from jointfit_daemon.kinematics.inverse_kinematics import solve_frames, tracking_error
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    LiveInverseKinematics,
+    solve_frames,
+    tracking_error,
+)
 
 COUNT = 30
 SHANK = [4, 5, 6, 7]

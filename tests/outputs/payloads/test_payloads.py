@@ -17,10 +17,13 @@ from scipy.spatial.transform import Rotation
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import (
     AngleConvention,
+    ChainModelState,
     FusionMode,
     JointAngles,
     JointState,
     LimbState,
+    MarkerFitErrors,
+    ModelCoordinate,
     OpticalJoint,
     OpticalSegment,
     OpticalState,
@@ -39,6 +42,7 @@ from jointfit_daemon.outputs.payloads import (
 )
 from jointfit_daemon.outputs.payloads._encoding import (
     encode,
+    encode_chain,
     encode_joint,
     encode_optical,
     encode_sensors,
@@ -422,4 +426,36 @@ def test_optical_pose_has_residuals_beside_what_the_cameras_see() -> None:
             | {"inner_deg": 143.24, "residual": residual, "residual_rms": residual},
             "ankle": nothing,
         },
+    }
+
+
+def test_optical_chain_has_units_by_coordinate_and_null_for_the_unknown() -> None:
+    state = ChainModelState(
+        7,
+        5_000_123_000,
+        "leg",
+        (
+            ModelCoordinate("knee", True, math.radians(-27.694), math.radians(1.72)),
+            ModelCoordinate("pelvis_tx", False, 0.07812, 0.00441),
+            ModelCoordinate("hip", True, None, None),
+        ),
+        {"T1": 0.01181, "T2": None},
+        MarkerFitErrors(0.00944, 0.04181, False),
+        None,
+        ("lost:T2",),
+    )
+    assert json.loads(encode_chain(state, 1_000_000)) == {
+        "v": 1,
+        "t_us": 5_001_123,
+        "frame": 7,
+        "model": "leg",
+        "coordinates": {
+            "knee": {"value_deg": -27.69, "sd_deg": 1.72},
+            "pelvis_tx": {"value_m": 0.0781, "sd_m": 0.0044},
+            "hip": {"value_deg": None, "sd_deg": None},
+        },
+        "error_m": {"T1": 0.0118, "T2": None},
+        "fit": {"rms_m": 0.0094, "maximum_m": 0.0418, "accepted": False},
+        "recent": None,
+        "flags": ["lost:T2"],
     }

@@ -20,16 +20,14 @@ import numpy as np
 from scipy.linalg import lapack
 
 from jointfit_daemon.kinematics.chains import ChainState, rest_state, step_state
-from jointfit_daemon.kinematics.inverse_kinematics import (
-    OPEN_M2,
-    Band,
-    IkOptions,
+from jointfit_daemon.kinematics.inverse_kinematics._levenberg_marquardt import Band
+from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
     MarkerFit,
     lower_equations,
     marker_fit,
     marker_slots,
-    solve_frames,
 )
+from jointfit_daemon.kinematics.inverse_kinematics._solver import OPEN_M2, IkOptions, solve_frames
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -46,6 +44,8 @@ _ROUNDING = 1e-9
 _OPEN_SLACK = 1e-2  # the regularization may raise the marker cost slightly
 _FORGETTING = 0.02
 _FIRST_SD_M = 0.003
+_FIRST_INSTANTS = 5
+"""Instants for which the first standard deviation counts."""
 _STRAIGHTEN = 32
 """Instants between two re-orthonormalizations of the rotations."""
 
@@ -66,6 +66,8 @@ class LiveOptions:
     """Marker error per axis, m; None: estimated from the residuals of the last 50 instants."""
     lost_m: float = 0.06
     """Tracking error, m, above which an instant restarts from the markers alone."""
+    restart_interval: int = 1
+    """Smallest number of instants between two restarts, which take much longer than a step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +84,10 @@ class LivePose:
     """Marker of the model minus measured, m, shape (M, 3); NaN where missing."""
     covariance: Array
     """Covariance of the step from the true state, rad^2 and m^2, shape (nq, nq)."""
+    determined: NDArray[np.bool_]
+    """Degrees of freedom with at least the information of one marker at a distance of 2 cm from
+    the axis, while all others are free; shape (nq,).
+    """
     underdetermined: bool
     """The markers left a degree of freedom undetermined, which was held at the last instant."""
     restarted: bool
@@ -108,6 +114,8 @@ class LiveInverseKinematics:
         weighing = model.weights[model.weights > 0.0]
         self._typical = float(np.median(weighing)) if weighing.size else 1.0
         self._fed = 0
+        self._restarted_at = 0
+        self._learned = 0
         self._lead = np.zeros(model.nq)
 
     def feed(self, markers: ArrayLike) -> LivePose:
@@ -131,25 +139,29 @@ class LiveInverseKinematics:
         seen: NDArray[np.bool_] = np.asarray(np.isfinite(given).all(axis=-1))
         measured = self._slots.filled_vectors(np.where(seen[:, None], given, 0.0)[None])
         weights = self._slots.filled((self._model.weights * seen)[None])
-        place, restarted = self._found(given, measured, weights)
         self._fed += 1
+        place, restarted = self._solve(given, measured, weights)
         self._lead = np.zeros(self._model.nq) if place.is_open or restarted else place.moved
         self._state = place.state if self._fed % _STRAIGHTEN else _straightened(place.state)
         return self._pose(place, seen, restarted=restarted)
 
-    def _found(self, given: Array, measured: Array, weights: Array) -> tuple[_Place, bool]:
+    def _solve(self, given: Array, measured: Array, weights: Array) -> tuple[_Place, bool]:
         """Return the state of the chain and whether it was restarted from the markers alone."""
+        still = np.zeros(self._model.nq)
         if self._state is None:
-            start = self._anew(given)
-            return self._follow(start, np.zeros(self._model.nq), measured, weights), True
+            return self._follow(self._start(given), still, measured, weights), True
+
         place = self._follow(self._state, self._lead, measured, weights)
-        if not self._is_lost(place):
+        waiting = self._fed - self._restarted_at < self._options.restart_interval
+        if waiting or not self._is_lost(place):
             return place, False
-        start = self._anew(given)
-        again = self._follow(start, np.zeros(self._model.nq), measured, weights)
+
+        self._restarted_at = self._fed
+        again = self._follow(self._start(given), still, measured, weights)
         return (again, True) if again.cost < place.cost else (place, False)
 
-    def _anew(self, given: Array) -> ChainState:
+    def _start(self, given: Array) -> ChainState:
+        """Return a state from the markers alone."""
         if not np.isfinite(given).any():
             return rest_state(self._model)
         options = IkOptions(iterations=15, huber_m=self._options.huber_m)
@@ -193,8 +205,11 @@ class LiveInverseKinematics:
         return np.asarray(weights * np.minimum(1.0, self._options.huber_m / (size + 1e-12)))
 
     def _equations(self, place: _Place, reference: ChainState) -> _Equations:
-        """Return normal matrix and gradient, regularized toward `reference` where markers leave a
-        degree of freedom undetermined."""
+        """Return normal matrix and gradient.
+
+        They are regularized toward `reference` where markers leave a degree of freedom
+        undetermined.
+        """
         lower, gradient = lower_equations(self._slots, place.at)
         H, g = lower[0], gradient[0]
         diagonal = H.ravel()[:: len(g) + 1]
@@ -230,6 +245,7 @@ class LiveInverseKinematics:
         residuals[~seen] = np.nan
         self._learn(place.cost, int(seen.sum()))
         half, _ = lapack.dpotri(place.factor, lower=1)
+        determined = half.diagonal() * OPEN_M2 * self._typical <= 1.0
         covariance = self._variance * (half + half.T)
         covariance.ravel()[:: len(half) + 1] *= 0.5
         return LivePose(
@@ -238,6 +254,7 @@ class LiveInverseKinematics:
             place.at.world[0, :, :3, 3],
             residuals,
             covariance,
+            determined,
             place.is_open,
             restarted,
         )
@@ -245,7 +262,9 @@ class LiveInverseKinematics:
     def _learn(self, cost: float, seen: int) -> None:
         freedom = 3 * seen - self._model.nq
         if self._options.marker_sd_m is None and freedom > 0:
-            self._variance += _FORGETTING * (cost / freedom - self._variance)
+            self._learned += 1
+            gain = max(_FORGETTING, 1.0 / (self._learned + _FIRST_INSTANTS))
+            self._variance += gain * (cost / freedom - self._variance)
 
 
 _ZERO = np.zeros(1)

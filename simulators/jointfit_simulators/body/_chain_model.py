@@ -1,4 +1,4 @@
-"""Chain model of the sample data, as TOML and as OpenSim 4.
+"""Chain model of a simulated subject, as TOML and as OpenSim 4.
 
 Invariant: both files describe the same model. The markers of thigh, shank and foot have errors of
 about a centimetre, like those of a scaled model. Two markers of the pelvis are exact and locked.
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from jointfit_daemon.arrays import Array
-    from jointfit_simulators.body import LegGeometry
+    from jointfit_simulators.body._limb import LegGeometry
 
 LOCKED = ("P1", "P2")
 """Markers that the refinement may not move."""

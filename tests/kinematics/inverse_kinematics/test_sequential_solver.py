@@ -5,11 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.baselines.live_inverse_kinematics import (
-    LiveInverseKinematics,
-    LiveOptions,
-    LivePose,
-)
 from jointfit_daemon.kinematics.chains import (
     ChainModel,
     ChainState,
@@ -21,7 +16,13 @@ from jointfit_daemon.kinematics.chains import (
     rest_state,
     step_between,
 )
-from jointfit_daemon.kinematics.inverse_kinematics import solve_frames, tracking_error
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    LiveInverseKinematics,
+    LiveOptions,
+    LivePose,
+    solve_frames,
+    tracking_error,
+)
 
 COUNT = 120
 NOISE = 0.002

@@ -1,0 +1,179 @@
+"""The chain model of ``[chain] model``, and its agreement with the rig.
+
+The names of a model's segments are those of its file. A body part of the rig is therefore the
+segment that carries its markers.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.config._fault_messages import Fault
+from jointfit_daemon.files.models import LoadedModel, as_data, load_model, model_of
+from jointfit_daemon.files.text import MalformedFileError
+from jointfit_daemon.kinematics.chain_coordinates import default_coordinates
+from jointfit_daemon.nearest_name import nearest_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from jointfit_daemon.config._tables import ChainTable
+    from jointfit_daemon.driver import MocapSettings
+    from jointfit_daemon.kinematics.chains import ChainModel
+
+KEY = "chain.model"
+_LISTED = 8
+"""Largest number of names in a message."""
+
+
+def read_chain_model(given: str | dict[str, Any]) -> LoadedModel:
+    """Return the model of a file, or of a table with the keys of a TOML model.
+
+    Raises
+    ------
+    MalformedFileError
+        Damaged file or wrong content.
+    OSError
+        The file cannot be read.
+    """
+    if isinstance(given, str):
+        return load_model(Path(given))
+    chain = model_of(given, KEY)
+    return LoadedModel(chain, default_coordinates(chain))
+
+
+def content_of(model: LoadedModel) -> dict[str, Any]:
+    """Return a model as a table; `read_chain_model` is the inverse, with default coordinates."""
+    return as_data(model.chain)
+
+
+def load_chain_model(
+    given: str | dict[str, Any], table: ChainTable, mocap: MocapSettings | None
+) -> tuple[LoadedModel | None, list[Fault]]:
+    """Return the chain model and its faults; keys of the tables that had faults are None.
+
+    The remarks of the model contain the markers of the rig that it lacks.
+    """
+    try:
+        loaded = read_chain_model(given)
+    except MalformedFileError as error:
+        return None, [Fault(KEY, str(error))]
+    except OSError as error:
+        text = f"cannot be read: {error.strerror}; expected a .toml, .json or .osim file"
+        return None, [Fault(KEY, text, given)]
+    if mocap is None:
+        return loaded, [Fault(KEY, "needs cameras, which track its markers: add [mocap]")]
+
+    parts = [*filter(None, (table.proximal, *(table.segments or ()), table.distal))]
+    markers = {part: names for part in parts if (names := (mocap.markers or {}).get(part))}
+    faults = [*_check_markers(loaded.chain, markers), *_check_bare_segments(table, markers)]
+    carriers, more = _find_carriers(loaded.chain, markers)
+    faults += more or _check_connections(loaded.chain, carriers)
+    known = set(loaded.chain.marker_names)
+    if absent := [name for names in markers.values() for name in names if name not in known]:
+        remark = f"not in the model, so not tracked by it: {_listed(absent)}"
+        loaded = replace(loaded, remarks=(*loaded.remarks, remark))
+    return loaded, faults
+
+
+def _listed(names: Sequence[str]) -> str:
+    rest = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + rest
+
+
+def _check_bare_segments(
+    table: ChainTable, markers: Mapping[str, Sequence[str]]
+) -> Iterator[Fault]:
+    for segment in table.segments or ():
+        if segment not in markers:
+            yield Fault(
+                f"mocap.markers.{segment}",
+                "missing; chain.model is tracked by single markers: name those of this segment "
+                "(a rigid body does not suffice)",
+            )
+
+
+def _check_markers(model: ChainModel, markers: Mapping[str, Sequence[str]]) -> Iterator[Fault]:
+    """Check that the rig has the markers of the model, and that they determine its segments."""
+    known = [name for names in markers.values() for name in names]
+    other = [m.name for m in model.markers if m.weight > 0.0 and m.name not in known]
+    if other:
+        yield Fault(
+            KEY,
+            f"has markers that are not in mocap.markers: {_listed(other)}; add them there, or "
+            "remove them from the model",
+            near=nearest_name(other[0], [name for name in known if name not in model.marker_names]),
+        )
+
+    needed = {m.segment for m in model.markers}
+    for segment in reversed(model.segments):
+        if segment.name in needed and segment.parent is not None:
+            needed.add(segment.parent)
+    bare = [segment.name for segment in model.segments if segment.name not in needed]
+    if bare:
+        yield Fault(
+            KEY,
+            f"has segments without markers on them or below them: {_listed(bare)}; remove them "
+            "from the model, or add markers",
+        )
+
+
+def _find_carriers(
+    model: ChainModel, markers: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, str], list[Fault]]:
+    """Return the segment of the model that carries the markers of each body part, and faults."""
+    of = {m.name: m.segment for m in model.markers}
+    carriers: dict[str, str] = {}
+    faults: list[Fault] = []
+    for part, names in markers.items():
+        key = f"mocap.markers.{part}"
+        counted = Counter(of[name] for name in names if name in of)
+        if not counted:
+            text = f"none of these markers is in chain.model, which has {_listed(list(of))}"
+            faults.append(Fault(key, f"{text}: rename them in one of the two", list(names)))
+            continue
+
+        carrier = carriers[part] = counted.most_common(1)[0][0]
+        faults += [
+            Fault(
+                key,
+                f"chain.model has {name} on {of[name]!r} and the other markers of this part on "
+                f"{carrier!r}: correct the segment of {name} in the model, or its part in the rig",
+            )
+            for name in names
+            if name in of and of[name] != carrier
+        ]
+        if before := [p for p in carriers if p != part and carriers[p] == carrier]:
+            text = f"chain.model has these markers on {carrier!r}, like those of {before[0]!r}"
+            faults.append(Fault(key, f"{text}: expected another segment for each part"))
+    return carriers, faults
+
+
+def _check_connections(model: ChainModel, carriers: Mapping[str, str]) -> list[Fault]:
+    """Check that the model has a joint between the segments of successive parts.
+
+    Segments without markers of the rig may lie between them, such as the talus.
+    """
+    parents = {s.name: s.parent for s in model.segments}
+
+    def above(name: str) -> list[str]:
+        path, parent = [], parents[name]
+        while parent is not None:
+            path.append(parent)
+            parent = parents[parent] if parent not in carriers.values() else None
+        return path
+
+    faults, parts = [], list(carriers)
+    for first, second in pairwise(parts):
+        one, other = carriers[first], carriers[second]
+        if one not in above(other) and other not in above(one):
+            text = (
+                f"has no joint between {one!r} (part {first!r} of the rig) and {other!r} (part "
+                f"{second!r}), expected the chain {' – '.join(parts)}: connect them in the model"
+            )
+            faults.append(Fault(KEY, text))
+    return faults

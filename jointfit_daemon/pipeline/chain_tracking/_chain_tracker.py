@@ -1,0 +1,170 @@
+"""Inverse kinematics of a chain model from single mocap frames, at a limited rate.
+
+Invariant: nothing here depends on an IMU or on a calibration of the limb.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from math import sqrt
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.kinematics.accepted_errors import is_accepted
+from jointfit_daemon.kinematics.chain_coordinates import CoordinateTracker
+from jointfit_daemon.kinematics.inverse_kinematics import LiveInverseKinematics, LiveOptions
+from jointfit_daemon.model import ChainModelState, MarkerFitErrors, MarkerFlag, ModelCoordinate
+from jointfit_daemon.pipeline.chain_tracking._marker_monitor import MarkerMonitor
+from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
+from jointfit_daemon.timing.alignment import RateDivider
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.files.models import LoadedModel
+    from jointfit_daemon.kinematics.inverse_kinematics import LivePose
+    from jointfit_daemon.model import MocapFrame, MocapLayout
+    from jointfit_daemon.pipeline.chain_tracking._marker_monitor import MarkerReport
+    from jointfit_daemon.pipeline.events import Output
+
+RECENT_NS = 10_000_000_000
+"""Time over which recent errors are computed, ns: a few gait cycles."""
+FEWEST_MARKERS = 3
+"""Markers of a frame with a solution: fewer do not determine the position of the first segment."""
+OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
+"""Up to six steps, because frames are 100 ms apart. The Huber threshold bounds the influence of an
+exchanged marker until it is excluded. A restart takes ten times as long as a frame."""
+
+
+class _FrameErrors(NamedTuple):
+    t_ns: int
+    square: float
+    """Sum of the squared marker errors, m²."""
+    markers: int
+    maximum: float
+
+
+class ChainTracker:
+    """Fits a chain model to the markers of mocap frames.
+
+    Parameters
+    ----------
+    loaded : LoadedModel
+        The chain model and the names of its coordinates.
+    rate_hz : float
+        Greatest number of fitted frames per second; above 0.
+    """
+
+    def __init__(self, loaded: LoadedModel, rate_hz: float) -> None:
+        self._model = model = loaded.chain
+        self._solver = LiveInverseKinematics(model, OPTIONS)
+        self._monitor = MarkerMonitor(model)
+        self._coordinates = CoordinateTracker(model, loaded.coordinates)
+        self._described = [
+            (name, is_angle, columns)
+            for joint, columns in zip(loaded.coordinates, model.columns, strict=True)
+            for name, is_angle in zip(joint.names, joint.is_angle, strict=True)
+        ]
+        self._rate = RateDivider(rate_hz)
+        self._layout: MocapLayout | None = None
+        self._columns: list[int | None] = []
+        self._recent: deque[_FrameErrors] = deque()
+
+    def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
+        """Return the state of the model in a live frame, if one is due, and notices."""
+        if not self._rate.is_due(t_ns):
+            return []
+        measured = self._markers(frame)
+        seen: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=1))
+        reports = self._monitor.see(t_ns, seen)
+        used: NDArray[np.bool_] = seen & ~self._monitor.excluded & (self._model.weights > 0.0)
+        names = self._model.marker_names
+        if used.sum() < FEWEST_MARKERS:
+            unknown = tuple(ModelCoordinate(n, a, None, None) for n, a, _ in self._described)
+            state = self._state(t_ns, frame, unknown, dict.fromkeys(names), None)
+            return [state, *_notices(t_ns, reports)]
+
+        pose = self._solver.feed(np.where(used[:, None], measured, np.nan))
+        distances, faults = self._monitor.compare(t_ns, measured, pose.rotations, pose.origins)
+        shown = {
+            name: d if seen_one else None
+            for name, d, seen_one in zip(names, distances.tolist(), seen.tolist(), strict=True)
+        }
+        fit = self._errors(t_ns, distances[used])
+        state = self._state(t_ns, frame, self._values(pose), shown, fit)
+        return [state, *_notices(t_ns, [*reports, *faults])]
+
+    def _markers(self, frame: MocapFrame) -> Array:
+        """Return the markers of the model in a frame, m, shape (M, 3); NaN where missing."""
+        if frame.layout is not self._layout:
+            self._layout = frame.layout
+            column = {name: k for k, name in enumerate(frame.layout.markers)}
+            self._columns = [column.get(name) for name in self._model.marker_names]
+        padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
+        return padded[[-1 if column is None else column for column in self._columns]]
+
+    def _values(self, pose: LivePose) -> tuple[ModelCoordinate, ...]:
+        values, sd = self._coordinates.read(pose.state, pose.covariance)
+        found = zip(self._described, values.tolist(), sd.tolist(), strict=True)
+        return tuple(
+            ModelCoordinate(name, is_angle, value, spread)
+            if pose.determined[columns].all() and np.isfinite(value)
+            else ModelCoordinate(name, is_angle, None, None)
+            for (name, is_angle, columns), value, spread in found
+        )
+
+    def _errors(self, t_ns: int, distances: Array) -> MarkerFitErrors:
+        square, maximum = float((distances**2).sum()), float(distances.max())
+        self._recent.append(_FrameErrors(t_ns, square, len(distances), maximum))
+        return _fit_errors(square, len(distances), maximum)
+
+    def _state(
+        self,
+        t_ns: int,
+        frame: MocapFrame,
+        coordinates: tuple[ModelCoordinate, ...],
+        errors: dict[str, float | None],
+        fit: MarkerFitErrors | None,
+    ) -> ChainModelState:
+        while self._recent and t_ns - self._recent[0].t_ns > RECENT_NS:
+            self._recent.popleft()
+        recent = None
+        if self._recent:
+            _, squares, counts, largest = zip(*self._recent, strict=True)
+            recent = _fit_errors(sum(squares), sum(counts), max(largest))
+
+        open_ones = any(coordinate.value is None for coordinate in coordinates)
+        flags = [MarkerFlag.UNDETERMINED.value] if open_ones else []
+        return ChainModelState(
+            frame.number,
+            t_ns,
+            self._model.name,
+            coordinates,
+            errors,
+            fit,
+            recent,
+            (*flags, *self._monitor.flags(t_ns)),
+        )
+
+
+def _fit_errors(square: float, count: int, maximum: float) -> MarkerFitErrors:
+    rms = sqrt(square / count)
+    return MarkerFitErrors(rms, maximum, is_accepted(rms, maximum))
+
+
+def _notices(t_ns: int, reports: Iterable[MarkerReport]) -> list[Output]:
+    return [
+        Notice(
+            t_ns,
+            NoticeKind.MARKER,
+            report.id,
+            report.text,
+            NoticeLevel.INFO if report.state == "ok" else NoticeLevel.WARNING,
+            {"state": report.state, **report.data},
+        )
+        for report in reports
+    ]

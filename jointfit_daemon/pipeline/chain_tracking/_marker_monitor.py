@@ -1,0 +1,303 @@
+"""Detection of lost, exchanged and misplaced markers from their distances to a chain model.
+
+Faulty markers are excluded from inverse kinematics and compared with the model as before, so that
+their recovery is detected.
+
+Invariant: markers are excluded only while the others fit: at most a third of the visible markers is
+far from its place, and the median distance is small. Otherwise the model itself does not fit, which
+is reported, and no marker is excluded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.model import MarkerFlag
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chains import ChainModel
+
+FAR_M = 0.06
+"""Distance of a misplaced marker, m: soft-tissue artefact is smaller, and 0.04 m is accepted."""
+NEAR_M = 0.03
+"""Distance below which a faulty marker recovers, m."""
+EXCHANGE_GAIN = 0.2
+"""Ratio of the squared distances after and before an exchange of two labels, below which the labels
+are exchanged."""
+FAULT_NS = 1_000_000_000
+"""Time for which a marker is misplaced, exchanged or hidden before it is flagged, ns."""
+RECOVERY_NS = 2_000_000_000
+"""Time for which a faulty marker is near its place before it is used again, ns."""
+LOST_REPORT_NS = 10_000_000_000
+"""Time for which a marker is hidden before a notice, ns: occlusions of seconds are frequent."""
+_MOST_EXCLUDED = 1 / 3
+_MEMORY = 0.02
+"""Weight of a new frame in the mean position of a misplaced marker: 5 s at 10 Hz."""
+_OBSERVED = 50
+"""Frames after which the movement of a misplaced marker is compared with the segments."""
+_RIGID_M = 0.012
+"""Standard deviation below which a marker is fixed to a segment, m."""
+_MOVING_M = 0.025
+"""Standard deviation above which it is not fixed to its own segment, m."""
+
+
+class MarkerReport(NamedTuple):
+    """A change worth a notice."""
+
+    id: str
+    """Name of a marker, or of the model."""
+    state: str
+    """`MarkerFlag`, or ``ok``."""
+    text: str
+    data: Mapping[str, object]
+
+
+@dataclass(slots=True)
+class _Observation:
+    """Mean and variance of a misplaced marker in the axes of every segment."""
+
+    mean: Array
+    variance: Array
+    frames: int = 1
+    reported: bool = False
+
+
+@dataclass(slots=True)
+class MarkerMonitor:
+    """Monitors the markers of one chain model.
+
+    Parameters
+    ----------
+    model
+        The chain.
+    """
+
+    model: ChainModel
+    excluded: NDArray[np.bool_] = field(init=False)
+    """Markers that inverse kinematics must not use, shape (M,)."""
+    misfit: bool = False
+    """Whether the model as a whole does not fit."""
+    _seen_ns: list[int | None] = field(init=False)
+    """Instant at which each marker was visible for the last time."""
+    _reported_lost: set[str] = field(default_factory=set)
+    _since_ns: dict[str, dict[str, int]] = field(default_factory=dict)
+    """Beginning of each condition, by kind of condition and flag."""
+    _faults: dict[str, tuple[int, ...]] = field(default_factory=dict)
+    """Markers of each flag in force."""
+    _observed: dict[int, _Observation] = field(default_factory=dict)
+    _began_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.model.markers)
+        self.excluded = np.zeros(count, dtype=np.bool_)
+        self._seen_ns = [None] * count
+
+    def flags(self, t_ns: int) -> tuple[str, ...]:
+        """Return the flags in force."""
+        lost = [
+            f"{MarkerFlag.LOST}:{marker.name}"
+            for marker, seen_ns in zip(self.model.markers, self._seen_ns, strict=True)
+            if marker.weight > 0.0 and t_ns - self._hidden_since(seen_ns, t_ns) > FAULT_NS
+        ]
+        misfit = [MarkerFlag.MISFIT.value] if self.misfit else []
+        return (*misfit, *self._faults, *lost)
+
+    def _hidden_since(self, seen_ns: int | None, t_ns: int) -> int:
+        if seen_ns is not None:
+            return seen_ns
+        return t_ns if self._began_ns is None else self._began_ns
+
+    def see(self, t_ns: int, seen: NDArray[np.bool_]) -> list[MarkerReport]:
+        """Record the visible markers of a frame, shape (M,)."""
+        self._began_ns = t_ns if self._began_ns is None else self._began_ns
+        reports = []
+        for m, marker in enumerate(self.model.markers):
+            name, hidden_ns = marker.name, t_ns - self._hidden_since(self._seen_ns[m], t_ns)
+            if seen[m]:
+                self._seen_ns[m] = t_ns
+                if name in self._reported_lost:
+                    self._reported_lost.remove(name)
+                    text = f"{name}: visible again after {hidden_ns / 1e9:.0f} s"
+                    reports.append(MarkerReport(name, "ok", text, {"hidden_s": hidden_ns / 1e9}))
+            elif hidden_ns > LOST_REPORT_NS and name not in self._reported_lost and seen.any():
+                self._reported_lost.add(name)
+                text = (
+                    f"{name}: not visible for {hidden_ns / 1e9:.0f} s; the other markers are used. "
+                    "Uncover it, fix it, or correct its name"
+                )
+                reports.append(
+                    MarkerReport(name, MarkerFlag.LOST, text, {"hidden_s": hidden_ns / 1e9})
+                )
+        return reports
+
+    def compare(
+        self, t_ns: int, measured: Array, rotations: Array, origins: Array
+    ) -> tuple[Array, list[MarkerReport]]:
+        """Compare the markers of one frame with a pose of the model.
+
+        Parameters
+        ----------
+        t_ns
+            Instant of the frame.
+        measured
+            World, m, shape (M, 3); NaN where hidden.
+        rotations, origins
+            Segments in the world, shapes (S, 3, 3) and (S, 3), m.
+
+        Returns
+        -------
+        distances
+            Of the markers from their places in the model, m, shape (M,); NaN where hidden.
+        reports
+            Faults that were found or ended.
+        """
+        segments = self.model.marker_segments
+        places = (rotations[segments] @ self.model.positions[:, :, None])[..., 0]
+        places += origins[segments]
+        distances = np.sqrt(((places - measured) ** 2).sum(axis=1))
+
+        far = distances > FAR_M  # False where NaN
+        exchanged = _exchanged_pairs(places, measured, far) if far.any() else []
+        paired = {m for pair in exchanged for m in pair}
+        suspects: dict[str, tuple[int, ...]] = {
+            self._flag(MarkerFlag.EXCHANGED, *pair): pair for pair in exchanged
+        }
+        for m in np.flatnonzero(far).tolist():
+            if m not in paired:
+                suspects[self._flag(MarkerFlag.MISPLACED, m)] = (m,)
+
+        reports = self._recover(t_ns, distances)
+        reports += self._exclude(t_ns, suspects, distances)
+        local = np.einsum("sji,smj->smi", rotations, measured[None] - origins[:, None])
+        return distances, [*reports, *self._observe(local, distances)]
+
+    def _flag(self, kind: MarkerFlag, *markers: int) -> str:
+        return f"{kind}:{'~'.join(self.model.markers[m].name for m in markers)}"
+
+    def _lasting(self, t_ns: int, condition: str, flags: Iterable[str], least_ns: int) -> set[str]:
+        """Return the flags for which a condition has lasted; forget those that are not given."""
+        before = self._since_ns.get(condition, {})
+        now = self._since_ns[condition] = {flag: before.get(flag, t_ns) for flag in flags}
+        return {flag for flag, since_ns in now.items() if t_ns - since_ns >= least_ns}
+
+    def _exclude(
+        self, t_ns: int, suspects: Mapping[str, tuple[int, ...]], distances: Array
+    ) -> list[MarkerReport]:
+        """Exclude lasting suspects, unless the model as a whole does not fit."""
+        visible = np.isfinite(distances)
+        few = int(((distances > FAR_M) & visible).sum()) <= _MOST_EXCLUDED * int(visible.sum())
+        fits = few and float(np.median(distances[visible])) < NEAR_M
+        lasting = self._lasting(t_ns, "far", suspects, FAULT_NS)
+        if self.misfit:
+            ended = self._lasting(t_ns, "fits", [MarkerFlag.MISFIT] if fits else [], RECOVERY_NS)
+            self.misfit = not ended
+            return [self._fits_again()] if ended else []
+
+        new = {
+            flag: suspects[flag]
+            for flag in sorted(lasting)
+            if not self.excluded[list(suspects[flag])].any()
+        }
+        if new and not fits:
+            self.misfit = True
+            return [self._misfit(distances)]
+
+        reports = []
+        for flag, markers in new.items():
+            self._faults[flag] = markers
+            self.excluded[list(markers)] = True
+            reports.append(self._report(markers, distances))
+        return reports
+
+    def _report(self, markers: tuple[int, ...], distances: Array) -> MarkerReport:
+        names = [self.model.markers[m].name for m in markers]
+        shown = " and ".join(f"{1000 * distances[m]:.0f} mm" for m in markers)
+        if len(markers) > 1:
+            text = (
+                f"{' and '.join(names)} look exchanged ({shown} from their places in the model): "
+                "exchange their labels back. Both are excluded until then"
+            )
+            return MarkerReport(names[0], MarkerFlag.EXCHANGED, text, {"markers": names})
+        segment = self.model.markers[markers[0]].segment
+        text = (
+            f"{names[0]}: {shown} from its place on {segment} in the model: check its label, its "
+            "place and its segment. It is excluded until then"
+        )
+        return MarkerReport(names[0], MarkerFlag.MISPLACED, text, {"segment": segment})
+
+    def _misfit(self, distances: Array) -> MarkerReport:
+        rms = float(np.sqrt(np.nanmean(distances**2)))
+        text = (
+            f"chain model {self.model.name!r} does not fit: markers are {1000 * rms:.0f} mm RMS "
+            "from their places: check the subject, the scale of the model, and the labels"
+        )
+        return MarkerReport(self.model.name, MarkerFlag.MISFIT, text, {"rms_m": rms})
+
+    def _fits_again(self) -> MarkerReport:
+        return MarkerReport(self.model.name, "ok", f"chain model {self.model.name!r} fits", {})
+
+    def _recover(self, t_ns: int, distances: Array) -> list[MarkerReport]:
+        """Use the markers of faults again that are near their places."""
+        near = [flag for flag, m in self._faults.items() if (distances[list(m)] < NEAR_M).all()]
+        reports = []
+        for flag in sorted(self._lasting(t_ns, "near", near, RECOVERY_NS)):
+            markers = self._faults.pop(flag)
+            self.excluded[list(markers)] = False
+            names = [self.model.markers[m].name for m in markers]
+            text = f"{' and '.join(names)}: at the expected place again, and in use"
+            reports.append(MarkerReport(names[0], "ok", text, {"markers": names}))
+        return reports
+
+    def _observe(self, local: Array, distances: Array) -> list[MarkerReport]:
+        """Compare the movement of misplaced markers with that of every segment.
+
+        `local` is the position of each marker in the axes of each segment, m, shape (S, M, 3).
+        """
+        single = {markers[0] for markers in self._faults.values() if len(markers) == 1}
+        self._observed = {m: seen for m, seen in self._observed.items() if m in single}
+        reports = []
+        for m in single:
+            if not np.isfinite(distances[m]):
+                continue
+            x = local[:, m]
+            seen = self._observed.setdefault(m, _Observation(x, np.zeros(len(x))))
+            off = x - seen.mean
+            seen.mean = seen.mean + _MEMORY * off
+            seen.variance = (1 - _MEMORY) * (seen.variance + _MEMORY * (off**2).sum(axis=1))
+            seen.frames += 1
+
+            own, sd = int(self.model.marker_segments[m]), np.sqrt(seen.variance)
+            best = int(sd.argmin())
+            fixed_elsewhere = best != own and sd[best] < _RIGID_M and sd[own] > _MOVING_M
+            if seen.frames > _OBSERVED and fixed_elsewhere and not seen.reported:
+                seen.reported = True
+                reports.append(self._moves_with(m, best))
+        return reports
+
+    def _moves_with(self, m: int, other: int) -> MarkerReport:
+        marker, segment = self.model.markers[m], self.model.segment_names[other]
+        text = (
+            f"{marker.name}: moves with {segment}, but the model has it on {marker.segment}: move "
+            f"the marker, or correct its segment"
+        )
+        data = {"segment": marker.segment, "moves_with": segment}
+        return MarkerReport(marker.name, MarkerFlag.MISPLACED, text, data)
+
+
+def _exchanged_pairs(
+    places: Array, measured: Array, far: NDArray[np.bool_]
+) -> list[tuple[int, int]]:
+    """Return pairs of far markers that fit much better with each other's label."""
+    rows = np.flatnonzero(far)
+    square = ((places[rows, None] - measured[None, rows]) ** 2).sum(axis=-1)
+    own = square.diagonal()
+    better = square + square.T < EXCHANGE_GAIN * (own[:, None] + own[None])
+    return [(int(rows[i]), int(rows[j])) for i, j in np.argwhere(np.triu(better, 1)).tolist()]

@@ -1,0 +1,164 @@
+"""A chain model that differs from the rig is refused with its differences."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from jointfit_daemon.config import ConfigError, load_rig, parse_rig
+from jointfit_daemon.files.models import as_data, model_of, write_model
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+Table = dict[str, Any]
+
+
+def model() -> Table:
+    """Return a leg of two segments, three markers each."""
+    return {
+        "name": "leg",
+        "segment": [
+            {"name": "femur"},
+            {"name": "tibia", "parent": "femur", "joint": "hinge"},
+        ],
+        "marker": [
+            {"name": f"{letter}{k}", "segment": segment, "position": [0.1 * k, 0.0, -0.1]}
+            for letter, segment in (("T", "femur"), ("C", "tibia"))
+            for k in (1, 2, 3)
+        ],
+    }
+
+
+@pytest.fixture
+def rig(table: Table) -> Table:
+    """Return a rig with that model."""
+    table["mocap"]["markers"] = {"thigh": ["T1", "T2", "T3"], "shank": ["C1", "C2", "C3"]}
+    table["chain"]["model"] = model()
+    return table
+
+
+def refusals(table: Table) -> list[str]:
+    with pytest.raises(ConfigError) as caught:
+        parse_rig(table)
+    return [fault.text() for fault in caught.value.faults]
+
+
+RIG = """
+[rig]
+name = "bench-1"
+[chain]
+joints = ["hip", "knee", "ankle"]
+segments = ["thigh", "shank"]
+model = "there/leg.json"
+[[imu]]
+id = "S1"
+segment = "thigh"
+driver = "fake"
+port = "/dev/nowhere-1"
+[[imu]]
+id = "S2"
+segment = "shank"
+driver = "fake"
+port = "/dev/nowhere-2"
+[mocap]
+driver = "fakemocap"
+markers.thigh = ["T1", "T2", "T3"]
+markers.shank = ["C1", "C2", "C3"]
+"""
+
+
+def test_model_is_read_from_a_file_beside_the_rig(fakes: object, tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    write_model(tmp_path / "there" / "leg.json", model_of(model(), "test"))
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG)
+    loaded = load_rig(path)
+    assert loaded.chain_model is not None
+    assert loaded.chain_model.chain.marker_names == ("T1", "T2", "T3", "C1", "C2", "C3")
+    names = [name for one in loaded.chain_model.coordinates for name in one.names]
+    assert names[-1] == "tibia_angle"
+
+    # the table has the content: a recording is sufficient for a replay
+    assert loaded.table["chain"]["model"] == as_data(loaded.chain_model.chain)
+    again = parse_rig(loaded.table)
+    assert again.chain_model is not None
+    assert again.chain_model.chain == loaded.chain_model.chain
+
+
+def test_rig_without_a_model_has_none(table: Table) -> None:
+    assert parse_rig(table).chain_model is None
+
+
+def test_missing_and_damaged_files_are_reported(rig: Table, tmp_path: Path) -> None:
+    rig["chain"]["model"] = str(tmp_path / "no.osim")
+    assert "cannot be read" in refusals(rig)[0]
+    (tmp_path / "bad.toml").write_text("segment = 3")
+    rig["chain"]["model"] = str(tmp_path / "bad.toml")
+    assert "segment must be a list of tables" in refusals(rig)[0]
+    rig["chain"]["model"] = 7
+    assert refusals(rig) == [
+        "chain.model = 7: expected the name of a file (chain model for inverse kinematics from the "
+        "markers: an OpenSim model or a TOML or JSON file, relative to the folder of rig.toml, or "
+        "a table with the same keys)"
+    ]
+
+
+def test_markers_that_the_rig_lacks_are_named(rig: Table) -> None:
+    rig["chain"]["model"]["marker"].append(
+        {"name": "T4", "segment": "femur", "position": [0, 0, 0]}
+    )
+    (text,) = refusals(rig)
+    assert "has markers that are not in mocap.markers: T4; add them there, or remove" in text
+
+
+def test_marker_on_another_segment_is_named(rig: Table) -> None:
+    rig["chain"]["model"]["marker"][1]["segment"] = "tibia"
+    (text,) = refusals(rig)
+    assert text.startswith("mocap.markers.thigh: chain.model has T2 on 'tibia'")
+    assert "on 'femur': correct the segment of T2 in the model" in text
+
+
+def test_parts_of_other_names_are_reported(rig: Table) -> None:
+    for marker in rig["chain"]["model"]["marker"][:3]:
+        marker["name"] = f"L{marker['name']}"
+    texts = refusals(rig)
+    assert any("LT1, LT2, LT3; add them there" in text for text in texts)
+    assert any("none of these markers is in chain.model, which has LT1" in text for text in texts)
+
+
+def test_parts_on_one_segment_are_reported(rig: Table) -> None:
+    for marker in rig["chain"]["model"]["marker"]:
+        marker["segment"] = "femur"
+    texts = refusals(rig)
+    assert any("on 'femur', like those of 'thigh'" in text for text in texts)
+    assert any("segments without markers on them or below them: tibia" in text for text in texts)
+
+
+def test_segments_without_a_joint_between_them_are_reported(rig: Table) -> None:
+    del rig["chain"]["model"]["segment"][1]["parent"], rig["chain"]["model"]["segment"][1]["joint"]
+    (text,) = refusals(rig)
+    assert "no joint between 'femur' (part 'thigh' of the rig) and 'tibia' (part 'shank')" in text
+
+
+def test_intermediate_segments_without_markers_are_allowed(rig: Table) -> None:
+    segments = rig["chain"]["model"]["segment"]
+    segments.insert(1, {"name": "patella", "parent": "femur", "joint": "hinge"})
+    segments[2]["parent"] = "patella"
+    assert parse_rig(rig).chain_model is not None
+
+
+def test_rigid_bodies_and_missing_cameras_are_refused(rig: Table) -> None:
+    rig["mocap"]["markers"] = {"thigh": ["T1", "T2", "T3"]}
+    rig["mocap"]["rigid_body"] = {"shank": "Shank"}
+    assert any("a rigid body does not suffice" in text for text in refusals(rig))
+    del rig["mocap"]
+    assert refusals(rig)[0] == ("chain.model: needs cameras, which track its markers: add [mocap]")
+
+
+def test_markers_that_the_model_lacks_are_a_remark(rig: Table) -> None:
+    rig["mocap"]["markers"]["thigh"].append("T9")
+    loaded = parse_rig(rig).chain_model
+    assert loaded is not None
+    assert loaded.remarks == ("not in the model, so not tracked by it: T9",)
