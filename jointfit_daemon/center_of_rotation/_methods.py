@@ -63,8 +63,8 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     movement : Movement or ndarray
         An array, shape (n, k, d) or (n, d), stands for `Movement` with these points only.
     method : str
-        A key of `METHODS`, or ``auto``: ``sphere``; in a plane ``geometric``; ``score`` where there
-        are no points but both bodies' poses.
+        A key of `METHODS`, or ``auto``: in a plane ``geometric``; ``score`` if the markers and the
+        poses of both bodies are known, or no points but both poses; otherwise ``sphere``.
 
     Returns
     -------
@@ -87,8 +87,7 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
         movement = replace(movement, points=np.where(whole, p, np.nan))
 
     if method == "auto":
-        planar = movement.points is not None and movement.points.shape[-1] == 2
-        method = "geometric" if planar else "sphere" if movement.points is not None else "score"
+        method = _automatic(movement)
     chosen = METHODS.get(method)
     if chosen is None:
         raise ValueError(f"no method {method!r}; there are: {', '.join(sorted(METHODS))}")
@@ -103,6 +102,14 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
 
     given = [getattr(movement, name) for name in chosen.needs]
     return _beyond_parent(chosen.run(movement, *given), movement.parent_markers)
+
+
+def _automatic(movement: Movement) -> str:
+    if movement.points is None:
+        return "score"
+    if movement.points.shape[-1] == 2:
+        return "geometric"
+    return "sphere" if movement.both_markers() is None else "score"
 
 
 def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimate:
@@ -195,14 +202,16 @@ _ALL = (
         "both bodies treated alike; needs three markers on each",
         ("parent", "child"),
         False,
-        lambda m, parent, child: fit_score(parent, child, near=m.near),
+        lambda m, parent, child: fit_score(parent, child, near=m.near, markers=m.both_markers()),
     ),
     EstimationMethod(
         "sara",
         "axis of a hinge from both bodies",
         ("parent", "child"),
         False,
-        lambda m, parent, child: fit_axis(parent, child, near=m.near, toward=m.axis),
+        lambda m, parent, child: fit_axis(
+            parent, child, near=m.near, toward=m.axis, markers=m.both_markers()
+        ),
     ),
 )
 METHODS: dict[str, EstimationMethod] = {method.name: method for method in _ALL}

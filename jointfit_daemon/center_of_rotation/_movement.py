@@ -10,7 +10,10 @@ from dataclasses import dataclass
 from math import radians
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import MIN_MARKERS, is_line
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -52,6 +55,9 @@ class Movement:
     parent_markers: Array | None = None
     """The parent's own markers in its coordinates, m, shape (m, 3). If given, the effect of their
     noise on `points` is separated from the noise of the child's markers."""
+    child_markers: Array | None = None
+    """The child's own markers in its coordinates, m, shape (k, 3). None: the median of `points` in
+    the child's coordinates, if `child` is given."""
     angles: Array | None = None
     """Angle of the child about the joint's axis relative to the parent, rad, shape (n,), from
     inertial sensors: for ``oriented``."""
@@ -62,6 +68,23 @@ class Movement:
     if None."""
     interval: float = 0.01
     """Time between frames, s."""
+
+    def both_markers(self) -> tuple[Array, Array] | None:
+        """Return the markers of parent and child, each in its own coordinates, m.
+
+        None if those of one body are unknown, fewer than three, or on a line.
+        """
+        child = self.child_markers
+        if child is None and not (self.points is None or self.parent is None or self.child is None):
+            world = rotation.rotate(self.parent.q[:, None], self.points) + self.parent.t[:, None]
+            local = self.child.to_body(world)
+            placed = np.isfinite(local).all(axis=-1).any(axis=0)
+            child = np.nanmedian(local[:, placed], axis=0)
+
+        if self.parent_markers is None or child is None:
+            return None
+        both = self.parent_markers, child
+        return both if all(len(m) >= MIN_MARKERS and not is_line(m) for m in both) else None
 
     @property
     def least_turn(self) -> float:

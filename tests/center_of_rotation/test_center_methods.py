@@ -12,7 +12,16 @@ from hypothesis import strategies as st
 from scipy.signal import lfilter
 
 from bench.baselines.circle_theory import circle_rms_bound
-from bench.subjects.simulated_joints import ball_turns, carried, covers, fan, hinge_turns, watched
+from bench.subjects.simulated_joints import (
+    CHILD,
+    PARENT,
+    ball_turns,
+    carried,
+    covers,
+    fan,
+    hinge_turns,
+    watched,
+)
 from jointfit_daemon.center_of_rotation import (
     METHODS,
     BodyPoses,
@@ -109,6 +118,11 @@ def test_linear_sphere_fits_refuse_a_hinge(name: str) -> None:
 def test_auto_selects_a_method_for_the_given_data() -> None:
     ball = whole("ball")
     assert estimate_center(ball).method == "sphere"
+    both = replace(ball, parent_markers=PARENT)
+    assert estimate_center(both).method == "score"
+    assert estimate_center(replace(both, child_markers=CHILD[:2])).method == "sphere"
+    line = np.linspace(0.0, 0.1, 4)[:, None] * np.ones(3)
+    assert estimate_center(replace(both, child_markers=line)).method == "sphere"
     assert estimate_center(Movement(parent=ball.parent, child=ball.child)).method == "score"
     assert estimate_center(planar()).method == "geometric"
     assert estimate_center(planar().points[:, 0]).method == "geometric"  # type: ignore[index]  # it has points

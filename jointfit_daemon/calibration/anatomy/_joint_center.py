@@ -13,15 +13,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration._robust_weights import rms
-from jointfit_daemon.center_of_rotation import refusal
+from jointfit_daemon.center_of_rotation import BodyPoses, refusal
 from jointfit_daemon.center_of_rotation.spatial import (
     SphereLimits,
     SphereOptions,
+    fit_score,
     judge_sphere,
     objection,
     solve_sphere,
 )
-from jointfit_daemon.limb_model import visible
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import MIN_MARKERS, is_line, visible
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -156,9 +158,50 @@ def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> Cen
     """Fit the center between two body parts, in static-world coordinates, m (shape (3,)).
 
     The markers of the distal part are first transformed to static-world coordinates of the proximal
-    part, in which the center is fixed.
+    part, in which the center is fixed. Their spheres decide which directions were observed. The
+    center along these directions is the point that coincides in both parts: noise of a part's
+    markers rotates it, which moves distant markers off their spheres and biases their center.
     """
-    return fit_center(parent.to_static(child.points), start)
+    found = fit_center(parent.to_static(child.points), start)
+    if found.refused is not None:
+        return found
+    markers = _markers(parent), _markers(child)
+    if any(len(m) < MIN_MARKERS or is_line(m) for m in markers):
+        return found
+
+    both = fit_score(
+        _poses(parent), _poses(child), near=found.center, markers=markers, posture=False
+    )
+    if not np.isfinite(both.center).all():
+        return found
+    return _replace_observed(found, both)
+
+
+def _markers(track: ClusterTrack) -> Array:
+    """Return the markers of a part in the static world, m, medians over the frames, (k, 3)."""
+    local = track.to_static(track.points)
+    local = local[:, visible(local).any(axis=0)]
+    return np.asarray(np.nanmedian(local, axis=0))
+
+
+def _poses(track: ClusterTrack) -> BodyPoses:
+    """Return the poses that map static-world points to the optical world, at most `MAX_FRAMES`."""
+    step = max(1, -(-len(track.q) // MAX_FRAMES))
+    q, p = track.q[::step], track.p[::step]
+    return BodyPoses(q, p - rotation.rotate(q, track.origin))
+
+
+def _replace_observed(found: CenterEstimate, both: CenterEstimate) -> CenterEstimate:
+    """Return `found` with the center and covariance of `both` in the directions that both observed.
+
+    `both` was placed at the center of `found` along its own unobserved direction.
+    """
+    kept = both.unseen.T @ both.unseen
+    C = both.covariance + kept @ found.covariance @ kept
+    unseen = found.unseen.T @ found.unseen
+    across = np.eye(3) - unseen
+    center = across @ both.center + unseen @ found.center
+    return replace(found, center=center, covariance=across @ C @ across)
 
 
 def carried_center_gap(parent: ClusterTrack, child: ClusterTrack, center: Array) -> float:

@@ -9,7 +9,8 @@ through the leverage
           \frac{\mathrm{Cov}(v_j)}{R_j^2} \Big]^{-1} + \sigma_s^2 I
 
 with :math:`v_j` marker j in coordinates of the proximal part at distance :math:`R_j` from the
-center. Constants and arithmetic are those of the final fit, so that the prediction matches it.
+center. The constants are those of the final fit, so that the predicted soft-tissue error matches.
+The final fit compares both body parts instead of spheres, and has a smaller random error.
 """
 
 from __future__ import annotations

@@ -48,8 +48,9 @@ class CircleLimits:
     """Distance of a marker from the center, m."""
     arc: float = radians(10.0)
     """Smallest arc of the movement, rad."""
-    sd: float = 0.02
-    """Largest predicted RMS error, m."""
+    sd: float = inf
+    """Largest predicted RMS error, m. Noise that curves the arc by chance reduces the prediction. A
+    limit near the expected error therefore selects biased centers outside their ellipses."""
 
 
 def circle_estimate(

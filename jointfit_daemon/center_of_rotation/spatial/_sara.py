@@ -24,6 +24,7 @@ def fit_axis(
     near: Array | None = None,
     toward: Array | None = None,
     robust: bool = True,
+    markers: tuple[Array, Array] | None = None,
 ) -> CenterEstimate:
     """Estimate the axis of a hinge and the point on it nearest to `near`.
 
@@ -39,13 +40,17 @@ def fit_axis(
         Direction along which the axis has a positive component, such as the subject's right.
     robust : bool
         Huber weights on the gap between the two sides.
+    markers : tuple of ndarray, optional
+        Markers of parent and child, see `two_sided_estimate`.
 
     Returns
     -------
     CenterEstimate
         `axis` is in the parent's coordinates; refused if the movement was about more than one axis.
     """
-    estimate = two_sided_estimate("sara", parent, child, near, hinge=True, robust=robust)
+    estimate = two_sided_estimate(
+        "sara", parent, child, near, hinge=True, robust=robust, markers=markers
+    )
     axis = estimate.axis
     if axis is None or toward is None or float(axis @ toward) >= 0.0:
         return estimate

@@ -1,16 +1,19 @@
 """Center of rotation from the poses of two bodies (SCoRE), or the axis of a hinge.
 
 The method finds the point of the parent and the point of the child that coincide in every frame.
-Both poses may be noisy. The singular values of N = [R₁, -R₂] distinguish a point from an axis.
+Both poses may be noisy. The singular values of N = [R₁, -R₂] distinguish a point from an axis. If
+the markers of both bodies are known, their noise is separated from the movement (`fit_two_sides`).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from math import inf, sqrt
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.center_of_rotation._movement import BodyPoses
 from jointfit_daemon.center_of_rotation._path_statistics import arc_of
 from jointfit_daemon.center_of_rotation._result import CenterEstimate, refusal
 from jointfit_daemon.center_of_rotation.spatial._observability import (
@@ -18,13 +21,18 @@ from jointfit_daemon.center_of_rotation.spatial._observability import (
     posture_share,
     within95,
 )
-from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import objection
+from jointfit_daemon.center_of_rotation.spatial._sphere_estimate import PERSISTENT, objection
 from jointfit_daemon.center_of_rotation.spatial._sphere_sums import LAGS
+from jointfit_daemon.center_of_rotation.spatial._two_sided_fit import (
+    ClusterNoise,
+    TwoSidedFit,
+    fit_two_sides,
+    huber_weights,
+)
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.center_of_rotation._movement import BodyPoses
 
 
 HINGE_RATIO = 0.3
@@ -42,27 +50,48 @@ MIN_TURN_RAD = 0.02
 LEVER_M = 0.24
 """Replaces the radius in T, m, since poses carry no marker positions: the center must be known to
 40 mm."""
-HUBER = 1.5
+HIDDEN = (
+    "noise of the markers rotates both bodies as much as the joint does: move the joint further, "
+    "or put the markers of each body further apart"
+)
 _PASSES = 10
 _LEAST_M = 1e-9
 
 
 def fit_score(
-    parent: BodyPoses, child: BodyPoses, *, near: Array | None = None, robust: bool = True
+    parent: BodyPoses,
+    child: BodyPoses,
+    *,
+    near: Array | None = None,
+    robust: bool = True,
+    markers: tuple[Array, Array] | None = None,
+    posture: bool = True,
 ) -> CenterEstimate:
     """Estimate a center by SCoRE; if only an axis was observed, return the estimate of a hinge.
 
     Ehrig et al. 2006. Parameters as in `two_sided_estimate`.
     """
-    return two_sided_estimate("score", parent, child, near, hinge=False, robust=robust)
+    return two_sided_estimate(
+        "score", parent, child, near, hinge=False, robust=robust, markers=markers, posture=posture
+    )
 
 
 def two_sided_estimate(
-    name: str, parent: BodyPoses, child: BodyPoses, near: Array | None, *, hinge: bool, robust: bool
+    name: str,
+    parent: BodyPoses,
+    child: BodyPoses,
+    near: Array | None,
+    *,
+    hinge: bool,
+    robust: bool,
+    markers: tuple[Array, Array] | None = None,
+    posture: bool = True,
 ) -> CenterEstimate:
     r"""Estimate the point, or the axis, that coincides in both bodies.
 
     .. math:: \min \sum_t \rho\left(|R_1 c_1 + t_1 - R_2 c_2 - t_2|\right)
+
+    With `markers`, the estimate continues from this point by `fit_two_sides`.
 
     Parameters
     ----------
@@ -78,11 +107,19 @@ def two_sided_estimate(
         two is below `HINGE_RATIO`.
     robust : bool
         Huber weights on the gap, which reduce the influence of marker swaps.
+    markers : tuple of ndarray, shapes (m, 3) and (k, 3), or None
+        Markers of parent and child that the poses were fitted to, each in coordinates of its body,
+        m; at least three each, not on a line. None: the noise of the poses is unknown, and a small
+        movement gives a biased center with too small an error.
+    posture : bool
+        Whether persistent residuals count as soft-tissue artefact; if not, the caller adds its
+        variance.
 
     Returns
     -------
     CenterEstimate
-        In the parent's coordinates; `residual` is the RMS gap between the two sides.
+        In the parent's coordinates; `residual` is the RMS gap between the two sides. `noise` is
+        that of a marker's coordinate, without `markers` that of the gap's.
     """
     good = np.isfinite(parent.q).all(1) & np.isfinite(child.q).all(1)
     good &= np.isfinite(parent.t).all(1) & np.isfinite(child.t).all(1)
@@ -90,9 +127,9 @@ def two_sided_estimate(
     if n < MIN_FRAMES:
         return refusal(name, 3, 0, FEW)
 
-    R1, R2 = rotation.to_matrix(parent.q[good]), rotation.to_matrix(child.q[good])
-    N = np.concatenate((R1, -R2), axis=2)
-    rhs = child.t[good] - parent.t[good]
+    poses = BodyPoses(parent.q[good], parent.t[good]), BodyPoses(child.q[good], child.t[good])
+    R1, R2 = rotation.to_matrix(poses[0].q), rotation.to_matrix(poses[1].q)
+    N, rhs = np.concatenate((R1, -R2), axis=2), poses[1].t - poses[0].t
     w = _huber_weights(N, rhs, hinge=hinge) if robust else np.ones(n)
     c, gaps, s, Vt, rank = _solve(N, rhs, w, hinge=hinge)
 
@@ -103,26 +140,46 @@ def two_sided_estimate(
     if hinge and ratio >= HINGE_RATIO:
         return refusal(name, 3, n, SEVERAL_AXES.format(ratio))
 
-    inverse = (Vt[:rank].T / np.maximum(s[:rank], 1e-12) ** 2) @ Vt[:rank]
-    white, C, rho = _covariances(gaps, w, inverse, rank)
+    # with unit noise of the gap, S = M = NᵀWN
+    squares = np.diag(s[:rank] ** 2)
+    residual = sqrt(float((gaps**2).sum(axis=1).mean()))
+    fit = TwoSidedFit(c, gaps, w, residual, squares, squares)
+    if markers is not None:
+        noise = ClusterNoise.of(markers[0]), ClusterNoise.of(markers[1])
+        fit = fit_two_sides(poses, noise, c, Vt[:rank].T, robust=robust)
+    found = _answer(name, fit, Vt, _arc(*poses), near, posture=posture)
+    if markers is None or not np.isfinite(found.center).all():
+        return found
+    return replace(found, radii=_radii(markers[1] - fit.point[3:], Vt[len(fit.score) :, 3:]))
+
+
+def _answer(
+    name: str, fit: TwoSidedFit, Vt: Array, arc: float, near: Array | None, *, posture: bool
+) -> CenterEstimate:
+    """Return the estimate of a fit along the first rows of `Vt`."""
+    n, rank = len(fit.gaps), len(fit.score)
+    inner = fit.spread()
+    if inner is None:
+        return refusal(name, 3, n, HIDDEN)
+    inverse = Vt[:rank].T @ inner @ Vt[:rank]
+    white, C, rho, repeated = _covariances(fit, inverse, rank, posture=posture)
 
     # the direction along the axis is unobserved
     axis = Vt[5, :3] / np.linalg.norm(Vt[5, :3]) if rank == 5 else None
-    center = c[:3]
+    center = fit.point[:3]
     if axis is not None:
         P = np.eye(3) - np.outer(axis, axis)
         along = 0.0 if near is None else float(axis @ (near - center))
         center, C = center + along * axis, P @ C @ P
 
-    arc = _arc(parent, child)
     conditioning = LEVER_M / sqrt(max(float(np.linalg.eigvalsh(C)[-1]), 1e-18))
     return CenterEstimate(
         method=name,
         center=center,
         covariance=(C + C.T) / 2.0,
-        noise=sqrt(float((gaps**2).mean())),
-        residual=sqrt(float((gaps**2).sum(axis=1).mean())),
-        radii=np.array([float(np.linalg.norm(c[3:]))]),
+        noise=sqrt(float((fit.gaps**2).mean())),
+        residual=fit.residual,
+        radii=np.array([float(np.linalg.norm(fit.point[3:]))]),
         arc=arc,
         bound=inf if rank == 5 else sqrt(float(np.trace(white))),
         conditioning=conditioning,
@@ -130,33 +187,47 @@ def two_sided_estimate(
         effective_frames=n * (1.0 - rho) / (1.0 + rho),
         unseen=np.zeros((0, 3)) if axis is None else axis[None],
         axis=axis,
-        flags=("hinge",) if rank == 5 else (),
+        flags=(
+            *(("hinge",) if rank == 5 else ()),
+            *(("residuals_persist",) if rho > PERSISTENT else ()),
+            *(("residuals_repeat",) if repeated > 0.0 else ()),
+        ),
         within95=within95(rank - 3, 3.0 * n * (1 - rho) / (1 + rho) - 6.0),
         refused=objection(arc, LEVER_M, conditioning, SphereLimits()),
     )
 
 
-def _covariances(gaps: Array, w: Array, inverse: Array, rank: int) -> tuple[Array, Array, float]:
+def _radii(away: Array, axis: Array) -> Array:
+    """Return the distances of markers from the center, m; across the axis (rows) of a hinge."""
+    along = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)
+    return np.asarray(np.linalg.norm(away - away @ along.T @ along, axis=1))
+
+
+def _covariances(
+    fit: TwoSidedFit, inverse: Array, rank: int, *, posture: bool
+) -> tuple[Array, Array, float, float]:
     """Return the covariance of the parent's point for white noise and in total, m², shape (3, 3).
 
     The third value is the correlation of the gaps from one frame to the next. Persistent noise
-    reduces the effective frames; with soft-tissue artefact a single one remains.
+    reduces the effective frames; with soft-tissue artefact a single one remains. The fourth value
+    is the share of the gaps' variance that repeats with posture.
     """
+    gaps, w = fit.gaps, fit.weights
     n = len(gaps)
     noise2 = max(float((w[:, None] * gaps**2).sum()) / max(3.0 * n - rank, 1.0), _LEAST_M**2)
-    soft_tissue2 = noise2 * float(w.sum()) * posture_share(_correlation(gaps, LAGS[1]), n)
+    repeated = posture_share(_correlation(gaps, LAGS[1]), n) if posture else 0.0
+    soft_tissue2 = noise2 * float(w.sum()) * repeated
     rho = _correlation(gaps, LAGS[0])
     rho = min(rho, 0.99) if rho > 2.0 / sqrt(gaps.size) else 0.0
 
     white = noise2 * inverse
     total = white * (1.0 + rho) / (1.0 - rho) + soft_tissue2 * inverse
-    return white[:3, :3], total[:3, :3], rho
+    return white[:3, :3], total[:3, :3], rho, repeated
 
 
 def _arc(parent: BodyPoses, child: BodyPoses) -> float:
     """Return the arc of the direction that rotated most, rad."""
-    q = rotation.multiply(rotation.conjugate(parent.q), child.q)
-    R = rotation.to_matrix(q[np.isfinite(q).all(axis=1)])
+    R = rotation.to_matrix(rotation.multiply(rotation.conjugate(parent.q), child.q))
     # the length of the mean of that direction is its resultant
     return arc_of(float(np.linalg.svd(R.mean(axis=0))[1][2]))
 
@@ -165,10 +236,7 @@ def _huber_weights(N: Array, rhs: Array, *, hinge: bool) -> Array:
     """Return the weight of each frame, shape (n,)."""
     w = np.ones(len(N))
     for _ in range(_PASSES):
-        size = np.linalg.norm(_solve(N, rhs, w, hinge=hinge)[1], axis=1)
-        # the median length of three normal components is 1.538 of each
-        scale = max(float(np.median(size)) / 1.538, _LEAST_M)
-        again = np.minimum(1.0, 2.0 * HUBER * scale / np.maximum(size, 1e-300))
+        again = huber_weights(np.linalg.norm(_solve(N, rhs, w, hinge=hinge)[1], axis=1))
         if np.allclose(again, w, rtol=0.0, atol=1e-6):
             break
         w = again

@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.subjects.noisy_bodies import FRAMES, Subject
 from jointfit_daemon.calibration.anatomy import on_skin
-from jointfit_daemon.calibration.anatomy._joint_center import align_vertically, fit_center
+from jointfit_daemon.calibration.anatomy._joint_center import (
+    align_vertically,
+    fit_center,
+    joint_center,
+)
+from jointfit_daemon.calibration.anatomy._marker_clusters import ClusterTrack
+from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
+    from jointfit_daemon.center_of_rotation import BodyPoses
 
 CHILD = np.array([[0.05, 0, -0.25], [-0.04, 0.05, -0.3], [0, -0.06, -0.2], [0.06, 0.04, -0.32]])
 CENTER = np.array([0.1, -0.2, 0.9])
@@ -109,3 +117,33 @@ def test_no_movement_is_refused_with_the_reason(points: Array, reason: str) -> N
     found = fit_center(points, CENTER)
     assert found.refused is not None
     assert reason in found.refused
+
+
+def track(poses: BodyPoses, points: Array) -> ClusterTrack:
+    t_ns = np.arange(FRAMES)
+    return ClusterTrack(t_ns, poses.q, poses.t, points, np.zeros(FRAMES), np.zeros(3))
+
+
+def test_noise_of_both_clusters_does_not_bias_the_calibrated_center() -> None:
+    sphere, calibrated = [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        person = Subject.random(rng, 4)
+        seen = person.observe(rng, 20.0, 1e-3)
+        assert seen.parent is not None
+        assert seen.child is not None
+        assert seen.points is not None
+        markers = np.broadcast_to(person.parent, (FRAMES, 4, 3))
+        above = track(seen.parent, rotation.rotate(seen.parent.q[:, None], markers))
+        above.points[:] += seen.parent.t[:, None]
+        world = rotation.rotate(seen.parent.q[:, None], seen.points) + seen.parent.t[:, None]
+        below = track(seen.child, world)
+        start = np.array([0.0, 0.0, 0.01])
+        sphere.append(fit_center(above.to_static(world), start).center)
+        found = joint_center(above, below, start)
+        assert found.refused is None
+        assert found.leverage is not None
+        calibrated.append(found.center)
+
+    assert np.sqrt(np.mean(np.square(calibrated).sum(axis=1))) < 3e-3
+    assert np.sqrt(np.mean(np.square(sphere).sum(axis=1))) > 8e-3
