@@ -20,7 +20,7 @@ from bench.framework.material import MODEL_CENTERS
 if TYPE_CHECKING:
     from pathlib import Path
 
-METHODS = ("auto", "sara")
+METHODS = ("auto", "sphere")
 TRIALS = {
     "squats1": "squats",
     "STS1": "sit to stand",
