@@ -68,7 +68,11 @@ def _beside(trial: str, methods: tuple[Method, ...]) -> Callable[[Path], list[Re
 HEADING = (
     "the daemon compensates the relative heading of the sensors and the offline evaluation does not"
 )
-LOAD = "other processes of the machine delayed samples, so few frames were evaluated"
+LOAD = "other processes of the machine delayed samples, so fewer frames were evaluated"
+VARIES = (
+    "not known; between three runs on a machine with other load the difference varied from 0.03 to "
+    "0.2 degrees"
+)
 EXPERIMENTS = (
     Experiment(
         "end-to-end-squats",
@@ -77,7 +81,7 @@ EXPERIMENTS = (
         KNEE,
         (FOLDER,),
         long=True,
-        known_misses={"mean: share evaluated": LOAD},
+        known_misses={"anchored: thigh": VARIES, "anchored: flexion": VARIES},
     ),
     Experiment(
         "end-to-end-walking",
@@ -87,7 +91,7 @@ EXPERIMENTS = (
         (FOLDER,),
         long=True,
         known_misses={
-            "anchored: thigh": LOAD,
+            "anchored: thigh": VARIES,
             "anchored: flexion": HEADING,
             "anchored: share evaluated": LOAD,
         },
