@@ -9,6 +9,7 @@ from jointfit_daemon.calibration.marker_refinement._input_checks import (
 )
 from jointfit_daemon.calibration.marker_refinement._motion_trial import (
     MotionTrial,
+    RefinementCost,
     RefinementError,
     RefinementMethod,
     RefinementSettings,
@@ -27,6 +28,7 @@ __all__ = [
     "MarkerOutcome",
     "MotionTrial",
     "Refinement",
+    "RefinementCost",
     "RefinementError",
     "RefinementMethod",
     "RefinementSettings",

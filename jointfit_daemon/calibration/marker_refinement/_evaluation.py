@@ -15,7 +15,10 @@ from jointfit_daemon.calibration.marker_refinement._refinement_result import (
     TrialOutcome,
 )
 from jointfit_daemon.kinematics.chains import step_between
-from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
+from jointfit_daemon.kinematics.inverse_kinematics import (
+    restart_local_minima,
+    solve_frames,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -56,9 +59,13 @@ def judge_trial(
     trained: bool,
     options: IkOptions | None = None,
 ) -> TrialOutcome:
-    """Return tracking errors and joint-angle changes of one trial; both models are solved again."""
+    """Return tracking errors and joint-angle changes of one trial; both models are solved again.
+
+    Frames in a local minimum of inverse kinematics are solved again from other poses.
+    """
     ones = np.ones(len(before.markers))
     old = solve_frames(before, trial.targets, ones, options=options)
+    old, _ = restart_local_minima(before, trial.targets, ones, old, options)
     new = solve_frames(after, trial.targets, ones, start=old.state, options=options)
 
     return TrialOutcome(

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 RefinementMethod = Literal["joint", "block", "search"]
+RefinementCost = Literal["l1", "l2"]
 
 
 class RefinementError(ValueError):
@@ -51,6 +52,9 @@ class RefinementSettings:
     huber_m: float | None = 0.02
     """Error above which the loss is linear instead of quadratic, m; None: quadratic for all
     errors."""
+    cost: RefinementCost = "l2"
+    """``l2``: squared errors up to `huber_m`. ``l1``: distances, so that a marker that is often far
+    off has little influence. Not with the method ``search``."""
     frames: int = 150
     """Largest number of frames of a trial; longer trials are decimated, so that none dominates."""
     evenness: float = 0.0

@@ -15,7 +15,10 @@ from jointfit_daemon.calibration.marker_refinement._coordinate_search import sea
 from jointfit_daemon.calibration.marker_refinement._evaluation import judge_trial, marker_outcomes
 from jointfit_daemon.calibration.marker_refinement._gauge import Gauge, gauge_of
 from jointfit_daemon.calibration.marker_refinement._input_checks import CheckedTrials, check
-from jointfit_daemon.calibration.marker_refinement._motion_trial import RefinementSettings
+from jointfit_daemon.calibration.marker_refinement._motion_trial import (
+    RefinementError,
+    RefinementSettings,
+)
 from jointfit_daemon.calibration.marker_refinement._objective import RefinementProblem
 from jointfit_daemon.calibration.marker_refinement._refinement_result import Refinement
 from jointfit_daemon.calibration.marker_refinement._simultaneous import (
@@ -26,6 +29,7 @@ from jointfit_daemon.calibration.marker_refinement._simultaneous import (
 from jointfit_daemon.kinematics.inverse_kinematics import (
     IkOptions,
     IkResult,
+    restart_local_minima,
     solve_frames,
     tracking_error,
 )
@@ -40,6 +44,9 @@ if TYPE_CHECKING:
     Progress = Callable[[float, float], None]
     """Called with the share done, 0 to 1, and the training error, m."""
 
+L1_CORNER_M = 0.001
+"""Distance below which the loss of the cost ``l1`` is quadratic, m; it has a corner at zero
+otherwise."""
 _FINE = 1e-9
 _RISES = 2
 """Consecutive steps without a new minimum of the hold-out error that end the iteration."""
@@ -70,6 +77,8 @@ def refine_markers(
         too few frames.
     """
     settings = settings or RefinementSettings()
+    if settings.cost == "l1" and settings.method == "search":
+        raise RefinementError("cost l1: method search has no loss function; use joint or block")
     thin = [trial.thinned(settings.frames) for trial in trials]
     unseen = [trial.thinned(settings.frames) for trial in validation]
     checked = check(model, thin, unseen)
@@ -84,6 +93,11 @@ def refine_markers(
 
     rates = sorted({round(trial.rate_hz, 6) for trial in (*trials, *validation)})
     notes = checked.notes
+    if task.restarted:
+        notes += (
+            f"{task.restarted} of {len(task.problem.targets)} training frames started in a local"
+            " minimum of inverse kinematics; they were solved again from other poses",
+        )
     if len(rates) > 1:
         listed = ", ".join(f"{rate:g}" for rate in rates)
         notes += (f"recorded at {listed} Hz: trials are weighted by frames, not by duration",)
@@ -107,6 +121,8 @@ class _RefinementTask:
     first: IkResult
     """Poses of the training frames at the nominal positions."""
     holdout: _HoldOut | None
+    restarted: int
+    """Number of training frames whose poses improved by a restart from another pose."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +151,12 @@ def _task(
     )
     options = IkOptions(huber_m=settings.huber_m, limit_m2=settings.limit_m2)
     first = solve_frames(model, targets, weights, options=options)
+    first, improved = restart_local_minima(model, targets, weights, first, options)
+    if settings.cost == "l1":
+        # the loss of a typical error is smaller by this factor than its square; so is the prior
+        typical = float(np.nanmedian(np.linalg.norm(first.residuals, axis=-1)))
+        weaker = min(1.0, L1_CORNER_M / max(typical, L1_CORNER_M))
+        problem = replace(problem, huber_m=L1_CORNER_M, prior=weaker * settings.prior)
     if settings.evenness > 0.0:
         # The frames of a trial are weighted by a power of the trial's tracking error. The weights
         # are scaled to mean 1, so that the prior keeps its meaning.
@@ -146,9 +168,8 @@ def _task(
 
     held = [part.targets for _, part in parts if len(part.targets)]
     within = IkOptions(limit_m2=settings.limit_m2)
-    return _RefinementTask(
-        problem, first, _HoldOut(model, np.concatenate(held), within) if held else None
-    )
+    holdout = _HoldOut(model, np.concatenate(held), within) if held else None
+    return _RefinementTask(problem, first, holdout, int(improved.sum()))
 
 
 class _HoldOut:
@@ -284,5 +305,5 @@ def _gauge(task: _RefinementTask, positions: Array, settings: RefinementSettings
     state = solve_frames(model, plain.targets, plain.weights, start=task.first.state).state
     names = np.repeat([m.name for m in model.markers], 3)[plain.free.ravel()]
     S = linearize(plain, positions, state).reduced()
-    prior = 0.0 if settings.method == "search" else settings.prior
+    prior = 0.0 if settings.method == "search" else task.problem.prior
     return gauge_of(S, len(state), names.tolist(), prior=prior)

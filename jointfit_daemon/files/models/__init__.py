@@ -7,6 +7,7 @@ from jointfit_daemon.files.models._chain_file import (
     write_model,
 )
 from jointfit_daemon.files.models._loaded_model import LoadedModel, load_model
+from jointfit_daemon.files.models._marker_weights import read_marker_weights
 from jointfit_daemon.files.models._osim import read_osim
 from jointfit_daemon.files.models._osim_tasks import IkSetup, read_ik_setup
 
@@ -17,6 +18,7 @@ __all__ = [
     "load_model",
     "model_of",
     "read_ik_setup",
+    "read_marker_weights",
     "read_model",
     "read_osim",
     "write_model",

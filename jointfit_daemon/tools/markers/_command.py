@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, cast, get_args
 
@@ -15,7 +16,12 @@ from jointfit_daemon.tools.text_output import check_choice, echo_json
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.marker_refinement import Refinement, RefinementSettings
+    from jointfit_daemon.calibration.marker_refinement import (
+        Refinement,
+        RefinementCost,
+        RefinementMethod,
+        RefinementSettings,
+    )
     from jointfit_daemon.kinematics.chains import ChainModel
     from jointfit_daemon.tools.markers._trials import ModelRequest
 
@@ -42,6 +48,16 @@ Method = Annotated[
 ]
 Prior = Annotated[
     float, typer.Option("--prior", min=0.0, help="Cost of displacement relative to tracking error.")
+]
+Cost = Annotated[
+    str,
+    typer.Option(
+        "--cost", help="l2: squared errors; l1: distances, less influence of large errors."
+    ),
+]
+Weights = Annotated[
+    Path | None,
+    typer.Option("--weights", help="Marker weights: .toml, or .xml of OpenSim's IK tool."),
 ]
 Evenness = Annotated[
     float,
@@ -86,6 +102,8 @@ def markers(
     validate: Validate = None,
     method: Method = "joint",
     prior: Prior = 0.05,
+    cost: Cost = "l2",
+    weights: Weights = None,
     evenness: Evenness = 0.0,
     holdout: Holdout = 0.0,
     frames: Frames = 150,
@@ -102,14 +120,13 @@ def markers(
     """
     from jointfit_daemon.calibration.marker_refinement import (
         RefinementError,
-        RefinementMethod,
         RefinementSettings,
         SearchSettings,
     )
     from jointfit_daemon.tools.markers._output import ENDINGS
     from jointfit_daemon.tools.markers._trials import ModelRequest
 
-    check_choice("--method", method, get_args(RefinementMethod))
+    chosen = _loss(method, cost)
     check_choice("--up", up, "xyz")
     if threshold > first_step:
         raise ValueError(f"--threshold is {threshold:g} mm, expected --first-step or less")
@@ -118,18 +135,29 @@ def markers(
     check_plot(plot)
 
     names = (tuple(lock or ()), tuple(unlock or ()), tuple(without or ()))
-    asked = ModelRequest(model, *names, up or None)
-    chosen = cast("RefinementMethod", method)
+    asked = ModelRequest(model, *names, up or None, weights)
     search = SearchSettings(1e-3 * first_step, 1e-3 * threshold)
     settings = RefinementSettings(
-        chosen, prior, frames=frames, evenness=evenness, holdout_share=holdout, search=search
+        chosen[0], prior, frames=frames, evenness=evenness, holdout_share=holdout, search=search
     )
+    settings = replace(settings, cost=chosen[1])
     try:
         chain, remarks, found = _refined(asked, (trials, validate or []), settings)
     except RefinementError as refused:
         typer.echo(f"jointfit markers: refused: {refused}", err=True)
         raise typer.Exit(EXIT_FAILED) from None
     _write_result(chain, remarks, found, out or (), plot, as_json=json)
+
+
+def _loss(method: str, cost: str) -> tuple[RefinementMethod, RefinementCost]:
+    """Return the checked method and cost."""
+    from jointfit_daemon.calibration.marker_refinement import RefinementCost, RefinementMethod
+
+    check_choice("--method", method, get_args(RefinementMethod))
+    check_choice("--cost", cost, get_args(RefinementCost))
+    if cost == "l1" and method == "search":
+        raise ValueError("--cost l1 is for --method joint or block: search has no loss function")
+    return cast("RefinementMethod", method), cast("RefinementCost", cost)
 
 
 def _refined(

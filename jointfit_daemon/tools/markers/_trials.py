@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 from jointfit_daemon.files.mocap import read_marker_trial
-from jointfit_daemon.files.models import load_model
+from jointfit_daemon.files.models import load_model, read_marker_weights
 from jointfit_daemon.tools.marker_model import motion_trial, require_marker
 
 if TYPE_CHECKING:
@@ -33,6 +33,7 @@ class ModelRequest:
     unlock: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     up: str | None = None
+    weights: Path | None = None
 
 
 def load(
@@ -53,12 +54,25 @@ def load(
         require_marker(chain, name, "--without")
     kept = tuple(m for m in chain.markers if m.name not in asked.without)
     chain = replace(chain, markers=kept)
+    if asked.weights is not None:
+        chain = _weighted(chain, asked.weights)
 
     learned = [motion_trial(p.stem, t, chain) for p, t in zip(trials, read, strict=True)]
     chain = _locked(chain, asked.unlock, hold=False)
     chain = _locked(chain, asked.lock, hold=True)
     judged = [motion_trial(p.stem, t, chain) for p, t in zip(validation, judges, strict=True)]
     return chain, loaded.remarks, learned, judged
+
+
+def _weighted(chain: ChainModel, path: Path) -> ChainModel:
+    """Return the chain with the weights of a file; other markers keep theirs."""
+    weights = read_marker_weights(path)
+    for name in weights:
+        require_marker(chain, name, f"--weights {path}:")
+    if not any(weights.get(m.name, m.weight) > 0.0 for m in chain.markers):
+        raise ValueError(f"--weights {path}: every weight is 0, expected some above 0")
+    markers = (replace(m, weight=weights.get(m.name, m.weight)) for m in chain.markers)
+    return replace(chain, markers=tuple(markers))
 
 
 def _locked(chain: ChainModel, texts: Iterable[str], *, hold: bool) -> ChainModel:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import pytest
@@ -12,7 +12,10 @@ from scipy.optimize import least_squares
 
 from jointfit_daemon.calibration.marker_refinement import (
     MotionTrial,
+    RefinementCost,
+    RefinementError,
     RefinementSettings,
+    _refine,
     refine_markers,
 )
 from jointfit_daemon.calibration.marker_refinement._objective import RefinementProblem
@@ -31,6 +34,7 @@ from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frame
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration.marker_refinement import RefinementMethod
+    from jointfit_daemon.kinematics.inverse_kinematics import IkResult
 
 LOCKED = (True, True, True)
 
@@ -197,3 +201,63 @@ def test_trials_are_thinned_evenly_and_split_in_two_runs_of_frames() -> None:
     first, last = trial.split(0.25)
     np.testing.assert_array_equal(np.concatenate((first.targets, last.targets)), trial.targets)
     assert len(last.targets) == 25
+
+
+@pytest.mark.parametrize("method", ["joint", "block"])
+def test_cost_l1_reduces_the_effect_of_a_marker_that_is_often_far_off(
+    method: RefinementMethod,
+) -> None:
+    y = seen(0.001)
+    y[:20, 8] += 0.02  # thigh3 is off by less than the limit of the squared cost
+    off: dict[RefinementCost, float] = {}
+    for cost in get_args(RefinementCost):
+        settings = RefinementSettings(method, prior=0.001, cost=cost)
+        found = refine_markers(limb(), [MotionTrial("walk", y, 100.0)], settings)
+        off[cost] = np.linalg.norm(found.model.positions - limb().positions, axis=-1).max()
+    assert off["l1"] < 0.3 * off["l2"]
+
+
+def test_cost_l1_is_refused_for_the_search() -> None:
+    settings = RefinementSettings("search", cost="l1")
+    with pytest.raises(RefinementError, match="method search"):
+        refine_markers(limb(), [MotionTrial("walk", seen(), 100.0)], settings)
+
+
+def test_a_marker_of_small_weight_has_little_influence() -> None:
+    y = seen()
+    y[:20, 8] += 0.015
+    trial = MotionTrial("walk", y, 100.0)
+    off = {}
+    for weight in (1.0, 0.01):
+        model = limb()
+        markers = list(model.markers)
+        markers[8] = replace(markers[8], weight=weight)
+        found = refine_markers(replace(model, markers=tuple(markers)), [trial])
+        others = np.delete(found.model.positions - model.positions, 8, axis=0)
+        off[weight] = np.abs(others).max()
+    assert off[0.01] < 0.1 * off[1.0]
+
+
+def test_frames_in_a_local_minimum_are_solved_again_and_reported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    calls = 0
+
+    def stuck(model: ChainModel, *args: Any, **options: Any) -> IkResult:
+        nonlocal calls
+        found = solve_frames(model, *args, **options)
+        calls += 1
+        if calls > 1:
+            return found
+        step = np.zeros((len(found.state), model.nq))
+        step[20:30, -1] = 2.5
+        state = apply_step(model, found.state, step)
+        return replace(found, state=state, residuals=marker_positions(model, state) - args[0])
+
+    trial = MotionTrial("walk", seen(0.001), 100.0)
+    right = refine_markers(misplaced(limb()), [trial])
+    assert right.notes == ()
+    monkeypatch.setattr(_refine, "solve_frames", stuck)
+    found = refine_markers(misplaced(limb()), [trial])
+    assert any("10 of 60 training frames" in note for note in found.notes)
+    assert found.model.positions == pytest.approx(right.model.positions, abs=1e-5)

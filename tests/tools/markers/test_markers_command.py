@@ -204,3 +204,46 @@ def test_a_plot_is_drawn(folder: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert (folder / "a.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_weights_of_a_file_exclude_and_include_markers(folder: Path) -> None:
+    file = folder / "weights.toml"
+    file.write_text("T1 = 0.0\nS1 = 2.0\n", "utf-8")
+    moved = {m["name"]: m["moved_m"] for m in answer(folder)["markers"]}
+    found = answer(folder, "--weights", str(file))
+    now = {m["name"]: m["moved_m"] for m in found["markers"]}
+    assert np.linalg.norm(moved["T1"]) > 1e-3
+    assert np.linalg.norm(now["T1"]) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("T9 = 1.0\n", ("--weights", "T9", "unknown marker")),
+        ("T1 = -1.0\n", ("weights.toml", "T1", "0 or more")),
+        ('T1 = "much"\n', ("weights.toml", "T1", "expected a number")),
+        ("T1 = \n", ("weights.toml",)),
+    ],
+)
+def test_bad_weights_are_an_error_with_the_file_and_the_marker(
+    folder: Path, text: str, words: tuple[str, ...]
+) -> None:
+    file = folder / "weights.toml"
+    file.write_text(text, "utf-8")
+    result = run(app, asked(folder, "--weights", str(file)))
+    assert result.exit_code == 2
+    shown = " ".join(result.stderr.split())
+    assert all(word in shown for word in words), shown
+
+
+def test_cost_is_an_option(folder: Path) -> None:
+    squares, distances = (answer(folder, "--cost", cost) for cost in ("l2", "l1"))
+    assert squares["costs"] != distances["costs"] or squares["markers"] != distances["markers"]
+    assert distances["trials"][0]["after"]["rms_m"] < distances["trials"][0]["before"]["rms_m"]
+    for options, word in (
+        (("--cost", "l3"), "l3"),
+        (("--cost", "l1", "--method", "search"), "joint or block"),
+    ):
+        result = run(app, asked(folder, *options))
+        assert result.exit_code == 2
+        assert word in result.stderr
