@@ -1,0 +1,125 @@
+"""Repeatability between operators: six place the markers of one subject with their own errors."""
+
+from __future__ import annotations
+
+from math import inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bench.experiments.markers.refinement import motion
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import SIMULATED_MARKERS
+from bench.subjects.adult_lower_limbs import FOLDER, oc4_lower
+from jointfit_daemon.calibration.marker_refinement import (
+    MotionTrial,
+    RefinementSettings,
+    refine_markers,
+)
+from jointfit_daemon.kinematics.chains import marker_positions, step_between
+from jointfit_daemon.kinematics.inverse_kinematics import solve_frames
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.kinematics.chains import ChainModel, ChainState
+
+OPERATORS = 6
+TEAMS = 5
+"""Groups of six operators."""
+PLACEMENT_M = 0.01
+"""Standard deviation of the place of a marker per axis."""
+NOISE_M = 0.001
+_EVERY = {"walking1": 2, "squats1": 20, "DJ1": 4}
+_TRAINED = ("walking1", "squats1")
+_UNSEEN = "DJ1"
+_MM = 1000.0
+
+
+def _movements(data: Path) -> dict[str, ChainState]:
+    """Return the true poses of the subject."""
+    model = oc4_lower(data)
+    return {
+        name: solve_frames(model, motion(data, name, step).targets).state
+        for name, step in _EVERY.items()
+    }
+
+
+def _angle_errors(fitted: ChainModel, truth: ChainState, y: Array) -> Array:
+    """Return the errors of all joint angles, rad, shape (T, joints)."""
+    return step_between(fitted, truth, solve_frames(fitted, y).state)[:, 6:]
+
+
+def spread_deg(errors: list[Array]) -> float:
+    """Return the standard deviation between operators, RMS over frames and angles, deg."""
+    return float(np.degrees(np.sqrt(np.var(errors, axis=0, ddof=1).mean())))
+
+
+def team(
+    model: ChainModel, truly: dict[str, ChainState], seed: int, settings: RefinementSettings
+) -> dict[str, tuple[float, float]]:
+    """Return figures of six operators before and after the refinement."""
+    rng = np.random.default_rng([61, seed])
+    errors: dict[str, tuple[list[Array], list[Array]]] = {name: ([], []) for name in truly}
+    tracking, places = [], []
+    for _ in range(OPERATORS):
+        off = rng.normal(0.0, PLACEMENT_M, model.positions.shape)
+        placed = model.with_markers(model.positions + off)
+        seen = {
+            name: marker_positions(placed, state)
+            + rng.normal(0.0, NOISE_M, (len(state), *model.positions.shape))
+            for name, state in truly.items()
+        }
+        trials = [MotionTrial(name, seen[name], 50.0) for name in _TRAINED]
+        unseen = [MotionTrial(_UNSEEN, seen[_UNSEEN], 50.0)]
+        found = refine_markers(model, trials, settings, unseen)
+
+        for name, state in truly.items():
+            for kept, fitted in zip(errors[name], (model, found.model), strict=True):
+                kept.append(_angle_errors(fitted, state, seen[name]))
+        tracking += [(t.before.rms, t.after.rms) for t in found.trials if not t.trained]
+        wrong = found.model.positions - placed.positions
+        places.append([np.sqrt((e**2).sum(axis=1).mean()) for e in (off, wrong)])
+
+    before, after = np.mean(places, axis=0)
+    old, new = np.mean(tracking, axis=0)
+    trained = [float(np.mean([spread_deg(errors[name][k]) for name in _TRAINED])) for k in (0, 1)]
+    later = [spread_deg(errors[_UNSEEN][k]) for k in (0, 1)]
+    return {
+        "marker position error": (_MM * float(before), _MM * float(after)),
+        "tracking error, unseen movement": (_MM * float(old), _MM * float(new)),
+        "joint angles between operators, trained movements": (trained[0], trained[1]),
+        "joint angles between operators, unseen movement": (later[0], later[1]),
+    }
+
+
+def repeatability(data: Path, teams: int = TEAMS) -> list[Result]:
+    """Measure the median over teams before and after, and the worst ratio."""
+    model, truly = oc4_lower(data), _movements(data)
+    settings = RefinementSettings()
+    found = [team(model, truly, seed, settings) for seed in range(teams)]
+    results = []
+    for name in found[0]:
+        pairs = np.array([figures[name] for figures in found])
+        unit = "deg" if "angles" in name else "mm"
+        before, after = np.median(pairs, axis=0)
+        worst = 100.0 * float((pairs[:, 1] / pairs[:, 0] - 1.0).max())
+        results += [
+            Result(f"{name}: before, median", float(before), inf, unit=unit),
+            Result(f"{name}: after, median", float(after), float(before), unit=unit),
+            Result(f"{name}: change, worst team", worst, 0.0, unit="%"),
+        ]
+    return results
+
+
+EXPERIMENTS = (
+    Experiment(
+        "marker-refinement-operators",
+        "Six operators place the markers of one subject, 10 mm an axis, five groups: repeatability",
+        repeatability,
+        SIMULATED_MARKERS,
+        recordings=(FOLDER,),
+        long=True,
+    ),
+)
