@@ -88,12 +88,12 @@ frames = st.builds(
 @given(st.lists(frames, max_size=3 * MOST_MESSAGES))
 def test_xcdi(wire: list[CanFrame]) -> None:
     chunks = [Chunk(frame.t_ns, pack_frames([frame])) for frame in wire]
-    through_clock(XcdiDecoder(XcdiIds(), "auto", "big"), chunks)
+    through_clock(XcdiDecoder(XcdiIds(), "auto", "big", 100.0), chunks)
 
 
 @given(st.lists(st.binary(max_size=60) | st.from_regex(rb"[tTrR][0-9A-F]{1,27}\r"), max_size=60))
 def test_slcan(wires: list[bytes]) -> None:
-    decoder, xcdi = SlcanCodec(115_200), XcdiDecoder(XcdiIds(), "auto", "big")
+    decoder, xcdi = SlcanCodec(115_200), XcdiDecoder(XcdiIds(), "auto", "big", 100.0)
     for number, data in enumerate(wires):
         found = decoder.feed(data, number * PERIOD_NS)
         xcdi.feed(Chunk(0, pack_frames(item for item in found if isinstance(item, CanFrame))))

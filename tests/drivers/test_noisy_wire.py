@@ -114,7 +114,7 @@ def xcdi_outcome(seed: int, share: float) -> NoisyRun:
         t_ns = (number + 1) * PERIOD_NS
         found = slcan.feed(lines(chance, number, share), t_ns)
         chunks.append(pack_frames(item for item in found if isinstance(item, CanFrame)))
-    return outcome(XcdiDecoder(XcdiIds(), "100us", "big"), chunks)
+    return outcome(XcdiDecoder(XcdiIds(), "100us", "big", 100.0), chunks)
 
 
 @pytest.mark.parametrize("share", [0.01, 0.1])

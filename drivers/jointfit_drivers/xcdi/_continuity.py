@@ -8,7 +8,8 @@ their widths, and P the measured step of SampleTime per group:
 | c = round(d / P) within 1 % and a few counts            | same clock; c - 1 groups were lost  |
 | no counter, d forward by a few P                        | same clock; round(d / P) - 1 lost   |
 | d or c backward, only one of them 0, or disagreement    | contradiction: the group is held    |
-| the next group continues the held one                   | restart, unless time continued      |
+| the next group continues the held one                   | restart, unless time continued, or  |
+|                                                         | advanced as the host's did          |
 | the next group continues the last accepted one          | the held one was corrupt            |
 | three contradictions that continue each other, or       | two sensors share the identifiers   |
 | 14 broken groups, within 20 groups                      |                                     |
@@ -34,6 +35,10 @@ _SLACK_COUNTS = 2
 _NEAR = 10
 """Counts that corruption of counter and time may appear to skip."""
 _SLACK_SHARE = 0.01
+_SILENT = 20
+"""Least silence, groups, over which SampleTime is compared with host time."""
+_RAN_ON_SHARE = 0.1
+"""Largest difference of SampleTime and host time over a silence, share of the silence."""
 _LONGEST = 20_000
 """Longest gap, groups; beyond, the tolerance would accept any pair."""
 _BLIND = 100
@@ -77,7 +82,14 @@ class XcdiContinuity:
         self._quiet = 0  # groups since a contradiction or a broken one
         self.shared = False
 
-    def group(self, ticks: int | None, counter: int | None, *, broken: bool) -> XcdiStep:
+    def group(
+        self,
+        ticks: int | None,
+        counter: int | None,
+        *,
+        broken: bool,
+        host_ticks: int | None = None,
+    ) -> XcdiStep:
         """Return the step for one group.
 
         Parameters
@@ -86,8 +98,10 @@ class XcdiContinuity:
             Its SampleTime and GroupCounter.
         broken : bool
             Whether it, or the group before it, was incomplete.
+        host_ticks : int, optional
+            Its arrival, in ticks of the device's unit; None while the unit is unknown.
         """
-        step, rivals = self._step(ticks, counter)
+        step, rivals = self._step(ticks, counter, host_ticks)
         self._contradictions.append(rivals)
         self._broken.append(broken)
         self._quiet = 0 if rivals or broken else self._quiet + 1
@@ -105,36 +119,39 @@ class XcdiContinuity:
             return XcdiStep(shared=True)
         return XcdiStep(restarted=True) if was_shared else step  # one sensor remains
 
-    def _step(self, ticks: int | None, counter: int | None) -> tuple[XcdiStep, bool]:
+    def _step(
+        self, ticks: int | None, counter: int | None, host: int | None
+    ) -> tuple[XcdiStep, bool]:
         """Return the step, and whether the group continues earlier contradictions."""
         if self._track.continues(ticks, counter):
             self._held, self._astray = None, 0
-            lost = self._track.take(ticks, counter)
+            lost = self._track.take(ticks, counter, host)
             return (XcdiStep(lost) if lost else _CONTINUES), False
 
         held, self._held = self._held, None
         if held is not None and held.continues(ticks, counter):
             self._astray = 0
             groups, settled = self._track.groups_to(held), self._track.settled
-            lost = held.take(ticks, counter) + (groups or 1) - 1
+            restarted = groups is None and settled and not self._track.ran_on_to(held)
+            lost = held.take(ticks, counter, host) + (groups or 1) - 1
             self._track, self._rival = held, None
-            return XcdiStep(lost, restarted=groups is None and settled, confirmed=True), False
+            return XcdiStep(lost, restarted=restarted, confirmed=True), False
 
         self._astray += 1
         rival = self._rival
         rivals = rival is not None and rival.continues(ticks, counter)
         if rival is None or not rivals:
             rival = self._rival = _Track(self._track.period)
-        rival.take(ticks, counter)
+        rival.take(ticks, counter, host)
 
         if self._astray >= _ASTRAY:
             self._astray = 0
             self._track = _Track()
-            self._track.take(ticks, counter)
+            self._track.take(ticks, counter, host)
             return XcdiStep(restarted=True), rivals
 
         self._held = _Track(self._track.period)
-        self._held.take(ticks, counter)
+        self._held.take(ticks, counter, host)
         return _HELD, rivals
 
 
@@ -152,6 +169,7 @@ class _Track:
         self.settled = period is not None
         """Whether the period was determined from enough steps."""
         self._ticks: int | None = None
+        self._host: int | None = None  # arrival of the last group with time, ticks
         self._counter: int | None = None
         self._groups = 0  # number of groups since the last one with time, according to the counter
         self._uncounted = 0  # groups received, or known to be lost, since the last counter
@@ -202,7 +220,21 @@ class _Track:
             return None
         return max(passed, 1) if count is None else 1
 
-    def take(self, ticks: int | None, counter: int | None) -> int:
+    def ran_on_to(self, later: _Track) -> bool:
+        """Return whether SampleTime advanced by the time between the arrivals.
+
+        The clock then ran on while the sensor was silent: the sensor did not restart, even if its
+        counter stood still.
+        """
+        if self._ticks is None or later._ticks is None or self.period is None:
+            return False
+        if self._host is None or later._host is None:
+            return False
+        advance, elapsed = (later._ticks - self._ticks) % TICKS_MODULUS, later._host - self._host
+        near = abs(advance - elapsed) <= _RAN_ON_SHARE * elapsed
+        return near and elapsed >= _SILENT * self.period
+
+    def take(self, ticks: int | None, counter: int | None, host: int | None) -> int:
         """Add a group that continues this track; return the groups lost before it."""
         count = self._count(counter)
         lost = 0 if count is None else max(count - 1 - self._uncounted, 0)
@@ -223,7 +255,7 @@ class _Track:
         else:
             self._counter, self._uncounted = counter, 0
         if ticks is not None:
-            self._ticks, self._groups = ticks, 0
+            self._ticks, self._groups, self._host = ticks, 0, host
             self._counted = counter is not None
         return lost
 

@@ -50,20 +50,23 @@ class XcdiDecoder:
         ``100us`` or ``1us``, or ``auto``: determined from the data.
     byte_order : ByteOrder
         Byte order of the payloads.
+    rate_hz : float
+        Configured sample rate, Hz.
     """
 
-    def __init__(self, ids: XcdiIds, unit: str, byte_order: ByteOrder) -> None:
+    def __init__(self, ids: XcdiIds, unit: str, byte_order: ByteOrder, rate_hz: float) -> None:
         self._xcdi = XcdiCodec(ids, byte_order)
         self._continuity = XcdiContinuity()
         self._held: XcdiGroup | None = None
         self._gate = OrientationGate()
-        self._unit = TickUnit()
+        self._unit = TickUnit(rate_hz)
         self._configured = TICK_NS.get(unit)
         self.tick_clock: TickClock | None = None
         """Unit of SampleTime; None until it is determined."""
         if self._configured is not None:
             self.tick_clock = TickClock(self._configured, TICKS_MODULUS)
-        self._measured = self._has_time = self._has_counter = False
+        self._measured_ns: int | None = None  # measured duration of a tick
+        self._has_time = self._has_counter = False
         self._incomplete = self._timed = self._reported_at_ns = 0
         self._refused = 0
         self.discarded_bytes = 0
@@ -113,7 +116,9 @@ class XcdiDecoder:
         broken = torn or self._xcdi.incomplete != self._incomplete
         self._incomplete = self._xcdi.incomplete
 
-        step = self._continuity.group(ticks, counter, broken=broken)
+        clock = self.tick_clock
+        host_ticks = None if clock is None else group.t_ns // clock.tick_ns
+        step = self._continuity.group(ticks, counter, broken=broken, host_ticks=host_ticks)
 
         held = self._held
         if held is not None and not step.confirmed:
@@ -162,14 +167,14 @@ class XcdiDecoder:
         if ticks is None:
             if self._xcdi.ungrouped == _TIMELESS and not self._timed:
                 out += self._once("warning", "timeless", _NO_TIME)
-        elif not self._measured:
-            self._measure(ticks, group.t_ns, out)
+        else:
+            self._measure(ticks, group, out)
         out.append(ImuSample(group.t_ns, q, native, ticks, group.counter, group.status))
 
-    def _measure(self, ticks: int, t_ns: int, out: list[Decoded]) -> None:
-        """Determine the unit of SampleTime, or check the configured one."""
+    def _measure(self, ticks: int, group: XcdiGroup, out: list[Decoded]) -> None:
+        """Determine or correct the unit of SampleTime, or check the configured one."""
         self._timed += 1
-        tick_ns = self._unit.feed(ticks, t_ns)
+        tick_ns = self._unit.feed(ticks, group.counter, group.t_ns)
 
         rate = self._unit.ticks_per_s
         if tick_ns is None:
@@ -179,16 +184,24 @@ class XcdiDecoder:
                 out += self._once("warning", "unit", text)
             return
 
-        self._measured = True
-        name = next(key for key, value in TICK_NS.items() if value == tick_ns)
-        if self._configured not in {None, tick_ns}:
-            text = f"SampleTime counts {rate:.4g} ticks a second: set `sample_time_unit` = {name!r}"
-            out += self._once("warning", "unit", text)
+        before, self._measured_ns = self._measured_ns, tick_ns
+        if before == tick_ns:
             return
+        name = next(key for key, value in TICK_NS.items() if value == tick_ns)
+        if self._configured is not None:
+            if self._configured != tick_ns:
+                counts = f"SampleTime counts {rate:.4g} ticks a second"
+                text = f"{counts}: set `sample_time_unit` = {name!r}"
+                out += self._once("warning", "unit", text)
+                return
+            self._reported_topics.discard("unit")
 
         self.tick_clock = TickClock(tick_ns, TICKS_MODULUS)
         data = {"sample_time_unit": name, "ticks_per_s": rate}
-        out.append(DeviceEvent("info", f"SampleTime counts in {name}", data))
+        text = f"SampleTime counts in {name}"
+        if before is not None:
+            text += ": corrected from arrivals; check `rate_hz`"
+        out.append(DeviceEvent("info", text, data))
 
     def _check_norm(self, out: list[Decoded]) -> None:
         norm = self._gate.misconfigured_norm

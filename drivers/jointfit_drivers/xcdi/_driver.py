@@ -104,7 +104,8 @@ class XcdiSettings(ImuSettings):
         description="29-bit identifiers even where the numbers would fit 11 bits",
     )
     sample_time_unit: Literal["auto", "100us", "1us"] = Field(
-        "auto", description="unit of SampleTime; auto decides from ten groups or more"
+        "auto",
+        description="unit of SampleTime; auto: from ticks per sample and rate_hz",
     )
     byte_order: Literal["big", "little"] = Field("big", description="byte order of the payloads")
 
@@ -153,7 +154,9 @@ class XcdiImu:
     def decoder(self) -> XcdiDecoder:
         """Return the decoder from chunks to samples, for live data and replay."""
         settings = self._settings
-        return XcdiDecoder(self._ids, settings.sample_time_unit, settings.byte_order)
+        return XcdiDecoder(
+            self._ids, settings.sample_time_unit, settings.byte_order, settings.rate_hz
+        )
 
     async def run(self, emit: Emit) -> None:
         """Read the bus until cancelled.

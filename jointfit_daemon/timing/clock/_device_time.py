@@ -31,6 +31,10 @@ _GAP = 1.5
 """Intervals above this multiple of the usual one are compared with the counter."""
 _SLACK = 3
 """Counts by which time and counter may disagree."""
+_SILENCE_LEAST_NS = 500_000_000
+"""Least silence over which device time is compared with host time, ns: a busy host delays less."""
+_SILENCE_SHARE = 0.1
+"""Largest difference of device time and host time over a silence, share of the silence."""
 _WRAP_SLACK = 8
 """Counts by which a wrap may differ from the elapsed time while the counter width is unknown."""
 _LATE = 0.65
@@ -55,11 +59,17 @@ _SILENCE_NS = 2 * NS
 """Silence after which samples without device time cannot be numbered, ns."""
 
 
+def _ran_on(step_ns: int, elapsed_ns: int) -> bool:
+    """Return whether device time advanced by the duration of a silence."""
+    near = abs(step_ns - elapsed_ns) <= _SILENCE_SHARE * elapsed_ns
+    return near and elapsed_ns >= _SILENCE_LEAST_NS
+
+
 class TickTime:
     """Reader of device timestamps, with wraps and a consistency check against a sample counter.
 
     A step forward shared by the counter is a gap in the same clock. A step not shared by the
-    counter is a restart.
+    counter is a restart, unless it equals the silence: the device stopped sending, not its clock.
     """
 
     __slots__ = ("_arrival_ns", "_backward", "_clock", "_counter", "_last", "_step", "_turn_ns")
@@ -105,7 +115,8 @@ class TickTime:
                 self._backward += 1
                 fell = self._backward >= BACKWARD_LIMIT or self.to_ns(last - ticks) > FALL_NS
                 return None if fell else self.to_ns(ticks)
-            if self._contradicted(ticks - last, counter):
+            ran_on = _ran_on(self.to_ns(ticks - last), elapsed)
+            if not ran_on and self._contradicted(ticks - last, counter):
                 return None
         self._last, self._arrival_ns, self._backward = ticks, arrival_ns, 0
         self._counter = counter

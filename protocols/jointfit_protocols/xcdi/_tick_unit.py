@@ -1,66 +1,118 @@
 """Unit of the SampleTime of an XCDI device, determined from the data.
 
 MT1604P gives microseconds, the vendor's current pages ticks of 100 us. The rate is thus near
-10^6 or 10^4 ticks per second. These are two decades apart, more than jitter or a wrong nominal
-rate explain.
+10^6 or 10^4 ticks per second. These are two decades apart, more than a wrong nominal rate explains.
 
-Invariant: pure arithmetic on ticks and arrival stamps.
+The first estimate uses no arrival time: ticks per sample, from SampleTime and GroupCounter, times
+the configured sample rate. Frames that were buffered while the host was busy arrive within
+microseconds of each other, so a rate measured over few arrivals can be wrong by any factor.
+Arrivals over spans of a second or more decide where the first estimate is near neither unit, and
+where two such spans in a row contradict it.
+
+Invariant: pure arithmetic on ticks, counters and arrival stamps.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from itertools import pairwise
 from math import log10
 from statistics import median
 
-from jointfit_protocols.xcdi._messages import TICKS_MODULUS
+from jointfit_protocols.xcdi._messages import COUNTER_MODULUS, TICKS_MODULUS
 
 TICK_NS = {"100us": 100_000, "1us": 1_000}
 """Duration of a tick, ns, by the name of the unit."""
 
 _STEPS = 10
 """Steps before the unit is determined."""
-_WINDOW = 200
-"""Stored groups: half a second at 400 Hz."""
 _NEAR = 0.5
 """Largest deviation from 10^4 or 10^6 ticks per second, decades."""
+_SPAN_NS = 1_000_000_000
+"""Least span of arrivals that measures the rate, ns."""
+_CONTRADICTIONS = 2
+"""Consecutive spans of arrivals that correct the unit."""
 _NS = 1_000_000_000
 
 
 class TickUnit:
-    """Determines the unit from groups, once at least ten steps agree.
+    """Determines the unit from groups, and corrects it if arrivals contradict it.
 
-    The rate is the median step of SampleTime divided by the median step of arrival. If this is near
-    neither rate (an adapter that delivers in blocks), the whole span is used instead.
+    Parameters
+    ----------
+    rate_hz : float
+        Configured sample rate, Hz.
     """
 
-    def __init__(self) -> None:
-        self._groups: deque[tuple[int, int]] = deque(maxlen=_WINDOW)
+    def __init__(self, rate_hz: float) -> None:
+        self._rate_hz = rate_hz
+        self._tick_ns: int | None = None
         self.ticks_per_s: float | None = None
         """Last measured rate, ticks/s; None before ten steps."""
+        self.restart()
 
     def restart(self) -> None:
-        """Discard the groups: the device restarted."""
-        self._groups.clear()
+        """Discard the groups, but not the unit: the device restarted."""
+        self._last: tuple[int, int | None] | None = None
+        self._steps: list[float] = []  # ticks per sample
+        self._since_ns: int | None = None
+        self._span_ticks = self._contradictions = 0
 
-    def feed(self, ticks: int, t_ns: int) -> int | None:
-        """Return the duration of a tick, ns (1 000 or 100 000), or None while undetermined."""
-        self._groups.append((ticks, t_ns))
-        if len(self._groups) <= _STEPS:
+    def feed(self, ticks: int, counter: int | None, t_ns: int) -> int | None:
+        """Add a group and return the duration of a tick.
+
+        Parameters
+        ----------
+        ticks : int
+            Its SampleTime.
+        counter : int, optional
+            Its GroupCounter.
+        t_ns : int
+            Its arrival, ns.
+
+        Returns
+        -------
+        int or None
+            1 000 or 100 000 ns; None while undetermined.
+        """
+        last, self._last = self._last, (ticks, counter)
+        if last is None or self._since_ns is None:
+            self._since_ns = t_ns
+            return self._tick_ns
+
+        step = (ticks - last[0]) % TICKS_MODULUS
+        self._span_ticks += step
+        if self._tick_ns is None:
+            known = counter is not None and last[1] is not None
+            samples = (counter - last[1]) % COUNTER_MODULUS if known else 1  # type: ignore[operator]
+            if samples and len(self._steps) < _STEPS:
+                self._steps.append(step / samples)
+                if len(self._steps) == _STEPS:
+                    self._tick_ns = self._nearest(median(self._steps) * self._rate_hz)
+
+        if t_ns - self._since_ns >= _SPAN_NS:
+            self._end_span(t_ns)
+        return self._tick_ns
+
+    def _end_span(self, t_ns: int) -> None:
+        """Compare the unit with the arrivals since the last call."""
+        elapsed_ns, ticks = t_ns - (self._since_ns or 0), self._span_ticks
+        self._since_ns, self._span_ticks = t_ns, 0
+
+        if len(self._steps) < _STEPS and self._tick_ns is None:
+            return
+        measured = self._nearest(ticks * _NS / elapsed_ns)
+        if measured is None or measured == self._tick_ns:
+            self._contradictions = 0
+            return
+        self._contradictions += 1
+        if self._contradictions >= _CONTRADICTIONS:
+            self._tick_ns, self._contradictions = measured, 0
+
+    def _nearest(self, ticks_per_s: float) -> int | None:
+        """Return the tick, ns, of the unit with nearly this rate."""
+        if ticks_per_s <= 0:
             return None
-
-        pairs = list(pairwise(self._groups))
-        tick_steps = [(b[0] - a[0]) % TICKS_MODULUS for a, b in pairs]
-        time_steps = [b[1] - a[1] for a, b in pairs]
-
-        for ticks_step, time_step in (
-            (median(tick_steps), median(time_steps)),
-            (sum(tick_steps), sum(time_steps)),
-        ):
-            if ticks_step > 0 and time_step > 0:
-                self.ticks_per_s = ticks_step * _NS / time_step
-                for tick_ns in TICK_NS.values():
-                    if abs(log10(self.ticks_per_s * tick_ns / _NS)) < _NEAR:
-                        return tick_ns
+        self.ticks_per_s = ticks_per_s
+        for tick_ns in TICK_NS.values():
+            if abs(log10(ticks_per_s * tick_ns / _NS)) < _NEAR:
+                return tick_ns
         return None

@@ -55,7 +55,7 @@ class FrameTape:
 
 
 def events(unit: str = "100us", ids: XcdiIds | None = None) -> XcdiDecoder:
-    return XcdiDecoder(ids or XcdiIds(), unit, "big")
+    return XcdiDecoder(ids or XcdiIds(), unit, "big", 100.0)
 
 
 def decoded(tape: FrameTape, decoder: XcdiDecoder | None = None) -> list[Any]:
@@ -117,6 +117,30 @@ def test_unit_of_the_sample_time_is_detected_and_reported(unit: str, tick_ns: in
     assert clocks[-1] == TickClock(tick_ns, 2**32)
     assert len(told) == 1
     assert told[0].data["sample_time_unit"] == unit
+
+
+def test_frames_buffered_while_the_process_stood_still_do_not_change_the_unit() -> None:
+    tape, decoder = FrameTape(), events("auto")
+    device = XcdiDevice(tape)
+    for number in range(300):  # the first 50 groups arrive together, 20 us apart
+        tape.t_ns = 10**9 + max(number * 10 * MS, 500 * MS + number * 20_000)
+        device.push(number * 10 * MS, IDENTITY)
+    (info,) = of_kind(decoded(tape, decoder), "info")
+    assert info.data["sample_time_unit"] == "100us"
+    assert decoder.tick_clock == TickClock(100_000, 2**32)
+
+
+@pytest.mark.parametrize("unit", ["auto", "100us"])
+def test_a_pause_with_a_running_clock_and_a_counter_that_stands_is_no_restart(unit: str) -> None:
+    tape, decoder = FrameTape(), events(unit)
+    device = XcdiDevice(tape)
+    tape.play(device, range(300))
+    counter = device.counter
+    tape.play(device, range(700, 800))  # 4 s of silence; the counter counts sent groups only
+    assert device.counter == counter + 100
+    found = decoded(tape, decoder)
+    assert not of_kind(found, "restart")
+    assert len(samples(found)) == 400
 
 
 def test_wrong_configured_unit_is_reported_and_used() -> None:
@@ -291,7 +315,9 @@ def test_a_wrong_byte_order_is_named_after_a_hundred_samples() -> None:
     device = XcdiDevice(tape)
     for number in range(150):
         device.push(number * 10 * MS, (0.5, -0.5, 0.1, 0.7))
-    found = XcdiDecoder(XcdiIds(), "100us", "little").feed(Chunk(0, pack_frames(tape.frames)))
+    found = XcdiDecoder(XcdiIds(), "100us", "little", 100.0).feed(
+        Chunk(0, pack_frames(tape.frames))
+    )
     assert not samples(found)
     told = [event for event in of_kind(found, "warning") if "byte_order" in event.text]
     assert len(told) == 1

@@ -259,6 +259,16 @@ def test_samples_that_stay_late_are_a_restart_after_two_seconds() -> None:
     assert (epochs[1150], epochs[1250], epochs[1999]) == (0, 1, 1)
 
 
+def test_a_pause_that_device_time_shares_but_the_counter_does_not_is_no_restart() -> None:
+    clock = DeviceClock(PERIOD)
+    for k in range(3000):
+        pause_us = 4_000_000 if k >= 2000 else 0
+        t_us = k * 10_000 + pause_us
+        clock.feed_sample(1000 + t_us, k, START + t_us * 1000, MICROSECONDS)
+    assert clock.epoch == 0
+    assert not clock.news
+
+
 def test_a_gap_shared_by_the_counter_is_no_restart() -> None:
     clock = DeviceClock(PERIOD)
     samples = [s for s in Device(8).samples(30, punctual) if not 900 < s[2] < 1400]
