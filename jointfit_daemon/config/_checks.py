@@ -43,9 +43,16 @@ def check_control_characters(value: object, key: str = "") -> Iterator[Fault]:
             yield from check_control_characters(inner, f"{key}.{name}" if key else str(name))
     elif isinstance(value, list):
         for at, inner in enumerate(value):
-            yield from check_control_characters(inner, f"{key}[{at}]")
+            place = imu_name(inner, at + 1) if key == "imu" and isinstance(inner, dict) else at
+            yield from check_control_characters(inner, f"{key}[{place}]")
     elif isinstance(value, str) and "\0" in value:
         yield Fault(key, "must not contain a NUL character", value)
+
+
+def imu_name(imu: Mapping[str, Any], number: int) -> str:
+    """Return the name of the `number`-th ``[[imu]]`` table in messages: its id if it is a text."""
+    name = imu.get("id")
+    return name.replace("\0", "") if isinstance(name, str) and name else f"#{number}"
 
 
 def check_topic_name(key: str, name: str) -> list[Fault]:
@@ -118,6 +125,14 @@ def _check_values_by_name(table: ChainTable) -> Iterator[Fault]:
             yield from check_known_name(key, name, inner, "joint between two segments")
 
 
+def check_durations(table: CalibrationTable) -> Iterator[Fault]:
+    """Check that the functional phase may last its shortest duration; wrong keys are None."""
+    longest, shortest = table.functional_s, table.functional_min_s
+    if None not in (longest, shortest) and longest < shortest:
+        text = f"is shorter than functional_min_s = {shortest:g}: lengthen it, or shorten that one"
+        yield Fault("calibration.functional_s", text, longest)
+
+
 def check_procedure(calibration: CalibrationTable, chain: ChainTable) -> Iterator[Fault]:
     """Check that method and segment axes are those of the patent, if its procedure is chosen."""
     if calibration.procedure != "patent":
@@ -165,8 +180,10 @@ def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -
     worn = [imu["segment"] for imu in imus if isinstance(imu.get("segment"), str)]
     for at, imu in enumerate(imus, 1):
         if isinstance(imu.get("segment"), str):
-            key = f"imu[{imu.get('id', f'#{at}')}].segment"
+            key = f"imu[{imu_name(imu, at)}].segment"
             yield from check_known_name(key, imu["segment"], table.segments, "segment")
+    if any(not isinstance(imu.get("segment"), str) for imu in imus):
+        return  # reported; it may be the segment without sensor
     for segment in table.segments:
         if segment not in worn:
             yield Fault("imu", f"segment {segment!r} has no sensor, expected at least one")

@@ -99,7 +99,8 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
             known = f"unknown key; known here: {', '.join(fields)}"
             return Fault(path, known, detail["input"], nearest_name(loc[-1], fields))
         case "missing":
-            return Fault(path, f"missing; {_described(fields, loc[-1])}")
+            about = _described(fields, loc[-1])
+            return Fault(path, f"missing; {about}" if about else "missing: expected a value")
         case "literal_error":
             choices = str(detail["ctx"]["expected"])
             words = choices.replace("'", "").replace(" or ", ", ").split(", ")

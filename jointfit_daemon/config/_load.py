@@ -17,7 +17,7 @@ from jointfit_daemon.config import _bandwidth, _checks
 from jointfit_daemon.config._bus_faults import complete_bus, likely_interface, unknown_interface
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._rig import MOCAP, Rig, Source
-from jointfit_daemon.config._syntax import read_table
+from jointfit_daemon.config._syntax import UNREADABLE, read_table
 from jointfit_daemon.config._tables import (
     CalibrationTable,
     ChainTable,
@@ -38,7 +38,7 @@ from jointfit_daemon.model import Chain
 from jointfit_daemon.nearest_name import nearest_name
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
     from jointfit_daemon.driver import Driver
@@ -94,8 +94,9 @@ def _rig_of(table: dict[str, Any], source: str, syntax: Sequence[Fault]) -> Rig:
     reader.faults += unusable
     rig = None if unusable else reader.rig()
     faults = [*syntax, *reader.faults]
-    if syntax:  # a key that seems to be missing may be on a line with a syntax error
-        faults = [*syntax, *(fault for fault in reader.faults if fault.has_value)]
+    if syntax:  # the lines with syntax errors are reported already
+        others = [each for each in reader.faults if UNREADABLE not in f"{each.key} {each.value!r}"]
+        faults = [*syntax, *others]
     if rig is None or faults:
         raise ConfigError(source, list({fault.text(): fault for fault in faults}.values()))
     return rig
@@ -210,6 +211,8 @@ class _RigReader:
         if chain is not None and calibration is not None:
             self.faults += _checks.check_procedure(calibration, chain)
         table = calibration or self.partial.get("calibration")
+        if table is not None:
+            self.faults += _checks.check_durations(table)
         if table is not None and (cameras is not None or "mocap" not in self.table):
             self.faults += _checks.check_center_methods(table, limb, cameras)
 
@@ -297,7 +300,7 @@ class _RigReader:
         self.faults += _checks.check_sensors(tables, chain)
         found = []
         for at, imu in enumerate(tables, 1):
-            key = f"imu[{imu.get('id', f'#{at}')}]"
+            key = f"imu[{_checks.imu_name(imu, at)}]"
             driver = self._driver(key, imu, ImuSettings)
             has_bus = driver is None or "can" in driver.Settings.model_fields
             table = self._with_bus(key, imu, buses) if has_bus else imu
@@ -306,10 +309,12 @@ class _RigReader:
                 found.append(_imu_source(imu["driver"], settings, driver))
 
             known = settings or self.partial.get(key)
-            if driver is not None and known is not None and known.id is not None:
+            if driver is not None and known is not None:
+                if known.id is None:
+                    known = known.model_copy(update={"id": _checks.imu_name(imu, at)})
                 source = _imu_source(imu["driver"], known, driver)
                 self.imus_read.append(source)
-                if imu.keys() <= driver.Settings.model_fields.keys() and _has_load(known):
+                if _has_load(known, imu.keys() - driver.Settings.model_fields.keys()):
                     self.imus_with_load.append(source)
         return found
 
@@ -381,12 +386,39 @@ class _RigReader:
         return Source(MOCAP, "mocap", table["driver"], rate, None, settings, driver)
 
 
-def _has_load(settings: BaseModel) -> bool:
-    """Return whether only required keys have faults: names, which do not change the load."""
-    return all(
-        getattr(settings, name) is not None or field.is_required() or field.default is None
-        for name, field in type(settings).model_fields.items()
-    )
+def _has_load(settings: Any, unknown: Iterable[str]) -> bool:
+    """Return whether the load of a sensor depends on none of its faulty keys.
+
+    Parameters
+    ----------
+    settings
+        Its table; faulty keys are None.
+    unknown
+        Keys that do not exist: each is probably a misspelling of the one that it resembles.
+    """
+    fields = type(settings).model_fields
+    faulty = {
+        name
+        for name, field in fields.items()
+        if getattr(settings, name) is None and (field.is_required() or field.default is not None)
+    }
+    faulty |= {near for name in unknown if (near := nearest_name(name, fields)) is not None}
+
+    # Reading a key that is absent raises AttributeError.
+    readable = settings.model_copy()
+    for name in faulty:
+        readable.__dict__.pop(name, None)
+    try:
+        for name in (
+            "rate_hz",
+            "serial_bits_per_s",
+            "can_frames",
+            *{"baud", "can"} & fields.keys(),
+        ):
+            getattr(readable, name)
+    except (AttributeError, TypeError):
+        return False
+    return True
 
 
 def _imu_source(name: str, settings: Any, driver: type[Driver]) -> Source:

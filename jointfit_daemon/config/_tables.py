@@ -244,4 +244,6 @@ class MqttSettings(Settings):
 class RecordingSettings(Settings):
     """``[recording]``: if present, the daemon records all its input events."""
 
-    directory: str = Field("recordings", description="folder, relative to $STATE_DIRECTORY")
+    directory: str = Field(
+        "recordings", min_length=1, description="folder, relative to $STATE_DIRECTORY"
+    )

@@ -100,6 +100,82 @@ def test_the_load_is_not_checked_while_a_key_that_changes_it_is_wrong(wrong: str
     assert len(complaints(RIG.replace('"/dev/ttyUSB0"', f'"/dev/a"\nbaud = 9600\n{wrong}'))) == 1
 
 
+@pytest.mark.parametrize("wrong", ["silence_s = -1", "lag_sd_ms = 0", "colour = 3"])
+def test_a_fault_that_does_not_change_the_load_does_not_hide_it(wrong: str) -> None:
+    slow = RIG.replace('"/dev/ttyUSB0"', f'"/dev/a"\nbaud = 9600\n{wrong}')
+    assert [line.split(" =")[0] for line in complaints(slow)] == [
+        f"imu[S1].{wrong.partition(' ')[0]}",
+        "imu[S1].baud",
+    ]
+    full = in_bus(RIG, 'channel = "can0"\nbitrate = 50000').replace(
+        'can = "can1"\n', f'can = "can1"\n{wrong}\n', 1
+    )
+    bus = [line for line in complaints(full) if line.startswith("can.can1.bitrate")]
+    assert bus[0].startswith("can.can1.bitrate = 50000: S3, S4 need"), bus
+
+
+def test_a_sensor_without_a_valid_id_is_named_by_its_place_everywhere() -> None:
+    text = RIG.replace('id = "S1"\n', "").replace('"/dev/ttyUSB0"', '"/dev/a"\nbaud = 9600')
+    assert [line.split(":")[0] for line in complaints(text)] == [
+        "imu[#1].id",
+        "imu[#1].baud = 9600",
+    ]
+    assert complaints(RIG.replace("/dev/ttyUSB0", "a\\u0000b"))[0].startswith("imu[S1].port = ")
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        (f"{RIG}[calibration]\nfunctional_s = 10\n",
+         "calibration.functional_s = 10.0: is shorter than functional_min_s = 45"),
+        (f'{RIG}[recording]\ndirectory = ""\n', "recording.directory = ''"),
+        (RIG.replace("[[imu]]", "origin_m = [0, 0]\n[[imu]]", 1),
+         "chain.origin_m[2]: missing: expected a value"),
+    ],
+)  # fmt: skip
+def test_values_that_cannot_work_together_are_one_fault(text: str, line: str) -> None:
+    (found,) = complaints(text)
+    assert found.startswith(line)
+    assert not found.endswith("; ")
+
+
+SEVERAL = RIG.replace("ids = {", "# ids = {").replace('"/dev/ttyUSB0"', '"/dev/a"\nbaud = 9600')
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ('name = "bench"', "name = bench"),
+        ('[rig]\n', '[rig\n'),
+        ('[[imu]]\nid = "S1"', '[[imu]\nid = "S1"'),
+        ('segments = ["thigh", "shank"]', 'segments = [\n  "thigh" "shank"\n]'),
+        ('id = "S1"', "id = S1"),
+        ('segment = "thigh"', 'segment = "thigh'),
+    ],
+)  # fmt: skip
+def test_a_syntax_error_adds_one_fault_and_hides_none(
+    tmp_path: Path, wrong: tuple[str, str]
+) -> None:
+    text = f'{SEVERAL}[mqtt]\npassword = "secret"\n'
+    expected = complaints(text)
+    assert any("id 0x5 on this bus" in line for line in expected)
+    assert wrong[0] in text
+    shown = check(tmp_path, text.replace(*wrong, 1), "--json")
+    faults = orjson.loads(shown.stdout)["faults"]
+    assert faults[0]["key"].startswith("line ")
+    assert [fault["key"].replace("#1", "S1") for fault in faults[1:]] == [
+        line.split(":")[0].split(" =")[0] for line in expected
+    ]
+
+
+def test_a_line_with_a_syntax_error_causes_no_fault_by_its_default(tmp_path: Path) -> None:
+    (ids,) = [line for line in RIG.splitlines() if line.startswith("ids")]
+    for wrong in (ids.removesuffix("}"), "bitrate 500000"):
+        text = RIG.replace(ids, wrong) if wrong.startswith("ids") else f"{RIG}{wrong}\n"
+        shown = orjson.loads(check(tmp_path, text, "--json").stdout)
+        assert len(shown["faults"]) == 1, shown
+
+
 def test_a_wrong_bit_rate_is_one_fault_and_its_bus_exists() -> None:
     found = complaints(in_bus(RIG, 'channel = "can 0"\nbitrate = 123'))
     assert [line.split(" =")[0] for line in found] == ["can.can1.channel", "can.can1.bitrate"]

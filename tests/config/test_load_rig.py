@@ -371,7 +371,7 @@ def test_syntax_errors_and_wrong_values_are_reported_together(
     with pytest.raises(ConfigError) as caught:
         load_rig(path)
     keys = [fault.key for fault in caught.value.faults]
-    assert keys == ["line 2", "line 9", "rig.output_rate_hz", "chain.side"]
+    assert keys == ["line 2", "line 9", "rig.output_rate_hz", "chain.side", "imu"]
 
 
 FIFTEEN_MISTAKES = """

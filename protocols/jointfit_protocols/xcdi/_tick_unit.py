@@ -81,8 +81,9 @@ class TickUnit:
         step = (ticks - last[0]) % TICKS_MODULUS
         self._span_ticks += step
         if self._tick_ns is None:
-            known = counter is not None and last[1] is not None
-            samples = (counter - last[1]) % COUNTER_MODULUS if known else 1  # type: ignore[operator]
+            before, samples = last[1], 1
+            if counter is not None and before is not None:
+                samples = (counter - before) % COUNTER_MODULUS
             if samples and len(self._steps) < _STEPS:
                 self._steps.append(step / samples)
                 if len(self._steps) == _STEPS:

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 
     from jointfit_simulators.body import RigChain
 
+_SHORTEST_S = 45.0
+"""Shortest functional phase, s, unless the longest is shorter: the default of the daemon."""
+
 
 @dataclass(frozen=True, slots=True)
 class RigOptions:
@@ -101,6 +104,7 @@ def rig_toml(
         f'procedure = "{options.procedure}"\n'
         f"align_s = {options.align_s:g}\nstatic_s = {options.static_s:g}\n"
         f"functional_s = {options.functional_s:g}\n"
+        f"functional_min_s = {min(options.functional_s, _SHORTEST_S):g}\n"
     )
     tables.append(_mqtt_table(options))
     return "\n".join(tables)
