@@ -1,0 +1,86 @@
+"""The daemon with a chain model: faulty markers are flagged, and another model is refused."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.system.station import Listener, Station, running, stopped
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.tools.child_processes import Simulator
+    from tests.broker_fixture import Broker
+
+pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(200)]
+
+
+async def test_lost_and_exchanged_markers_are_flagged_and_the_rest_is_tracked(
+    tmp_path: Path, broker: Broker
+) -> None:
+    station = Station(tmp_path, broker.port, ("--chain-model",))
+    async with running(station) as (simulator, daemon, listener):
+        assert listener.client is not None
+        await listener.client.subscribe("optical/chain")
+        await listener.until(lambda: "optical/chain" in listener.latest)
+        faulty, sound = await lose_and_exchange_markers(simulator, listener)
+        code, _ = await stopped(daemon)
+        assert code == 0, station.log
+
+    for payload in (faulty, sound):
+        assert payload["fit"]["accepted"]
+        assert 0.0 < payload["fit"]["rms_m"] < 0.02
+        coordinates = payload["coordinates"]
+        assert 0.5 < coordinates["pelvis_tz"]["value_m"] < 1.3
+        assert -80.0 < coordinates["shank_angle"]["value_deg"] < 25.0
+        assert 0.0 < coordinates["shank_angle"]["sd_deg"] < 10.0
+    assert faulty["error_m"]["F2"] is None
+    assert faulty["error_m"]["T1"] > 0.06
+
+
+async def lose_and_exchange_markers(
+    simulator: Simulator, listener: Listener
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Hide a marker and exchange two labels, then end both; return a payload of each state."""
+
+    def flags() -> list[str]:
+        found: list[str] = listener.latest["optical/chain"]["flags"]
+        return found
+
+    await simulator.say("play walk")
+    await simulator.say("hide F2")
+    await simulator.say("exchange T1 T3")
+    await listener.until(lambda: {"lost:F2", "exchanged:T1~T3"} <= set(flags()))
+    await listener.event("T1", "T1 and T3 look exchanged")
+
+    # the next frame is fitted without the two markers
+    excluded_us = listener.latest["optical/chain"]["t_us"]
+    await listener.until(lambda: listener.latest["optical/chain"]["t_us"] > excluded_us)
+    faulty = listener.latest["optical/chain"]
+
+    await simulator.say("show F2")
+    await simulator.say("exchange T1 T3")
+    await listener.until(lambda: not flags())
+    await listener.event("T1", "in use")
+    return faulty, listener.latest["optical/chain"]
+
+
+async def test_a_model_with_other_markers_stops_the_start_with_their_names(
+    tmp_path: Path, broker: Broker
+) -> None:
+    station = Station(tmp_path, broker.port, ("--chain-model",))
+    async with station.simulator():
+        pass
+    model = tmp_path / "leg.toml"
+    model.write_text(model.read_text().replace('name = "T2"', 'name = "X2"'))
+    words = ["-m", "jointfit_daemon", "--config", str(station.rig)]
+    daemon = await asyncio.create_subprocess_exec(
+        sys.executable, *words, stderr=asyncio.subprocess.PIPE
+    )
+    _, printed = await daemon.communicate()
+    assert daemon.returncode == 2
+    assert "chain.model: has markers that are not in mocap.markers: X2" in printed.decode()
