@@ -10,28 +10,28 @@ from pydantic import ValidationError
 from jointfit_daemon.driver import CanBusSettings, driver_names, find_driver
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Mapping
 
 _CLOSE = 0.8
 """Least similarity, 0 to 1, at which a misspelled interface is checked as the one it resembles."""
 
 
-def unknown_interface(interface: str, in_use: Iterable[str]) -> str | None:
-    """Return the reason why all drivers for CAN refuse `interface`; None if one accepts it.
+def unusable_interface(table: Mapping[str, Any], in_use: Iterable[str]) -> str | None:
+    """Return the reason why all drivers for CAN refuse the bus of `table`, or None.
 
     Drivers know the interfaces that can be opened. The drivers `in_use` are asked first, so that
     no other is imported for a valid bus. The others are for a bus that no sensor names.
     """
+    bus = CanBusSettings.model_construct(**{"channel": "can0", **table})
     reason = None
     for name in dict.fromkeys([*in_use, *driver_names()]):
         try:
             model = find_driver(name).Settings
+            if "can" not in model.model_fields:
+                continue
+            text = _refusal(model, bus)
         except Exception:  # noqa: BLE001, S112 - a broken plug-in is a fault of its users only
             continue
-        if "can" not in model.model_fields:
-            continue
-
-        text = _refusal(model, CanBusSettings(interface=interface, channel="can0"))
         if text is None:
             return None
         reason = reason or text

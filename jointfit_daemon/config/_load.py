@@ -14,7 +14,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from jointfit_daemon.calibration import CalibrationSettings
 from jointfit_daemon.config import _bandwidth, _checks
-from jointfit_daemon.config._bus_faults import complete_bus, likely_interface, unknown_interface
+from jointfit_daemon.config._bus_faults import complete_bus, likely_interface, unusable_interface
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._rig import MOCAP, Rig, Source
 from jointfit_daemon.config._syntax import UNREADABLE, read_table
@@ -279,7 +279,7 @@ class _RigReader:
         for at, name in enumerate(tables):
             key, table = f"can.{name}", tables[name]
             kind = table.get("interface") if isinstance(table, dict) else None
-            if isinstance(kind, str) and (text := unknown_interface(kind, in_use)) is not None:
+            if isinstance(kind, str) and (text := unusable_interface(table, in_use)) is not None:
                 self.faults.append(Fault(f"{key}.interface", text, kind))
                 table = table | {"interface": likely_interface(kind)}
 
@@ -366,7 +366,12 @@ class _RigReader:
     ) -> Any:
         """Validate with the model of the driver; without one, the keys common to all drivers."""
         if driver is not None:
-            return self._validate(key, table, driver.Settings)
+            try:
+                return self._validate(key, table, driver.Settings)
+            except Exception as error:  # noqa: BLE001 - a broken plug-in is a fault of the rig
+                text = f"its check of this table failed ({error!r}): report it to its author"
+                self.faults.append(Fault(f"{key}.driver", text))
+                return None
         if isinstance(table, dict):
             table = {name: value for name, value in table.items() if name in base.model_fields}
         return self._validate(key, table, base)
@@ -416,7 +421,7 @@ def _has_load(settings: Any, unknown: Iterable[str]) -> bool:
             *{"baud", "can"} & fields.keys(),
         ):
             getattr(readable, name)
-    except (AttributeError, TypeError):
+    except Exception:  # noqa: BLE001 - AttributeError, or what a plug-in raises on missing keys
         return False
     return True
 

@@ -168,6 +168,25 @@ def test_a_syntax_error_adds_one_fault_and_hides_none(
     ]
 
 
+@pytest.mark.parametrize(
+    ("keys", "line"),
+    [
+        ('interface = "vector"\nchannel = "0"', "can.can1.interface = 'vector': CAN interface"),
+        ('interface = "socketcand"\nchannel = "can0"', "can.can1.interface = 'socketcand'"),
+        ('interface = "udp_multicast"\nchannel = "can0"', "can.can1.interface = 'udp_multicast'"),
+    ],
+)
+def test_a_bus_that_cannot_be_opened_here_is_one_fault(keys: str, line: str) -> None:
+    (found,) = complaints(in_bus(RIG, keys))
+    assert found.startswith(line)
+
+
+def test_a_network_bus_with_its_keys_is_valid() -> None:
+    keys = 'interface = "socketcand"\nchannel = "can0"\nhost = "192.168.1.5"\nport = 29536'
+    parse_rig(tomllib.loads(in_bus(RIG, keys)))
+    parse_rig(tomllib.loads(in_bus(RIG, 'interface = "udp_multicast"\nchannel = "239.74.163.2"')))
+
+
 def test_a_line_with_a_syntax_error_causes_no_fault_by_its_default(tmp_path: Path) -> None:
     (ids,) = [line for line in RIG.splitlines() if line.startswith("ids")]
     for wrong in (ids.removesuffix("}"), "bitrate 500000"):

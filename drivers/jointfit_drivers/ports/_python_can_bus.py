@@ -11,11 +11,18 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
+import os
 import socket
 import struct
 import threading
 import time
 from contextlib import suppress
+from ctypes import CDLL
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from inspect import signature
+from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any
 
 import can
@@ -34,6 +41,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 # python-can logs each failed opening, once a second for an absent interface; it is raised here.
 logging.getLogger("can.interfaces.socketcan").setLevel(logging.CRITICAL)
+# The same for a bus whose opening failed half-way: `_opening_error` reports the cause.
+logging.getLogger("can.bus").setLevel(logging.ERROR)
 
 _BATCH = 64
 """Frames per wake-up, so that a flood on one bus does not delay the others."""
@@ -47,6 +56,13 @@ _DROPS_EVERY_NS = 250_000_000
 """Period, ns, between two readings of the kernel's drop counter."""
 _SO_RCVBUFFORCE, _SO_MEMINFO = 33, 55
 _MEMINFO = struct.Struct("9I")
+_WINDOWS = frozenset({"etas", "iscan", "ixxat", "nican", "nixnet", "systec", "usb2can", "vector"})
+"""Interfaces of python-can whose libraries exist for Windows only."""
+_PACKAGES = {"neovi": "ics", "cantact": "cantact", "canalystii": "canalystii", "gs_usb": "usb"}
+"""Python packages that python-can imports when a bus is opened, by interface."""
+_LIBRARIES = {"pcan": "libpcanbasic.so", "kvaser": "libcanlib.so", "neousys": "libwdt_dio.so"}
+"""Libraries of vendors that python-can loads when a bus is opened, by interface."""
+_INSTEAD = 'set interface = "socketcan", or "slcan" for a serial adapter'
 _DROPS = 8
 """Place of the drop counter in SO_MEMINFO."""
 
@@ -166,8 +182,8 @@ class PythonCanBus:
 
     def _make(self) -> can.BusABC:
         settings = self._settings
-        if settings.interface not in can.VALID_INTERFACES:
-            raise can.CanInterfaceNotImplementedError(settings.interface)
+        if (reason := unusable_bus(settings)) is not None:
+            raise can.CanInterfaceNotImplementedError(reason)
         keys: dict[str, Any] = settings.model_dump(exclude={"baud", "transport"})
         return can.Bus(**keys, ignore_config=True)
 
@@ -210,7 +226,7 @@ class PythonCanBus:
         """Return the error for a bus that cannot be opened, with its remedy."""
         channel, kind = self._settings.channel, self._settings.interface
         if isinstance(error, (NotImplementedError, ImportError)):
-            reason = unknown_kind(kind) or f"interface {kind!r} cannot be loaded: {error}"
+            reason = unusable_bus(self._settings) or _cannot_load(kind, error)
             return DeviceMisconfiguredError(f"{channel}: {reason}")
         if isinstance(error, (can.CanError, OSError)):
             return self._error_by_number(error)
@@ -245,7 +261,9 @@ class PythonCanBus:
                 f"{channel}: the interface is down: `ip link set {channel} up type can bitrate "
                 f"{self._settings.bitrate}`"
             )
-        return DeviceLostError(f"{channel} ({self._settings.interface}): {error}")
+        found = os.strerror(number) if isinstance(number, int) and number > 0 else str(error)
+        hint = ": plug it in, or correct `channel`" if number == errno.ENOENT else ""
+        return DeviceLostError(f"{channel} ({self._settings.interface}): {found}{hint}")
 
 
 def _socket(bus: can.BusABC) -> socket.socket:
@@ -262,11 +280,68 @@ def _require_interface(name: str) -> None:
         raise OSError(errno.ENODEV, "no such interface") from error
 
 
-def unknown_kind(kind: str) -> str | None:
-    """Return the reason why no bus of this kind can be opened here, or None."""
-    if kind == "slcan" or kind in can.VALID_INTERFACES:
+def unusable_bus(settings: CanBusSettings) -> str | None:
+    """Return the reason why this bus can never be opened on this machine, or None.
+
+    Opens no device. The module of the interface is imported, because only this shows whether the
+    library of its vendor is installed.
+    """
+    kind = settings.interface
+    if kind == "slcan":
         return None
-    return unknown_name("CAN interface", kind, sorted({*can.VALID_INTERFACES, "slcan"}))
+    if kind not in can.VALID_INTERFACES:
+        return unknown_name("CAN interface", kind, sorted({*can.VALID_INTERFACES, "slcan"}))
+    if kind in _WINDOWS:
+        return f"CAN interface {kind!r} exists on Windows only: {_INSTEAD}"
+
+    backend = _load_backend(kind)
+    return backend if isinstance(backend, str) else _wrong_keys(settings, backend)
+
+
+def _wrong_keys(settings: CanBusSettings, backend: type[can.BusABC]) -> str | None:
+    """Return the fault of keys that `backend` requires or cannot use."""
+    kind = settings.interface
+    given = {"channel", *(settings.model_extra or {})}
+    missing = [
+        name
+        for name, key in signature(backend).parameters.items()
+        if key.default is key.empty and key.kind is key.POSITIONAL_OR_KEYWORD and name not in given
+    ]
+    if missing:
+        return f"CAN interface {kind!r} needs {' and '.join(missing)}: add them to this table"
+    if kind == "udp_multicast" and not _is_multicast(settings.channel):
+        example = "239.74.163.2"
+        return f"CAN interface {kind!r} needs a multicast address as channel, such as {example!r}"
+    return None
+
+
+@cache
+def _load_backend(kind: str) -> type[can.BusABC] | str:
+    """Return python-can's class for an interface, or the reason why it cannot be loaded."""
+    module, name = can.interfaces.BACKENDS[kind]
+    try:
+        backend: type[can.BusABC] = getattr(import_module(module), name)
+        package = _PACKAGES.get(kind)
+        if package is not None and find_spec(package) is None:
+            return _cannot_load(kind, f"the Python package {package!r} is not installed")
+        if kind in _LIBRARIES:
+            CDLL(_LIBRARIES[kind])
+    except Exception as error:  # noqa: BLE001 - vendors' modules raise anything without the library
+        return _cannot_load(kind, error)
+    return backend
+
+
+def _cannot_load(kind: str, error: object) -> str:
+    return (
+        f"CAN interface {kind!r} cannot be used here ({error}): install its library, or {_INSTEAD}"
+    )
+
+
+def _is_multicast(address: str) -> bool:
+    try:
+        return ip_address(str(address)).is_multicast
+    except ValueError:
+        return False
 
 
 class _Pump:

@@ -22,7 +22,7 @@ from weakref import WeakKeyDictionary
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
-from jointfit_drivers.ports._python_can_bus import PythonCanBus, unknown_kind
+from jointfit_drivers.ports._python_can_bus import PythonCanBus, unusable_bus
 from jointfit_drivers.ports._slcan_bus import SlcanBus
 from jointfit_protocols.can import HOST_CORRUPT, CanFrame, pack_frames
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.driver import CanBusSettings, Emit
 
-__all__ = ["CanKey", "SharedBus", "shared_bus", "unknown_kind"]
+__all__ = ["CanKey", "SharedBus", "shared_bus", "unusable_bus"]
 
 CanKey = tuple[int, bool]
 """Identifier of a frame, and whether it has 29 bits."""
@@ -181,7 +181,7 @@ class SharedBus:
             other = self._routes.get(key)
             if other is not None:
                 raise DeviceMisconfiguredError(
-                    f"{name} ({self.channel}): CAN identifier {_hex(key)} ({carries}) is also "
+                    f"{self.channel}: CAN identifier {_hex(key)} ({carries}) is also "
                     f"that of {other.name} ({other.ids[key]}): give each sensor a block of its own "
                     "(over UART, Xsens MT Manager) and set `ids` of both"
                 )
@@ -225,12 +225,11 @@ class SharedBus:
         # its settings are correct, because all identifiers arrived before
         if subscriber.is_complete and not others:
             return (
-                f"{subscriber.name} ({self.channel}): silent for {subscriber.silence_s:g} s: "
-                "check its power and wiring"
+                f"{self.channel}: silent for {subscriber.silence_s:g} s: check its power and wiring"
             )
 
         found = [f"{ids[key]} ({_hex(key)})" for key in others]
-        text = f"{subscriber.name} ({self.channel}): no {what} ({_hex(needed)}) arrives"
+        text = f"{self.channel}: no {what} ({_hex(needed)}) arrives"
         if found:
             text += f", though {', '.join(found)} {'do' if len(found) > 1 else 'does'}"
 
@@ -241,10 +240,9 @@ class SharedBus:
             text += f"; identifiers on the bus that no sensor claims: {named}{more}"
 
         alike = [key for key in unclaimed if all(map(resembles, self._seen[key]))]
-        if alike:
-            return (
-                f"{text}; the data of {_hex(alike[0])} look like a {what}: set `ids.{what}` to it"
-            )
+        twin = (needed[0], not needed[1])
+        if twin in unclaimed or alike:
+            return f"{text}; {_advise_id(needed, twin if twin in unclaimed else alike[0], what)}"
 
         if found or unclaimed:
             return f"{text}: set `ids`, or switch this output on (over UART, Xsens MT Manager)"
@@ -315,6 +313,19 @@ class SharedBus:
             if not each.ended.done():
                 lost = isinstance(error, DeviceLostError)
                 each.ended.set_exception(DeviceLostError(str(error)) if lost else error)
+
+
+def _advise_id(needed: CanKey, arriving: CanKey, what: str) -> str:
+    """Return the change of the configuration that accepts the identifier `arriving`."""
+    number, extended = arriving
+    width = ""
+    if extended != needed[1]:
+        width = "set `extended_ids = true`" if extended else "remove `extended_ids`"
+    if number == needed[0]:
+        bits = 29 if extended else 11
+        return f"this number arrives as an identifier of {bits} bits: {width}"
+    and_width = f", and {width}" if width else ""
+    return f"the data of {_hex(arriving)} look like a {what}: set `ids.{what}` to it{and_width}"
 
 
 def _hex(key: CanKey) -> str:

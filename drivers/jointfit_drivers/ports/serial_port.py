@@ -169,7 +169,9 @@ class SerialPort:
         except TimeoutError as error:
             if not limit.expired():  # raised by emit: a bug, not silence
                 raise
-            raise DeviceLostError(f"{self.path}: silent for {silence_s:g} s") from error
+            raise DeviceLostError(
+                f"{self.path}: silent for {silence_s:g} s: check power and cable, and `baud`"
+            ) from error
         finally:
             loop.remove_reader(self._fd)
             if ended.done() and not ended.cancelled():

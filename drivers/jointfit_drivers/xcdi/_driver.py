@@ -13,7 +13,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings, ImuSettings, Settings, Wire
-from jointfit_drivers.ports.can_bus import shared_bus, unknown_kind
+from jointfit_drivers.ports.can_bus import shared_bus, unusable_bus
 from jointfit_drivers.xcdi._decoder import XcdiDecoder
 from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX, unpack_frames
 from jointfit_protocols.corrupt import CorruptBytes
@@ -124,8 +124,8 @@ class XcdiSettings(ImuSettings):
 
     @field_validator("can")
     @classmethod
-    def _bus_of_a_known_kind(cls, can: CanBusSettings) -> CanBusSettings:
-        if (fault := unknown_kind(can.interface)) is not None:
+    def _bus_that_exists_here(cls, can: CanBusSettings) -> CanBusSettings:
+        if (fault := unusable_bus(can)) is not None:
             raise ValueError(fault)
         return can
 

@@ -146,7 +146,7 @@ async def test_only_the_silent_sensor_is_lost_and_its_report_lists_received_iden
                 break
             await asyncio.sleep(0.01)
         told = await lost(silent)
-        assert "S4" in told
+        assert told.startswith(f"{bus.channel}: "), "the daemon prefixes the sensor"
         assert "no quaternion (0x221) arrives, while other sensors send" in told
         assert not heard.task.done()
         await heard.cancel()
@@ -164,6 +164,28 @@ async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> N
     assert "no quaternion (0x321) arrives" in told
     assert "that no sensor claims: 0x005, 0x006, 0x011, 0x021" in told
     assert "the data of 0x021 look like a quaternion: set `ids.quaternion` to it" in told
+
+
+@pytest.mark.parametrize("extended", [True, False])
+async def test_identifiers_of_another_width_are_no_reason_to_change_their_number(
+    tmp_path: Path, extended: bool
+) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x200, extended=not extended)))
+    ids = XcdiIdSettings(sample_time=0x205, group_counter=0x206, quaternion=0x221)
+    async with serving(device):
+        settings = XcdiSettings(
+            id="S3", segment="shank", driver="xcdi", can=bus, ids=ids, silence_s=0.5,
+            extended_ids=extended,
+        )  # fmt: skip
+        run = DriverRun(XcdiImu(settings))
+        await opened(adapter)
+        for number in range(10):
+            device.push(number * 10_000_000, IDENTITY)
+        told = await lost(run)
+    remedy = "11 bits: remove `extended_ids`" if extended else "29 bits: set `extended_ids = true`"
+    assert told.endswith(f"this number arrives as an identifier of {remedy}")
+    assert "set `ids" not in told
 
 
 async def test_missing_quaternion_is_reported_while_time_and_counter_arrive(
@@ -230,7 +252,7 @@ async def test_one_identifier_for_two_devices_names_both(tmp_path: Path) -> None
     async with serving(device):
         first = DriverRun(xcdi_driver("S3", bus))
         await opened(adapter)
-        with pytest.raises(DeviceMisconfiguredError, match=r"S4.*0x\d+.*S3.*block of its own"):
+        with pytest.raises(DeviceMisconfiguredError, match=r"0x\d+.*S3.*block of its own"):
             await DriverRun(xcdi_driver("S4", bus)).task
         device.push(0, IDENTITY)
         await first.wait_for(1)

@@ -90,10 +90,42 @@ async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
             pass
 
 
-async def test_a_missing_vendor_library_is_a_configuration_matter() -> None:
-    bus = CanBusSettings(interface="kvaser", channel="0")
-    with pytest.raises(DeviceMisconfiguredError, match="opened as kvaser"):
-        await xcdi_driver("S3", bus).run(lambda _: None)
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"interface": "vector"}, "exists on Windows only: set interface"),
+        ({"interface": "etas"}, "exists on Windows only"),
+        ({"interface": "kvaser"}, r"libcanlib.so.*install its library"),
+        ({"interface": "pcan"}, r"libpcanbasic.so.*install its library"),
+        ({"interface": "neovi"}, "package 'ics' is not installed"),
+        ({"interface": "socketcand"}, "needs host and port: add them"),
+        ({"interface": "udp_multicast", "channel": "can0"}, "multicast address as channel"),
+    ],
+)
+async def test_a_bus_that_cannot_exist_here_has_one_text_in_check_and_daemon(
+    table: dict[str, Any], words: str
+) -> None:
+    bus = CanBusSettings(**{"channel": "0"} | table)
+    with pytest.raises(ValidationError, match=words):
+        xcdi_driver("S3", bus)
+    with pytest.raises(DeviceMisconfiguredError, match=words):
+        async with shared_bus(bus):
+            pass
+
+
+def test_a_complete_network_bus_is_accepted() -> None:
+    more: dict[str, Any] = {"host": "192.168.1.5", "port": 29536}
+    xcdi_driver("S3", CanBusSettings(interface="socketcand", channel="can0", **more))
+    xcdi_driver("S3", CanBusSettings(interface="udp_multicast", channel="239.74.163.2"))
+
+
+async def test_an_absent_port_of_an_adapter_is_named_once() -> None:
+    with pytest.raises(DeviceLostError) as lost:
+        async with shared_bus(CanBusSettings(interface="robotell", channel="/dev/nowhere")):
+            pass
+    assert str(lost.value) == (
+        "/dev/nowhere (robotell): No such file or directory: plug it in, or correct `channel`"
+    )
 
 
 @pytest.mark.parametrize(
