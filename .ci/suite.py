@@ -50,8 +50,8 @@ def main(arguments: list[str]) -> int:
     # An idle worker takes tests from the others: there are few long ones.
     parallel = _run(parts[0], reports, ["-n", str(workers), "--dist", "worksteal", *arguments])
     disturbed: list[str] = []
-    if parallel == TESTS_FAILED and not experiments:
-        disturbed = _repeat_system_tests(reports)
+    if parallel == TESTS_FAILED:
+        disturbed = _repeat_system_tests(parts[0], reports)
         parallel = 0 if disturbed else parallel
     alone = _run(parts[1], reports, arguments or _files_of_tests_alone())
 
@@ -79,14 +79,14 @@ def _files_of_tests_alone() -> list[str]:
     return [str(path) for path in files if "mark.alone" in path.read_text(encoding="utf-8")]
 
 
-def _repeat_system_tests(reports: Path) -> list[str]:
+def _repeat_system_tests(part: str, reports: Path) -> list[str]:
     """Repeat the failed system tests alone; return their names if this cleared all failures."""
     selection = ["--last-failed", "--last-failed-no-failures=none", "-m", "system"]
-    if _run("parallel", reports, selection, report="repeated") != 0:
+    if _run(part, reports, selection, report="repeated") != 0:
         return []
     failed = {
         name
-        for name, case in _cases(reports / "parallel.xml")
+        for name, case in _cases(reports / f"{part}.xml")
         if {"failure", "error"} & {child.tag for child in case}
     }
     repeated = {name for name, _ in _cases(reports / "repeated.xml")}
