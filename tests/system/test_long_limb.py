@@ -36,6 +36,8 @@ SETTINGS = (
     "transition_s=0.5", "seed=5",
 )  # fmt: skip
 SETTLE_S = 0.7
+FUNCTIONAL_S = 14.0
+"""Time in which the simulated movement takes every joint through its range."""
 CHAIN = (
     ('joints = ["hip", "knee", "ankle"]', 'joints = ["hip", "knee", "ankle", "toe"]'),
     ('segments = ["thigh", "shank"]', 'segments = ["thigh", "shank", "foot"]'),
@@ -91,7 +93,7 @@ async def test_chain_of_three_segments_with_six_sensors_is_calibrated_tracked_an
         async with station.daemon(), listening(station.port) as listener:
             await listener.connected({*SENSORS, "mocap"})
             await record_phase(scene, listener, "stand", "static", 2.0)
-            status = await record_phase(scene, listener, "functional", "functional", 8.0)
+            status = await record_phase(scene, listener, "functional", "functional", FUNCTIONAL_S)
             assert status["phase"] == "calibrated", status
             donned = await errors_deg(scene, listener, tmp_path)
             complete = [pose for pose in listener.poses[-100:] if sensors_in(pose) == {*SENSORS}]
