@@ -57,3 +57,9 @@ LIVE_RIG = Material(
     "instants at which the simulator took the samples",
 )
 THIS_MACHINE = Material("the machine of the run", "CLOCK_MONOTONIC and CPU time of the process")
+RECORDED_LEGS = Material(
+    "1 adult (OpenCap subject 4), both legs; 8 virtual IMUs: orientations of clusters of skin "
+    "markers plus orientation errors of recorded filters, in eight deals",
+    "inverse kinematics of the subject's model without any marker of thighs and shanks, with the "
+    "markers of the model as fitted, and as placed from the static trial",
+)

@@ -6,14 +6,23 @@ quantities are relative to the static pose, so links stay valid after sensors ar
 There are two kinds of links. A pair consists of two sensors of one segment; its quantity is the
 rotation :math:`d = \log(q_a^* q_b)`. A joint consists of two sensors of neighboring segments; its
 quantity is the angle about the vertical between their flexion axes, which on a hinge is small and
-depends on posture. Both are linear in ten polynomials of the tilts of the two segments.
+depends on posture. Both are linear in ten polynomials :math:`\phi` of the tilts of the two
+segments, :math:`d = W\phi`. Within the range of the movement the standard deviation of a component
+is the residual :math:`\sigma_0` of the movement, beyond it
+
+.. math::
+
+    \sigma^2 = \sigma_0^2 + \lVert U \phi \rVert^2 + \lVert W (\phi - \phi_0) \rVert^2 / c
+
+with the covariance :math:`U^\mathsf{T} U` of the weights, the nearest posture :math:`\phi_0` within
+the range, for which d is computed, and the number c of components.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import atan2
-from operator import le, mul
+from math import atan2, sqrt
+from operator import le, mul, sub
 from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
@@ -25,8 +34,6 @@ LinkKind = Literal["pair", "joint"]
 
 LEAST_LEVEL = 0.5
 """Smallest squared horizontal part of a flexion axis for which its heading is defined."""
-STRAY = 0.15
-"""Share of its range by which a tilt may exceed the training range without loss of certainty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +57,9 @@ class SensorLink:
     total: float
     """RMS per component of the predicted quantity itself, rad: the residual without a known
     posture."""
+    uncertainty: tuple[tuple[float, ...], ...] = ()
+    """U, a factor of the covariance of the weights of a component, shape (10, 10), rad; empty
+    without training."""
 
     def expected(self, up_a: Vector, up_near: Vector | None) -> tuple[tuple[float, ...], float]:
         """Return the expected components in a posture and their standard deviation, rad.
@@ -61,19 +71,20 @@ class SensorLink:
         """
         if up_near is None:
             return (0.0,) * len(self.weights), self.total + self.spread
-        seen, stray = posture_one(up_a, up_near), 0.0
-        if not (all(map(le, self.low, seen)) and all(map(le, seen, self.high))):
-            seen, stray = self._kept(seen)
-        said = tuple([sum(map(mul, row, seen)) for row in self.weights])
-        return said, self.spread + min(1.0, 2.0 * stray) * self.total
+        posture = posture_one(up_a, up_near)
+        variance = self.spread * self.spread
 
-    def _kept(self, posture: tuple[float, ...]) -> tuple[tuple[float, ...], float]:
-        """Return a posture limited to the training range, and its largest excess."""
-        kept, stray = [], 0.0
-        for value, low, high in zip(posture, self.low, self.high, strict=True):
-            kept.append(low if value < low else min(value, high))
-            stray = max(stray, abs(value - kept[-1]) - STRAY * (high - low))
-        return tuple(kept), stray
+        # The quantity is not extrapolated; what the weights would add is counted as uncertain.
+        kept = posture
+        if not (all(map(le, self.low, posture)) and all(map(le, posture, self.high))):
+            kept = tuple(map(min, map(max, posture, self.low), self.high))
+            beyond = tuple(map(sub, posture, kept))
+            for row in self.weights:
+                variance += sum(map(mul, row, beyond)) ** 2 / len(self.weights)
+            for row in self.uncertainty:
+                variance += sum(map(mul, row, posture)) ** 2
+        expected = tuple([sum(map(mul, row, kept)) for row in self.weights])
+        return expected, sqrt(variance)
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> SensorLink:
@@ -88,6 +99,7 @@ class SensorLink:
             high=tuple(data["high"]),
             spread=float(data["spread"]),
             total=float(data["total"]),
+            uncertainty=tuple(tuple(row) for row in data["uncertainty"]),
         )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from bench.baselines import fusion_methods
 from bench.experiments.fusion.recorded_movements import DEFAULT, NAMES
 from bench.framework.experiment import Experiment, Result
-from bench.framework.material import Material
+from bench.framework.material import RECORDED_LEGS
 from bench.subjects.recorded_knee import Judge, training_frames
 from bench.subjects.recorded_legs import (
     DEALS,
@@ -38,12 +38,6 @@ if TYPE_CHECKING:
 
 MARGIN_DEG = 0.1
 RIVALS = ("single", "mean", "markley", "patent6", "patent12")
-MATERIAL = Material(
-    "1 adult (OpenCap subject 4), both legs; 8 virtual IMUs: orientations of clusters of skin "
-    "markers plus orientation errors of recorded filters, in eight deals",
-    "inverse kinematics of the subject's model without any marker of thighs and shanks, with the "
-    "markers of the model as fitted, and as placed from the static trial",
-)
 
 
 def guided(trials: Trials) -> list[tuple[list[KneeTrial], Trials]]:
@@ -115,7 +109,7 @@ def _experiment(
         name,
         title,
         partial(columns, training=training),
-        MATERIAL,
+        RECORDED_LEGS,
         (FOLDER,),
         long=True,
         known_misses=dict.fromkeys(misses, reason),

@@ -1,4 +1,21 @@
-"""Fit of the links between the sensors of a limb."""
+r"""Fit of the links between the sensors of a limb.
+
+The weights of the polynomials :math:`\phi` are a ridge regression on a movement. Their covariance
+is
+
+.. math::
+
+    C = \Bigl(\frac{m}{\sigma_0^2} \overline{\phi\phi^\mathsf{T}} + \tau^{-2} S^2 \Bigr)^{-1}
+
+with the RMS residual :math:`\sigma_0` on held-out blocks, the RMS :math:`\tau` of the quantity as
+the standard deviation of a weight before the movement, and the RMS :math:`S` of the polynomials
+(C. M. Bishop, Pattern Recognition and Machine Learning, 2006, section 3.3). The residuals of
+neighboring frames are alike, so the n frames count as
+
+.. math:: m = n \Big/ \Bigl(1 + 2 \sum_{k=1}^{K} \rho_k\Bigr)
+
+with the autocorrelation :math:`\rho` of the residuals up to its first zero crossing.
+"""
 
 from __future__ import annotations
 
@@ -106,7 +123,9 @@ def _fit(
         rest[held] = False
         residuals.append(wanted[held] - shown[held] @ _ridge(shown[rest], wanted[rest]))
 
-    spread = float(np.sqrt(np.mean(np.concatenate(residuals) ** 2)))
+    residual = np.concatenate(residuals)
+    spread = float(max(np.sqrt(np.mean(residual**2)), LEAST_SPREAD))
+    total = float(np.sqrt(np.mean(wanted**2)))
     return SensorLink(
         a=a,
         b=b,
@@ -115,9 +134,57 @@ def _fit(
         weights=tuple(tuple(row) for row in _ridge(shown, wanted).T.tolist()),
         low=tuple(shown.min(axis=0).tolist()),
         high=tuple(shown.max(axis=0).tolist()),
-        spread=float(max(spread, LEAST_SPREAD)),
-        total=float(np.sqrt(np.mean(wanted**2))),
+        spread=spread,
+        total=total,
+        uncertainty=_uncertainty(shown, residual, spread, total),
     )
+
+
+def _uncertainty(
+    shown: Array, residual: Array, spread: float, total: float
+) -> tuple[tuple[float, ...], ...]:
+    """Return U with C = U^T U, shape (10, 10), rad."""
+    scale = np.sqrt(np.mean(shown**2, axis=0)) + 1e-6
+    g = shown / scale
+    frames = independent_frames(residual, g)
+    information = frames / spread**2 * (g.T @ g) / len(g)
+    information += np.eye(g.shape[1]) / max(total, LEAST_SPREAD) ** 2
+
+    # information = L L^T, so U = L^-1 for the scaled polynomials.
+    factor = np.linalg.inv(np.linalg.cholesky(information)) / scale
+    return tuple(tuple(row) for row in factor.tolist())
+
+
+def independent_frames(residual: Array, regressors: Array) -> float:
+    """Return the number of independent frames in a regression with correlated residuals.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (n, components)
+        Residuals at constant intervals, in order of time.
+    regressors : ndarray, shape (n, weights)
+        Values of the regressors, on one scale.
+
+    Returns
+    -------
+    float
+        From 1 to n.
+    """
+    n = len(residual)
+    correlation = _autocorrelation(residual)
+    crossing = int(np.argmax(correlation < 0.0)) or n
+    alike = float(correlation[:crossing] @ _autocorrelation(regressors)[:crossing])
+    return n / max(2.0 * alike - 1.0, 1.0)
+
+
+def _autocorrelation(values: Array) -> Array:
+    """Return the autocorrelation about zero, summed over the columns, shape (n,)."""
+    n = len(values)
+    spectrum = np.fft.rfft(values, 2 * n, axis=0)  # padded: no wrap-around
+    products: Array = np.fft.irfft((spectrum * spectrum.conj()).real.sum(axis=1))[:n]
+    if products[0] <= 0.0:
+        return np.ones(n)  # a perfect fit is no evidence of independence
+    return np.asarray(products / products[0])
 
 
 def _ridge(shown: Array, wanted: Array) -> Array:

@@ -165,7 +165,16 @@ def test_a_name_that_leaves_the_directory_is_refused(tmp_path: Path, name: str) 
 def stored_table(folder: Path) -> dict[str, Any]:
     """Return the file of a taught limb as the store writes it, parsed."""
     link = SensorLink(
-        "S1", "S2", "pair", ("S3",), ((0.0,) * 10,) * 3, (-1.0,) * 10, (1.0,) * 10, 0.01, 0.1
+        "S1",
+        "S2",
+        "pair",
+        ("S3",),
+        ((0.0,) * 10,) * 3,
+        (-1.0,) * 10,
+        (1.0,) * 10,
+        0.01,
+        0.1,
+        ((0.02,) * 10,) * 10,
     )
     calibration = replace(
         calibrated_subject.calibration(), links=(link,), correlations={"knee": 0.5}
