@@ -90,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="the short form, where there is one")
     parser.add_argument("--list", action="store_true", help="print IDs, topics and titles")
     parser.add_argument("--json", type=Path, metavar="FILE", help="also write the results to FILE")
-    parser.add_argument("--dry-run", action="store_true", help="leave results and pages unchanged")
+    parser.add_argument("--dry-run", action="store_true", help="run, but store no results or pages")
     parser.add_argument("--single-thread", action="store_true", help=argparse.SUPPRESS)
     return parser
 

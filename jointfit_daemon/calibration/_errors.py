@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.nearest_name import did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Collection, Iterable, Sequence
 
 
 class CalibrationError(Exception):
@@ -24,9 +24,14 @@ class CalibrationError(Exception):
         self.reasons: tuple[str, ...] = reasons
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> str:
-    """Return the message for a name that the stream does not have, with the nearest spelling."""
+def unknown_name(kind: str, name: str, known: Iterable[str], taken: Collection[str] = ()) -> str:
+    """Return the message for a name that the stream does not have, with the nearest spelling.
+
+    The spelling is none of `taken`, the names that the rig uses already.
+    """
     choices: Sequence[str] = sorted(known)
     listed = f"it has: {', '.join(choices) or 'none'}"
-    hint = " ".join(filter(None, (did_you_mean(name, choices), listed)))
+    hint = " ".join(
+        filter(None, (did_you_mean(name, (each for each in choices if each not in taken)), listed))
+    )
     return f"{kind} {name!r} is not in the stream; {hint}"

@@ -71,6 +71,8 @@ class LimbFuser:
     ) -> None:
         self._chain, self._drifting = chain, drifting
         self.sensor_monitor = sensor_monitor or SensorMonitor(chain)
+        self.worn = True
+        """Whether the sensors are on the body; on the plate they are not compared."""
         usable = calibration is not None and calibration.fits(chain)
         self._uncorrected = calibration is not None and calibration.procedure == "patent"
         """Whether the sensors are used as they are, also with faults."""
@@ -246,7 +248,7 @@ class LimbFuser:
         spread: tuple[float, ...] = ()
         flags: tuple[str, ...] = ()
         measured = inputs
-        if self.consistency is not None:
+        if self.consistency is not None and self.worn:
             inputs = self.consistency.correct_headings(inputs)
             spread, slipped, flags = self.consistency.update(t_ns, inputs)
             inputs = self.consistency.correct_pairs(inputs)

@@ -18,6 +18,7 @@ from jointfit_daemon.pipeline._notice_limiter import NoticeLimiter, unix_step_no
 from jointfit_daemon.pipeline._optical_comparison import OpticalComparison
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
 from jointfit_daemon.pipeline.events import (
+    CalibrationPhase,
     CalibrationStored,
     ChunkArrived,
     Configured,
@@ -366,6 +367,7 @@ class Core:
         self._empty += not frame.orientations
         mocap = self._mocap.is_fresh(self._now_ns)
 
+        self._fuser.worn = self._session.phase != CalibrationPhase.ALIGN
         state = self._fuser.fuse(
             frame.t_ns,
             frame.completed_ns,

@@ -15,10 +15,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.calibration.record import CalibrationFileError, CalibrationStore
 from jointfit_daemon.pipeline.events import CalibrationStored
-from jointfit_daemon.supervisor.state_directory import state_directory
+from jointfit_daemon.supervisor.state_directory import (
+    WRITE_REMEDY,
+    describe_write_error,
+    state_directory,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration
@@ -42,6 +47,11 @@ class LoadedCalibration(NamedTuple):
 def store_of(rig: Rig) -> CalibrationStore:
     """Return the calibration store of the rig."""
     return CalibrationStore(state_directory() / "calibrations", rig.calibration_store)
+
+
+def store_directory(rig: Rig) -> Path:
+    """Return the folder of the calibration store of the rig."""
+    return state_directory() / "calibrations" / rig.calibration_store
 
 
 def load_latest(rig: Rig) -> LoadedCalibration:
@@ -142,9 +152,12 @@ class CalibrationWriter:
             try:
                 version = await asyncio.to_thread(save, rig, calibration)
             except OSError as error:
-                if (fault := str(error)) != self.fault:
+                if (fault := describe_write_error(error, store_directory(rig))) != self.fault:
                     self.fault = fault
-                    self._report(f"in force but not stored: {fault}; retrying every {RETRY_S:g} s")
+                    self._report(
+                        f"in force but not stored: {fault}. It would be lost at a restart: "
+                        f"{WRITE_REMEDY}; retrying every {RETRY_S:g} s"
+                    )
                 if self._next_try is None:
                     loop = asyncio.get_running_loop()
                     self._next_try = loop.call_later(RETRY_S, self.retry)

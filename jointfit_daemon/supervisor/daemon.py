@@ -49,6 +49,7 @@ from jointfit_daemon.pipeline.events import (
 from jointfit_daemon.supervisor._calibration_store import (
     CalibrationWriter,
     calibration_age_s,
+    store_directory,
     store_of,
 )
 from jointfit_daemon.supervisor._core_runner import CoreRunner
@@ -60,7 +61,11 @@ from jointfit_daemon.supervisor._status_line import FrameRateCounter, status_lin
 from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
 from jointfit_daemon.supervisor.process_exit import exit_within
 from jointfit_daemon.supervisor.requests import RequestAuthenticator, parse_request
-from jointfit_daemon.supervisor.state_directory import state_directory, write_fault
+from jointfit_daemon.supervisor.state_directory import (
+    WRITE_REMEDY,
+    state_directory,
+    write_fault,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -214,15 +219,14 @@ class Daemon:
 
     async def _check_state(self) -> None:
         """Report a state directory without write access before a calibration needs it."""
-        folder = state_directory() / "calibrations"
+        folder = store_directory(self._rig)
         before, fault = self._state_fault, await asyncio.to_thread(write_fault, folder)
         self._state_fault = fault
         if fault is not None:
             self._report(
                 NoticeKind.STATE,
                 f"state directory cannot be written: {fault}. A calibration will be used and "
-                "published, but lost at a restart: check mount, permissions and free space, or "
-                "set STATE_DIRECTORY",
+                f"published, but lost at a restart: {WRITE_REMEDY}",
                 NoticeLevel.ERROR,
             )
         elif before is not None:

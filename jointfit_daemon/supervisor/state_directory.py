@@ -22,6 +22,8 @@ PRIVATE_UMASK = 0o077
 _DIRECTORY_MODE, _FILE_MODE = 0o700, 0o600
 _OWNED = ("calibrations", "recordings")
 """Folders written by the daemon; others in the state directory may belong to other programs."""
+WRITE_REMEDY = "check mount, permissions and free space, or set STATE_DIRECTORY"
+"""Remedy for a directory that cannot be written."""
 _PROBE_BYTES = bytes(4096)
 """Content of the probe file: a full disk accepts an empty file."""
 _HELD = (errno.EWOULDBLOCK, errno.EACCES)
@@ -107,5 +109,10 @@ def write_fault(directory: Path) -> str | None:
         finally:
             probe.unlink(missing_ok=True)
     except OSError as error:
-        return f"{directory.absolute()}: {error.strerror or error}"
+        return describe_write_error(error, directory)
     return None
+
+
+def describe_write_error(error: OSError, directory: Path) -> str:
+    """Return the directory and the reason for which it cannot be written."""
+    return f"{directory.absolute()}: {error.strerror or error}"

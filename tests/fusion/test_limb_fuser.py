@@ -338,3 +338,17 @@ def test_frame_of_four_sensors_takes_less_than_2_ms(
         took.append(time.perf_counter_ns() - began)
     assert np.median(took) < 2e6  # generous; the goal is 0.3 ms and bench/ measures it
     print(f"median {np.median(took) / 1000:.0f} us per frame")
+
+
+@pytest.mark.parametrize("worn", [True, False])
+def test_sensors_on_the_plate_are_not_compared(calibration: Calibration, worn: bool) -> None:
+    fuser = LimbFuser(CHAIN, calibration)
+    fuser.worn = worn
+    flags: set[str] = set()
+    for k in range(1500):  # one common movement of all sensors, which no limb performs
+        angles = np.array([0.8 * np.sin(k / 40), 0.7 * np.sin(k / 55), k / 200])
+        q = as_quaternion(Rotation.from_rotvec(angles).as_quat(scalar_first=True))
+        flags |= set(fuser.fuse(k * STEP, k * STEP, k, dict.fromkeys(OWNER, q)).flags)
+    faults = [f for f in flags if f.startswith(("slipped:", "pair_disagrees:", "heading_"))]
+    assert bool(faults) == worn
+    assert worn or not fuser.pop_reports(1500 * STEP)

@@ -146,6 +146,25 @@ async def test_a_reload_while_a_calibration_is_written_finds_it(
     assert configured[-1].calibration_version == 1
 
 
+async def test_an_unwritable_store_is_reported_at_the_start_like_the_state_directory(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
+    store = tmp_path / "calibrations" / rig.calibration_store
+    store.parent.mkdir()
+    store.write_text("")  # a file in the place of the folder
+    running = asyncio.create_task(
+        Daemon(tmp_path / "rig.toml", rig, ReadyCore(calibration_of(rig, "new"))).run()
+    )
+    async with asyncio.timeout(20):
+        while "state directory cannot be written" not in caplog.text:
+            await asyncio.sleep(0.01)
+    assert f"{store}: " in caplog.text
+    assert "check mount, permissions and free space" in caplog.text
+    running.cancel()
+    await asyncio.wait([running])
+
+
 async def test_an_unwritable_state_is_reported_at_the_start_and_the_result_stored_later(
     rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -159,7 +178,7 @@ async def test_an_unwritable_state_is_reported_at_the_start_and_the_result_store
     async with asyncio.timeout(20):
         while "state directory cannot be written" not in caplog.text:
             await asyncio.sleep(0.01)
-        assert f"{blocked}/state/calibrations: Not a directory" in caplog.text
+        assert f"{blocked}/state/calibrations/{rig.calibration_store}: Not a dir" in caplog.text
 
         daemon._core.feed(Request(1, "calibrate", "t", {}))
         while daemon._calibrations.fault is None:
@@ -247,9 +266,9 @@ async def test_failed_write_is_retried(rig: Rig, monkeypatch: pytest.MonkeyPatch
         runner.start(rig, calibration_of(rig, "new"))
         while not events:
             await asyncio.sleep(0.01)
-    assert [complaint.split(": ")[1] for complaint in complaints] == [
-        "disk full; retrying every 0.05 s", "gone; retrying every 0.05 s",
-    ]  # fmt: skip
+    reasons = [text.split(": ")[2].partition(".")[0] for text in complaints]
+    assert reasons == ["disk full", "gone"]
+    assert all(text.endswith("; retrying every 0.05 s") for text in complaints)
     found = runner.load(rig)
     assert (found.version, found.warnings) == (1, ())
 

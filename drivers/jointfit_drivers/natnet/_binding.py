@@ -209,6 +209,11 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
         for spelling in entry.aliases:
             alias[spelling].append(entry)
 
+    # Entries that rig.toml uses already are no suggestion for another name.
+    used_by_rig = {
+        entry.name for name in wanted for entry in plain.get(name) or alias.get(name) or []
+    }
+    free_entries = {name: found for name, found in plain.items() if name not in used_by_rig}
     taken: set[Key] = set()
     problems: list[str] = []
     for name, key in wanted.items():
@@ -219,7 +224,7 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
             taken.add(fitting[0].key)
         else:
             found.unknown.append(name)
-            known = plain if len(problems) < _MOST_SUGGESTED else {}
+            known = free_entries if len(problems) < _MOST_SUGGESTED else {}
             problems.append(f"{what} {name!r} (mocap.{key}) " + _problem(name, fitting, known))
 
     used = set(found.names)

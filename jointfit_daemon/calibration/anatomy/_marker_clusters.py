@@ -94,7 +94,8 @@ def columns(track: OpticalTrack, name: str, settings: CalibrationSettings) -> li
 
 def _marker_columns(track: OpticalTrack, name: str, wanted: Sequence[str]) -> list[int]:
     index = {marker: i for i, marker in enumerate(track.markers)}
-    if missing := [unknown_name("marker", m, track.markers) for m in wanted if m not in index]:
+    missing = [unknown_name("marker", m, track.markers, wanted) for m in wanted if m not in index]
+    if missing:
         raise CalibrationError(*(f"markers.{name}: {text}" for text in missing))
     return [index[m] for m in wanted]
 

@@ -17,7 +17,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import orjson
 import typer
 
-from jointfit_daemon.tools.calibrate._phase_tracker import PhaseTracker, RequestRefusedError
+from jointfit_daemon.tools.calibrate._phase_tracker import (
+    PhaseTracker,
+    RequestRefusedError,
+    is_not_stored,
+)
 from jointfit_daemon.tools.calibrate._report import ProgressLines, movement_lines, report
 from jointfit_daemon.tools.command_group import EXIT_FAILED
 from jointfit_daemon.tools.stop_signals import cancel_on_signal
@@ -84,9 +88,10 @@ def calibrate(
 ) -> None:
     """Calibrate the rig of a running daemon; Ctrl-C or SIGTERM aborts the phase.
 
-    Exit codes: 0 success; 1 no broker, no daemon, or a phase was refused or aborted; 2 invalid
-    options or rig.toml; 3 the result is worse than the stored calibration, which remains active
-    (--force replaces it); 128 + N stopped by signal N after the phase was aborted.
+    Exit codes: 0 success; 1 no broker, no daemon, a phase was refused or aborted, or its result
+    could not be stored; 2 invalid options or rig.toml; 3 the result is worse than the stored
+    calibration, which remains active (--force replaces it); 128 + N stopped by signal N after the
+    phase was aborted.
     """
     from jointfit_daemon.config import load_rig
 
@@ -111,7 +116,7 @@ def calibrate(
 
 
 def _print_status(status: Mapping[str, Any], *, json: bool) -> None:
-    """Print the final status; exit with `EXIT_REJECTED` if the calibration was rejected."""
+    """Print the final status; exit with an error if the result was rejected or not stored."""
     if json:
         typer.echo(orjson.dumps(status))
     else:
@@ -120,6 +125,9 @@ def _print_status(status: Mapping[str, Any], *, json: bool) -> None:
     if status.get("kept") is not None:
         typer.echo(f"jointfit calibrate: calibration rejected: {status['kept']}", err=True)
         raise typer.Exit(EXIT_REJECTED)
+    if is_not_stored(status):
+        typer.echo(f"jointfit calibrate: calibration {status['text']}", err=True)
+        raise typer.Exit(EXIT_FAILED)
 
 
 async def _guide_phases(

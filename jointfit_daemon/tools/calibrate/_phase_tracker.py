@@ -19,6 +19,11 @@ OFFLINE_S = 60.0
 """Longest wait for a daemon that is offline, s: more than a restart takes on a Raspberry Pi."""
 
 
+def is_not_stored(status: Mapping[str, Any]) -> bool:
+    """Return whether the daemon uses the calibration of `status` but could not store it."""
+    return "not stored" in str(status.get("text", ""))
+
+
 class PhaseAbortedError(Exception):
     """The daemon aborted the phase, or cannot be reached; the message gives the reason."""
 
@@ -123,10 +128,12 @@ class PhaseTracker:
             await self._next_message()
 
     async def wait_for_store(self, ended: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the status with the stored version; `ended` if nothing is stored in time."""
+        """Return the status with the stored version or a failure; `ended` if none comes in time."""
         with suppress(TimeoutError):
             async with asyncio.timeout(STORING_S):
                 while self.status.get("version") == ended.get("version"):
+                    if is_not_stored(self.status):
+                        break
                     await self._next_message()
                 return self.status
         return ended

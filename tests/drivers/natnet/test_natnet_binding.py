@@ -71,6 +71,12 @@ def test_unknown_names_are_reported_together_with_suggestions() -> None:
     assert set(markers.data["unknown"]) == {"T9", "Q", "Shink", "Plate"}  # type: ignore[call-overload]
 
 
+def test_a_marker_in_use_is_not_suggested_for_another_one() -> None:
+    feeder = ready(markers={"thigh": ["T1", "T2", "T3", "T4"]})
+    (markers,) = told(feeder.events, "warning")
+    assert "'T4' (mocap.markers.thigh) is not in the stream. The server has" in markers.text
+
+
 def test_marker_names_come_from_the_description_before_the_set_before_a_number() -> None:
     named = described("A", 1, "own", "", named=True)
     model = ModelDefinition((named, MarkerSetDescription("A", ("set1", "set2", "set3"))))

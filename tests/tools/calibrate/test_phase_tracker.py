@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
+import typer
 
 from jointfit_daemon.tools.calibrate import (
     PhaseAbortedError,
@@ -17,6 +18,7 @@ from jointfit_daemon.tools.calibrate import (
     movement_lines,
 )
 from jointfit_daemon.tools.calibrate._report import report
+from jointfit_daemon.tools.command_group import EXIT_FAILED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -69,6 +71,18 @@ async def test_wait_for_store_returns_the_version_or_times_out(
     stored = {"phase": "calibrated", "text": "stored as version 2", "version": 2}
     asyncio.get_running_loop().call_later(0.01, one.on_status, stored)
     assert (await one.wait_for_store(ended))["version"] == 2
+
+
+async def test_wait_for_store_ends_at_once_if_the_result_could_not_be_stored() -> None:
+    one = tracker_after("functional", "fitting", "calibrated")
+    ended = await one.wait_for_end("functional")
+    failed = {"phase": "calibrated", "text": "in force but not stored: /state: Read-only"}
+    asyncio.get_running_loop().call_later(0.01, one.on_status, failed)
+    status = await one.wait_for_store(ended)
+    assert status == failed
+    with pytest.raises(typer.Exit) as stop:
+        _command._print_status(status, json=False)
+    assert stop.value.exit_code == EXIT_FAILED
 
 
 def test_report_contains_errors_centers_and_missing_align_phase() -> None:
