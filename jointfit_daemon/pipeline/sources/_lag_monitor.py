@@ -57,6 +57,10 @@ _FRAMES_PER_STEP = 150
 _MIN_FRAMES = 100
 
 
+_LOW_R2 = "no lag from this movement; normal on soft tissue, the lag in force stays"
+"""Cause of a low R² while tracking: the sensor moves on the skin, which is no fault."""
+
+
 class KnownLag(NamedTuple):
     """A lag that needs no estimate: ``lag_ms`` of rig.toml, from a sync line or a measurement."""
 
@@ -239,7 +243,7 @@ class LagMonitor:
         yield
         ref = rates_from_orientations(t_ref, q_ref, start_ns)
         yield
-        return (yield from estimate_in_steps(imu, ref, LagSettings()))
+        return (yield from estimate_in_steps(imu, ref, LagSettings(low_r2=_LOW_R2)))
 
     def _finish(self, now_ns: int, window: _Window, estimate: LagEstimate) -> list[Notice]:
         name, lag = window.sensor, self.sensors[window.sensor]

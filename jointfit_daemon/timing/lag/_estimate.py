@@ -91,6 +91,11 @@ class LagSettings:
     """
     min_r2: float = 0.98
     """Least R²: correct data on one rigid body reach 0.998, sensors on soft tissue less."""
+    low_r2: str = (
+        "different motions or a wrong convention; check that the sensor is on this body and "
+        "attached firmly"
+    )
+    """Likely cause of a smaller R², and its remedy."""
     min_weight: float = 0.7
     """Least mean Huber weight; below, the fit depends on a minority of the data."""
     min_valid: float = 0.8
@@ -286,8 +291,7 @@ def _gate(estimate: LagEstimate, fit: LagFit, settings: LagSettings) -> str | No
         (fit.converged, f"the fit did not converge: {IRREGULAR}"),
         (
             estimate.r2 >= settings.min_r2,
-            f"R² {estimate.r2:.3f} < {settings.min_r2:g}: different motions or a wrong convention; "
-            "check that the sensor is on this body and attached firmly",
+            f"R² {estimate.r2:.3f} < {settings.min_r2:g}: {settings.low_r2}",
         ),
         (
             estimate.mean_weight >= settings.min_weight,
