@@ -177,7 +177,8 @@ def _joints(c: Calibration) -> Iterator[str]:
             key = f"joint.{name}.rotation"
             yield from _finite(f"{key}.center", found.center, (3,))
             yield from _finite(f"{key}.covariance", found.covariance, (3, 3))
-            yield from _finite(f"{key}.unseen", found.unseen, (len(found.unseen), 3))
+            for direction in found.unseen:
+                yield from _finite(f"{key}.unseen", direction, (3,))
         if not _is_text(joint.source):
             yield f"joint.{name}.source: {joint.source!r}"
         yield from _bounded(f"joint.{name}", joint, ("sd", "residual_rms", "gap_rms"), _LARGEST_SD)
