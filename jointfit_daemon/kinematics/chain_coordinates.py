@@ -50,6 +50,12 @@ _FARTHEST_STEP = 0.8
 _CLOSE = 1e-3
 """Distance, rad and m, from which one more step leads to the solution at run time: the remaining
 error is about its square."""
+_SETTLED = 1e-4
+"""Largest step at run time, rad and m, of a joint that its coordinates describe in part only."""
+_FARTHEST_MISFIT = 0.5
+"""Largest rotation that its coordinates may leave undescribed, rad; more is another solution."""
+_RETRY = 10
+"""Instants between two attempts to find coordinates without those of the instant before."""
 _QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 """Angles from which an inversion begins without an instant before, rad."""
 _STEEP = 0.87
@@ -196,7 +202,9 @@ def coordinate_table(
 class CoordinateTracker:
     """Coordinates of one state after the other, each inverted from the values before.
 
-    The result is that of `coordinate_table`, in a hundredth of its time per instant.
+    The result is that of `coordinate_table`, in a hundredth of its time per instant. Where a joint
+    has fewer coordinates than degrees of freedom, the sine of the rotation that they leave is
+    minimized instead of the rotation.
 
     Parameters
     ----------
@@ -209,6 +217,8 @@ class CoordinateTracker:
     def __init__(self, model: ChainModel, coordinates: tuple[JointCoordinates, ...]) -> None:
         self._model, self._coordinates = model, coordinates
         self._last: list[Array | None] = [None] * len(coordinates)
+        self._waiting = [0] * len(coordinates)
+        """Instants until the next attempt of each joint to find coordinates without a start."""
 
     def read(self, state: ChainState, covariance: Array) -> tuple[Array, Array]:
         """Return values and standard deviations, rad and m, shape (K,); angles within half a turn.
@@ -253,6 +263,10 @@ class CoordinateTracker:
         """Return the values and their derivative, NaN if no start leads to the pose."""
         joint, last = self._coordinates[number], self._last[number]
         rows = 6 if is_free else 3
+        unknown = np.full(len(joint.names), np.nan), np.full((rows, len(joint.names)), np.nan)
+        if self._waiting[number]:
+            self._waiting[number] -= 1
+            return unknown
         for start in _starts(joint) if last is None else chain([last], _starts(joint)):
             found = _invert_from(joint, start, A, origin, rows)
             if found is None:
@@ -264,9 +278,8 @@ class CoordinateTracker:
             if second <= 0.5 * np.pi + _CLOSE:
                 self._last[number] = values
                 return values, G
-        self._last[number] = None
-        count = len(joint.names)
-        return np.full(count, np.nan), np.full((rows, count), np.nan)
+        self._last[number], self._waiting[number] = None, _RETRY
+        return unknown
 
 
 def _starts(joint: JointCoordinates) -> Iterator[Array]:
@@ -298,6 +311,10 @@ def _invert_from(
         scale = min(1.0, _FARTHEST_STEP / max(turned, _CONVERGED))
         values = values + np.where(joint.is_angle, scale * step, step)
         if off < _CLOSE:
+            return values, G
+
+        # Fewer coordinates than degrees of freedom describe a noisy pose by least squares.
+        if len(values) < rows and np.abs(step).max() < _SETTLED and off < _FARTHEST_MISFIT:
             return values, G
     return None
 

@@ -99,7 +99,7 @@ class SensorLink:
             high=tuple(data["high"]),
             spread=float(data["spread"]),
             total=float(data["total"]),
-            uncertainty=tuple(tuple(row) for row in data["uncertainty"]),
+            uncertainty=tuple(tuple(row) for row in data.get("uncertainty", ())),
         )
 
 

@@ -65,14 +65,15 @@ class MovingCenters:
             return
         self._calibration = calibration
         clusters = {name: restore_cluster(name, c) for name, c in calibration.clusters.items()}
-        self._centers = LiveJointCenters(
-            chain, clusters, forgetting=exp(-1.0 / (RATE_HZ * memory_s)), limits=SphereLimits()
-        )
+        self._centers = LiveJointCenters(chain, clusters, limits=SphereLimits())
         above = dict(zip(chain.joints, body_parts(chain), strict=False))
         self._segments = [above[joint] or "" for joint in self._centers.joints]
         self._frames = RateDivider(RATE_HZ)
         self._turns = RateDivider(PUBLISHED_HZ * max(len(self._segments), 1))
         self._latest: list[tuple[RunningCenter, CenterEstimate | None]] = []
+        self._before_ns: int | None = None
+        self._seen: dict[str, tuple[int, int]] = {}
+        """Frames with both body parts of a joint, and the stamp of the last one, ns."""
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[RunningCenters]:
         """Add one live mocap frame with its stamp; return the centers about once a second.
@@ -82,11 +83,15 @@ class MovingCenters:
         centers = self._centers
         if centers is None or not centers.joints or not self._frames.is_due(t_ns):
             return []
+        if self._before_ns is not None:
+            elapsed_s = max(t_ns - self._before_ns, 0) * 1e-9
+            centers.fade(exp(-elapsed_s / self._memory_s))
+        self._before_ns = t_ns
         centers.feed(frame)
         if not self._turns.is_due(t_ns):
             return []
         live, fit = centers.estimate_next()
-        self._latest.append((self._compare(centers, live, fit), fit))
+        self._latest.append((self._compare(t_ns, centers, live, fit), fit))
         if len(self._latest) < len(self._segments):
             return []
         found = tuple(self._placed(centers, one, fit) for one, fit in self._latest)
@@ -106,9 +111,19 @@ class MovingCenters:
         return found._replace(position=vector(parts.R[number] @ away + parts.p[number]))
 
     def _compare(
-        self, centers: LiveJointCenters, live: LiveJointCenter, fit: CenterEstimate | None
+        self,
+        t_ns: int,
+        centers: LiveJointCenters,
+        live: LiveJointCenter,
+        fit: CenterEstimate | None,
     ) -> RunningCenter:
         segment = self._segments[centers.joints.index(live.joint)]
+        frames, seen_ns = self._seen.get(live.joint, (-1, t_ns))
+        if live.frames != frames:
+            self._seen[live.joint] = live.frames, t_ns
+        elif (hidden_s := (t_ns - seen_ns) * 1e-9) > self._memory_s:
+            refused = f"its markers have been hidden for {hidden_s:.0f} s"
+            return RunningCenter(live.joint, segment, live.arc, refused)
         found = RunningCenter(live.joint, segment, live.arc, live.refused)
         if fit is None or fit.refused is not None:
             return found._replace(refused=live.refused or "the joint has hardly turned")

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.kinematics.chain_coordinates import (
     CoordinateTracker,
+    JointCoordinates,
     coordinate_table,
     default_coordinates,
 )
@@ -59,3 +61,26 @@ def test_each_instant_begins_at_the_one_before() -> None:
         turns = (values - table.values[0]) / (2.0 * np.pi) * np.array(table.is_angle)
         off = values - table.values[0] - 2.0 * np.pi * np.round(turns)
         assert np.abs(off).max() < RESOLUTION
+
+
+def test_a_joint_of_two_angles_has_coordinates_although_noise_leaves_a_third() -> None:
+    model = ChainModel((Segment("forearm"), Segment("hand", "forearm", Joint("ball"))), ())
+    forearm, hand = default_coordinates(model)
+    assert hand.pose is not None
+    pose = hand.pose
+    wrist = JointCoordinates(
+        "hand",
+        ("flexion", "deviation"),
+        (True, True),
+        lambda values: pose(np.column_stack((values, np.zeros(len(values))))),
+    )
+    tracker = CoordinateTracker(model, (forearm, wrist))
+    rng, covariance = np.random.default_rng(1), 1e-4 * np.eye(model.nq)
+    for k in range(50):
+        step = np.zeros((1, model.nq))
+        step[0, model.columns[1]] = rng.normal(0.0, 0.01, 3)
+        step[0, model.columns[1].start] += 0.5 * np.sin(0.1 * k)
+        state = apply_step(model, rest_state(model), step)
+        values, sd = tracker.read(state, covariance)
+        assert values[-2:] == pytest.approx([0.5 * np.sin(0.1 * k), 0.0], abs=0.05)
+        assert np.isfinite(sd).all()

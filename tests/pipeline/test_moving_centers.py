@@ -186,3 +186,22 @@ def test_the_payload_has_units_and_no_unrounded_numbers() -> None:
     assert np.shape(knee["covariance_m2"]) == (3, 3)
     assert 0.0 <= knee["p_value"] <= 1.0
     assert knee["moved"] is False
+
+
+def test_centers_end_when_their_markers_have_been_hidden_for_the_time_constant() -> None:
+    subject = Subject(4)
+    running = MovingCenters(CHAIN, calibration(subject), MEMORY_S)
+    optical = record(subject, motion(Subject(5), 20.0, 200.0), 5, sensors=False).optical
+    assert optical is not None
+    layout, none = MocapLayout(optical.markers, ()), np.zeros((0, 3))
+    told = []
+    for k, (t_ns, row) in enumerate(zip(optical.t_ns.tolist(), optical.positions, strict=True)):
+        seen = row if t_ns < optical.t_ns[0] + 13e9 else np.full_like(row, np.nan)
+        frame = MocapFrame(t_ns, k, None, layout, seen, none, np.zeros((0, 4)))
+        told += running.add_frame(t_ns, frame)
+    before = next(found for found in reversed(told) if found.t_ns < optical.t_ns[0] + 12.9e9)
+    assert of("hip", before).center is not None
+    hidden = of("hip", told[-1])
+    assert hidden.center is None
+    assert hidden.refused is not None
+    assert "hidden for" in hidden.refused

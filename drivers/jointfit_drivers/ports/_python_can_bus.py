@@ -18,8 +18,7 @@ import threading
 import time
 from contextlib import suppress
 from ctypes import CDLL
-from functools import cache
-from importlib import import_module
+from importlib import import_module, invalidate_caches
 from importlib.util import find_spec
 from inspect import signature
 from ipaddress import ip_address
@@ -315,10 +314,10 @@ def _wrong_keys(settings: CanBusSettings, backend: type[can.BusABC]) -> str | No
     return None
 
 
-@cache
 def _load_backend(kind: str) -> type[can.BusABC] | str:
     """Return python-can's class for an interface, or the reason why it cannot be loaded."""
     module, name = can.interfaces.BACKENDS[kind]
+    invalidate_caches()  # a library may have been installed since the last attempt
     try:
         backend: type[can.BusABC] = getattr(import_module(module), name)
         package = _PACKAGES.get(kind)

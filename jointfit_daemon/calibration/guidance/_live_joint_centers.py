@@ -84,7 +84,7 @@ class LiveJointCenters:
         Joints, segments and adjacent body parts.
     clusters : mapping of str to MarkerCluster
         Body parts in the static pose; parts without markers are absent.
-    forgetting, limits
+    limits
         See `RunningSphere`.
     """
 
@@ -93,7 +93,6 @@ class LiveJointCenters:
         chain: Chain,
         clusters: Mapping[str, MarkerCluster],
         *,
-        forgetting: float = 1.0,
         limits: SphereLimits | None = None,
     ) -> None:
         self._chain = chain
@@ -113,7 +112,7 @@ class LiveJointCenters:
 
         starts = (self.parts.origins[self._parents] + self.parts.origins[self._children]) / 2
         self._spheres = [
-            RunningSphere(size, near=start, forgetting=forgetting, limits=limits)
+            RunningSphere(size, near=start, limits=limits)
             for size, start in zip(self._sizes, starts, strict=True)
         ]
         self._frames = np.zeros(len(pairs), dtype=np.int64)
@@ -121,6 +120,11 @@ class LiveJointCenters:
             joint: (_unknown(joint, 0, 0.0, 3, "no frame yet"), None) for joint in self.joints
         }
         self._turn = -1
+
+    def fade(self, share: float) -> None:
+        """Multiply the weights of all frames so far by a factor between 0 and 1."""
+        for sphere in self._spheres:
+            sphere.fade(share)
 
     def feed(self, frame: MocapFrame) -> None:
         """Process one frame: markers of the distal parts relative to the proximal ones."""

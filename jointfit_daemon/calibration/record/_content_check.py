@@ -208,7 +208,8 @@ def _link(link: SensorLink, sensors: Sequence[str]) -> Iterator[str]:
     yield from _finite(f"{key}.weights", link.weights, (_COMPONENTS[link.kind], _POLYNOMIALS))
     yield from _finite(f"{key}.low", link.low, (_POLYNOMIALS,))
     yield from _finite(f"{key}.high", link.high, (_POLYNOMIALS,))
-    yield from _finite(f"{key}.uncertainty", link.uncertainty, (_POLYNOMIALS, _POLYNOMIALS))
+    if link.uncertainty:
+        yield from _finite(f"{key}.uncertainty", link.uncertainty, (_POLYNOMIALS, _POLYNOMIALS))
     if not (_number(link.spread, 0.0, _LARGEST_SD) and _number(link.total, 0.0, _LARGEST_SD)):
         yield f"{key}: spread and total must be standard deviations"
 

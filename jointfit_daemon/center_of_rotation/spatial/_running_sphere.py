@@ -137,9 +137,7 @@ class RunningSphere:
             phi = np.where(w[:, None] > 0.0, phi, 0.0) * np.sqrt(w)[:, None]
         flat = phi.reshape(-1)
         if self._forgetting < 1.0:
-            self._M *= self._forgetting
-            self._L *= self._forgetting
-            self._squares *= self._forgetting**2
+            self.fade(self._forgetting)
 
         self._M += flat[:, None] * flat
         for g, lag in enumerate(LAGS):
@@ -147,6 +145,12 @@ class RunningSphere:
         self._squares += 1.0 if w is None else w * w
         self._past.append(phi.copy())
         self._frames += 1 if w is None else int(w.any())
+
+    def fade(self, share: float) -> None:
+        """Multiply the weights of all frames so far by a factor between 0 and 1."""
+        self._M *= share
+        self._L *= share
+        self._squares *= share**2
 
     def sums(self) -> SphereSums:
         """Return the sums over all frames."""

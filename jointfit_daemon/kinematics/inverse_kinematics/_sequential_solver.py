@@ -46,6 +46,8 @@ _FORGETTING = 0.02
 _FIRST_SD_M = 0.003
 _FIRST_INSTANTS = 5
 """Instants for which the first standard deviation counts."""
+_MOST_PATIENCE = 32
+"""Most restart intervals between two restarts of a chain that does not fit its markers."""
 _STRAIGHTEN = 32
 """Instants between two re-orthonormalizations of the rotations."""
 
@@ -115,6 +117,8 @@ class LiveInverseKinematics:
         self._typical = float(np.median(weighing)) if weighing.size else 1.0
         self._fed = 0
         self._restarted_at = 0
+        self._patience = 1
+        """Restart intervals to wait: doubled by every restart that does not help."""
         self._learned = 0
         self._lead = np.zeros(model.nq)
 
@@ -152,12 +156,15 @@ class LiveInverseKinematics:
             return self._follow(self._start(given), still, measured, weights), True
 
         place = self._follow(self._state, self._lead, measured, weights)
-        waiting = self._fed - self._restarted_at < self._options.restart_interval
-        if waiting or not self._is_lost(place):
+        if not self._is_lost(place):
+            self._patience = 1
+            return place, False
+        if self._fed - self._restarted_at < self._patience * self._options.restart_interval:
             return place, False
 
         self._restarted_at = self._fed
         again = self._follow(self._start(given), still, measured, weights)
+        self._patience = min(2 * self._patience, _MOST_PATIENCE) if self._is_lost(again) else 1
         return (again, True) if again.cost < place.cost else (place, False)
 
     def _start(self, given: Array) -> ChainState:

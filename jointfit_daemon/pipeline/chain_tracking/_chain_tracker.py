@@ -33,11 +33,15 @@ if TYPE_CHECKING:
 
 RECENT_NS = 10_000_000_000
 """Time over which recent errors are computed, ns: a few gait cycles."""
+FARTHEST_M = 1000.0
+"""Distance from the origin beyond which a marker counts as missing, m: no camera sees so far, and
+the squares of larger distances would spoil the solution."""
 FEWEST_MARKERS = 3
 """Markers of a frame with a solution: fewer do not determine the position of the first segment."""
 OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
 """Up to six steps, because frames are 100 ms apart. The Huber threshold bounds the influence of an
-exchanged marker until it is excluded. A restart takes ten times as long as a frame."""
+exchanged marker until it is excluded. A restart takes ten times as long as a frame, so
+restarts that do not help become rare."""
 
 
 class _FrameErrors(NamedTuple):
@@ -105,7 +109,9 @@ class ChainTracker:
             column = {name: k for k, name in enumerate(frame.layout.markers)}
             self._columns = [column.get(name) for name in self._model.marker_names]
         padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
-        return padded[[-1 if column is None else column for column in self._columns]]
+        found = padded[[-1 if column is None else column for column in self._columns]]
+        possible = (np.abs(found) < FARTHEST_M).all(axis=1, keepdims=True)
+        return np.where(possible, found, np.nan)
 
     def _values(self, pose: LivePose) -> tuple[ModelCoordinate, ...]:
         values, sd = self._coordinates.read(pose.state, pose.covariance)

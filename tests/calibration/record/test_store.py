@@ -328,3 +328,10 @@ def test_no_flipped_bit_changes_the_content(tmp_path: Path) -> None:
         except CalibrationFileError:
             continue
         assert found == PLAIN
+
+
+def test_a_link_stored_without_uncertainty_is_read(tmp_path: Path) -> None:
+    table = stored_table(tmp_path)
+    link = dict(table["calibration"]["links"][0])
+    del link["uncertainty"]
+    assert SensorLink.from_dict(link).uncertainty == ()

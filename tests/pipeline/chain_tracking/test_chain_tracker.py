@@ -188,3 +188,9 @@ def test_coordinates_are_unknown_while_markers_do_not_determine_them() -> None:
     assert nothing.fit is None
     assert all(c.value is None and c.sd is None for c in nothing.coordinates)
     assert all(error is None for error in nothing.errors.values())
+
+
+def test_a_marker_far_beyond_the_room_counts_as_missing() -> None:
+    states, _ = track(3.0, replaced("shank1", lambda t_s, points: points[0] + 1e12 * (t_s > 1.0)))
+    assert states[-1].errors["shank1"] is None
+    assert np.abs(flexion_errors_deg(states)).max() < 2.0
