@@ -66,6 +66,7 @@ def _at(trace: Trace, t_s: float) -> int:
     return trace.begin_ns + round(t_s * 1e9)
 
 
+@pytest.mark.experiment
 def test_a_recorded_run_is_drawn_like_a_simulated_one(tmp_path: Path) -> None:
     """In a process of its own: matplotlib keeps its fonts open."""
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")

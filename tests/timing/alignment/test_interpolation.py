@@ -192,6 +192,7 @@ def turned(angle: float) -> Quaternion:
     return (cos(angle / 2), 0.0, sin(angle / 2), 0.0)
 
 
+@pytest.mark.experiment
 def test_mean_rates_are_worse_than_no_rates() -> None:
     """Why a driver must leave such rates out (``ImuSample.rate``)."""
 

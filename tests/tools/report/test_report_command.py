@@ -21,6 +21,7 @@ run = CliRunner().invoke
 SHORT = ["report", "--cor-study", "--repeats", "4"]
 
 
+@pytest.mark.experiment
 def test_report_contains_its_setup_both_tables_and_every_limitation(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     out = tmp_path / "made" / "here"
