@@ -45,6 +45,8 @@ RECONNECT_S = 0.1
 """Pause of the listener before it connects again, s."""
 PATIENCE_S = 60.0
 """Time limit for a message that arrives within 3 s on an idle machine, s."""
+FIT_PATIENCE_S = 150.0
+"""Time limit for a fit, s: it takes 10 s on an idle machine, and its process has a low priority."""
 
 
 def broker(port: int, base: str = BASE) -> MqttSettings:
@@ -190,7 +192,7 @@ class Listener:
         request = {"phase": name, "seconds": seconds, "force": force}
         answer = await self.client.request("calibrate", request)
         assert answer["status"] == "accepted", answer
-        async with asyncio.timeout(seconds + PATIENCE_S):
+        async with asyncio.timeout(seconds + FIT_PATIENCE_S):
             return await self.calibration.wait_for_end(name)
 
 
