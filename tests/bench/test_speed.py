@@ -37,6 +37,7 @@ def measured(tmp_path: Path, *ids: str, timeout_s: float = 28.0) -> dict[str, An
     return {entry["name"]: entry for content in contents for entry in content["results"]}
 
 
+@pytest.mark.experiment
 @pytest.mark.alone
 def test_codecs_keep_their_thresholds_and_slcan_is_several_times_cheaper_than_python_cans(
     tmp_path: Path,
