@@ -105,4 +105,4 @@ def test_independent_frames_of_an_autoregressive_process_are_counted(correlation
 
 
 def test_perfect_fit_counts_as_one_independent_frame() -> None:
-    assert independent_frames(np.zeros((50, 1)), np.ones((50, 1))) == 1.0
+    assert independent_frames(np.zeros((50, 1)), np.ones((50, 1))) == pytest.approx(1.0)
