@@ -59,6 +59,9 @@ _WINDOWS = frozenset({"etas", "iscan", "ixxat", "nican", "nixnet", "systec", "us
 """Interfaces of python-can whose libraries exist for Windows only."""
 _PACKAGES = {"neovi": "ics", "cantact": "cantact", "canalystii": "canalystii", "gs_usb": "usb"}
 """Python packages that python-can imports when a bus is opened, by interface."""
+_NETWORKED = ("socketcand", "udp_multicast")
+"""Interfaces that need a network port."""
+_PORTS = 0x10000
 _LIBRARIES = {"pcan": "libpcanbasic.so", "kvaser": "libcanlib.so", "neousys": "libwdt_dio.so"}
 """Libraries of vendors that python-can loads when a bus is opened, by interface."""
 _INSTEAD = 'set interface = "socketcan", or "slcan" for a serial adapter'
@@ -308,6 +311,9 @@ def _wrong_keys(settings: CanBusSettings, backend: type[can.BusABC]) -> str | No
     ]
     if missing:
         return f"CAN interface {kind!r} needs {' and '.join(missing)}: add them to this table"
+    port = (settings.model_extra or {}).get("port", 1)
+    if kind in _NETWORKED and (type(port) is not int or not 0 < port < _PORTS):
+        return f"CAN interface {kind!r}: expected port = 1 to {_PORTS - 1}, found {port!r}"
     if kind == "udp_multicast" and not _is_multicast(settings.channel):
         example = "239.74.163.2"
         return f"CAN interface {kind!r} needs a multicast address as channel, such as {example!r}"

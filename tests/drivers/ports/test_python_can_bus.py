@@ -99,6 +99,8 @@ async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
         ({"interface": "pcan"}, r"libpcanbasic.so.*install its library"),
         ({"interface": "neovi"}, "package 'ics' is not installed"),
         ({"interface": "socketcand"}, "needs host and port: add them"),
+        ({"interface": "socketcand", "host": "::1", "port": 99999}, "port = 1 to 65535"),
+        ({"interface": "socketcand", "host": "::1", "port": "abc"}, "found 'abc'"),
         ({"interface": "udp_multicast", "channel": "can0"}, "multicast address as channel"),
     ],
 )
