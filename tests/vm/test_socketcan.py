@@ -264,7 +264,7 @@ async def test_a_silent_sensor_is_lost_alone_on_a_live_bus(wire: PythonCanWire) 
         for number in range(80):
             identity(device, 1, first=number)
             await asyncio.sleep(0.01)
-        missing = r"S4.*no quaternion \(0x221\) arrives, while other sensors send"
+        missing = r"no quaternion \(0x221\) arrives, while other sensors send"
         with pytest.raises(DeviceLostError, match=missing):
             await task
         assert len(heard.samples) == 80
@@ -272,5 +272,5 @@ async def test_a_silent_sensor_is_lost_alone_on_a_live_bus(wire: PythonCanWire) 
 
 async def test_two_sensors_with_one_identifier_are_refused_by_name(wire: PythonCanWire) -> None:
     async with running(XcdiImu(settings("S3"))):
-        with pytest.raises(DeviceMisconfiguredError, match=r"S4.*0x.*S3"):
+        with pytest.raises(DeviceMisconfiguredError, match=r"0x.*also that of S3"):
             await XcdiImu(settings("S4")).run(lambda _: None)
