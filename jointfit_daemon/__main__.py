@@ -146,7 +146,7 @@ def rig_summary(rig: Rig) -> str:
 
 def _run(config: Path, rig: Rig) -> int:
     from jointfit_daemon.supervisor.daemon import run_daemon
-    from jointfit_daemon.supervisor.process_exit import exit_within
+    from jointfit_daemon.supervisor.process_exit import ExitLimit
 
     signal.signal(signal.SIGHUP, signal.SIG_IGN)  # until the daemon has its own handler
     code = 0
@@ -156,7 +156,7 @@ def _run(config: Path, rig: Rig) -> int:
         except Exception:
             log.exception("the daemon ends because of a bug; please report it with this traceback")
             code = EXIT_BUG
-        exit_within(THREADS_TIMEOUT_S, code, "a thread")
+        ExitLimit(THREADS_TIMEOUT_S, code, "a thread").start()
     return code
 
 

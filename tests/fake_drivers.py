@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import time
 from importlib.metadata import EntryPoint
-from typing import TYPE_CHECKING, Any, ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
 from pydantic import Field
 
@@ -20,9 +21,6 @@ from jointfit_daemon.driver import (
     Wire,
 )
 from jointfit_daemon.model import Chunk, Decoded, ImuSample, TickClock
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SMALLEST_RIG = """
 [rig]
@@ -48,7 +46,7 @@ class FakeSettings(ImuSettings):
     """A fake IMU on a port; `mood` says how it behaves."""
 
     port: str = Field(description="name of the port, never opened")
-    mood: str = Field("well", description="well | lost | wrong | bug")
+    mood: str = Field("well", description="well | lost | wrong | bug | hang")
 
 
 class FakeIds(Settings):
@@ -117,6 +115,8 @@ class FakeImu:
                 raise DeviceMisconfiguredError("it is a toaster; set mood = well")
             case "bug":
                 raise ZeroDivisionError("a bug")
+            case "hang":
+                hang(Path(self._settings.port))
         self.running.append(self._settings.id)
         self.started.append(self._settings.id)
         count = 0
@@ -127,6 +127,12 @@ class FakeImu:
                 await asyncio.sleep(1 / self._settings.rate_hz)
         finally:
             self.running.remove(self._settings.id)
+
+
+def hang(note: Path) -> None:
+    """Create `note` and block the event loop."""
+    note.touch()
+    time.sleep(3600.0)
 
 
 class FakeCanImu(FakeImu):

@@ -59,7 +59,7 @@ from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
 from jointfit_daemon.supervisor._source_tasks import SourceTasks, stop
 from jointfit_daemon.supervisor._status_line import FrameRateCounter, status_line
 from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
-from jointfit_daemon.supervisor.process_exit import exit_within
+from jointfit_daemon.supervisor.process_exit import ExitLimit
 from jointfit_daemon.supervisor.requests import RequestAuthenticator, parse_request
 from jointfit_daemon.supervisor.state_directory import (
     WRITE_REMEDY,
@@ -401,19 +401,24 @@ async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreInterface] =
     main = asyncio.current_task()
     loop = asyncio.get_running_loop()
     stopping = False
+    limit = ExitLimit(STOP_S, 1, "the stop")
 
     def stop_once() -> None:
         nonlocal stopping
         if not stopping and main is not None:
             stopping = True
-            exit_within(STOP_S, 1, "the stop")
             main.cancel()
 
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop_once)
+        # The loop may hang, and calls no handler then. This one runs in any state, and the loop
+        # still learns of the signal by its wake-up descriptor.
+        signal.signal(number, lambda *_: limit.start())
     try:
         await Daemon(config, rig, core()).run()
     except asyncio.CancelledError:
         if not stopping:
             raise
         log.info("stopped")
+    finally:
+        limit.cancel()

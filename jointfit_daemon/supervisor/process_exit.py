@@ -6,15 +6,21 @@ import faulthandler
 import logging
 import os
 import threading
+import time
+from queue import SimpleQueue
 
 log = logging.getLogger(__name__)
 
+_REPORT_S = 0.15
+"""Longest time for the log line and the tracebacks of a forced end, s."""
 
-def exit_within(seconds: float, code: int, activity: str) -> None:
-    """End the process with `code` after `seconds`, unless it has ended by then.
+
+class ExitLimit:
+    """Ends the process with an exit code if it is still running some time after `start`.
 
     A thread that resolves a host name, or a driver that does not return, cannot be interrupted.
-    The limit runs in a thread of its own, since the event loop may be the part that hangs.
+    The limit runs in a thread of its own, since the event loop may be the part that hangs. That
+    thread runs from the beginning: none can be started safely in a signal handler.
 
     Parameters
     ----------
@@ -26,12 +32,30 @@ def exit_within(seconds: float, code: int, activity: str) -> None:
         Name of the activity with the time limit, for the log.
     """
 
-    def exit_now() -> None:
-        log.error("%s did not end within %g s: exiting", activity, seconds)
+    def __init__(self, seconds: float, code: int, activity: str) -> None:
+        self._seconds, self._code, self._activity = seconds, code, activity
+        self._started: SimpleQueue[bool] = SimpleQueue()
+        threading.Thread(target=self._run, name=f"limit of {activity}", daemon=True).start()
+
+    def start(self) -> None:
+        """Start the time limit; safe in a signal handler, and without effect when repeated."""
+        self._started.put(True)
+
+    def cancel(self) -> None:
+        """End the thread, unless the time limit was started."""
+        self._started.put(False)
+
+    def _run(self) -> None:
+        if not self._started.get():
+            return
+        time.sleep(self._seconds)
+        # Standard error may be a pipe that no process reads, and its lock may be held for ever.
+        report = threading.Thread(target=self._report, daemon=True)
+        report.start()
+        report.join(_REPORT_S)
+        os._exit(self._code)
+
+    def _report(self) -> None:
+        log.error("%s did not end within %g s: exiting", self._activity, self._seconds)
         faulthandler.dump_traceback()
         logging.shutdown()
-        os._exit(code)
-
-    timer = threading.Timer(seconds, exit_now)
-    timer.daemon = True
-    timer.start()

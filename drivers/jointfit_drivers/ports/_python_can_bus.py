@@ -29,6 +29,7 @@ from can.typechecking import CanFilter
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.nearest_name import unknown_name
+from jointfit_drivers.ports._bus_opening import open_in_thread, require_socketcand
 from jointfit_drivers.ports._kernel_stamps import KernelStamps
 from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX, CanFrame, host_dropped
 
@@ -42,6 +43,8 @@ log = logging.getLogger(__name__)
 logging.getLogger("can.interfaces.socketcan").setLevel(logging.CRITICAL)
 # The same for a bus whose opening failed half-way: `_opening_error` reports the cause.
 logging.getLogger("can.bus").setLevel(logging.ERROR)
+# socketcand's client logs every byte that it cannot use, and each attempt to connect.
+logging.getLogger("can.interfaces.socketcand").setLevel(logging.CRITICAL)
 
 _BATCH = 64
 """Frames per wake-up, so that a flood on one bus does not delay the others."""
@@ -161,24 +164,17 @@ class PythonCanBus:
             bus.shutdown()
 
     async def _open_bus(self) -> can.BusABC:
-        """Open the bus, outside the event loop where that may take long, and convert its errors."""
-
-        def close_late(made: asyncio.Future[can.BusABC]) -> None:
-            if not made.cancelled() and made.exception() is None:
-                made.result().shutdown()
-
+        """Open the bus, in a thread unless that is fast, and convert its errors."""
+        settings = self._settings
         try:
             if self._kernel:
-                _require_interface(self._settings.channel)  # otherwise python-can leaks a socket
-            if self._kernel or self._settings.interface == "virtual":
+                _require_interface(settings.channel)  # otherwise python-can leaks a socket
+            if self._kernel or settings.interface == "virtual":
                 return self._make()
-            making = asyncio.create_task(asyncio.to_thread(self._make), name="open CAN bus")
-            try:
-                return await asyncio.shield(making)
-            except asyncio.CancelledError:
-                # The thread cannot be cancelled: close its bus when it is open.
-                making.add_done_callback(close_late)
-                raise
+            name = f"{settings.channel} ({settings.interface})"
+            return await open_in_thread(settings.model_dump_json(), name, self._make)
+        except (DeviceLostError, DeviceMisconfiguredError):
+            raise
         except Exception as error:  # a missing vendor library may raise even NameError
             raise self._opening_error(error) from error
 
@@ -187,6 +183,8 @@ class PythonCanBus:
         if (reason := unusable_bus(settings)) is not None:
             raise can.CanInterfaceNotImplementedError(reason)
         keys: dict[str, Any] = settings.model_dump(exclude={"baud", "transport"})
+        if settings.interface == "socketcand":
+            require_socketcand(settings.channel, keys["host"], keys["port"])
         return can.Bus(**keys, ignore_config=True)
 
     def _drain(self, bus: can.BusABC, deliver: Callable[[int, list[CanFrame]], None]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
+import time
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.outputs.token_bucket import TokenBucket
@@ -30,20 +31,19 @@ class MqttLogHandler(logging.Handler):
         self._publish = publish
         self._loop = asyncio.get_running_loop()
         self._thread = threading.get_ident()
-        self._bucket = TokenBucket(RATE_HZ, RATE_HZ, self._loop.time())
+        self._bucket = TokenBucket(RATE_HZ, RATE_HZ, time.monotonic())
         self._suppressed = 0
 
     def emit(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
         """Accept one record from any thread."""
-        line = record.levelname.lower(), record.name, record.getMessage()
-        if threading.get_ident() == self._thread:
-            self._pass_on(*line)
-        elif not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._pass_on, *line)
-
-    def _pass_on(self, level: str, name: str, text: str) -> None:
-        if not self._bucket.take(self._loop.time()):
+        # Records are counted before they reach the event loop: a library that logs without pause
+        # in a thread would fill the loop's queue and delay everything else.
+        if not self._bucket.take(time.monotonic()):
             self._suppressed += 1
             return
         suppressed, self._suppressed = self._suppressed, 0
-        self._publish(level, name, text, suppressed)
+        line = record.levelname.lower(), record.name, record.getMessage(), suppressed
+        if threading.get_ident() == self._thread:
+            self._publish(*line)
+        elif not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._publish, *line)

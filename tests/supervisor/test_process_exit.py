@@ -1,0 +1,69 @@
+"""The time limit of a stop: a hanging event loop, and standard error that no process reads."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.fake_drivers import SMALLEST_RIG, install
+from tests.system.station import load_factor
+
+PROJECT = Path(__file__).resolve().parents[2]
+LIMIT_S = 0.3
+SHORT = f"""
+import sys
+import jointfit_daemon.supervisor.daemon as daemon
+from jointfit_daemon.__main__ import main
+
+daemon.STOP_S = {LIMIT_S}
+sys.exit(main(["--config", sys.argv[1]]))
+"""
+"""The daemon with a shorter limit of the stop."""
+
+
+@pytest.mark.parametrize("full_pipe", [False, True])
+def test_sigterm_ends_a_daemon_whose_event_loop_hangs(tmp_path: Path, *, full_pipe: bool) -> None:
+    install(tmp_path / "site")
+    rig, hanging = tmp_path / "rig.toml", tmp_path / "hanging"
+    sensor = f'port = "{hanging}"\nmood = "hang"'
+    rig.write_text(SMALLEST_RIG.format(port=1).replace('port = "a"', sensor), encoding="utf-8")
+    reading, writing = os.pipe()
+    daemon = subprocess.Popen(
+        [sys.executable, "-c", SHORT, str(rig)],
+        env=os.environ
+        | {
+            "PYTHONPATH": f"{tmp_path / 'site'}{os.pathsep}{PROJECT}",
+            "STATE_DIRECTORY": str(tmp_path / "state"),
+        },
+        stderr=writing,
+    )
+    try:
+        until = time.monotonic() + 60.0
+        while not hanging.exists():
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        if full_pipe:
+            os.set_blocking(writing, False)
+            while True:
+                try:
+                    os.write(writing, bytes(65536))
+                except BlockingIOError:
+                    break
+            os.set_blocking(writing, True)
+        began = time.monotonic()
+        daemon.send_signal(signal.SIGTERM)
+        assert daemon.wait(timeout=60.0) == 1
+        assert time.monotonic() - began < (LIMIT_S + 1.0) * load_factor()
+    finally:
+        daemon.kill()
+        daemon.wait()
+        os.close(writing)
+        with os.fdopen(reading, "rb") as pipe:
+            said = pipe.read()
+    assert full_pipe or b"the stop did not end within 0.3 s: exiting" in said
