@@ -451,6 +451,8 @@ class ChainModelState(NamedTuple):
     t_ns: int
     model: str
     """Name of the chain model."""
+    refined: bool
+    """Whether its marker positions are those of the calibration in force."""
     coordinates: tuple[ModelCoordinate, ...]
     errors: Mapping[str, float | None]
     """Distance of each marker from its place in the model, m; None if it is not visible."""

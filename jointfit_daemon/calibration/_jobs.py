@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from jointfit_daemon.limb_model import Calibration
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from jointfit_daemon.calibration._trial import (
         CalibrationSettings,
@@ -86,6 +86,16 @@ class RefitJob:
 
 
 CalibrationJob = AlignJob | StaticJob | FunctionalJob | RefitJob
+
+
+@dataclass(frozen=True, slots=True)
+class JobControl:
+    """Time and progress of a running job, supplied by the process that runs it."""
+
+    elapsed_s: Callable[[], float] = lambda: 0.0
+    """Returns the time since the start of the job, s."""
+    report: Callable[[float, str], None] = lambda _share, _text: None
+    """Publishes progress, 0 to 1, and a sentence about it."""
 
 
 @dataclass(frozen=True, slots=True)

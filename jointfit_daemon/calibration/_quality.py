@@ -95,6 +95,40 @@ class MarkerQuality:
 
 
 @dataclass(frozen=True, slots=True)
+class MarkerErrors:
+    """Errors of the markers of a chain model in inverse kinematics."""
+
+    rms_m: float
+    maximum_m: float
+    """Largest error of one marker in one frame."""
+    accepted: bool
+    """Whether both are below the limits of `kinematics.accepted_errors`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChainQuality:
+    """Quality of the refinement of a chain model; errors are those of held-out frames."""
+
+    model: str
+    method: str
+    refused: str | None = None
+    """Reason why nothing was refined; the figures are then absent."""
+    frames: int | None = None
+    """Number of frames of the refinement."""
+    judged: int | None = None
+    """Number of held-out frames."""
+    before: MarkerErrors | None = None
+    after: MarkerErrors | None = None
+    """Errors of the model that is used."""
+    parts: Mapping[str, PartQuality] | None = None
+    """By segment of the model with refined markers."""
+    moved_m: Mapping[str, float] | None = None
+    """Displacement of each refined marker in its segment."""
+    stopped: str | None = None
+    """Reason for the end of the iteration."""
+
+
+@dataclass(frozen=True, slots=True)
 class JointQuality:
     """Quality of one joint center."""
 

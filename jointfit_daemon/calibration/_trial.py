@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.marker_refinement import RefinementSettings
+    from jointfit_daemon.kinematics.chains import ChainModel
     from jointfit_daemon.limb_model import Method, Procedure
 
 CenterMethod = Literal["sphere", "score", "sara", "geometric", "oriented", "grid", "three_frames"]
@@ -63,6 +65,17 @@ class CalibrationTrial:
 
 
 @dataclass(frozen=True, slots=True)
+class ChainRefinement:
+    """Refinement of the markers of a chain model in the functional phase."""
+
+    model: ChainModel
+    """The model of rig.toml, with the locks and weights of the refinement."""
+    settings: RefinementSettings
+    limit_s: float
+    """Longest duration of the iteration, s."""
+
+
+@dataclass(frozen=True, slots=True)
 class CalibrationSettings:
     """Settings of the calibration in rig.toml, in SI units.
 
@@ -98,6 +111,8 @@ class CalibrationSettings:
     """Last, contiguous share of the functional trial that is held out for evaluation."""
     refine_markers: bool = True
     """Whether marker positions on the body parts are refined from the movement."""
+    chain_refinement: ChainRefinement | None = None
+    """Refinement of the chain model; None without one."""
     learn_online: bool = True
     """Whether the models are refitted while the cameras see the limb."""
 

@@ -12,8 +12,21 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.calibration import ChainRefinement
+from jointfit_daemon.calibration.marker_refinement import (
+    RefinementSettings,
+    SearchSettings,
+    with_locks,
+    with_weights,
+)
 from jointfit_daemon.config._fault_messages import Fault
-from jointfit_daemon.files.models import LoadedModel, as_data, load_model, model_of
+from jointfit_daemon.files.models import (
+    LoadedModel,
+    as_data,
+    load_model,
+    model_of,
+    read_marker_weights,
+)
 from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.kinematics.chain_coordinates import default_coordinates
 from jointfit_daemon.nearest_name import nearest_name
@@ -21,11 +34,12 @@ from jointfit_daemon.nearest_name import nearest_name
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from jointfit_daemon.config._tables import ChainTable
+    from jointfit_daemon.config._tables import ChainRefinementTable, ChainTable
     from jointfit_daemon.driver import MocapSettings
     from jointfit_daemon.kinematics.chains import ChainModel
 
 KEY = "chain.model"
+REFINEMENT_KEY = "calibration.chain_refinement"
 _LISTED = 8
 """Largest number of names in a message."""
 
@@ -78,6 +92,49 @@ def load_chain_model(
         remark = f"not in the model, so not tracked by it: {_listed(absent)}"
         loaded = replace(loaded, remarks=(*loaded.remarks, remark))
     return loaded, faults
+
+
+def load_refinement(
+    model: ChainModel, table: ChainRefinementTable
+) -> tuple[ChainRefinement | None, dict[str, float], list[Fault]]:
+    """Return the refinement of a chain model, the weights of markers, and faults."""
+    faults: list[Fault] = []
+
+    def fail(key: str, text: str, value: object) -> None:
+        faults.append(Fault(f"{REFINEMENT_KEY}.{key}", text, value))
+
+    weights: dict[str, float] = {}
+    try:
+        given = table.weights
+        weights = read_marker_weights(Path(given)) if isinstance(given, str) else given
+        model = with_weights(model, weights, "marker")
+    except OSError as error:
+        fail("weights", f"cannot be read: {error.strerror}", table.weights)
+    except ValueError as error:  # includes MalformedFileError
+        fail("weights", str(error), table.weights)
+    for key, locked in (("unlock", False), ("lock", True)):
+        try:
+            model = with_locks(model, getattr(table, key), "marker", locked=locked)
+        except ValueError as error:
+            fail(key, str(error), list(getattr(table, key)))
+
+    # Options that exclude each other.
+    if table.threshold_mm > table.first_step_mm:
+        text = f"expected first_step_mm = {table.first_step_mm:g} or less"
+        fail("threshold_mm", text, table.threshold_mm)
+    if table.cost == "l1" and table.method == "search":
+        fail("cost", "method search has no loss function: use joint or block, or l2", "l1")
+    if faults:
+        return None, weights, faults
+    settings = RefinementSettings(
+        table.method,
+        table.prior,
+        cost=table.cost,
+        frames=table.frames,
+        holdout_share=table.holdout,
+        search=SearchSettings(1e-3 * table.first_step_mm, 1e-3 * table.threshold_mm),
+    )
+    return ChainRefinement(model, settings, table.limit_s), weights, []
 
 
 def _listed(names: Sequence[str]) -> str:

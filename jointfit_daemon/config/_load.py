@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from jointfit_daemon.calibration import ChainRefinement
     from jointfit_daemon.driver import Driver
     from jointfit_daemon.files.models import LoadedModel
 
@@ -62,6 +63,9 @@ def load_rig(path: Path) -> Rig:
     table, syntax = read_table(path)
     mqtt, folder = table.get("mqtt"), path.absolute().parent
     _anchor(table.get("chain"), ("model",), folder)
+    calibration = table.get("calibration")
+    if isinstance(calibration, dict):
+        _anchor(calibration.get("chain_refinement"), ("weights",), folder)
     if isinstance(mqtt, dict):
         _anchor(mqtt, ("password_file", "request_key_file"), folder)
         _anchor(mqtt.get("tls"), ("ca", "cert", "key"), folder)
@@ -174,6 +178,7 @@ class _RigReader:
         cameras = self.partial.get(MOCAP) if mocap is None else mocap.settings
         self._check_limb(chain, calibration, cameras)
         model = None if limb is None else self._chain_model(limb, cameras)
+        refinement = self._chain_refinement(calibration, model)
         if head is None or chain is None or calibration is None or mqtt is None or self.faults:
             return None
 
@@ -186,8 +191,9 @@ class _RigReader:
             chain_model=model,
             sources=(*sources, mocap) if mocap is not None else tuple(sources),
             calibration=CalibrationSettings(
-                **calibration.model_dump(exclude={"store", "center_target_mm"}),
+                **calibration.model_dump(exclude={"store", "center_target_mm", "chain_refinement"}),
                 center_target_m=calibration.center_target_mm / 1e3,
+                chain_refinement=refinement,
                 markers={} if mocap is None else dict(mocap.settings.markers),
                 rigid_bodies={} if mocap is None else dict(mocap.settings.rigid_body),
                 plate=None if mocap is None else mocap.settings.plate,
@@ -233,6 +239,28 @@ class _RigReader:
         if model is not None and not faults:
             self.table["chain"]["model"] = content_of(model)
         return model
+
+    def _chain_refinement(
+        self, calibration: CalibrationTable | None, model: LoadedModel | None
+    ) -> ChainRefinement | None:
+        """Return the refinement of the chain model; weights replace the name of their file."""
+        if calibration is None:
+            return None
+        key, name = "calibration.chain_refinement", "chain_refinement"
+        given = self.table.get("calibration", {}).get(name)
+        if model is None:
+            has_model = isinstance(chain := self.table.get("chain"), dict) and "model" in chain
+            if given is not None and not has_model:
+                text = "needs a chain model: add [chain] model, or remove this table"
+                self.faults.append(Fault(key, text))
+            return None
+        from jointfit_daemon.config._chain_model import load_refinement  # noqa: PLC0415 - as above
+
+        refinement, weights, faults = load_refinement(model.chain, calibration.chain_refinement)
+        self.faults += faults
+        if given and not faults:
+            given["weights"] = weights
+        return refinement
 
     def _names(self) -> list[Fault]:
         """Check the names of topics and folders, even if another key of their table is wrong."""

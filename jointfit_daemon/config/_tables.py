@@ -7,11 +7,16 @@ Invariant: unknown keys are refused, and the description of every field states i
 from __future__ import annotations
 
 import ipaddress
+import math
 from typing import Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from jointfit_daemon.calibration import CenterMethod  # noqa: TC001 - pydantic reads it
+from jointfit_daemon.calibration import (  # noqa: TC001 - pydantic reads them
+    CenterMethod,
+    RefinementCost,
+    RefinementMethod,
+)
 from jointfit_daemon.driver import Settings
 from jointfit_daemon.limb_model import Method, Procedure  # noqa: TC001 - pydantic reads them
 from jointfit_daemon.model import AngleConvention  # noqa: TC001 - as above
@@ -77,6 +82,55 @@ class ChainTable(Settings):
         raise ValueError("expected the name of a file")
 
 
+class ChainRefinementTable(Settings):
+    """``[calibration.chain_refinement]``: options as those of ``jointfit markers``."""
+
+    method: RefinementMethod = Field(
+        "joint", description="`joint`: poses and markers in one solve; `block`, or `search` (slow)"
+    )
+    prior: float = Field(
+        0.05, ge=0, le=100, description="cost of a displacement relative to a tracking error"
+    )
+    cost: RefinementCost = Field(
+        "l2", description="`l2`: squared errors; `l1`: distances (not with method `search`)"
+    )
+    weights: str | dict[str, float] = Field(
+        default_factory=dict,
+        description="weights of squared errors by marker, or a .toml or .xml file with them, "
+        "relative to the folder of rig.toml",
+    )
+    lock: tuple[str, ...] = Field(
+        (), description='locked markers ("C1") and coordinates in segment axes ("C1.x")'
+    )
+    unlock: tuple[str, ...] = Field(
+        (), description='markers whose locks in the model are ignored; "*" for all'
+    )
+    holdout: float = Field(
+        0.0, ge=0, le=0.5, description="last share of the training part, for early stopping"
+    )
+    frames: int = Field(
+        150, ge=10, le=1000, description="largest number of frames of each part, evenly spaced"
+    )
+    first_step_mm: float = Field(8.0, ge=0.01, le=100, description="first step of `search`, mm")
+    threshold_mm: float = Field(
+        2.0, ge=0.001, le=100, description="step at which `search` ends, mm"
+    )
+    limit_s: float = Field(60.0, gt=0, le=200, description="longest duration of the iteration, s")
+
+    @field_validator("weights", mode="before")
+    @classmethod
+    def _check_weights(cls, weights: object) -> object:
+        if isinstance(weights, str):
+            return weights
+        if not isinstance(weights, dict):
+            raise ValueError("expected a table, or the name of a file")  # noqa: TRY004 - pydantic
+        for name, weight in weights.items():
+            number = isinstance(weight, int | float) and not isinstance(weight, bool)
+            if not number or not 0.0 <= weight < math.inf:
+                raise ValueError(f"weight of {name}: expected a number of 0 or more")
+        return weights
+
+
 class CalibrationTable(Settings):
     """``[calibration]``."""
 
@@ -126,7 +180,12 @@ class CalibrationTable(Settings):
     )
     refine_markers: bool = Field(
         True,
-        description="whether the functional phase refines the positions of markers on body parts",
+        description="whether the functional phase refines the positions of markers on body parts, "
+        "and those of the chain model",
+    )
+    chain_refinement: ChainRefinementTable = Field(
+        default_factory=ChainRefinementTable,
+        description="refinement of the markers of [chain] model in the functional phase",
     )
     learn_online: bool = Field(
         True,

@@ -36,6 +36,7 @@ from jointfit_daemon.limb_model._marker_cluster import (
 )
 from jointfit_daemon.limb_model._mean_model import MeanModel
 from jointfit_daemon.limb_model._patent_model import PatentModel, PatentReading
+from jointfit_daemon.limb_model._refined_chain import RefinedChain, chain_fingerprint
 from jointfit_daemon.limb_model._rigid_fit import (
     MAX_FIT_RMS_M,
     MIN_MARKERS,
@@ -86,6 +87,7 @@ __all__ = [
     "PatentReading",
     "Prediction",
     "Procedure",
+    "RefinedChain",
     "SegmentCalibration",
     "SegmentModel",
     "SensorCalibration",
@@ -96,6 +98,7 @@ __all__ = [
     "axis_heading_one",
     "body_parts",
     "bumps",
+    "chain_fingerprint",
     "cluster_record",
     "configured_length",
     "equal_weights",

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.limb_model._json_form import fields_form
 from jointfit_daemon.limb_model._marker_cluster import StoredCluster, vector
+from jointfit_daemon.limb_model._refined_chain import RefinedChain
 from jointfit_daemon.limb_model._segment_model import SegmentModel
 from jointfit_daemon.limb_model._sensor_link import SensorLink
 
@@ -126,6 +127,8 @@ class Calibration:
     learning."""
     procedure: Procedure = "corrected"
     """With ``patent``, every segment has one model, for all of its sensors."""
+    chain: RefinedChain | None = None
+    """Refined markers of the chain model; None if there are none."""
 
     @property
     def lag_ns(self) -> dict[str, int]:
@@ -209,7 +212,13 @@ def _from_dict(data: Mapping[str, Any]) -> Calibration:
         correlations=correlations,
         memory=str(data.get("memory", "")),
         procedure=cast("Procedure", data.get("procedure", "corrected")),
+        chain=None if data.get("chain") is None else _chain(data["chain"]),
     )
+
+
+def _chain(item: Mapping[str, Any]) -> RefinedChain:
+    positions = {name: vector(position) for name, position in item["positions"].items()}
+    return RefinedChain(item["model"], item["fingerprint"], positions)
 
 
 def _joint(item: Mapping[str, Any]) -> JointCalibration:

@@ -6,6 +6,7 @@ in the same order give the same outputs, byte for byte, so a recording can be re
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import drifting_imus, heading_warning
@@ -25,6 +26,7 @@ from jointfit_daemon.pipeline.events import (
     DeviceInfo,
     DeviceStatus,
     JobFinished,
+    JobProgress,
     Notice,
     NoticeKind,
     NoticeLevel,
@@ -102,6 +104,7 @@ class Core:
             Tick: lambda _: [],
             Request: self._update_session,
             JobFinished: self._update_session,
+            JobProgress: self._update_session,
             CalibrationStored: self._update_session,
             UnixOffset: self._set_unix_offset,
         }
@@ -170,7 +173,7 @@ class Core:
         else:
             self._grid.reload(rig)
         self._aligner = self._grid.aligner
-        self._chain_tracker = _chain_tracker(rig)
+        self._chain_tracker = None
         if before is None or before.chain != rig.chain:
             self._sensor_monitor = SensorMonitor(rig.chain)
 
@@ -185,6 +188,7 @@ class Core:
             outputs.append(
                 Notice(event.t_ns, NoticeKind.DEVICE, rig.name, warning, NoticeLevel.WARNING)
             )
+        outputs += self._unused_refinement(event.t_ns)
         text = "stored calibration loaded" if event.calibration else "no stored calibration"
         return [*outputs, session.status(event.t_ns, text)]
 
@@ -221,8 +225,24 @@ class Core:
         rate_hz = rig.mqtt.sensors_hz
         self._sensors_rate = RateDivider(rate_hz) if rate_hz > 0.0 else None
         self._moving_centers = MovingCenters(rig.chain, usable, rig.mqtt.centers_memory_s)
+        self._chain_tracker = _chain_tracker(rig, usable, self._chain_tracker)
         wanted = rig.calibration.learn_online
         self._collector = OnlineFrameCollector(rig.chain, usable, wanted=wanted)
+
+    def _unused_refinement(self, t_ns: int) -> list[Output]:
+        """Return a notice if the calibration contains markers of another chain model."""
+        if self._rig is None or (loaded := self._rig.chain_model) is None or self._usable is None:
+            return []
+        chain = self._usable.chain
+        if chain is None or chain.apply(loaded.chain) is not None:
+            return []
+        text = (
+            f"the calibration contains refined markers of another version of the chain model "
+            f"({chain.model!r}): those of the file are used. Repeat the functional phase to refine "
+            "them"
+        )
+        level = NoticeLevel.WARNING
+        return [Notice(t_ns, NoticeKind.CALIBRATION, loaded.chain.name, text, level)]
 
     # --- sources -----------------------------------------------------------------------------
 
@@ -383,11 +403,15 @@ class Core:
 
     # --- calibration -------------------------------------------------------------------------
 
-    def _update_session(self, event: Request | JobFinished | CalibrationStored) -> list[Output]:
+    def _update_session(
+        self, event: Request | JobFinished | JobProgress | CalibrationStored
+    ) -> list[Output]:
         """Pass an event to the session, and use its new calibration, if any."""
         before = self._session.calibration
         if isinstance(event, JobFinished):
             outputs = self._session.finish_job(event)
+        elif isinstance(event, JobProgress):
+            outputs = self._session.report_job(event)
         elif isinstance(event, CalibrationStored):
             outputs = self._session.set_stored_version(event)
         elif event.command == "calibrate":
@@ -404,14 +428,22 @@ class Core:
         return outputs
 
 
-def _chain_tracker(rig: Rig) -> ChainTracker | None:
+def _chain_tracker(
+    rig: Rig, calibration: Calibration | None, before: ChainTracker | None
+) -> ChainTracker | None:
+    """Return a tracker of the chain model with its refined markers; `before` if it is equal."""
     if rig.chain_model is None or rig.mqtt.chain_hz <= 0.0:
         return None
+    stored = None if calibration is None else calibration.chain
+    refined = None if stored is None else stored.apply(rig.chain_model.chain)
+    loaded = rig.chain_model if refined is None else replace(rig.chain_model, chain=refined)
+    if before is not None and before.loaded == loaded:
+        return before
     from jointfit_daemon.pipeline.chain_tracking import (  # noqa: PLC0415 - it loads scipy
         ChainTracker,
     )
 
-    return ChainTracker(rig.chain_model, rig.mqtt.chain_hz)
+    return ChainTracker(loaded, rig.mqtt.chain_hz, refined=refined is not None)
 
 
 def _calibration_inputs(rig: Rig) -> tuple[object, ...]:

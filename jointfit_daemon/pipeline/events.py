@@ -123,6 +123,17 @@ class JobFinished:
 
 
 @dataclass(frozen=True, slots=True)
+class JobProgress:
+    """The worker reported the progress of a job; at most 5 a second."""
+
+    t_ns: int
+    job: int
+    progress: float
+    """0 to 1."""
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class CalibrationStored:
     """The calibration of the last ``CalibrationReady`` was stored."""
 
@@ -149,6 +160,7 @@ Event = (
     | Tick
     | Request
     | JobFinished
+    | JobProgress
     | CalibrationStored
     | UnixOffset
 )

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import orjson
 
 from jointfit_daemon.calibration import FitResult
-from jointfit_daemon.pipeline.events import JobFinished
+from jointfit_daemon.pipeline.events import JobFinished, JobProgress
 from jointfit_daemon.supervisor.worker import HEADER
 
 if TYPE_CHECKING:
@@ -33,12 +33,14 @@ FIT_TIMEOUT_S = 300.0
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 """Environment of the worker; numpy reads it on import. Threads would use the CPU core of the
 sensors, and slow down on small matrices: 11 s instead of 1 s."""
+_LONGEST_LINE = 256 * 1024 * 1024
+"""Bytes of the longest result; a calibration of four sensors has about 1 MB."""
 _STDERR_TAIL = 4000
 """Bytes of the worker's standard error that are logged."""
 
 
 class FitRunner:
-    """Runs the worker process of a job and delivers `JobFinished`.
+    """Runs the worker process of a job and delivers `JobProgress` and `JobFinished`.
 
     Parameters
     ----------
@@ -64,10 +66,14 @@ class FitRunner:
             self._running = None
 
     async def _run(self, job: FitJob) -> None:
+        def report(line: dict[str, Any]) -> None:
+            share, text = line["progress"], line["text"]
+            self._deliver(JobProgress(time.monotonic_ns(), job.job, share, text))
+
         began = time.monotonic()
         try:
             async with asyncio.timeout(FIT_TIMEOUT_S):
-                answer = await _in_worker(job)
+                answer = await _in_worker(job, report)
         except TimeoutError:
             answer = {"error": f"the fit did not end within {FIT_TIMEOUT_S:g} s"}
 
@@ -78,17 +84,22 @@ class FitRunner:
         self._deliver(JobFinished(time.monotonic_ns(), job.job, result, error))
 
 
-async def _in_worker(job: FitJob) -> dict[str, Any]:
+async def _in_worker(job: FitJob, report: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
     # Pickling minutes of samples takes tens of milliseconds, so it runs in a thread.
     data = await asyncio.to_thread(pickle.dumps, job.work)
     command = [sys.executable, "-m", "jointfit_daemon.supervisor.worker"]
     pipe = asyncio.subprocess.PIPE
     worker = await asyncio.create_subprocess_exec(
-        *command, stdin=pipe, stdout=pipe, stderr=pipe, env=ONE_THREAD | os.environ
+        *command,
+        stdin=pipe,
+        stdout=pipe,
+        stderr=pipe,
+        env=ONE_THREAD | os.environ,
+        limit=_LONGEST_LINE,
     )
     try:
         async with asyncio.TaskGroup() as pipes:
-            answer = pipes.create_task(_read(worker.stdout), name="fit result")
+            answer = pipes.create_task(_answer(worker.stdout, report), name="fit result")
             printed = pipes.create_task(_read(worker.stderr), name="fit output")
             # The pipe stays open: the worker exits when it closes. If the worker ended early, its
             # missing answer is reported.
@@ -105,9 +116,21 @@ async def _in_worker(job: FitJob) -> dict[str, Any]:
             worker.stdin.close()
     if text := printed.result()[-_STDERR_TAIL:].decode("utf-8", "replace").strip():
         log.warning("fit %s: output of the worker:\n%s", job.work.name, text)
-    if not answer.result():
-        return {"error": f"the worker process ended with exit code {code} and without a result"}
-    found: dict[str, Any] = orjson.loads(answer.result())
+    without = f"the worker process ended with exit code {code} and without a result"
+    return answer.result() or {"error": without}
+
+
+async def _answer(
+    pipe: asyncio.StreamReader | None, report: Callable[[dict[str, Any]], None]
+) -> dict[str, Any]:
+    """Return the last line of the worker, and report those before it; empty without a result."""
+    found: dict[str, Any] = {}
+    while pipe is not None and (line := await pipe.readline()):
+        content = orjson.loads(line)
+        if "progress" in content:
+            report(content)
+        else:
+            found = content
     return found
 
 

@@ -1,7 +1,8 @@
 """The worker process: one fit, started as ``python -m jointfit_daemon.supervisor.worker``.
 
-The worker reads a pickled job from standard input and writes one JSON object: ``{"result": …}`` or
-``{"error": text}``. Everything else that a fit prints is redirected to standard error. The parent
+The worker reads a pickled job from standard input and writes JSON objects, one a line: any number
+of ``{"progress": …, "text": …}``, at most five a second, then ``{"result": …}`` or ``{"error":
+text}``. Everything else that a fit prints is redirected to standard error. The parent
 keeps its end of the input open: when that closes, the worker exits.
 """
 
@@ -13,12 +14,19 @@ import pickle
 import struct
 import sys
 import threading
+import time
 import traceback
+from typing import TYPE_CHECKING
 
 import orjson
 
+if TYPE_CHECKING:
+    from jointfit_daemon.calibration import JobControl
+
 HEADER = struct.Struct("<Q")
 """Length of the pickled job, bytes."""
+_REPORT_S = 0.2
+"""Shortest time between two reports of progress, s."""
 _NICE = 10
 """Decrease of the priority: acquisition comes first."""
 
@@ -39,7 +47,7 @@ def main() -> int:
         from jointfit_daemon.calibration.phases import run_job  # noqa: PLC0415 - its fault is an answer
 
         job = pickle.loads(data)  # noqa: S301 - written by our parent
-        answer: dict[str, object] = {"result": run_job(job).to_dict()}
+        answer: dict[str, object] = {"result": run_job(job, _control(answer_fd)).to_dict()}
     except Exception as error:  # noqa: BLE001 - the parent reports it
         traceback.print_exc()
         answer = {"error": f"{type(error).__name__}: {error}"}
@@ -47,6 +55,21 @@ def main() -> int:
     with os.fdopen(answer_fd, "wb") as output:
         output.write(orjson.dumps(answer, option=orjson.OPT_SERIALIZE_NUMPY))
     return 0
+
+
+def _control(answer_fd: int) -> JobControl:
+    """Return the time since now, and reports on a descriptor."""
+    from jointfit_daemon.calibration import JobControl  # noqa: PLC0415 - as above
+
+    began = reported = time.monotonic()
+
+    def report(share: float, text: str) -> None:
+        nonlocal reported
+        if (now := time.monotonic()) - reported >= _REPORT_S:
+            reported = now
+            os.write(answer_fd, orjson.dumps({"progress": share, "text": text}) + b"\n")
+
+    return JobControl(lambda: time.monotonic() - began, report)
 
 
 def _exit_with_parent() -> None:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from jointfit_daemon.config import ConfigError, load_rig, parse_rig
 from jointfit_daemon.files.models import as_data, model_of, write_model
+from jointfit_daemon.limb_model import RefinedChain, chain_fingerprint
+from jointfit_daemon.pipeline import Core
+from jointfit_daemon.pipeline._core import _chain_tracker
+from jointfit_daemon.pipeline.events import Configured, Notice, NoticeLevel
+from tests.limb_model.plain_calibration import plain_calibration
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from jointfit_daemon.pipeline.events import Output
 
 Table = dict[str, Any]
 
@@ -162,3 +170,91 @@ def test_markers_that_the_model_lacks_are_a_remark(rig: Table) -> None:
     loaded = parse_rig(rig).chain_model
     assert loaded is not None
     assert loaded.remarks == ("not in the model, so not tracked by it: T9",)
+
+
+def test_options_of_the_refinement_are_those_of_the_command(rig: Table) -> None:
+    rig["calibration"] = {
+        "chain_refinement": {
+            "method": "search", "prior": 0.1, "weights": {"T1": 0.5}, "lock": ["C1", "C2.x"],
+            "holdout": 0.2, "frames": 80, "first_step_mm": 5, "threshold_mm": 1, "limit_s": 30,
+        }
+    }  # fmt: skip
+    refinement = parse_rig(rig).calibration.chain_refinement
+    assert refinement is not None
+    settings = refinement.settings
+    assert (settings.method, settings.prior, settings.frames) == ("search", 0.1, 80)
+    assert (settings.search.first_step_m, settings.search.threshold_m) == (0.005, 0.001)
+    assert settings.holdout_share == 0.2
+    assert refinement.limit_s == 30.0
+    of = {m.name: m for m in refinement.model.markers}
+    assert of["T1"].weight == 0.5
+    assert of["C1"].locked == (True, True, True)
+    assert of["C2"].locked == (True, False, False)
+
+
+def test_weights_of_a_file_replace_its_name(rig: Table, tmp_path: Path) -> None:
+    path = tmp_path / "weights.toml"
+    path.write_text("T1 = 0.25")
+    rig["calibration"] = {"chain_refinement": {"weights": str(path)}}
+    loaded = parse_rig(rig)
+    assert loaded.table["calibration"]["chain_refinement"]["weights"] == {"T1": 0.25}
+    assert loaded.calibration.chain_refinement is not None
+    assert loaded.calibration.chain_refinement.model.markers[0].weight == 0.25
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"lock": ["T9"]}, "chain_refinement.lock = ['T9']: marker T9: unknown marker; did you"),
+        ({"unlock": ["Q"]}, "unknown marker; there are: T1, T2, T3, C1, C2, C3"),
+        ({"weights": {"T9": 1.0}}, "marker T9: unknown marker; did you mean"),
+        ({"weights": {"T1": -1.0}}, "weight of T1: expected a number of 0 or more"),
+        ({"weights": "nowhere.toml"}, "nowhere.toml: cannot be read: No such file"),
+        ({"threshold_mm": 9.0}, "threshold_mm = 9.0: expected first_step_mm = 8 or less"),
+        ({"method": "search", "cost": "l1"}, "method search has no loss function"),
+        ({"method": "serach"}, "did you mean 'search'?"),
+        ({"frames": 5}, "chain_refinement.frames = 5: should be greater than or equal to 10"),
+        ({"limit_s": 999}, "chain_refinement.limit_s = 999: should be less than or equal to 200"),
+        ({"first_step": 8}, "did you mean 'first_step_mm'?"),
+    ],
+)
+def test_faulty_options_of_the_refinement_are_named(
+    rig: Table, options: Table, message: str
+) -> None:
+    rig["calibration"] = {"chain_refinement": options}
+    (text,) = refusals(rig)
+    assert message in text
+
+
+def test_refinement_without_a_chain_model_is_refused(rig: Table) -> None:
+    del rig["chain"]["model"]
+    rig["calibration"] = {"chain_refinement": {"frames": 80}}
+    (text,) = refusals(rig)
+    assert text.startswith("calibration.chain_refinement: needs a chain model: add [chain] model")
+
+
+def test_live_model_has_the_refined_markers_of_the_same_model_only(rig: Table) -> None:
+    loaded = parse_rig(rig)
+    assert loaded.chain_model is not None
+    model = loaded.chain_model.chain
+    chain = RefinedChain("leg", chain_fingerprint(model), {"T1": (0.2, 0.0, 0.0)})
+    calibration = replace(plain_calibration(loaded.chain), chain=chain)
+    tracker = _chain_tracker(loaded, calibration, None)
+    assert tracker is not None
+    assert tracker.loaded.chain.markers[0].position == (0.2, 0.0, 0.0)
+    assert tracker.loaded.chain.markers[1:] == model.markers[1:]
+    assert _chain_tracker(loaded, calibration, tracker) is tracker  # its monitor continues
+
+    core = Core()
+    assert not [one for one in core.feed(Configured(0, loaded, calibration)) if warned(one)]
+    other = replace(calibration, chain=replace(chain, fingerprint="another"))
+    plain = _chain_tracker(loaded, other, tracker)
+    assert plain is not None
+    assert plain.loaded == loaded.chain_model
+    (warning,) = [one for one in core.feed(Configured(1, loaded, other)) if warned(one)]
+    assert isinstance(warning, Notice)
+    assert "refined markers of another version of the chain model ('leg')" in warning.text
+
+
+def warned(output: Output) -> bool:
+    return isinstance(output, Notice) and output.level == NoticeLevel.WARNING

@@ -40,7 +40,7 @@ from jointfit_daemon.pipeline.health import (
     WireCounts,
 )
 from jointfit_daemon.supervisor._core_runner import LONGEST_TICK_INTERVAL_NS, CoreRunner
-from jointfit_daemon.supervisor._fit_runner import FitRunner
+from jointfit_daemon.supervisor._fit_runner import FitRunner, _answer
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
 from jointfit_daemon.supervisor._source_tasks import run_source
 from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
@@ -510,6 +510,15 @@ async def test_failed_fit_reports_its_reason() -> None:
 
 async def test_cancelled_fit_is_killed_without_a_result() -> None:
     assert await fit(cancel_after_s=0.05) == []
+
+
+async def test_progress_of_the_worker_precedes_its_result() -> None:
+    lines: list[dict[str, Any]] = []
+    pipe = asyncio.StreamReader()
+    pipe.feed_data(b'{"progress":0.5,"text":"halfway"}\n{"result":{"quality":{}}}')
+    pipe.feed_eof()
+    assert await _answer(pipe, lines.append) == {"result": {"quality": {}}}
+    assert lines == [{"progress": 0.5, "text": "halfway"}]
 
 
 async def test_request_on_an_invalid_topic_is_ignored(broker: Broker) -> None:

@@ -12,6 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
 from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
@@ -227,6 +228,19 @@ def judge_the_chain_model(run: CalibratedRun) -> None:
     rate_hz = (len(run.chain) - 1) / (run.chain[-1]["t_us"] - run.chain[0]["t_us"]) * 1e6
     assert 4 < rate_hz <= 10.5
     assert run.chain[-1]["fit"]["rms_m"] < 0.02
+
+    # the calibration refines the markers, and the reload finds them in its file
+    refined = [payload["refined"] for payload in run.chain]
+    assert refined == sorted(refined)
+    errors = {kind: [p["fit"]["rms_m"] for p in run.chain if p["refined"] is kind and p["fit"]]
+              for kind in (False, True)}  # fmt: skip
+    assert np.median(errors[True]) < 0.7 * np.median(errors[False])
+    stored = [e.calibration for e in read_events(run.recording) if isinstance(e, Configured)][1]
+    assert stored is not None
+    assert stored.chain is not None
+    figures = stored.quality["chain"]
+    assert figures["after"]["rms_m"] < figures["before"]["rms_m"]
+    assert figures["after"]["accepted"]
 
     # x points to the right, so that knee flexion is a negative angle of the shank
     knees = [p["coordinates"]["shank_angle"]["value_deg"] for p in run.chain]

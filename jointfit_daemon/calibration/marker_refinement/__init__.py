@@ -2,19 +2,23 @@
 
 from jointfit_daemon.calibration.marker_refinement._block_descent import Carriers
 from jointfit_daemon.calibration.marker_refinement._coordinate_search import SearchSettings, search
+from jointfit_daemon.calibration.marker_refinement._evaluation import judge_trial
 from jointfit_daemon.calibration.marker_refinement._input_checks import (
     MOST_RMS_M,
     exchanged_markers,
     find_trial_faults,
 )
+from jointfit_daemon.calibration.marker_refinement._marker_options import (
+    require_marker,
+    with_locks,
+    with_weights,
+)
 from jointfit_daemon.calibration.marker_refinement._motion_trial import (
     MotionTrial,
-    RefinementCost,
     RefinementError,
-    RefinementMethod,
     RefinementSettings,
 )
-from jointfit_daemon.calibration.marker_refinement._refine import refine_markers
+from jointfit_daemon.calibration.marker_refinement._refine import STOPPED, refine_markers
 from jointfit_daemon.calibration.marker_refinement._refinement_result import (
     MarkerOutcome,
     Refinement,
@@ -24,19 +28,22 @@ from jointfit_daemon.calibration.marker_refinement._refinement_result import (
 
 __all__ = [
     "MOST_RMS_M",
+    "STOPPED",
     "Carriers",
     "MarkerOutcome",
     "MotionTrial",
     "Refinement",
-    "RefinementCost",
     "RefinementError",
-    "RefinementMethod",
     "RefinementSettings",
     "SearchSettings",
     "TrackingStatistics",
     "TrialOutcome",
     "exchanged_markers",
     "find_trial_faults",
+    "judge_trial",
     "refine_markers",
+    "require_marker",
     "search",
+    "with_locks",
+    "with_weights",
 ]

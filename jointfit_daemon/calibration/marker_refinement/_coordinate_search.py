@@ -50,6 +50,8 @@ class SearchResult:
     """RMS tracking error at the start and after every accepted step, m."""
     runs: int
     """Number of runs of inverse kinematics."""
+    complete: bool = True
+    """Whether every step is below the threshold."""
 
 
 def search(
@@ -58,6 +60,8 @@ def search(
     free: NDArray[np.bool_],
     settings: SearchSettings = SearchSettings(),
     progress: Callable[[float, float], None] | None = None,
+    *,
+    stop: Callable[[], bool] = lambda: False,
 ) -> SearchResult:
     """Refine marker positions coordinate by coordinate.
 
@@ -72,11 +76,15 @@ def search(
         False where a coordinate is locked, shape (M, 3).
     progress
         Called with the largest remaining step and the error, both m, after every pass.
+    stop
+        Called before every coordinate; true ends the search.
     """
     walk = _Walk(tracking_error, start)
     steps = np.where(free, settings.first_step_m, 0.0)
     while (steps >= settings.threshold_m).any():
         for marker, axis in np.argwhere(steps >= settings.threshold_m):
+            if stop():
+                return SearchResult(walk.positions, tuple(walk.errors), walk.runs, complete=False)
             if not walk.along(marker, axis, steps[marker, axis], settings.least_gain_m):
                 steps[marker, axis] /= 2.0
 

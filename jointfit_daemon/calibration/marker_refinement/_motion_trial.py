@@ -6,15 +6,13 @@ Positions are in meters, in the order of the model's markers, NaN where a marker
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from jointfit_daemon.calibration.marker_refinement._coordinate_search import SearchSettings
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
-
-RefinementMethod = Literal["joint", "block", "search"]
-RefinementCost = Literal["l1", "l2"]
+    from jointfit_daemon.calibration._refinement_choices import RefinementCost, RefinementMethod
 
 
 class RefinementError(ValueError):

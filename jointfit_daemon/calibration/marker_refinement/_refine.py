@@ -43,11 +43,15 @@ if TYPE_CHECKING:
 
     Progress = Callable[[float, float], None]
     """Called with the share done, 0 to 1, and the training error, m."""
+    Stop = Callable[[], bool]
+    """Called during the iteration; true ends it with the positions so far."""
 
 L1_CORNER_M = 0.001
 """Distance below which the loss of the cost ``l1`` is quadratic, m; it has a corner at zero
 otherwise."""
 _FINE = 1e-9
+STOPPED = "stopped before convergence"
+"""`Refinement.stopped` of an iteration that its caller ended."""
 _RISES = 2
 """Consecutive steps without a new minimum of the hold-out error that end the iteration."""
 
@@ -58,6 +62,8 @@ def refine_markers(
     settings: RefinementSettings | None = None,
     validation: Sequence[MotionTrial] = (),
     progress: Progress | None = None,
+    *,
+    stop: Stop | None = None,
 ) -> Refinement:
     """Refine the positions of markers on their segments.
 
@@ -69,6 +75,11 @@ def refine_markers(
         Training trials.
     validation
         Trials that are evaluated, not fitted.
+    progress
+        Called after every step.
+    stop
+        Called after every step, and by ``search`` before every coordinate; the result is that of
+        the steps so far if it returns true.
 
     Raises
     ------
@@ -83,7 +94,8 @@ def refine_markers(
     unseen = [trial.thinned(settings.frames) for trial in validation]
     checked = check(model, thin, unseen)
     task = _task(model, checked, settings)
-    ended = _METHODS[settings.method](task, settings, progress)
+    control = _RunControl(progress or _ignore, stop or _never)
+    ended = _METHODS[settings.method](task, settings, control)
     after = model.with_markers(ended.positions)
     within = IkOptions(limit_m2=settings.limit_m2)
     outcomes = tuple(
@@ -113,6 +125,20 @@ def refine_markers(
         _gauge(task, ended.positions, settings),
         notes,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class _RunControl:
+    progress: Progress
+    stop: Stop
+
+
+def _ignore(_share: float, _error: float) -> None:
+    return
+
+
+def _never() -> bool:
+    return False
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,22 +225,22 @@ class _HoldOut:
 
 
 def _jointly(
-    task: _RefinementTask, settings: RefinementSettings, progress: Progress | None
+    task: _RefinementTask, settings: RefinementSettings, control: _RunControl
 ) -> _RefinementEnd:
     problem = task.problem
     start = place(problem, problem.model.positions, task.first.state)
-    watch = _StopCriterion(task.holdout, problem, progress)
+    watch = _StopCriterion(task.holdout, problem, control)
     tolerance = settings.tolerance or 1e-6
     steps = solve_jointly(problem, start, lambda s: watch(s.positions, s.cost), tolerance)
     return watch.ended(steps[-1].positions, [s.cost for s in steps], 1)
 
 
 def _in_turns(
-    task: _RefinementTask, settings: RefinementSettings, progress: Progress | None
+    task: _RefinementTask, settings: RefinementSettings, control: _RunControl
 ) -> _RefinementEnd:
     problem = task.problem
     chain = ChainFollower(problem, task.first)
-    watch = _StopCriterion(task.holdout, problem, progress)
+    watch = _StopCriterion(task.holdout, problem, control)
     tolerance = settings.tolerance or 1e-4
     turns = solve_in_turns(
         problem, chain, lambda t: watch(t.positions, t.cost), tolerance=tolerance
@@ -223,7 +249,7 @@ def _in_turns(
 
 
 def _searching(
-    task: _RefinementTask, settings: RefinementSettings, progress: Progress | None
+    task: _RefinementTask, settings: RefinementSettings, control: _RunControl
 ) -> _RefinementEnd:
     problem, last = task.problem, task.first
     present = problem.weights > 0.0
@@ -242,13 +268,13 @@ def _searching(
     first_step = settings.search.first_step_m
 
     def report(step: float, at: float) -> None:
-        if progress is not None:
-            halvings = np.log2(first_step / step) if step > 0 else np.inf
-            all_of_them = np.log2(first_step / settings.search.threshold_m) + 1.0
-            progress(min(1.0, float(halvings / all_of_them)), at)
+        halvings = np.log2(first_step / step) if step > 0 else np.inf
+        all_of_them = np.log2(first_step / settings.search.threshold_m) + 1.0
+        control.progress(min(1.0, float(halvings / all_of_them)), at)
 
-    found = search(error, problem.model.positions, problem.free, settings.search, report)
-    stopped = "every step is below the threshold"
+    start = problem.model.positions
+    found = search(error, start, problem.free, settings.search, report, stop=control.stop)
+    stopped = "every step is below the threshold" if found.complete else STOPPED
     return _RefinementEnd(found.positions, found.errors, found.runs, stopped)
 
 
@@ -278,22 +304,23 @@ class _StopCriterion:
     """Reports progress after every step and decides whether the iteration stops."""
 
     def __init__(
-        self, holdout: _HoldOut | None, problem: RefinementProblem, progress: Progress | None
+        self, holdout: _HoldOut | None, problem: RefinementProblem, control: _RunControl
     ) -> None:
-        self._holdout, self._progress = holdout, progress
+        self._holdout, self._control = holdout, control
         self._total = float(problem.weights.sum())
         self._count = 0
-        self._early = False
+        self._early = self._stopped = False
 
     def __call__(self, positions: Array, cost: float) -> bool:
         self._count += 1
-        if self._progress is not None:
-            self._progress(1.0 - 0.5**self._count, float(np.sqrt(2.0 * cost / self._total)))
+        self._control.progress(1.0 - 0.5**self._count, float(np.sqrt(2.0 * cost / self._total)))
         self._early = self._holdout is not None and self._holdout.enough(positions)
-        return self._early
+        self._stopped = not self._early and self._control.stop()
+        return self._early or self._stopped
 
     def ended(self, positions: Array, costs: Sequence[float], runs: int) -> _RefinementEnd:
         stopped = "the hold-out error rose" if self._early else "converged"
+        stopped = STOPPED if self._stopped else stopped
         if self._holdout is not None:
             positions = self._holdout.positions
         return _RefinementEnd(positions, tuple(costs), runs, stopped)

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration._refinement_choices import RefinementMethod
     from jointfit_daemon.calibration.marker_refinement._gauge import Gauge
-    from jointfit_daemon.calibration.marker_refinement._motion_trial import RefinementMethod
     from jointfit_daemon.kinematics.chains import ChainModel
 
 

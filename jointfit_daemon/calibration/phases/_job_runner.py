@@ -14,11 +14,13 @@ from jointfit_daemon.calibration._jobs import (
     CalibrationJob,
     FitResult,
     FunctionalJob,
+    JobControl,
     RefitJob,
     StaticJob,
 )
 from jointfit_daemon.calibration._quality import WorldQuality, quality_table
 from jointfit_daemon.calibration.phases._acceptance import compare_calibrations
+from jointfit_daemon.calibration.phases._chain_refinement import with_refined_chain
 from jointfit_daemon.calibration.phases._functional import fit_calibration
 from jointfit_daemon.calibration.phases._online import refit_models
 from jointfit_daemon.calibration.phases._plate_alignment import (
@@ -38,7 +40,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
 
 
-def run_job(job: CalibrationJob) -> FitResult:
+def run_job(job: CalibrationJob, control: JobControl | None = None) -> FitResult:
     """Run one fit and return its result, or the reason for which the fit was refused."""
     try:
         match job:
@@ -47,7 +49,7 @@ def run_job(job: CalibrationJob) -> FitResult:
             case StaticJob():
                 return _static(job)
             case FunctionalJob():
-                return _functional(job)
+                return _functional(job, control or JobControl())
             case RefitJob():
                 return _refit(job)
     except CalibrationError as refusal:
@@ -89,7 +91,7 @@ def _static(job: StaticJob) -> FitResult:
     return FitResult(quality_table(pose.quality), calibration=found, notes=notes)
 
 
-def _functional(job: FunctionalJob) -> FitResult:
+def _functional(job: FunctionalJob, control: JobControl) -> FitResult:
     previous = _previous(job)
     found = fit_calibration(
         job.static,
@@ -102,6 +104,7 @@ def _functional(job: FunctionalJob) -> FitResult:
         tracked=job.tracked,
         previous=previous,
     )
+    found = with_refined_chain(found, job.functional, job.settings, control)
     worse = None
     if previous is not None:
         better, reason = compare_calibrations(found, previous)

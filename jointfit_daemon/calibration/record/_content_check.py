@@ -72,6 +72,7 @@ def _faults(c: Calibration) -> Iterator[str]:
         yield from _segment(name, segment)
     yield from _joints(c)
     yield from _clusters(c)
+    yield from _chain(c)
     for link in c.links:
         yield from _link(link, sensors)
     yield from _quality(c.quality)
@@ -196,6 +197,15 @@ def _clusters(c: Calibration) -> Iterator[str]:
             yield from _finite(f"{key}.template", cluster.template, (count, 3))
         yield from _finite(f"{key}.origin", cluster.origin, (3,))
         yield from _unit(f"{key}.q_body", cluster.q_body)
+
+
+def _chain(c: Calibration) -> Iterator[str]:
+    if c.chain is None:
+        return
+    if not (_is_text(c.chain.model) and _is_text(c.chain.fingerprint)):
+        yield "chain: model and fingerprint must be text"
+    for name, position in c.chain.positions.items():
+        yield from _finite(f"chain.positions.{name}", position, (3,))
 
 
 def _link(link: SensorLink, sensors: Sequence[str]) -> Iterator[str]:

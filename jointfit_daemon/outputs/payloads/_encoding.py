@@ -162,6 +162,7 @@ def encode_chain(state: ChainModelState, offset_ns: int) -> bytes:
             "t_us": (state.t_ns + offset_ns) // _NS_PER_US,
             "frame": state.number,
             "model": state.model,
+            "refined": state.refined,
             "coordinates": {one.name: _coordinate(one) for one in state.coordinates},
             "error_m": {name: _metres(error) for name, error in state.errors.items()},
             "fit": _fit_errors(state.fit),

@@ -29,6 +29,7 @@ from jointfit_daemon.pipeline.events import (
     ChunkArrived,
     Configured,
     JobFinished,
+    JobProgress,
     Request,
     SourceClosed,
     SourceOpened,
@@ -128,6 +129,7 @@ _EVENTS: dict[str, Any] = {
     "closed": SourceClosed,
     "request": Request,
     "job": JobFinished,
+    "progress": JobProgress,
     "stored": CalibrationStored,
     "unix": UnixOffset,
 }

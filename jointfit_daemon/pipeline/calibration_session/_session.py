@@ -53,7 +53,13 @@ if TYPE_CHECKING:
     )
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
-    from jointfit_daemon.pipeline.events import CalibrationStored, JobFinished, Output, Request
+    from jointfit_daemon.pipeline.events import (
+        CalibrationStored,
+        JobFinished,
+        JobProgress,
+        Output,
+        Request,
+    )
     from jointfit_daemon.pipeline.sources import LagMonitor
 
 
@@ -327,6 +333,13 @@ class CalibrationSession:
         return FunctionalJob(
             chain, settings, self._static, trial, alignment, previous, lag_ns, tracked
         )
+
+    def report_job(self, event: JobProgress) -> list[Output]:
+        """Publish the progress of the running fit; that of cancelled jobs is ignored."""
+        if self._fit is None or event.job != self._fit.job:
+            return []
+        fitting = CalibrationPhase.FITTING
+        return [CalibrationProgress(event.t_ns, fitting, round(event.progress, 3), event.text)]
 
     def finish_job(self, event: JobFinished) -> list[Output]:
         """Use the result of the worker. Results of cancelled jobs are ignored."""

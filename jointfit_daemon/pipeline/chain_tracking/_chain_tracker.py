@@ -61,9 +61,12 @@ class ChainTracker:
         The chain model and the names of its coordinates.
     rate_hz : float
         Greatest number of fitted frames per second; above 0.
+    refined : bool
+        Whether the marker positions are those of a calibration.
     """
 
-    def __init__(self, loaded: LoadedModel, rate_hz: float) -> None:
+    def __init__(self, loaded: LoadedModel, rate_hz: float, *, refined: bool = False) -> None:
+        self.loaded, self._refined = loaded, refined
         self._model = model = loaded.chain
         self._solver = LiveInverseKinematics(model, OPTIONS)
         self._monitor = MarkerMonitor(model)
@@ -149,6 +152,7 @@ class ChainTracker:
             frame.number,
             t_ns,
             self._model.name,
+            self._refined,
             coordinates,
             errors,
             fit,

@@ -43,6 +43,7 @@ def report(quality: Mapping[str, Any]) -> list[str]:
         if m >= MOVED_M
     ]
 
+    lines += _chain_lines(quality.get("chain") or {})
     anatomy: Mapping[str, Any] = quality.get("anatomy") or {}
     for name, joint in (anatomy.get("joints") or {}).items():
         sd_m = joint.get("sd_m")
@@ -109,6 +110,33 @@ class ProgressLines:
             return []
         self._next_s = now_s + self.interval_s
         return [self._line, *(f"  {line}" for line in movement_lines(data))]
+
+
+def _chain_lines(chain: Mapping[str, Any]) -> list[str]:
+    """Return the result of the refinement of the chain model, and markers with large errors."""
+    name = f"chain model {chain.get('model')!r}"
+    if chain.get("refused"):
+        return [f"{name}: markers not refined: {chain['refused']}"]
+    if not chain:
+        return []
+    (rms, most), (new_rms, new_most) = (
+        (1000 * chain[key]["rms_m"], 1000 * chain[key]["maximum_m"]) for key in ("before", "after")
+    )
+    limits = "within" if chain["after"]["accepted"] else "ABOVE"
+    first = (
+        f"{name}: marker error {rms:.1f} mm RMS, {most:.0f} mm at most; refined {new_rms:.1f} and "
+        f"{new_most:.0f} mm, {limits} the accepted errors"
+    )
+    kept = [part for part, one in chain["parts"].items() if not one["refined"]]
+    moved = {marker: 1000 * m for marker, m in chain["moved_m"].items() if m >= MOVED_M}
+    return [
+        first,
+        *(f"{name}: {part}: not improved, positions of the model retained" for part in kept),
+        *(
+            f"{marker}: {mm:.0f} mm from its place in the chain model"
+            for marker, mm in sorted(moved.items(), key=lambda item: -item[1])
+        ),
+    ]
 
 
 def _error_line(quantity: str, by_method: Mapping[str, Any], method: str) -> str:

@@ -17,6 +17,7 @@ from jointfit_daemon.calibration.marker_refinement import (
     RefinementError,
     exchanged_markers,
     find_trial_faults,
+    require_marker,
 )
 from jointfit_daemon.files.mocap import read_marker_trial
 from jointfit_daemon.files.models import IkSetup, load_model, read_ik_setup
@@ -27,7 +28,7 @@ from jointfit_daemon.kinematics.inverse_kinematics import (
     restart_local_minima,
     solve_frames,
 )
-from jointfit_daemon.tools.marker_model import motion_trial, require_marker
+from jointfit_daemon.tools.marker_model import motion_trial
 from jointfit_daemon.tools.text_output import list_names
 
 if TYPE_CHECKING:

@@ -16,12 +16,8 @@ from jointfit_daemon.tools.text_output import check_choice, echo_json
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.calibration.marker_refinement import (
-        Refinement,
-        RefinementCost,
-        RefinementMethod,
-        RefinementSettings,
-    )
+    from jointfit_daemon.calibration import RefinementCost, RefinementMethod
+    from jointfit_daemon.calibration.marker_refinement import Refinement, RefinementSettings
     from jointfit_daemon.kinematics.chains import ChainModel
     from jointfit_daemon.tools.markers._trials import ModelRequest
 
@@ -151,7 +147,7 @@ def markers(
 
 def _loss(method: str, cost: str) -> tuple[RefinementMethod, RefinementCost]:
     """Return the checked method and cost."""
-    from jointfit_daemon.calibration.marker_refinement import RefinementCost, RefinementMethod
+    from jointfit_daemon.calibration import RefinementCost, RefinementMethod
 
     check_choice("--method", method, get_args(RefinementMethod))
     check_choice("--cost", cost, get_args(RefinementCost))

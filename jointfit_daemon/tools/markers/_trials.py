@@ -8,20 +8,22 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
+from jointfit_daemon.calibration.marker_refinement import (
+    require_marker,
+    with_locks,
+    with_weights,
+)
 from jointfit_daemon.files.mocap import read_marker_trial
 from jointfit_daemon.files.models import load_model, read_marker_weights
-from jointfit_daemon.tools.marker_model import motion_trial, require_marker
+from jointfit_daemon.tools.marker_model import motion_trial
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from jointfit_daemon.calibration.marker_refinement import MotionTrial
     from jointfit_daemon.files.axes import Axis
     from jointfit_daemon.kinematics.chains import ChainModel
-
-_AXES = "xyz"
-_ALL = "*"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,39 +57,11 @@ def load(
     kept = tuple(m for m in chain.markers if m.name not in asked.without)
     chain = replace(chain, markers=kept)
     if asked.weights is not None:
-        chain = _weighted(chain, asked.weights)
+        weights = read_marker_weights(asked.weights)
+        chain = with_weights(chain, weights, f"--weights {asked.weights}:")
 
     learned = [motion_trial(p.stem, t, chain) for p, t in zip(trials, read, strict=True)]
-    chain = _locked(chain, asked.unlock, hold=False)
-    chain = _locked(chain, asked.lock, hold=True)
+    chain = with_locks(chain, asked.unlock, "--unlock", locked=False)
+    chain = with_locks(chain, asked.lock, "--lock", locked=True)
     judged = [motion_trial(p.stem, t, chain) for p, t in zip(validation, judges, strict=True)]
     return chain, loaded.remarks, learned, judged
-
-
-def _weighted(chain: ChainModel, path: Path) -> ChainModel:
-    """Return the chain with the weights of a file; other markers keep theirs."""
-    weights = read_marker_weights(path)
-    for name in weights:
-        require_marker(chain, name, f"--weights {path}:")
-    if not any(weights.get(m.name, m.weight) > 0.0 for m in chain.markers):
-        raise ValueError(f"--weights {path}: every weight is 0, expected some above 0")
-    markers = (replace(m, weight=weights.get(m.name, m.weight)) for m in chain.markers)
-    return replace(chain, markers=tuple(markers))
-
-
-def _locked(chain: ChainModel, texts: Iterable[str], *, hold: bool) -> ChainModel:
-    """Return the chain with the named locks set (`hold`) or cleared."""
-    locks = {m.name: list(m.locked) for m in chain.markers}
-    for text in texts:
-        if text == _ALL:
-            locks = {name: [hold] * 3 for name in locks}
-            continue
-        # A full marker name with a dot takes precedence over a marker and its coordinate.
-        name, dot, axis = text.rpartition(".")
-        if text in locks or not dot or axis not in tuple(_AXES):
-            name, axis = text, _AXES
-        require_marker(chain, name, "--lock" if hold else "--unlock")
-        for letter in axis:
-            locks[name][_AXES.index(letter)] = hold
-
-    return chain.with_locks({name: (x, y, z) for name, (x, y, z) in locks.items()})

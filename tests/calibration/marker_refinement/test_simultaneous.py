@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from jointfit_daemon.calibration import RefinementCost
 from jointfit_daemon.calibration.marker_refinement import (
     MotionTrial,
-    RefinementCost,
     RefinementError,
     RefinementSettings,
     _refine,
@@ -33,7 +33,7 @@ from jointfit_daemon.kinematics.chains import (
 from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames, tracking_error
 
 if TYPE_CHECKING:
-    from jointfit_daemon.calibration.marker_refinement import RefinementMethod
+    from jointfit_daemon.calibration import RefinementMethod
     from jointfit_daemon.kinematics.inverse_kinematics import IkResult
 
 LOCKED = (True, True, True)

@@ -434,6 +434,7 @@ def test_optical_chain_has_units_by_coordinate_and_null_for_the_unknown() -> Non
         7,
         5_000_123_000,
         "leg",
+        True,
         (
             ModelCoordinate("knee", True, math.radians(-27.694), math.radians(1.72)),
             ModelCoordinate("pelvis_tx", False, 0.07812, 0.00441),
@@ -449,6 +450,7 @@ def test_optical_chain_has_units_by_coordinate_and_null_for_the_unknown() -> Non
         "t_us": 5_001_123,
         "frame": 7,
         "model": "leg",
+        "refined": True,
         "coordinates": {
             "knee": {"value_deg": -27.69, "sd_deg": 1.72},
             "pelvis_tx": {"value_m": 0.0781, "sd_m": 0.0044},

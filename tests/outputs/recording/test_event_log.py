@@ -37,6 +37,7 @@ from jointfit_daemon.pipeline.events import (
     ChunkArrived,
     Configured,
     JobFinished,
+    JobProgress,
     Request,
     SourceClosed,
     SourceOpened,
@@ -74,6 +75,7 @@ events = st.one_of(
     st.builds(SourceClosed, instants, words, st.sampled_from(["lost", "removed"]), words),
     st.builds(Request, instants, words, words, tables),
     st.builds(JobFinished, instants, st.integers(0, 99), st.none() | results, st.none() | words),
+    st.builds(JobProgress, instants, st.integers(0, 99), st.floats(0.0, 1.0), words),
     st.builds(CalibrationStored, instants, st.integers(1, 99)),
     st.builds(UnixOffset, instants, st.integers(-(2**62), 2**62)),
 )

@@ -13,6 +13,7 @@ from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.model import Chain, MocapFrame, MocapLayout
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
 from jointfit_daemon.pipeline.events import (
+    CalibrationPhase,
     CalibrationProgress,
     CalibrationReady,
     CalibrationStatus,
@@ -20,6 +21,7 @@ from jointfit_daemon.pipeline.events import (
     CancelJob,
     FitJob,
     JobFinished,
+    JobProgress,
     Notice,
     Reply,
     Request,
@@ -354,3 +356,15 @@ def test_notes_of_the_alignment_are_published() -> None:
     notes = ["S1: heading only; turn the plate about more axes"]
     outputs = done(one, job, alignment={"sensors": {}, "notes": notes}, quality={})
     assert [notice.text for notice in only(outputs, Notice)] == notes
+
+
+def test_progress_of_the_running_fit_is_published_and_that_of_others_is_not() -> None:
+    one = session()
+    ask(one, 0, "static")
+    (job,) = only(feed(one, 0, 10), FitJob)
+    text = "refining the markers of the chain model: error 5.1 mm"
+    (progress,) = one.report_job(JobProgress(11 * SECOND, job.job, 0.51234, text))
+    assert progress == CalibrationProgress(11 * SECOND, CalibrationPhase.FITTING, 0.512, text)
+    assert one.report_job(JobProgress(11 * SECOND, job.job + 1, 0.5, text)) == []
+    done(one, job, quality={})
+    assert one.report_job(JobProgress(12 * SECOND, job.job, 0.9, text)) == []

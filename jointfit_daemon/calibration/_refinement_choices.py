@@ -1,0 +1,8 @@
+"""Names of the methods and costs of a marker refinement, without the code of the refinement."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+RefinementMethod = Literal["joint", "block", "search"]
+RefinementCost = Literal["l1", "l2"]

@@ -1,0 +1,255 @@
+"""Refinement of the markers of a chain model, through inverse kinematics of the movement.
+
+The first part of the movement refines the positions; the rest judges them. A segment whose markers
+have no smaller error there keeps the positions of the model, and so does the whole model if its
+error is not smaller. A model that does not fit the movement is reported, and the calibration
+continues without a refinement.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration._quality import (
+    ChainQuality,
+    MarkerErrors,
+    PartQuality,
+    quality_table,
+)
+from jointfit_daemon.calibration._robust_weights import rms
+from jointfit_daemon.calibration.marker_refinement import (
+    STOPPED,
+    MotionTrial,
+    RefinementError,
+    judge_trial,
+    refine_markers,
+)
+from jointfit_daemon.kinematics.accepted_errors import (
+    ACCEPTED_MAXIMUM_M,
+    ACCEPTED_RMS_M,
+    is_accepted,
+)
+from jointfit_daemon.kinematics.inverse_kinematics import IkOptions
+from jointfit_daemon.limb_model import RefinedChain, chain_fingerprint, vector
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration._jobs import JobControl
+    from jointfit_daemon.calibration._trial import (
+        CalibrationSettings,
+        CalibrationTrial,
+        ChainRefinement,
+        OpticalTrack,
+    )
+    from jointfit_daemon.calibration.marker_refinement import Refinement, TrialOutcome
+    from jointfit_daemon.kinematics.chains import ChainModel
+    from jointfit_daemon.limb_model import Calibration
+
+FARTHEST_M = 0.06
+"""Largest plausible error of a marker in a model, m: in operation, a marker at this distance counts
+as misplaced."""
+_MM = 1e3
+
+
+@dataclass(frozen=True, slots=True)
+class ChainOutcome:
+    """Result of the refinement of a chain model."""
+
+    chain: RefinedChain | None = None
+    """None if the positions of the model remain in use."""
+    figures: ChainQuality | None = None
+    """None without a chain model."""
+    notes: tuple[str, ...] = ()
+
+
+def refine_chain(
+    functional: CalibrationTrial, settings: CalibrationSettings, control: JobControl
+) -> ChainOutcome:
+    """Refine the markers of the chain model of the rig, if it has one.
+
+    Parameters
+    ----------
+    functional
+        The movement.
+    settings
+        Chain model, options and share of the movement that is held out.
+    control
+        Elapsed time, which bounds the iteration, and progress.
+    """
+    wanted = settings.chain_refinement
+    if wanted is None or not settings.refine_markers or functional.optical is None:
+        return ChainOutcome()
+    moving = marker_trial(wanted.model, functional.optical)
+    learned, unseen = moving.split(settings.holdout_share)
+    began_s = control.elapsed_s()
+
+    def show_progress(share: float, error: float) -> None:
+        text = f"refining the markers of the chain model: error {_MM * error:.1f} mm"
+        control.report(share, text)
+
+    try:
+        found = refine_markers(
+            wanted.model,
+            [learned],
+            wanted.settings,
+            [unseen],
+            show_progress,
+            stop=lambda: control.elapsed_s() - began_s >= wanted.limit_s,
+        )
+    except (RefinementError, np.linalg.LinAlgError) as refusal:
+        model, reason = wanted.model.name, str(refusal)
+        text = f"chain model {model!r}: markers not refined: {reason}"
+        return ChainOutcome(None, ChainQuality(model, wanted.settings.method, reason), (text,))
+    return _outcome(wanted, found, unseen.thinned(wanted.settings.frames))
+
+
+def with_refined_chain(
+    calibration: Calibration,
+    functional: CalibrationTrial,
+    settings: CalibrationSettings,
+    control: JobControl,
+) -> Calibration:
+    """Return the calibration with the refined markers of the chain model, figures and notes."""
+    outcome = refine_chain(functional, settings, control)
+    if outcome.figures is None:
+        return calibration
+    quality = {**calibration.quality, "chain": quality_table(outcome.figures)}
+    notes = (*calibration.notes, *outcome.notes)
+    return replace(calibration, chain=outcome.chain, quality=quality, notes=notes)
+
+
+def marker_trial(model: ChainModel, optical: OpticalTrack) -> MotionTrial:
+    """Return the markers of the model in a movement, NaN where missing."""
+    targets = np.full((len(optical.t_ns), len(model.markers), 3), np.nan)
+    for at, name in enumerate(model.marker_names):
+        if name in optical.markers:
+            targets[:, at] = optical.positions[:, optical.markers.index(name)]
+    rate_hz = 1e9 / float(np.median(np.diff(optical.t_ns)))
+    return MotionTrial("functional", targets, rate_hz)
+
+
+def _outcome(wanted: ChainRefinement, found: Refinement, unseen: MotionTrial) -> ChainOutcome:
+    """Select the segments whose markers have a smaller error on the held-out frames."""
+    model = wanted.model
+    shift = found.model.positions - model.positions
+    far = np.linalg.norm(shift, axis=1) >= FARTHEST_M
+    refused = {model.markers[m].segment for m in np.flatnonzero(far)}
+    notes = [
+        f"chain model {model.name!r}: markers of {model.markers[m].segment} not refined: "
+        f"{model.markers[m].name} would move by {_MM * np.linalg.norm(shift[m]):.0f} mm; check its "
+        "label, and its place in the model"
+        for m in np.flatnonzero(far)
+    ]
+
+    judge, parts = _select(wanted, found, unseen, refused)
+    figures = _figures(wanted, found, judge, parts, shift)
+    notes += _notes(wanted, found, figures)
+    used = {s for s, part in parts.items() if part.refined}
+    return ChainOutcome(_record(model, found, used), figures, tuple(notes))
+
+
+def _select(
+    wanted: ChainRefinement, found: Refinement, unseen: MotionTrial, refused: set[str]
+) -> tuple[TrialOutcome, dict[str, PartQuality]]:
+    """Return the errors with the selected segments, and those of every segment that moved.
+
+    The errors of a segment depend on its neighbors, so each selection is judged as a whole.
+    """
+    model = wanted.model
+    shift = found.model.positions - model.positions
+    moved = {model.markers[m].segment for m in np.flatnonzero(shift.any(axis=1))}
+    judge = next(trial for trial in found.trials if not trial.trained)
+    errors = _part_errors(model, judge, moved)
+    parts = {s: PartQuality(*both, refined=False) for s, both in errors.items()}
+
+    used = moved - refused
+    while True:
+        if used != moved:
+            selected = np.array([m.segment in used for m in model.markers])
+            mixed = model.with_markers(model.positions + shift * selected[:, None])
+            within = IkOptions(limit_m2=wanted.settings.limit_m2)
+            judge = judge_trial(model, mixed, unseen, trained=False, options=within)
+        errors = _part_errors(model, judge, used)
+        parts |= {s: PartQuality(*both, refined=True) for s, both in errors.items()}
+        worse = {s for s, (before, after) in errors.items() if after >= before}
+        if not worse and judge.after.rms >= judge.before.rms:
+            worse = used
+        if not worse:
+            return judge, parts
+        parts |= {s: replace(parts[s], refined=False) for s in worse}
+        used = used - worse
+
+
+def _part_errors(
+    model: ChainModel, judge: TrialOutcome, segments: set[str]
+) -> dict[str, tuple[float, float]]:
+    """Return the RMS error of the markers of each segment before and after, m."""
+    names = np.array([m.segment for m in model.markers])
+    before, after = judge.before.by_marker, judge.after.by_marker
+    return {s: (rms(before[names == s], 0.0), rms(after[names == s], 0.0)) for s in segments}
+
+
+def _figures(
+    wanted: ChainRefinement,
+    found: Refinement,
+    judge: TrialOutcome,
+    parts: dict[str, PartQuality],
+    shift: Array,
+) -> ChainQuality:
+    model = wanted.model
+    stopped = found.stopped
+    if stopped == STOPPED:
+        stopped = f"stopped after {wanted.limit_s:g} s"
+    used = {s for s, part in parts.items() if part.refined}
+    return ChainQuality(
+        model.name,
+        found.method,
+        frames=next(trial.frames for trial in found.trials if trial.trained),
+        judged=judge.frames,
+        before=_errors(judge.before.rms, judge.before.maximum),
+        after=_errors(judge.after.rms, judge.after.maximum),
+        parts={s: parts[s] for s in model.segment_names if s in parts},
+        moved_m={
+            m.name: float(np.linalg.norm(shift[k]))
+            for k, m in enumerate(model.markers)
+            if m.segment in used
+        },
+        stopped=stopped,
+    )
+
+
+def _errors(root_mean_square: float, maximum: float) -> MarkerErrors:
+    return MarkerErrors(root_mean_square, maximum, is_accepted(root_mean_square, maximum))
+
+
+def _notes(wanted: ChainRefinement, found: Refinement, figures: ChainQuality) -> list[str]:
+    """Return what the operator should know or change."""
+    name = f"chain model {wanted.model.name!r}"
+    notes = [f"{name}: {note}" for note in found.notes]
+    if found.stopped == STOPPED:
+        notes.append(
+            f"{name}: the refinement was {figures.stopped}, before it converged; the result so far "
+            "was judged. Use fewer frames, another method, or a longer limit_s"
+        )
+    if found.gauge.fixed_by == "nothing":
+        notes.append(
+            f"{name}: {found.gauge.free} motions of {', '.join(found.gauge.involved)} are not "
+            "determined by the movement: lock markers on bony landmarks, or set prior"
+        )
+    if (after := figures.after) is not None and not after.accepted:
+        notes.append(
+            f"{name}: marker errors of {_MM * after.rms_m:.0f} mm RMS, {_MM * after.maximum_m:.0f} "
+            f"mm at most, expected below {_MM * ACCEPTED_RMS_M:.0f} and "
+            f"{_MM * ACCEPTED_MAXIMUM_M:.0f} mm: check labels, scale and joints of the model"
+        )
+    return notes
+
+
+def _record(model: ChainModel, found: Refinement, used: set[str]) -> RefinedChain | None:
+    if not used:
+        return None
+    positions = {m.name: vector(m.position) for m in found.model.markers if m.segment in used}
+    return RefinedChain(model.name, chain_fingerprint(model), positions)
