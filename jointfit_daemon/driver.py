@@ -11,16 +11,29 @@ cancelled. The daemon feeds every emitted chunk to a new decoder; a replay feeds
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from contextlib import suppress
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, cast
+from ipaddress import ip_address
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, Self, cast
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.nearest_name import unknown_name
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
     from jointfit_daemon.model import Decoded, TickClock
 
 ENTRY_POINT_GROUP = "jointfit.drivers"
@@ -55,16 +68,81 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
+    def contradictions(self) -> Iterable[tuple[str, str]]:
+        """Yield the keys whose values do not fit together, each with the fault and its remedy.
+
+        Override this method instead of adding a validator of the model: the check of rig.toml also
+        calls it for tables with other faults. A value that cannot be read is then None.
+        """
+        return ()
+
+    @model_validator(mode="after")
+    def _without_contradictions(self) -> Self:
+        for key, text in self.contradictions():
+            raise PydanticCustomError(CONTRADICTION, "{key}: {text}", {"key": key, "text": text})
+        return self
+
+
+CONTRADICTION = "contradiction"
+"""Type of the pydantic error that `Settings.contradictions` causes."""
+
+
+class CanBusError(ValueError):
+    """A ``[can.NAME]`` table cannot be used on this machine; a validator of a driver raises it.
+
+    Parameters
+    ----------
+    faults
+        Fault and remedy of each wrong key of the table.
+    """
+
+    def __init__(self, faults: Mapping[str, str]) -> None:
+        texts = [text if key == "interface" else f"{key}: {text}" for key, text in faults.items()]
+        super().__init__("; ".join(texts))
+        self.faults = dict(faults)
+
 
 _SLCAN_BITRATES = (
     10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000,
 )  # fmt: skip
+SERIAL_ADAPTERS = ("slcan", "serial", "seeedstudio", "robotell")
+"""CAN interfaces whose channel is a serial port."""
 _LONGEST_INTERFACE = 15
 """Longest name of a network interface, bytes: IFNAMSIZ of the kernel without its NUL."""
 INTERFACE_NAME_EXPECTED = (
     "expected the name of a network interface, as `ip link` shows it: up to "
     f"{_LONGEST_INTERFACE} bytes without slash or space"
 )
+
+
+def host_fault(host: str) -> str | None:
+    """Return why `host` is neither an IP address nor the name of a host, or None if it is one."""
+    with suppress(ValueError):
+        ip_address(host)
+        return None
+    labels = host.removesuffix(".").split(".")
+    if labels[-1].isdigit():
+        return "expected an IP address of four numbers from 0 to 255, such as 192.168.1.20"
+    if not all(_HOST_LABEL.fullmatch(label) for label in labels):
+        return "expected one address or name without spaces, slashes and port, such as 192.168.1.20"
+    return None
+
+
+_HOST_LABEL = re.compile(r"(?!-)[\w-]{1,63}(?<!-)")
+"""Part of a host name between dots."""
+
+
+_NO_PORT = re.compile(r"(v|vx|sl)?can\d+|eth\d+|tty\w+|COM\d+", re.IGNORECASE)
+"""Names of network interfaces, of Windows, and of device files without their folder."""
+
+
+def port_path_fault(path: str) -> str | None:
+    """Return why `path` is not the device file of a serial port, or None if it may be one."""
+    if not path.strip():
+        return "must not be empty: expected a serial port, such as /dev/ttyUSB0"
+    if _NO_PORT.fullmatch(path):
+        return "expected the path of a serial port, such as /dev/ttyUSB0 (see ls /dev/serial/by-id)"
+    return None
 
 
 def is_interface_name(name: str) -> bool:
@@ -105,7 +183,10 @@ class CanBusSettings(Settings):
         """Refuse names that the kernel does not permit."""
         if not channel:
             raise ValueError("must not be empty")
-        if info.data.get("interface") == "socketcan" and not is_interface_name(channel):
+        interface = info.data.get("interface")
+        if interface in SERIAL_ADAPTERS and (fault := port_path_fault(channel)) is not None:
+            raise ValueError(f'{fault}; a network interface needs interface = "socketcan"')
+        if interface == "socketcan" and not is_interface_name(channel):
             raise ValueError(
                 f'{INTERFACE_NAME_EXPECTED}; a serial adapter needs interface = "slcan"'
             )

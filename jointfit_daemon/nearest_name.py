@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 _CUTOFF = 0.5
 """Least similarity, 0 to 1, of a suggested spelling: half of the characters agree."""
 
+_SHORT = 3
+"""Length, characters, up to which a similar name has the same first character, or the same
+characters in another order."""
+
 
 def nearest_names(name: object, known: Iterable[str], *, count: int = 1) -> list[str]:
     """Return up to `count` names of `known` that resemble `name`, the most similar first.
@@ -22,9 +26,18 @@ def nearest_names(name: object, known: Iterable[str], *, count: int = 1) -> list
     `name` itself is never returned, and a value that is not text is compared by its `str`.
     """
     wanted = str(name)
+    folded = wanted.casefold()
     by_folded = {other.casefold(): other for other in known if other != wanted}
-    found = get_close_matches(wanted.casefold(), list(by_folded), n=count, cutoff=_CUTOFF)
-    return [by_folded[folded] for folded in found]
+    if len(folded) <= _SHORT:  # one equal character is half of a short name
+        candidates = [
+            other
+            for other in by_folded
+            if other[:1] == folded[:1] or sorted(other) == sorted(folded)
+        ]
+    else:
+        candidates = list(by_folded)
+    found = get_close_matches(folded, candidates, n=count, cutoff=_CUTOFF)
+    return [by_folded[similar] for similar in found]
 
 
 def nearest_name(name: object, known: Iterable[str]) -> str | None:

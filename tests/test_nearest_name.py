@@ -27,6 +27,12 @@ def test_nearest_names_are_ordered_by_similarity() -> None:
     assert nearest_names("LKNE1", ["LKNEE", "LKNE", "RANK"], count=2) == ["LKNE", "LKNEE"]
 
 
+def test_a_short_name_resembles_names_with_its_first_character_only() -> None:
+    assert nearest_name("T5", ["R5", "C5"]) is None
+    assert nearest_name("T5", ["R5", "T4"]) == "T4"
+    assert nearest_name("5T", ["T5"]) == "T5"
+
+
 def test_did_you_mean_quotes_suggestions_and_is_empty_without_any() -> None:
     assert did_you_mean("tigh", SEGMENTS) == "did you mean 'thigh'?"
     assert did_you_mean("T9", ["T1", "T2"], count=2) == "did you mean 'T2' or 'T1'?"

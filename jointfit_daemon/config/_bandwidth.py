@@ -6,12 +6,18 @@ Worst case: all sensors of a bus send at their rate, with the largest number of 
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import TYPE_CHECKING
+from itertools import product
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+
+from pydantic import BaseModel
 
 from jointfit_daemon.config._fault_messages import Fault
+from jointfit_daemon.nearest_name import nearest_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from pydantic.fields import FieldInfo
 
     from jointfit_daemon.config._rig import Source
     from jointfit_daemon.driver import CanBusSettings
@@ -38,6 +44,88 @@ def frame_bits(data_bytes: int, *, extended: bool) -> int:
 def slcan_bits(data_bytes: int, *, extended: bool) -> int:
     """Return the length of an SLCAN line, bit: letter, identifier, length, data, CR."""
     return BYTE_BITS * (1 + (8 if extended else 3) + 1 + 2 * data_bytes + 1)
+
+
+_ADAPTERS: dict[str, tuple[str, int, Callable[[int, bool], int]]] = {
+    "serial": ("baudrate", 115_200, lambda size, _: 11 + size),
+    "seeedstudio": ("baudrate", 2_000_000, lambda size, ext: (7 if ext else 5) + size),
+    "robotell": ("ttyBaudrate", 115_200, lambda _size, _: 21),
+}
+"""Serial adapters of python-can: key of the speed, its default, and the bytes of a CAN frame."""
+
+
+def _adapter_line(bus: CanBusSettings) -> tuple[str, int, Callable[[int, bool], int]] | None:
+    """Return key and speed, baud, of an adapter's serial line, and the bits of a frame on it."""
+    if bus.interface == "slcan" and bus.transport == "uart":
+        return "baud", bus.baud, lambda size, ext: slcan_bits(size, extended=ext)
+    if bus.interface not in _ADAPTERS:
+        return None
+    key, default, length = _ADAPTERS[bus.interface]
+    speed = (bus.model_extra or {}).get(key, default)
+    return None if type(speed) is not int else (key, speed, lambda *a: BYTE_BITS * length(*a))
+
+
+def least_load(settings: Any, unknown: Iterable[str]) -> Any:
+    """Return the settings of a sensor with its smallest possible load; None if that is unknown.
+
+    The load with a faulty choice, such as a misspelled orientation, is at least the smallest of all
+    choices. If even this one is too large, the line is too slow in any case.
+
+    Parameters
+    ----------
+    settings
+        Its table; faulty keys are None.
+    unknown
+        Keys that do not exist: each is probably a misspelling of the one that it resembles.
+    """
+    fields = type(settings).model_fields
+    faulty = {
+        name
+        for name, field in fields.items()
+        if getattr(settings, name) is None and (field.is_required() or field.default is not None)
+    }
+    faulty |= {near for name in unknown if (near := nearest_name(name, fields)) is not None}
+
+    possible: list[tuple[float, int, Any]] = []
+    choices = {name: _choices(fields[name]) for name in sorted(faulty)}
+    for values in product(*filter(None, choices.values())):
+        candidate = settings.model_copy()
+        for name in faulty:  # reading a key that is absent raises AttributeError
+            candidate.__dict__.pop(name, None)
+        candidate.__dict__.update(
+            zip((name for name, known in choices.items() if known), values, strict=True)
+        )
+        try:
+            possible.append((_load(candidate), len(possible), candidate))
+        except Exception:  # noqa: BLE001 - AttributeError, or what a plug-in raises on missing keys
+            return None
+    return min(possible)[2]
+
+
+def _choices(field: FieldInfo) -> list[Any]:
+    """Return all values of a key that has few; identifiers do not change the load."""
+    annotation: Any = field.annotation
+    if annotation is bool:
+        return [False, True]
+    if get_origin(annotation) is Literal:
+        return list(get_args(annotation))
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [] if field.is_required() else [field.get_default(call_default_factory=True)]
+    return []
+
+
+def _load(settings: Any) -> float:
+    """Return the load of a sensor, bit/s, on the serial line or the bus that it uses.
+
+    Raises
+    ------
+    AttributeError
+        A key that changes the load is absent.
+    """
+    for name in {"rate_hz", "baud", "can"} & type(settings).model_fields.keys():
+        getattr(settings, name)
+    on_bus = sum(frame_bits(size, extended=ext) for size, ext in settings.can_frames)
+    return float(settings.serial_bits_per_s or 0.0) + float(settings.rate_hz * on_bus)
 
 
 def check_serial_lines(sources: Sequence[Source]) -> Iterator[Fault]:
@@ -84,13 +172,16 @@ def check_can_buses(
                 bus.bitrate,
             )
 
-        on_line = sum(hz * slcan_bits(size, extended=ext) for hz, (size, ext) in sent)
-        if bus.interface == "slcan" and bus.transport == "uart" and on_line > bus.baud:
+        if (line := _adapter_line(bus)) is None:
+            continue
+        key, speed, bits = line
+        on_line = sum(hz * bits(size, ext) for hz, (size, ext) in sent)
+        if on_line > speed:
             yield Fault(
-                f"can.{name}.baud",
-                f"{needing} {on_line:.0f} bit/s as SLCAN, the line carries {bus.baud}: "
-                f"{_faster('baud', on_line, _BAUDS)}lower rate_hz",
-                bus.baud,
+                f"can.{name}.{key}",
+                f"{needing} {on_line:.0f} bit/s on the adapter's serial line, which carries "
+                f"{speed}: {_faster(key, on_line, _BAUDS)}lower rate_hz",
+                speed,
             )
 
 

@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from jointfit_daemon.driver import CanBusSettings, driver_names, find_driver
+from jointfit_daemon.config._readable import readable_part
+from jointfit_daemon.driver import (
+    SERIAL_ADAPTERS,
+    CanBusError,
+    CanBusSettings,
+    driver_names,
+    find_driver,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -16,36 +23,41 @@ _CLOSE = 0.8
 """Least similarity, 0 to 1, at which a misspelled interface is checked as the one it resembles."""
 
 
-def unusable_interface(table: Mapping[str, Any], in_use: Iterable[str]) -> str | None:
-    """Return the reason why all drivers for CAN refuse the bus of `table`, or None.
+def unusable_keys(table: Mapping[str, Any], in_use: Iterable[str]) -> dict[str, str]:
+    """Return the faults by key if all drivers for CAN refuse the bus of `table`.
 
     Drivers know the interfaces that can be opened. The drivers `in_use` are asked first, so that
     no other is imported for a valid bus. The others are for a bus that no sensor names.
     """
-    bus = CanBusSettings.model_construct(**{"channel": "can0", **table})
-    reason = None
+    bus = readable_part({"channel": "can0", **table}, CanBusSettings, [])
+    defaults = dict(CanBusSettings(channel="can0"))
+    absent = {key: value for key, value in defaults.items() if getattr(bus, key) is None}
+    bus = bus.model_copy(update=absent)
+    reason: dict[str, str] = {}
     for name in dict.fromkeys([*in_use, *driver_names()]):
         try:
             model = find_driver(name).Settings
             if "can" not in model.model_fields:
                 continue
-            text = _refusal(model, bus)
+            faults = _refusal(model, bus)
         except Exception:  # noqa: BLE001, S112 - a broken plug-in is a fault of its users only
             continue
-        if text is None:
-            return None
-        reason = reason or text
+        if not faults:
+            return {}
+        reason = reason or faults
     return reason
 
 
-def _refusal(model: Any, bus: CanBusSettings) -> str | None:
+def _refusal(model: Any, bus: CanBusSettings) -> dict[str, str]:
     try:
         model.model_validate({"can": bus})
     except ValidationError as error:
         for detail in error.errors():
             if detail["loc"] == ("can",):
-                return detail["msg"].removeprefix("Value error, ")
-    return None
+                cause = detail.get("ctx", {}).get("error")
+                text = detail["msg"].removeprefix("Value error, ")
+                return cause.faults if isinstance(cause, CanBusError) else {"interface": text}
+    return {}
 
 
 def likely_interface(interface: str) -> str:
@@ -53,12 +65,13 @@ def likely_interface(interface: str) -> str:
     return next(iter(get_close_matches(interface, ("socketcan", "slcan"), 1, _CLOSE)), "virtual")
 
 
-def complete_bus(partial: CanBusSettings, channel: str) -> CanBusSettings:
+def complete_bus(partial: CanBusSettings, name: str) -> CanBusSettings:
     """Return the bus of a table with faults; its wrong keys, None in `partial`, are replaced.
 
-    The values cause no further fault. `channel` must be unique, because sensors are compared on
-    equal buses only.
+    The values cause no further fault. `name` must be unique, because sensors are compared on equal
+    buses only.
     """
+    channel = f"/dev/{name}" if partial.interface in SERIAL_ADAPTERS else name
     valid = dict(CanBusSettings(interface="virtual", channel=channel))
     wrong = [name for name, value in partial if value is None and name in valid]
     return partial.model_copy(update={name: valid[name] for name in wrong})

@@ -82,6 +82,10 @@ def load_chain_model(
     if mocap is None:
         return loaded, [Fault(KEY, "needs cameras, which track its markers: add [mocap]")]
 
+    named: Any = mocap.markers
+    if named is None or None in named.values():
+        return loaded, []  # markers that cannot be read may be those of the model
+
     parts = [*filter(None, (table.proximal, *(table.segments or ()), table.distal))]
     markers = {part: names for part in parts if (names := (mocap.markers or {}).get(part))}
     faults = [*_check_markers(loaded.chain, markers), *_check_bare_segments(table, markers)]

@@ -49,6 +49,18 @@ def check_control_characters(value: object, key: str = "") -> Iterator[Fault]:
         yield Fault(key, "must not contain a NUL character", value)
 
 
+def without_control_characters(value: Any) -> Any:
+    """Return a copy of `value` without NUL, for the checks of everything else."""
+    if isinstance(value, dict):
+        return {
+            without_control_characters(name): without_control_characters(inner)
+            for name, inner in value.items()
+        }
+    if isinstance(value, list):
+        return [without_control_characters(inner) for inner in value]
+    return value.replace("\0", "") if isinstance(value, str) else value
+
+
 def imu_name(imu: Mapping[str, Any], number: int) -> str:
     """Return the name of the `number`-th ``[[imu]]`` table in messages: its id if it is a text."""
     name = imu.get("id")
@@ -114,13 +126,17 @@ def check_chain(table: ChainTable) -> Iterator[Fault]:
 
 def _check_values_by_name(table: ChainTable) -> Iterator[Fault]:
     """Check the lengths of segments and the angle conventions of joints."""
-    for name, length in (table.lengths_m or {}).items():
+    lengths: Any = table.lengths_m or {}
+    for name, length in lengths.items():
         if table.segments:
             yield from check_known_name(f"chain.lengths_m.{name}", name, table.segments, "segment")
-        if not 0 < length < _LONGEST_M:
+        if length is not None and not 0 < length < _LONGEST_M:
             yield Fault(f"chain.lengths_m.{name}", "expected a length in metres", length)
+    joints, segments = table.joints or (), table.segments or ()
+    complete = len(joints) == len(segments) + 1
+    inner = joints[1:-1] if complete else joints  # only joints between two segments have angles
     for name in table.angles or {}:
-        if inner := (table.joints or ())[1:-1]:  # only joints between two segments have angles
+        if inner:
             key = f"chain.angles.{name}"
             yield from check_known_name(key, name, inner, "joint between two segments")
 
@@ -133,15 +149,20 @@ def check_durations(table: CalibrationTable) -> Iterator[Fault]:
         yield Fault("calibration.functional_s", text, longest)
 
 
-def check_procedure(calibration: CalibrationTable, chain: ChainTable) -> Iterator[Fault]:
-    """Check that method and segment axes are those of the patent, if its procedure is chosen."""
-    if calibration.procedure != "patent":
+def check_procedure(
+    calibration: CalibrationTable | None, chain: ChainTable | None
+) -> Iterator[Fault]:
+    """Check that method and segment axes are those of the patent, if its procedure is chosen.
+
+    Keys of the tables that had faults are None.
+    """
+    if calibration is None or calibration.procedure != "patent":
         return
-    if calibration.method not in get_args(PatentReading):
+    if calibration.method not in {None, *get_args(PatentReading)}:
         regressions = " or ".join(f'"{name}"' for name in get_args(PatentReading))
         text = f'expected {regressions} with procedure = "patent": the patent is a regression'
         yield Fault("calibration.method", text, calibration.method)
-    if chain.axes != "static":
+    if chain is not None and chain.axes == "anatomical":
         text = (
             'expected "static" with calibration.procedure = "patent": the patent defines every '
             "segment as unrotated in the static pose"
@@ -194,11 +215,14 @@ def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator
     for kind in ("markers", "rigid_body"):
         for part in getattr(settings, kind) or ():
             if table is not None and table.segments:
-                parts = [*table.segments, *filter(None, (table.proximal, table.distal))]
+                ends = filter(None, (table.proximal, table.distal))
+                parts = [*dict.fromkeys([*table.segments, *ends])]
                 taken = {*(settings.markers or ()), *(settings.rigid_body or ())}
                 yield from check_known_name(f"mocap.{kind}.{part}", part, parts, "segment", taken)
 
-    for part, names in (settings.markers or {}).items():
+    given: Any = settings.markers or {}
+    readable = {part: names for part, names in given.items() if names is not None}
+    for part, names in readable.items():
         key = f"mocap.markers.{part}"
         yield from _repeated(key, names)
         if len(set(names)) < _LEAST_MARKERS:
@@ -208,7 +232,7 @@ def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator
 
     # A marker belongs to one body part.
     owners: dict[str, str] = {}
-    for part, names in (settings.markers or {}).items():
+    for part, names in readable.items():
         for name in dict.fromkeys(names):
             if (owner := owners.setdefault(name, part)) != part:
                 yield Fault(f"mocap.markers.{part}", f"is a marker of {owner!r} already", name)
@@ -221,14 +245,14 @@ def check_center_methods(
 
     Keys of `table` and `chain` that had faults are None; `mocap` is None without cameras.
     """
-    chosen = table.joint_center_methods or {}
+    chosen: Any = table.joint_center_methods or {}
     explicit = {f"calibration.joint_center_methods.{joint}": joint for joint in chosen}
     if mocap is None:
         keys = [*explicit] if table.center_method == "sphere" else ["calibration.center_method"]
         for key in keys:
             yield Fault(key, "joint centers need cameras: add [mocap], or remove this key")
         return
-    if chain is None or not chain.joints or not chain.segments:
+    if chain is None or not chain.joints or not chain.segments or mocap.markers is None:
         return
 
     marked = {*(mocap.markers or ()), *(mocap.rigid_body or ())}
@@ -243,11 +267,11 @@ def check_center_methods(
         for end, part in ends.items():
             if part is None:
                 text = f"needs markers on both sides of the joint: add chain.{end} and its markers"
-                yield Fault(key, text, chosen[joint])
+                yield Fault(key, text, chosen[joint] or joint)
         for part in parts[at : at + 2]:
             if part is not None and part not in marked:
                 text = f"needs markers on both sides of the joint: add mocap.markers.{part}"
-                yield Fault(key, text, chosen[joint])
+                yield Fault(key, text, chosen[joint] or joint)
 
 
 def check_ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) -> Iterator[Fault]:
@@ -274,7 +298,7 @@ def check_can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
 
     An 11-bit and a 29-bit identifier of the same number are different identifiers.
     """
-    owners: dict[tuple[str, int, bool], str] = {}
+    owners: dict[tuple[str, int, bool], tuple[str, str]] = {}
     for source in sources:
         settings = source.settings
         bus = getattr(settings, "can", None)
@@ -286,8 +310,8 @@ def check_can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
             extended = getattr(settings, "extended_ids", False) or number > _STANDARD_MAX
             derived = " derived from its other ids" if getattr(ids, message, 0) is None else ""
             user = f"{source.id} ({message}{derived})"
-            owner = owners.setdefault((repr(bus), number, extended), user)
-            if owner != user:
+            sensor, owner = owners.setdefault((repr(bus), number, extended), (source.id, user))
+            if sensor != source.id:
                 text = f"id {number:#x} on this bus belongs to {owner}; expected a unique id"
                 if derived:
                     text = f"{text}. It is{derived}: set it to an unused one"
@@ -347,7 +371,11 @@ def _numbers(ids: object) -> Iterator[tuple[str, int]]:
     A model that derives identifiers from each other has a method ``resolved``.
     """
     resolved = getattr(ids, "resolved", None)
-    if callable(resolved):
+    fields = type(ids).model_fields if isinstance(ids, BaseModel) else {}
+    faulty = any(
+        field.default is not None and getattr(ids, name) is None for name, field in fields.items()
+    )
+    if callable(resolved) and not faulty:  # nothing is derived from an identifier that is wrong
         ids = resolved()
     if isinstance(ids, BaseModel):
         ids = dict(ids)

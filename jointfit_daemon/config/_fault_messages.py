@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import BaseModel, ValidationError
 from pydantic_core import PydanticUndefined
 
+from jointfit_daemon.driver import CONTRADICTION, CanBusError
 from jointfit_daemon.nearest_name import nearest_name
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 _LONGEST_VALUE = 60
 """Longest value in a message, characters."""
 _NO_VALUE = object()
-_SECRET = re.compile(r"passw|passphrase|secret|token|api_?key|private_?key|request_?key")
+SECRET = re.compile(r"passw|passphrase|secret|token|api_?key|private_?key|request_?key")
 """Names of keys whose values must not appear in a message."""
 
 
@@ -77,8 +78,17 @@ class ConfigError(Exception):
 
 
 def faults_of(error: ValidationError, model: type[BaseModel], key: str) -> list[Fault]:
-    """Return the faults that pydantic found in the table at `key`."""
-    return [_fault(detail, model, key) for detail in error.errors(include_url=False)]
+    """Return the faults that pydantic found in the table at `key`.
+
+    Omitted are contradictions, which `_readable.contradictions` finds completely, and the faults of
+    a bus, which are those of its own table.
+    """
+    return [
+        _fault(detail, model, key)
+        for detail in error.errors(include_url=False)
+        if detail["type"] != CONTRADICTION
+        and not isinstance(detail.get("ctx", {}).get("error"), CanBusError)
+    ]
 
 
 def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
@@ -87,7 +97,7 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
     owner = _model_at(model, loc[:-1])
     fields = owner.model_fields if owner is not None else {}
     match detail["type"]:
-        case "extra_forbidden" if _SECRET.search(str(loc[-1]).lower()):
+        case "extra_forbidden" if SECRET.search(str(loc[-1]).lower()):
             files = [name for name in fields if name.endswith("_file")]
             instead = f" and name it: {' or '.join(files)}" if files else ""
             return Fault(

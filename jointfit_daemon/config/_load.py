@@ -5,19 +5,20 @@ Invariant: all faults are reported together, before any device is opened.
 
 from __future__ import annotations
 
-import contextlib
 import json
 from copy import deepcopy
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from jointfit_daemon.calibration import CalibrationSettings
 from jointfit_daemon.config import _bandwidth, _checks
-from jointfit_daemon.config._bus_faults import complete_bus, likely_interface, unusable_interface
+from jointfit_daemon.config._bus_faults import complete_bus, likely_interface, unusable_keys
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
+from jointfit_daemon.config._readable import contradictions, readable_part
 from jointfit_daemon.config._rig import MOCAP, Rig, Source
-from jointfit_daemon.config._syntax import UNREADABLE, read_table
+from jointfit_daemon.config._syntax import read_table, without_unreadable
 from jointfit_daemon.config._tables import (
     CalibrationTable,
     ChainTable,
@@ -38,7 +39,7 @@ from jointfit_daemon.model import Chain
 from jointfit_daemon.nearest_name import nearest_name
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from jointfit_daemon.calibration import ChainRefinement
@@ -93,36 +94,14 @@ def parse_rig(table: Mapping[str, Any], *, source: str = "rig.toml") -> Rig:
 
 
 def _rig_of(table: dict[str, Any], source: str, syntax: Sequence[Fault]) -> Rig:
-    reader = _RigReader(table)
     unusable = list(_checks.check_control_characters(table))
-    reader.faults += unusable
-    rig = None if unusable else reader.rig()
-    faults = [*syntax, *reader.faults]
-    if syntax:  # the lines with syntax errors are reported already
-        others = [each for each in reader.faults if UNREADABLE not in f"{each.key} {each.value!r}"]
-        faults = [*syntax, *others]
+    reader = _RigReader(_checks.without_control_characters(table) if unusable else table)
+    rig = reader.rig()
+    others = list(filter(None, map(without_unreadable, reader.faults))) if syntax else reader.faults
+    faults = [*syntax, *unusable, *others]
     if rig is None or faults:
         raise ConfigError(source, list({fault.text(): fault for fault in faults}.values()))
     return rig
-
-
-def _partial(table: Mapping[str, Any], model: type[Model], error: ValidationError) -> Model:
-    """Return a model without validation, with None for the keys that have faults."""
-    wrong = {detail["loc"][0] for detail in error.errors() if detail["loc"]}
-    values = {
-        name: None
-        if field.is_required() or name in wrong
-        else field.get_default(call_default_factory=True)
-        for name, field in model.model_fields.items()
-    }
-
-    # Keys without faults, validated one at a time.
-    for name in values.keys() & table.keys() - wrong:
-        text = json.dumps(table[name], default=str)
-        annotation: Any = model.model_fields[name].annotation
-        with contextlib.suppress(ValidationError):
-            values[name] = TypeAdapter(annotation).validate_json(text, strict=True)
-    return model.model_construct(**values)
 
 
 def _anchor(part: object, keys: Sequence[str], folder: Path) -> None:
@@ -141,6 +120,8 @@ class _RigReader:
         self.faults: list[Fault] = []
         self.partial: dict[str, Any] = {}
         """Tables with faults, by key, as partial models for the checks across tables."""
+        self.cameras: MocapSettings | None = None
+        """The table of the cameras, even with faults."""
         self.imus_read: list[Source] = []
         """All IMUs whose tables could be read, even with faults."""
         self.imus_with_load: list[Source] = []
@@ -175,7 +156,7 @@ class _RigReader:
         ]
         self.faults += [fault for fault in loads if fault.key not in reported]
         self.faults += self._names()
-        cameras = self.partial.get(MOCAP) if mocap is None else mocap.settings
+        cameras = self.cameras
         self._check_limb(chain, calibration, cameras)
         model = None if limb is None else self._chain_model(limb, cameras)
         refinement = self._chain_refinement(calibration, model)
@@ -214,9 +195,8 @@ class _RigReader:
         limb = chain or self.partial.get("chain")
         if limb is not None:
             self.faults += _checks.check_chain(limb)
-        if chain is not None and calibration is not None:
-            self.faults += _checks.check_procedure(calibration, chain)
         table = calibration or self.partial.get("calibration")
+        self.faults += _checks.check_procedure(table, limb)
         if table is not None:
             self.faults += _checks.check_durations(table)
         if table is not None and (cameras is not None or "mocap" not in self.table):
@@ -290,7 +270,9 @@ class _RigReader:
             return model.model_validate_json(json.dumps(table, default=str), strict=True)
         except ValidationError as error:
             self.faults += faults_of(error, model, key)
-            self.partial[key] = _partial(table, model, error)
+            wrong = [detail["loc"] for detail in error.errors()]
+            self.partial[key] = readable_part(table, model, wrong)
+            self.faults += contradictions(self.partial[key], key)
             return None
 
     def _buses(self) -> dict[str, CanBusSettings]:
@@ -306,10 +288,9 @@ class _RigReader:
         buses = {}
         for at, name in enumerate(tables):
             key, table = f"can.{name}", tables[name]
-            kind = table.get("interface") if isinstance(table, dict) else None
-            if isinstance(kind, str) and (text := unusable_interface(table, in_use)) is not None:
-                self.faults.append(Fault(f"{key}.interface", text, kind))
-                table = table | {"interface": likely_interface(kind)}
+            kind = table.get("interface", "socketcan") if isinstance(table, dict) else 0
+            if isinstance(kind, str):
+                table = self._check_bus_keys(key, table, in_use)
 
             bus = self._validate(key, table, CanBusSettings)
             partial = self.partial.get(key)
@@ -319,11 +300,23 @@ class _RigReader:
                 buses[name] = bus
         return buses
 
+    def _check_bus_keys(
+        self, key: str, table: dict[str, Any], in_use: Sequence[str]
+    ) -> dict[str, Any]:
+        """Report the keys of a bus that its interface refuses; return a table with a valid one."""
+        unusable = unusable_keys(table, in_use)
+        usable = table
+        if "interface" in unusable:
+            usable = table | {"interface": likely_interface(table["interface"])}
+            if usable["interface"] != "virtual":
+                unusable = unusable_keys(usable, in_use) | unusable
+        for name, text in unusable.items():
+            shown = (table[name],) if name in table else ()
+            self.faults.append(Fault(f"{key}.{name}", text, *shown))
+        return usable
+
     def _imus(self, chain: ChainTable | None, buses: Mapping[str, CanBusSettings]) -> list[Source]:
-        tables = self.table.get("imu", [])
-        if not isinstance(tables, list) or not all(isinstance(imu, dict) for imu in tables):
-            self.faults.append(Fault("imu", "expected [[imu]] tables", tables))
-            return []
+        tables = self._imu_tables()
 
         self.faults += _checks.check_sensors(tables, chain)
         found = []
@@ -342,9 +335,21 @@ class _RigReader:
                     known = known.model_copy(update={"id": _checks.imu_name(imu, at)})
                 source = _imu_source(imu["driver"], known, driver)
                 self.imus_read.append(source)
-                if _has_load(known, imu.keys() - driver.Settings.model_fields.keys()):
-                    self.imus_with_load.append(source)
+                unknown = imu.keys() - driver.Settings.model_fields.keys()
+                if (least := _bandwidth.least_load(known, unknown)) is not None:
+                    self.imus_with_load.append(replace(source, settings=least))
         return found
+
+    def _imu_tables(self) -> list[dict[str, Any]]:
+        """Return the readable tables of sensors; report all others."""
+        found = self.table.get("imu", [])
+        if not isinstance(found, list) or not all(isinstance(imu, dict) for imu in found):
+            single = "; write [[imu]] in place of [imu]" if isinstance(found, dict) else ""
+            shown = () if single and found else (found,)
+            self.faults.append(Fault("imu", f"expected [[imu]] tables{single}", *shown))
+        if isinstance(found, dict):
+            return [found] if found else []
+        return [imu for imu in found if isinstance(imu, dict)] if isinstance(found, list) else []
 
     def _with_bus(
         self, key: str, imu: dict[str, Any], buses: Mapping[str, CanBusSettings]
@@ -377,8 +382,9 @@ class _RigReader:
         try:
             driver = find_driver(name)
         except UnknownDriverError:
-            self.faults += _checks.check_known_name(f"{key}.driver", name, driver_names(), "driver")
-            return None
+            faults = _checks.check_known_name(f"{key}.driver", name, driver_names(), "driver")
+            self.faults += faults
+            return _similar_driver(faults[0].near, base)
         except Exception as error:  # noqa: BLE001 - a broken plug-in is a fault of the rig
             self.faults.append(Fault(f"{key}.driver", f"cannot be loaded: {error!r}", name))
             return None
@@ -411,6 +417,7 @@ class _RigReader:
         driver = self._driver(MOCAP, table, MocapSettings) if isinstance(table, dict) else None
         settings = self._settings(MOCAP, table, driver, MocapSettings)
         known = settings or self.partial.get(MOCAP)
+        self.cameras = known
         if known is not None:
             self.faults += _checks.check_markers(known, chain)
         if settings is None or driver is None or head is None:
@@ -419,39 +426,13 @@ class _RigReader:
         return Source(MOCAP, "mocap", table["driver"], rate, None, settings, driver)
 
 
-def _has_load(settings: Any, unknown: Iterable[str]) -> bool:
-    """Return whether the load of a sensor depends on none of its faulty keys.
-
-    Parameters
-    ----------
-    settings
-        Its table; faulty keys are None.
-    unknown
-        Keys that do not exist: each is probably a misspelling of the one that it resembles.
-    """
-    fields = type(settings).model_fields
-    faulty = {
-        name
-        for name, field in fields.items()
-        if getattr(settings, name) is None and (field.is_required() or field.default is not None)
-    }
-    faulty |= {near for name in unknown if (near := nearest_name(name, fields)) is not None}
-
-    # Reading a key that is absent raises AttributeError.
-    readable = settings.model_copy()
-    for name in faulty:
-        readable.__dict__.pop(name, None)
+def _similar_driver(name: str | None, base: type[BaseModel]) -> type[Driver] | None:
+    """Return the driver that a misspelled name resembles, to check the other keys of its table."""
     try:
-        for name in (
-            "rate_hz",
-            "serial_bits_per_s",
-            "can_frames",
-            *{"baud", "can"} & fields.keys(),
-        ):
-            getattr(readable, name)
-    except Exception:  # noqa: BLE001 - AttributeError, or what a plug-in raises on missing keys
-        return False
-    return True
+        driver = None if name is None else find_driver(name)
+    except Exception:  # noqa: BLE001 - a broken plug-in is a fault of its users only
+        return None
+    return driver if driver is not None and issubclass(driver.Settings, base) else None
 
 
 def _imu_source(name: str, settings: Any, driver: type[Driver]) -> Source:

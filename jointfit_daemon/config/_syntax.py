@@ -1,8 +1,8 @@
 """Parsing of rig.toml, with all syntax errors.
 
-After an error its line is replaced and the rest is parsed again, so that further errors are found.
-The replacement is a wrong value of the same key. A removed key would cause faults of its own, such
-as a missing key, or a default value that contradicts other tables.
+A file with errors is read statement by statement. A statement that cannot be read is replaced by a
+wrong value of the same key, so that the rest is checked as well. A removed key would cause faults
+of its own, such as a missing key, or a default value that contradicts other tables.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, Any
 
-from jointfit_daemon.config._fault_messages import ConfigError, Fault
+from jointfit_daemon.config._fault_messages import SECRET, ConfigError, Fault
 from jointfit_daemon.files.text import (
     MAX_NESTING,
     MalformedFileError,
@@ -24,18 +24,40 @@ if TYPE_CHECKING:
 
 _MOST_BYTES = 256 * 1024
 """Largest file, bytes: a rig of four sensors has 3 kB, and parsing takes 0.5 s per MB."""
-_MOST_ERRORS = 20
+_MOST_ERRORS = 50
 """Largest number of syntax errors that are reported."""
-_OF_SEVERAL_LINES = ("[", "]", "{", "}", '"""', "'''")
-_AT_LINE = re.compile(r"(.*) \(at line (\d+), column \d+\)", re.DOTALL)
-_HEADER = re.compile(r"\[{1,2}\s*([\w-]+(?:\.[\w-]+)*)")
-_KEY = re.compile(r"([\w-]+(?:\.[\w-]+)*)(?=\s|=)")
-_ASSIGNED = re.compile(r"\s*[\w.\"'-]+\s*=")
+_MOST_REPEATED = 20
+"""Largest number of tables and keys that occur twice; each is found by parsing the whole file."""
+_MOST_LINES = 200
+"""Largest number of lines of one value in a file with syntax errors."""
 UNREADABLE = "unreadable-line"
 """Key of the table that replaces the value on a line with a syntax error. No table of a rig has
 this key, so the value is wrong everywhere; its further faults are not reported.
 """
+_POSITION = re.compile(r"(.*?)(?: \(at (?:line (\d+), column \d+|end of document)\))?", re.DOTALL)
+_HEADER = re.compile(r"\[{1,2}\s*([\w-]+(?:\s*\.\s*[\w-]+)*)")
+_WHOLE_HEADER = re.compile(rf"{_HEADER.pattern}\s*\]{{1,2}}\s*(?:#.*)?")
+_KEY = re.compile(r"([\w-]+(?:\.[\w-]+)*)(?=\s|=)")
+_ASSIGNED = re.compile(r"\s*[\w.\"'-]+\s*=")
 _DECIMAL_COMMA = re.compile(r"[=\[,]\s*[+-]?\d+,\d+\s*(#.*)?$")
+_BOOLEAN = re.compile(r"=\s*(True|False|TRUE|FALSE|yes|no|on|off)\b")
+_REMEDIES = (
+    ("Invalid value", "a text needs quotation marks"),
+    ("Unterminated string", "close it with the quotation marks that open it"),
+    ("Unclosed array", "separate its values by commas and close it with ]"),
+    ("Unclosed inline table", "separate its keys by commas and close it with }"),
+    ("Expected '='", "write key = value, or # in front of a comment"),
+    ("Expected newline", "write one key = value on a line, and # in front of a comment"),
+    ("Invalid statement", "write key = value, a [table], or # in front of a comment"),
+    ("Expected ']]'", "close it with ]]"),
+    ("Expected ']'", "close it with ]"),
+    ("Invalid initial character", "write key = value; a key has letters, digits, _ and - only"),
+    ("Unescaped", "write \\\\ for a backslash, or use single quotation marks"),
+    ("Illegal character '\\n'", "close the text with a quotation mark on the same line"),
+    ("Illegal character", "remove it, or write it as an escape sequence such as \\t"),
+    ("Duplicate inline table key", "remove one of the two"),
+)
+"""Begin of an error message of tomllib, and what to do."""
 
 
 def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
@@ -52,11 +74,7 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
         fault = Fault("file", str(error).removeprefix(f"{path}: "))
         raise ConfigError(str(path), [fault]) from error
 
-    try:
-        table, faults = _parse(text.split("\n"))
-    except RecursionError as error:
-        fault = Fault("TOML", f"nested more than {MAX_NESTING} levels deep")
-        raise ConfigError(str(path), [fault]) from error
+    table, faults = _parse(text.replace("\r\n", "\n"))
     if table is None:
         raise ConfigError(str(path), faults)
     if (text_of_fault := find_structure_fault(table)) is not None:
@@ -64,92 +82,174 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
     return table, faults
 
 
-def _parse(lines: list[str]) -> tuple[dict[str, Any] | None, list[Fault]]:
-    """Return the table; None if the removed lines would cause further faults."""
-    repair = _Repair(lines)
-    while len(repair.faults) < _MOST_ERRORS:
-        try:
-            return parse_toml("\n".join(repair.lines)), repair.faults
-        except ValueError as error:  # an integer of 5000 digits is a plain ValueError
-            if not repair.replace(error):
-                break
-    return None, repair.faults
+def _parse(text: str) -> tuple[dict[str, Any] | None, list[Fault]]:
+    """Return the table and the syntax errors; no table if the repaired text is not TOML either."""
+    try:
+        return parse_toml(text), []
+    except (ValueError, RecursionError):
+        repair = _Repair(text.split("\n"))
+    repair.replace_statements()
+    return repair.parse(), repair.faults[:_MOST_ERRORS]
+
+
+def _error_of(text: str) -> tuple[str, int | None] | None:
+    """Return the first error of a TOML text and its line; None for a valid text."""
+    try:
+        parse_toml(text)
+    except RecursionError:
+        return f"nested more than {MAX_NESTING} levels deep", None
+    except ValueError as error:  # an integer of 5000 digits is a plain ValueError
+        found = _POSITION.fullmatch(str(error))
+        if found is None or type(error) is ValueError:
+            return f"is no TOML value: {error}", None
+        return found[1], int(found[2]) if found[2] else None
+    return None
+
+
+def _with_remedy(text: str, line: str) -> str:
+    """Return an error message of tomllib with the remedy for `line`."""
+    plain = f"{text[:1].lower()}{text[1:]}"
+    if _DECIMAL_COMMA.search(line):
+        return f"{plain}; use a decimal point, not a comma"
+    if _BOOLEAN.search(line):
+        return f"{plain}; write true or false"
+    remedy = next((remedy for begin, remedy in _REMEDIES if text.startswith(begin)), None)
+    return f"{plain}: {remedy}" if remedy else plain
 
 
 class _Repair:
-    """Lines of a file whose errors are replaced one after the other."""
+    """Lines of a file, in which statements with errors are replaced."""
 
     def __init__(self, lines: list[str]) -> None:
         self.lines, self.faults = list(lines), list[Fault]()
         self._original = lines
-        self._last, self._opened = -1, False
+        self._starts: list[int] = []
+        """Places of the first lines of all statements."""
+        self._repeated: dict[str, list[str]] = {}
+        """Tables that occur again: temporary name, and path of the first."""
 
-    def replace(self, error: ValueError) -> bool:
-        """Report and replace the line of `error`; return False if the rest cannot be read."""
-        found = _AT_LINE.fullmatch(str(error))
-        number = int(found[2]) if found else 0
-        if self._opened and (found is None or number == self._last + 1):
-            self._opened = False
-            return self._replace_value(self._last)  # the replaced line was a part of it
-        if found is None:
-            if not self.faults:
-                self.faults.append(Fault("TOML", str(error)))
-            return False
-        if number == self._last and self.lines[number - 1]:
-            self.lines[number - 1] = ""  # the replacement is not accepted either
-            return True
+    def replace_statements(self) -> None:
+        """Replace every statement that is not TOML by itself."""
+        at = 0
+        while at < len(self.lines):
+            self._starts.append(at)
+            length = self._length(at)
+            at += length or self._replace(at)
 
-        line, text = self.lines[number - 1].strip(), found[1]
-        remedy = "; use a decimal point, not a comma" if _DECIMAL_COMMA.search(line) else ""
-        self.faults.append(Fault(f"line {number}", f"{text[:1].lower()}{text[1:]}{remedy}", line))
-        self._last = number
-        if not line:
-            return False
-        if not _ASSIGNED.match(line) and _is_open(self.lines[: number - 1]):
-            return self._replace_value(number)
+    def parse(self) -> dict[str, Any] | None:
+        """Return the table, after the removal of keys and tables that occur a second time."""
+        for _ in range(_MOST_REPEATED):
+            error = _error_of(text := "\n".join(self.lines))
+            if error is None:
+                return self._merged(parse_toml(text))
+            self._remove_repeated(*error)
+        return None
 
-        self.lines[number - 1] = _replacement(line)
-        self._opened = any(mark in line for mark in _OF_SEVERAL_LINES)
-        # Without a header its keys would belong to another table.
-        return bool(self.lines[number - 1])
+    def _report(self, at: int, text: str) -> None:
+        line = self._original[at].strip()
+        where = f"line {at + 1}"
+        shown = () if SECRET.search(line.lower()) else (line,)
+        self.faults.append(Fault(where, text, *shown))
 
-    def _replace_value(self, number: int) -> bool:
-        """Make the value of several lines that contains line `number` unreadable.
+    def _length(self, at: int) -> int:
+        """Return the number of lines of the statement at `at`; 0 if it is not TOML."""
+        line = self.lines[at]
+        opened = any(mark in line for mark in ('"""', "'''")) or any(
+            line.count(opening) > line.count(closing) for opening, closing in ("[]", "{}")
+        )
+        for end in range(at + 1, min(at + _MOST_LINES, len(self.lines)) + 1):
+            if _error_of("\n".join(self.lines[at:end])) is None:
+                return end - at
+            if not opened or (end < len(self.lines) and _WHOLE_HEADER.fullmatch(self.lines[end])):
+                break
+        return 0
 
-        Returns False if its first line is not found.
-        """
-        original = self._original
-        starts = [
-            at for at, line in enumerate(original) if _ASSIGNED.match(line) or line[:1] == "["
-        ]
-        first = max((at for at in starts if at < number - 1), default=None)
-        if first is None or original[first].startswith("["):
-            return False
+    def _replace(self, at: int) -> int:
+        """Report and replace the statement at `at`; return its number of lines."""
+        line = self.lines[at].strip()
+        is_value = _ASSIGNED.match(line) is not None
+        opened = is_value and any(mark in line for mark in ("[", "{", '"""', "'''"))
+        end = at + 1
+        while opened and end < len(self.lines) and not self._begins(end):
+            end += 1
 
-        after = min((at for at in starts if at > first), default=len(original))
-        blank = [""] * (after - first - 1)
-        self.lines[first:after] = [_replacement(original[first].strip()), *blank]
-        # The line of the error is the next value if the bracket before it is missing.
-        self.lines[after:number] = original[after:number]
-        return True
+        text, number = _error_of("\n".join(self.lines[at:end])) or ("Invalid statement", 1)
+        wrong = at + (number or 1) - 1
+        self._report(wrong, _with_remedy(text, self.lines[wrong].strip()))
+        self.lines[at:end] = [_replacement(line, at), *[""] * (end - at - 1)]
+        return end - at
+
+    def _begins(self, at: int) -> bool:
+        """Return whether a statement begins at `at`, seen from within an unclosed value."""
+        line = self.lines[at]
+        return bool(_ASSIGNED.match(line) or _WHOLE_HEADER.fullmatch(line))
+
+    def _remove_repeated(self, text: str, number: int | None) -> None:
+        """Report and remove the statement of an error that other statements cause."""
+        last = len(self.lines) if number is None else number
+        at = max(start for start in self._starts if start < last)
+        line = self.lines[at].strip()
+        header = _HEADER.match(line)
+        if header is not None and header[1] == "imu":
+            self._replace_single_imus()
+            return
+
+        end = next((start for start in self._starts if start > at), len(self.lines))
+        self.lines[at:end] = [""] * (end - at)
+        if header is not None:
+            name = f"{UNREADABLE}-{at}"
+            self._repeated[name] = [part.strip() for part in header[1].split(".")]
+            self.lines[at] = f"[{name}]"
+            text = f"table [{header[1]}] occurs a second time: merge the two"
+        elif key := _KEY.match(line):
+            text = f"{key[1]} occurs a second time in this table: remove one of the two"
+        self._report(at, text)
+
+    def _replace_single_imus(self) -> None:
+        """Make every ``[imu]`` an ``[[imu]]``."""
+        for at in self._starts:
+            header = _WHOLE_HEADER.fullmatch(self.lines[at].strip())
+            if header and header[1] == "imu" and not self.lines[at].strip().startswith("[["):
+                self.lines[at] = "[[imu]]"
+                self._report(at, "one table of several: write [[imu]]")
+
+    def _merged(self, table: dict[str, Any]) -> dict[str, Any]:
+        """Move the keys of repeated tables into the first one of the name."""
+        unnamed = {name: table.pop(name) for name in [*table] if name.startswith(UNREADABLE)}
+        for name, path in self._repeated.items():
+            keys, first = unnamed.get(name, {}), table
+            for part in path:
+                inner: Any = first.get(part)
+                first = inner[-1] if isinstance(inner, list) and inner else inner
+                if not isinstance(first, dict):
+                    break
+            else:
+                first.update({key: value for key, value in keys.items() if key not in first})
+        return table
 
 
-def _is_open(lines: list[str]) -> bool:
-    """Return whether valid `lines` end within a value of several lines."""
-    try:
-        parse_toml("\n".join(lines))
-    except ValueError:
-        return True
-    return False
-
-
-def _replacement(line: str) -> str:
+def _replacement(line: str, at: int) -> str:
     """Return a valid line for a wrong one: the header that it resembles, or an unreadable value."""
     if line.startswith("["):
         header = _HEADER.match(line)
         if header is None:
-            return ""
-        repaired = f"[[{header[1]}]]" if header[1] == "imu" else f"[{header[1]}]"
-        return "" if repaired == line else repaired
+            return f"[{UNREADABLE}-{at}]"  # its keys belong to no other table
+        return f"[[{header[1]}]]" if header[1] == "imu" else f"[{header[1]}]"
     key = _KEY.match(line)
-    return f"{key[1]} = {{ {UNREADABLE} = true }}" if key else f"# {line}"
+    if key is None:
+        return ""
+    assigned = "true" if _ASSIGNED.match(line) else "false"
+    return f"{key[1]} = {{ {UNREADABLE} = {assigned} }}"
+
+
+def without_unreadable(fault: Fault) -> Fault | None:
+    """Return the fault of a value, or None if its line is reported as a syntax error already.
+
+    An unknown key on such a line is a fault of its own, and returned without its value.
+    """
+    shown = f"{fault.key} {fault.value!r}" if fault.has_value else fault.key
+    if UNREADABLE not in f"{shown} {fault.expected}":
+        return fault
+    if fault.value == {UNREADABLE: True} and fault.expected.startswith("unknown key"):
+        return Fault(fault.key, fault.expected, near=fault.near)
+    return None

@@ -17,7 +17,7 @@ from jointfit_daemon.calibration import (  # noqa: TC001 - pydantic reads them
     RefinementCost,
     RefinementMethod,
 )
-from jointfit_daemon.driver import Settings
+from jointfit_daemon.driver import Settings, host_fault
 from jointfit_daemon.limb_model import Method, Procedure  # noqa: TC001 - pydantic reads them
 from jointfit_daemon.model import AngleConvention  # noqa: TC001 - as above
 
@@ -214,7 +214,7 @@ class TlsSettings(Settings):
     @field_validator("key")
     @classmethod
     def _check_key(cls, key: str | None, info: ValidationInfo) -> str | None:
-        if key is not None and info.data.get("cert") is None:
+        if key is not None and info.data.get("cert", "unreadable") is None:
             raise ValueError("the key has no certificate: set cert, too")
         return key
 
@@ -272,8 +272,8 @@ class MqttSettings(Settings):
     @field_validator("host")
     @classmethod
     def _check_host(cls, host: str) -> str:
-        if any(letter.isspace() or letter == "/" for letter in host):
-            raise ValueError("expected one name or address without spaces and slashes")
+        if (fault := host_fault(host)) is not None:
+            raise ValueError(fault)
         return host
 
     @field_validator("insecure")

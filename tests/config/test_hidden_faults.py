@@ -172,8 +172,8 @@ def test_a_syntax_error_adds_one_fault_and_hides_none(
     ("keys", "line"),
     [
         ('interface = "vector"\nchannel = "0"', "can.can1.interface = 'vector': CAN interface"),
-        ('interface = "socketcand"\nchannel = "can0"', "can.can1.interface = 'socketcand'"),
-        ('interface = "udp_multicast"\nchannel = "can0"', "can.can1.interface = 'udp_multicast'"),
+        ('interface = "socketcand"\nchannel = "can0"\nport = 29536', "can.can1.host: missing"),
+        ('interface = "udp_multicast"\nchannel = "can0"', "can.can1.channel = 'can0': expected a"),
     ],
 )
 def test_a_bus_that_cannot_be_opened_here_is_one_fault(keys: str, line: str) -> None:
@@ -224,7 +224,7 @@ def test_a_bus_without_sensors_is_checked() -> None:
         (RIG + MOCAP.replace("192.168.1.20", ""), "mocap.server = '': expected one address"),
         (RIG + MOCAP.replace("192.168.1.20", "a b"), "mocap.server = 'a b': expected one address"),
         (f'{RIG}{MOCAP}plate = ""\n', "mocap.plate = '': "),
-        (f'{RIG}[mqtt]\nhost = "a b"\ninsecure = true\n', "mqtt.host = 'a b': expected one name"),
+        (f'{RIG}[mqtt]\nhost = "a b"\ninsecure = true\n', "mqtt.host = 'a b': expected one add"),
         (RIG.replace("0x121", "0x921"),
          "imu[S4].extended_ids = False: ids.quaternion = 0x921 is above 0x7FF"),
         (RIG.replace("0x121", "0x106"), "imu[S4].ids: each identifier once: found 0x106"),
@@ -277,3 +277,50 @@ def test_a_valid_bus_imports_drivers_in_use_only(monkeypatch: pytest.MonkeyPatch
     parse_rig(tomllib.loads(in_bus(RIG, 'interface = "socketcan"\nchannel = "can0"')))
     assert set(asked) <= {"xbus", "xcdi"}
     assert "xcdi" in asked
+
+
+@pytest.mark.parametrize(
+    ("wrong", "expected"),
+    [
+        (
+            ('joints = ["hip", "knee", "ankle"]', 'joints = ["hip", "knee", "ankle"'),
+            "unclosed array",
+        ),
+        (('id = "S1"', 'id = """S1'), "unterminated string"),
+        (("[[imu]]", "[rig]\nname = 'b'\n[[imu]]"), "table [rig] occurs a second time"),
+        (('name = "bench"', 'name = "bench"\nname = "b"'), "name occurs a second time"),
+        (('name = "bench"', 'name = "bench"\naxis = [1 2]'), "rig.axis: unknown key"),
+    ],
+)
+def test_no_syntax_error_hides_a_fault_or_shows_internals(
+    tmp_path: Path, wrong: tuple[str, str], expected: str
+) -> None:
+    text = SEVERAL.replace(*wrong, 1)
+    assert text != SEVERAL
+    shown = check(tmp_path, text).stderr
+    assert expected in shown
+    for line in ("imu[S4].ids.quaternion", ".baud = 9600"):
+        assert line in shown
+    assert "unreadable" not in shown
+    assert "('" not in shown
+
+
+@pytest.mark.parametrize(
+    ("keys", "line"),
+    [
+        (
+            'interface = "serial"\nchannel = "/dev/a"\nbaudrate = 9600',
+            "can.can1.baudrate = 9600:",
+        ),
+        ('interface = "slcan"\nchannel = "can0"', "can.can1.channel = 'can0': expected the path"),
+        ('channel = "can0"\nfoo_bar = 1', "can.can1.foo_bar = 1: unknown key of CAN interface"),
+    ],
+)
+def test_a_bus_that_the_daemon_would_refuse_is_a_fault(keys: str, line: str) -> None:
+    (found,) = complaints(in_bus(RIG, keys))
+    assert found.startswith(line)
+
+
+def test_the_check_prints_no_message_of_python_can(capfd: pytest.CaptureFixture[str]) -> None:
+    complaints(in_bus(RIG, 'interface = "neovi"\nchannel = "0"'))
+    assert capfd.readouterr().err == ""

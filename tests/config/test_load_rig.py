@@ -513,7 +513,7 @@ def test_an_11_bit_and_a_29_bit_identifier_of_one_number_are_different() -> None
          "can.can0.bitrate = 125000: S3, S4 need 244000 bit/s at most, the bus carries 125000: "
          "set bitrate = 250000"),
         ({"can": {"interface": "slcan", "transport": "uart"}, "xcdi": {"rate_hz": 200}},
-         "can.can0.baud = 115200: S3, S4 need 184000 bit/s as SLCAN"),
+         "can.can0.baud = 115200: S3, S4 need 184000 bit/s on the adapter's serial line"),
     ],
 )  # fmt: skip
 def test_insufficient_bit_rates_and_invalid_interface_names_are_refused(

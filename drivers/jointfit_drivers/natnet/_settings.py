@@ -2,11 +2,28 @@
 
 from __future__ import annotations
 
+import re
+from ipaddress import IPv4Address
 from typing import Literal
 
 from pydantic import Field, field_validator
 
-from jointfit_daemon.driver import INTERFACE_NAME_EXPECTED, MocapSettings, is_interface_name
+from jointfit_daemon.driver import (
+    INTERFACE_NAME_EXPECTED,
+    MocapSettings,
+    host_fault,
+    is_interface_name,
+)
+
+_DOTTED = re.compile(r"\d+(\.\d+){2,}")
+"""Numbers that are meant as an IPv4 address."""
+
+
+def _address(text: str) -> IPv4Address | None:
+    try:
+        return IPv4Address(text)
+    except ValueError:
+        return None
 
 
 class NatNetSettings(MocapSettings):
@@ -50,10 +67,14 @@ class NatNetSettings(MocapSettings):
     @classmethod
     def _server_with_a_name(cls, server: str) -> str:
         """Refuse text that is neither an address nor a host name."""
-        if not server or any(letter.isspace() or letter in "/:" for letter in server):
-            raise ValueError(
-                "expected one address or name without spaces, slashes and port, as 192.168.1.20"
-            )
+        if ":" in server:
+            raise ValueError("expected an IPv4 address or a name, without port")
+        if (fault := host_fault(server)) is not None:
+            raise ValueError(fault)
+        if (address := _address(server)) is not None and (
+            address.is_multicast or address.is_unspecified
+        ):
+            raise ValueError(f"{server} is the address of no host: expected that of the server")
         return server
 
     @field_validator("interface")
@@ -62,6 +83,8 @@ class NatNetSettings(MocapSettings):
         """Refuse a value that is neither an address nor a name that the kernel allows."""
         if interface is not None and not is_interface_name(interface):
             raise ValueError(f"{INTERFACE_NAME_EXPECTED}; or an IPv4 address")
+        if interface is not None and _DOTTED.fullmatch(interface) and not _address(interface):
+            raise ValueError("expected four numbers from 0 to 255, such as 192.168.1.2")
         return interface
 
     @property

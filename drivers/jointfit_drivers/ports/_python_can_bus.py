@@ -17,18 +17,13 @@ import struct
 import threading
 import time
 from contextlib import suppress
-from ctypes import CDLL
-from importlib import import_module, invalidate_caches
-from importlib.util import find_spec
-from inspect import signature
-from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any
 
 import can
 from can.typechecking import CanFilter
 
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
-from jointfit_daemon.nearest_name import unknown_name
+from jointfit_daemon.driver import CanBusError, DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.ports._bus_faults import bus_faults, cannot_load
 from jointfit_drivers.ports._bus_opening import open_in_thread, require_socketcand
 from jointfit_drivers.ports._kernel_stamps import KernelStamps
 from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX, CanFrame, host_dropped
@@ -58,16 +53,6 @@ _DROPS_EVERY_NS = 250_000_000
 """Period, ns, between two readings of the kernel's drop counter."""
 _SO_RCVBUFFORCE, _SO_MEMINFO = 33, 55
 _MEMINFO = struct.Struct("9I")
-_WINDOWS = frozenset({"etas", "iscan", "ixxat", "nican", "nixnet", "systec", "usb2can", "vector"})
-"""Interfaces of python-can whose libraries exist for Windows only."""
-_PACKAGES = {"neovi": "ics", "cantact": "cantact", "canalystii": "canalystii", "gs_usb": "usb"}
-"""Python packages that python-can imports when a bus is opened, by interface."""
-_NETWORKED = ("socketcand", "udp_multicast")
-"""Interfaces that need a network port."""
-_PORTS = 0x10000
-_LIBRARIES = {"pcan": "libpcanbasic.so", "kvaser": "libcanlib.so", "neousys": "libwdt_dio.so"}
-"""Libraries of vendors that python-can loads when a bus is opened, by interface."""
-_INSTEAD = 'set interface = "socketcan", or "slcan" for a serial adapter'
 _DROPS = 8
 """Place of the drop counter in SO_MEMINFO."""
 
@@ -180,8 +165,8 @@ class PythonCanBus:
 
     def _make(self) -> can.BusABC:
         settings = self._settings
-        if (reason := unusable_bus(settings)) is not None:
-            raise can.CanInterfaceNotImplementedError(reason)
+        if faults := bus_faults(settings):
+            raise can.CanInterfaceNotImplementedError(str(CanBusError(faults)))
         keys: dict[str, Any] = settings.model_dump(exclude={"baud", "transport"})
         if settings.interface == "socketcand":
             require_socketcand(settings.channel, keys["host"], keys["port"])
@@ -226,7 +211,8 @@ class PythonCanBus:
         """Return the error for a bus that cannot be opened, with its remedy."""
         channel, kind = self._settings.channel, self._settings.interface
         if isinstance(error, (NotImplementedError, ImportError)):
-            reason = unusable_bus(self._settings) or _cannot_load(kind, error)
+            faults = bus_faults(self._settings)
+            reason = str(CanBusError(faults)) if faults else cannot_load(kind, error)
             return DeviceMisconfiguredError(f"{channel}: {reason}")
         if isinstance(error, (can.CanError, OSError)):
             return self._error_by_number(error)
@@ -278,73 +264,6 @@ def _require_interface(name: str) -> None:
         socket.if_nametoindex(name)  # not if_nameindex: that asks netlink, which the unit refuses
     except OSError as error:  # CPython sets no error number here
         raise OSError(errno.ENODEV, "no such interface") from error
-
-
-def unusable_bus(settings: CanBusSettings) -> str | None:
-    """Return the reason why this bus can never be opened on this machine, or None.
-
-    Opens no device. The module of the interface is imported, because only this shows whether the
-    library of its vendor is installed.
-    """
-    kind = settings.interface
-    if kind == "slcan":
-        return None
-    if kind not in can.VALID_INTERFACES:
-        return unknown_name("CAN interface", kind, sorted({*can.VALID_INTERFACES, "slcan"}))
-    if kind in _WINDOWS:
-        return f"CAN interface {kind!r} exists on Windows only: {_INSTEAD}"
-
-    backend = _load_backend(kind)
-    return backend if isinstance(backend, str) else _wrong_keys(settings, backend)
-
-
-def _wrong_keys(settings: CanBusSettings, backend: type[can.BusABC]) -> str | None:
-    """Return the fault of keys that `backend` requires or cannot use."""
-    kind = settings.interface
-    given = {"channel", *(settings.model_extra or {})}
-    missing = [
-        name
-        for name, key in signature(backend).parameters.items()
-        if key.default is key.empty and key.kind is key.POSITIONAL_OR_KEYWORD and name not in given
-    ]
-    if missing:
-        return f"CAN interface {kind!r} needs {' and '.join(missing)}: add them to this table"
-    port = (settings.model_extra or {}).get("port", 1)
-    if kind in _NETWORKED and (type(port) is not int or not 0 < port < _PORTS):
-        return f"CAN interface {kind!r}: expected port = 1 to {_PORTS - 1}, found {port!r}"
-    if kind == "udp_multicast" and not _is_multicast(settings.channel):
-        example = "239.74.163.2"
-        return f"CAN interface {kind!r} needs a multicast address as channel, such as {example!r}"
-    return None
-
-
-def _load_backend(kind: str) -> type[can.BusABC] | str:
-    """Return python-can's class for an interface, or the reason why it cannot be loaded."""
-    module, name = can.interfaces.BACKENDS[kind]
-    invalidate_caches()  # a library may have been installed since the last attempt
-    try:
-        backend: type[can.BusABC] = getattr(import_module(module), name)
-        package = _PACKAGES.get(kind)
-        if package is not None and find_spec(package) is None:
-            return _cannot_load(kind, f"the Python package {package!r} is not installed")
-        if kind in _LIBRARIES:
-            CDLL(_LIBRARIES[kind])
-    except Exception as error:  # noqa: BLE001 - vendors' modules raise anything without the library
-        return _cannot_load(kind, error)
-    return backend
-
-
-def _cannot_load(kind: str, error: object) -> str:
-    return (
-        f"CAN interface {kind!r} cannot be used here ({error}): install its library, or {_INSTEAD}"
-    )
-
-
-def _is_multicast(address: str) -> bool:
-    try:
-        return ip_address(str(address)).is_multicast
-    except ValueError:
-        return False
 
 
 class _Pump:

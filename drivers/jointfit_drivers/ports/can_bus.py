@@ -22,7 +22,8 @@ from weakref import WeakKeyDictionary
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
-from jointfit_drivers.ports._python_can_bus import PythonCanBus, unusable_bus
+from jointfit_drivers.ports._bus_faults import bus_faults
+from jointfit_drivers.ports._python_can_bus import PythonCanBus
 from jointfit_drivers.ports._slcan_bus import SlcanBus
 from jointfit_protocols.can import HOST_CORRUPT, CanFrame, pack_frames
 
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.driver import CanBusSettings, Emit
 
-__all__ = ["CanKey", "SharedBus", "shared_bus", "unusable_bus"]
+__all__ = ["CanKey", "SharedBus", "bus_faults", "shared_bus"]
 
 CanKey = tuple[int, bool]
 """Identifier of a frame, and whether it has 29 bits."""

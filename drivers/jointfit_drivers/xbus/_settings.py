@@ -7,7 +7,7 @@ from typing import Literal
 from pydantic import Field, ValidationInfo, field_validator
 from typing_extensions import override
 
-from jointfit_daemon.driver import FASTEST_BAUD, SLOWEST_BAUD, ImuSettings
+from jointfit_daemon.driver import FASTEST_BAUD, SLOWEST_BAUD, ImuSettings, port_path_fault
 from jointfit_drivers import gateway_orientation
 from jointfit_drivers.xbus._required_outputs import message_bytes, required_outputs
 from jointfit_drivers.xbus._sync_lines import XbusSyncSettings  # noqa: TC001 - pydantic reads it
@@ -75,8 +75,8 @@ class XbusSettings(ImuSettings):
     @field_validator("port")
     @classmethod
     def _port_with_a_name(cls, port: str) -> str:
-        if not port.strip():
-            raise ValueError("must not be empty")
+        if (fault := port_path_fault(port)) is not None:
+            raise ValueError(fault)
         return port
 
     @field_validator("rate_hz")

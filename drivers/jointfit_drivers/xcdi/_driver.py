@@ -7,13 +7,13 @@ default). Nothing can be requested or set over CAN, so faults are reported with 
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, field_validator
 from typing_extensions import override
 
-from jointfit_daemon.driver import CanBusSettings, ImuSettings, Settings, Wire
-from jointfit_drivers.ports.can_bus import shared_bus, unusable_bus
+from jointfit_daemon.driver import CanBusError, CanBusSettings, ImuSettings, Settings, Wire
+from jointfit_drivers.ports.can_bus import bus_faults, shared_bus
 from jointfit_drivers.xcdi._decoder import XcdiDecoder
 from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX, unpack_frames
 from jointfit_protocols.corrupt import CorruptBytes
@@ -21,6 +21,8 @@ from jointfit_protocols.orientation import OrientationGate
 from jointfit_protocols.xcdi import QUATERNION_SCALE, DataId, XcdiIds, decode, id_block
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from jointfit_daemon.driver import Emit
     from jointfit_daemon.model import Chunk
 
@@ -56,27 +58,28 @@ class XcdiIdSettings(Settings):
         description="Error; default: 0x01, moved like the three above if they move together",
     )
 
-    @model_validator(mode="after")
-    def _usable(self) -> Self:
+    @override
+    def contradictions(self) -> Iterator[tuple[str, str]]:
         """Refuse identifiers that are not distinct, or whose order would split groups."""
-        ids = self.resolved()
+        in_order: tuple[Any, ...] = (self.sample_time, self.group_counter, self.quaternion)
+        ids = self.resolved()._asdict() if None not in in_order else dict(self)
 
         owners: dict[int, str] = {}
-        for name, number in zip(_ID_NAMES, ids, strict=False):  # without `extended`
-            if number is None:
+        for name in _ID_NAMES:
+            if (number := ids[name]) is None:
                 continue
             if (owner := owners.setdefault(number, name)) != name:
                 derived = [key for key in (owner, name) if getattr(self, key) is None]
                 hint = f" ({derived[0]} is derived from the others: set it, too)" if derived else ""
-                raise ValueError(
-                    f"each identifier once: found 0x{number:X} for {owner} and {name}{hint}"
-                )
-        if not self.sample_time < self.group_counter < self.quaternion:
-            raise ValueError(
+                yield "", f"each identifier once: found 0x{number:X} for {owner} and {name}{hint}"
+
+        known = [number for number in in_order if number is not None]
+        if known != sorted(known):
+            yield (
+                "",
                 "sample_time < group_counter < quaternion: the lowest identifier leaves first, and "
-                "the quaternion must complete its group"
+                "the quaternion must complete its group",
             )
-        return self
 
     def resolved(self, *, extended: bool = False) -> XcdiIds:
         """Return all identifiers; those left out are derived from a block if there is one."""
@@ -100,7 +103,6 @@ class XcdiSettings(ImuSettings):
     )
     extended_ids: bool = Field(
         False,
-        validate_default=True,
         description="29-bit identifiers even where the numbers would fit 11 bits",
     )
     sample_time_unit: Literal["auto", "100us", "1us"] = Field(
@@ -109,24 +111,24 @@ class XcdiSettings(ImuSettings):
     )
     byte_order: Literal["big", "little"] = Field("big", description="byte order of the payloads")
 
-    @field_validator("extended_ids")
-    @classmethod
-    def _fits_its_identifiers(cls, extended_ids: bool, info: ValidationInfo) -> bool:
-        """Refuse 11-bit identifiers out of range, even if another key has a fault."""
-        for name, number in info.data.get("ids", ()):
-            if number is not None and number > STANDARD_MAX and not extended_ids:
-                raise ValueError(
+    @override
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """Refuse 11-bit identifiers out of range."""
+        ids: Any = self.ids  # None: cannot be read
+        for name, number in ids or ():
+            if number is not None and number > STANDARD_MAX and self.extended_ids is False:
+                yield (
+                    "extended_ids",
                     f"ids.{name} = 0x{number:X} is above 0x{STANDARD_MAX:X}, the greatest 11-bit "
                     "identifier: correct it, or set extended_ids = true if the sensor sends 29-bit "
-                    "identifiers"
+                    "identifiers",
                 )
-        return extended_ids
 
     @field_validator("can")
     @classmethod
     def _bus_that_exists_here(cls, can: CanBusSettings) -> CanBusSettings:
-        if (fault := unusable_bus(can)) is not None:
-            raise ValueError(fault)
+        if faults := bus_faults(can):
+            raise CanBusError(faults)
         return can
 
     @property

@@ -98,10 +98,16 @@ async def test_unknown_interfaces_are_named_with_the_nearest() -> None:
         ({"interface": "kvaser"}, r"libcanlib.so.*install its library"),
         ({"interface": "pcan"}, r"libpcanbasic.so.*install its library"),
         ({"interface": "neovi"}, "package 'ics' is not installed"),
-        ({"interface": "socketcand"}, "needs host and port: add them"),
+        ({"interface": "socketcand"}, "host: missing: .* port: missing: "),
         ({"interface": "socketcand", "host": "::1", "port": 99999}, "port = 1 to 65535"),
         ({"interface": "socketcand", "host": "::1", "port": "abc"}, "found 'abc'"),
-        ({"interface": "udp_multicast", "channel": "can0"}, "multicast address as channel"),
+        ({"interface": "udp_multicast", "channel": "239.1.1.1", "hop_limit": 300}, "0 to 255"),
+        ({"interface": "seeedstudio", "channel": "/dev/a", "bitrate": 300_000}, "bitrate: expect"),
+        ({"interface": "serial", "channel": "/dev/a", "baud": 9600}, "set baudrate instead"),
+        (
+            {"interface": "udp_multicast", "channel": "can0"},
+            "channel: expected a multicast add",
+        ),
     ],
 )
 async def test_a_bus_that_cannot_exist_here_has_one_text_in_check_and_daemon(

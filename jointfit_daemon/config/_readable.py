@@ -1,0 +1,124 @@
+"""The readable part of a table with faults, for the checks of values against each other."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from jointfit_daemon.config._fault_messages import Fault, join
+from jointfit_daemon.config._syntax import UNREADABLE
+from jointfit_daemon.driver import Settings
+from jointfit_daemon.nearest_name import nearest_name
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+Model = TypeVar("Model", bound=BaseModel)
+_Locations = list[tuple[int | str, ...]]
+
+
+def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Locations) -> Model:
+    """Return `table` as a model without validation.
+
+    Parameters
+    ----------
+    table
+        The table; keys that its model refuses are omitted.
+    model
+        Its model.
+    wrong
+        Locations of its faults, as pydantic returns them.
+
+    Returns
+    -------
+    Model
+        None are required keys that are missing, keys that are probably misspelled in the table, and
+        values that cannot be read. In arrays of texts a number is the text of its digits.
+    """
+    fields = model.model_fields
+    unknown = table.keys() - fields.keys()
+    misspelled = {nearest_name(name, fields) for name in unknown} - table.keys()
+    values = {}
+    for name, field in fields.items():
+        if name in table:
+            inside = [place[1:] for place in wrong if place[:1] == (name,)]
+            values[name] = _readable(table[name], field.annotation, inside)
+        elif field.is_required() or name in misspelled:
+            values[name] = None
+        else:
+            values[name] = field.get_default(call_default_factory=True)
+    if model.model_config.get("extra") == "allow":
+        values |= {name: value for name, value in table.items() if name not in values}
+    return model.model_construct(**values)
+
+
+def _readable(value: Any, annotation: Any, wrong: _Locations) -> Any:
+    """Return the readable part of `value`; None without one."""
+    if not wrong:
+        return _valid(value, annotation)
+    if isinstance(value, dict) and UNREADABLE in value:
+        return None
+
+    choices = [annotation, *get_args(annotation)]  # of X | None: X
+    for choice in choices:
+        if isinstance(choice, type) and issubclass(choice, BaseModel) and isinstance(value, dict):
+            return readable_part(value, choice, wrong)
+        arguments = get_args(choice)
+        if get_origin(choice) is dict and isinstance(value, dict):
+            parts = _below(wrong)
+            return {
+                key: _readable(inner, arguments[1], parts.get(key, []))
+                for key, inner in value.items()
+            }
+        if get_origin(choice) is tuple and arguments == (str, ...) and isinstance(value, list):
+            return _texts(value)
+    return None
+
+
+def _valid(value: Any, annotation: Any) -> Any:
+    """Return a value without faults of its own."""
+    try:
+        return _adapter(annotation).validate_json(json.dumps(value, default=str), strict=True)
+    except ValidationError:
+        return None  # a driver's validator of several keys raised at another one
+
+
+@cache
+def _adapter(annotation: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(annotation)
+
+
+def _below(wrong: _Locations) -> dict[int | str, _Locations]:
+    below: dict[int | str, _Locations] = {}
+    for place in wrong:
+        below.setdefault(place[0] if place else "", []).append(place[1:])
+    return below
+
+
+def _texts(values: Sequence[Any]) -> tuple[str, ...] | None:
+    if any(isinstance(value, (list, dict)) for value in values):
+        return None
+    return tuple(map(str, values))
+
+
+def contradictions(settings: BaseModel, key: str) -> Iterator[Fault]:
+    """Return the values of `settings` and its inner tables that do not fit together.
+
+    Parameters
+    ----------
+    settings
+        A table; values that cannot be read are None.
+    key
+        Its path.
+    """
+    for name, value in settings:
+        if isinstance(value, BaseModel):
+            yield from contradictions(value, join(key, (name,)))
+    if isinstance(settings, Settings):
+        for name, text in settings.contradictions():
+            value = getattr(settings, name, None)
+            shown = () if value is None or isinstance(value, (BaseModel, dict)) else (value,)
+            yield Fault(join(key, (name,)) if name else key, text, *shown)
