@@ -50,7 +50,7 @@ from jointfit_daemon.timing.alignment import RateDivider
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.config import Rig
+    from jointfit_daemon.config import Rig, Source
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.chain_tracking import ChainTracker
@@ -95,7 +95,7 @@ class Core:
         self._usable: Calibration | None = None
         """The calibration in force, if it belongs to the chain of the rig."""
         self._sensors_rate: RateDivider | None = None
-        self._moving_centers: MovingCenters
+        self._moving_centers: MovingCenters | None = None
         self._chain_tracker: ChainTracker | None = None
         self._handlers: dict[type, Callable[[Any], list[Output]]] = {
             Configured: self._configure,
@@ -173,7 +173,8 @@ class Core:
         else:
             self._grid.reload(rig)
         self._aligner = self._grid.aligner
-        self._chain_tracker = None
+        if before is None or _cameras(before) != _cameras(rig):
+            self._moving_centers = self._chain_tracker = None
         if before is None or before.chain != rig.chain:
             self._sensor_monitor = SensorMonitor(rig.chain)
 
@@ -224,7 +225,9 @@ class Core:
         self._usable = usable
         rate_hz = rig.mqtt.sensors_hz
         self._sensors_rate = RateDivider(rate_hz) if rate_hz > 0.0 else None
-        self._moving_centers = MovingCenters(rig.chain, usable, rig.mqtt.centers_memory_s)
+        centers = MovingCenters(rig.chain, usable, rig.mqtt.centers_memory_s)
+        if self._moving_centers is None or not self._moving_centers.serves(centers):
+            self._moving_centers = centers
         self._chain_tracker = _chain_tracker(rig, usable, self._chain_tracker)
         wanted = rig.calibration.learn_online
         self._collector = OnlineFrameCollector(rig.chain, usable, wanted=wanted)
@@ -317,7 +320,8 @@ class Core:
                 self._mocap.add(self._now_ns, item, self._session, self._lags, self._collector)
                 if measurement.live:
                     self._comparison.add_frame(stamp.t_ns, measurement, synced=stamp.synced)
-                    outputs += self._moving_centers.add_frame(stamp.t_ns, measurement)
+                    if self._moving_centers is not None:
+                        outputs += self._moving_centers.add_frame(stamp.t_ns, measurement)
                     if self._chain_tracker is not None:
                         outputs += self._chain_tracker.add_frame(stamp.t_ns, measurement)
         return outputs
@@ -428,6 +432,10 @@ class Core:
         return outputs
 
 
+def _cameras(rig: Rig) -> list[Source]:
+    return [source for source in rig.sources if source.kind == "mocap"]
+
+
 def _chain_tracker(
     rig: Rig, calibration: Calibration | None, before: ChainTracker | None
 ) -> ChainTracker | None:
@@ -437,7 +445,8 @@ def _chain_tracker(
     stored = None if calibration is None else calibration.chain
     refined = None if stored is None else stored.apply(rig.chain_model.chain)
     loaded = rig.chain_model if refined is None else replace(rig.chain_model, chain=refined)
-    if before is not None and before.loaded == loaded:
+    rate_hz, is_refined = rig.mqtt.chain_hz, refined is not None
+    if before is not None and before.serves(loaded, rate_hz, refined=is_refined):
         return before
     from jointfit_daemon.pipeline.chain_tracking import (  # noqa: PLC0415 - it loads scipy
         ChainTracker,

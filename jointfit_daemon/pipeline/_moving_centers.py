@@ -60,6 +60,17 @@ class MovingCenters:
 
     def __init__(self, chain: Chain, calibration: Calibration | None, memory_s: float) -> None:
         self._memory_s = memory_s
+        self._inputs: object = (
+            None
+            if calibration is None
+            else (
+                chain,
+                memory_s,
+                calibration.clusters,
+                calibration.joint,
+                {name: item.q_static for name, item in calibration.segment.items()},
+            )
+        )
         self._centers: LiveJointCenters | None = None
         if calibration is None or not calibration.fits(chain) or not memory_s > 0.0:
             return
@@ -74,6 +85,10 @@ class MovingCenters:
         self._before_ns: int | None = None
         self._seen: dict[str, tuple[int, int]] = {}
         """Frames with both body parts of a joint, and the stamp of the last one, ns."""
+
+    def serves(self, other: MovingCenters) -> bool:
+        """Return whether this object and a new one, `other`, have the same inputs."""
+        return self._inputs == other._inputs
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[RunningCenters]:
         """Add one live mocap frame with its stamp; return the centers about once a second.

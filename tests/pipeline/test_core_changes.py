@@ -10,6 +10,7 @@ import pytest
 
 from jointfit_daemon.calibration.phases import run_job
 from jointfit_daemon.config import parse_rig
+from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
@@ -24,6 +25,7 @@ from jointfit_daemon.pipeline.events import (
     SourceOpened,
 )
 from jointfit_protocols.natnet import FrameOfData, encode
+from tests.limb_model.plain_calibration import plain_calibration
 from tests.pipeline import core_feed
 from tests.pipeline.core_feed import (
     BEGIN_NS,
@@ -42,7 +44,6 @@ from tests.pipeline.core_feed import (
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.pipeline.events import Event
 
 VERDICTS = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")
@@ -208,6 +209,50 @@ def test_reload_preserves_the_consistency_monitor() -> None:
         ]
     )
     assert bench.core._fuser.consistency is watched
+
+
+@pytest.mark.parametrize(
+    ("changed", "kept"),
+    [
+        ({"pose_ui_hz": 20.0}, (True, True)),
+        ({"chain_hz": 5.0}, (False, True)),
+        ({"centers_memory_s": 7.0}, (True, False)),
+    ],
+)
+def test_reload_keeps_chain_tracking_and_running_centers_whose_configuration_is_the_same(
+    changed: dict[str, float], kept: tuple[bool, bool]
+) -> None:
+    rig = shaped({"S1": "thigh", "S3": "shank"}, mocap=True)
+    rig["mocap"]["markers"] = {"thigh": ["T1", "T2", "T3"], "shank": ["C1", "C2", "C3"]}
+    del rig["mocap"]["rigid_body"]
+    rig["chain"]["model"] = {
+        "segment": [{"name": "femur"}, {"name": "tibia", "parent": "femur", "joint": "hinge"}],
+        "marker": [
+            {"name": name, "segment": segment, "position": [0.1 * k, 0.0, -0.1]}
+            for part, segment in (("thigh", "femur"), ("shank", "tibia"))
+            for k, name in enumerate(rig["mocap"]["markers"][part])
+        ],
+    }
+
+    def state() -> tuple[object, object]:
+        return bench.core._chain_tracker, bench.core._moving_centers
+
+    def reload(number: int) -> tuple[object, object]:
+        # an equal object each time, as after another reading of the stored file
+        calibration = Calibration.from_dict(plain_calibration(parse_rig(rig).chain).to_dict())
+        bench.feed([Configured(at(number), parse_rig(rig), calibration)])
+        assert None not in state()
+        return state()
+
+    bench = Bench()
+    first = reload(0)
+    assert reload(1) == first
+    rig["mqtt"] = rig.get("mqtt", {}) | changed
+    second = reload(2)
+    assert tuple(a is b for a, b in zip(second, first, strict=True)) == kept
+    rig["mocap"]["up_axis"] = "z"
+    third = reload(3)
+    assert not any(a is b for a, b in zip(third, second, strict=True)), "other coordinates"
 
 
 def reconnected(after: Iterable[Event]) -> tuple[Bench, list[Notice]]:

@@ -55,7 +55,7 @@ class MarkerTrial:
         if not unknown:
             return self.trajectories.positions[:, [at for at in wanted if at is not None]]
 
-        # Name the nearest markers of each, or all once. Requested markers are not candidates.
+        # Name the nearest markers of each, and all once. Requested markers are not candidates.
         taken = set(names)
         free = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
         spellings = [*free, *map(_bare, free)]
@@ -64,8 +64,7 @@ class MarkerTrial:
             f"no marker {name!r}" + (f": {hint}" if hint else "")
             for name, hint in zip(unknown, hints, strict=True)
         ]
-        if not all(hints):
-            problems.append(f"there are: {', '.join(self.trajectories.names)}")
+        problems.append(f"there are: {', '.join(self.trajectories.names)}")
         raise UnknownMarkerError("; ".join(problems))
 
     def direction(self, axis: Axis) -> NDArray[np.float64]:

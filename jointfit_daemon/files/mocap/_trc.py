@@ -32,11 +32,14 @@ from jointfit_daemon.files.text import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
 _HEADER_ROWS = 5
+_SHOWN = 40
+"""Characters of a wrong cell in a message."""
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 """Metres per unit of length in marker files."""
 _KEYS = (
@@ -73,10 +76,7 @@ def read_trc(path: Path) -> MarkerTrajectories:
         Not a TRC file, no markers, no rows, or an unknown unit of length.
     """
     lines = read_lines(path)
-    if len(lines) < _HEADER_ROWS or not lines[0].startswith("PathFileType"):
-        raise MalformedFileError(
-            f"{path}: not a TRC file (its first cell must be PathFileType): export it again"
-        )
+    _require_header(path, lines)
     separator = separator_of(lines[3])
     names = tuple(strip_trailing_empty(cells_of(lines[3], separator))[2::3])
     if not names:
@@ -119,6 +119,21 @@ def read_trc(path: Path) -> MarkerTrajectories:
         rate_hz,
         warnings,
     )
+
+
+def _require_header(path: Path, lines: Sequence[str]) -> None:
+    """Raise `MalformedFileError` unless the lines begin with a complete header."""
+    if not lines or not lines[0].startswith("PathFileType"):
+        found = lines[0].split("\t")[0][:_SHOWN] if lines else ""
+        raise MalformedFileError(
+            f"{path}, line 1: not a TRC file: found {found!r}, expected PathFileType in the first "
+            "cell: export the trial as TRC again"
+        )
+    if len(lines) < _HEADER_ROWS:
+        raise MalformedFileError(
+            f"{path}: ends after line {len(lines)}, expected {_HEADER_ROWS} lines of header and "
+            "one line per frame: export the trial again"
+        )
 
 
 def write_trc(path: Path, trajectories: MarkerTrajectories) -> None:

@@ -72,10 +72,19 @@ def read_osim(path: Path, *, markers: Collection[str] | None = None) -> Imported
     document = read_document(path)
     names = {m.name for m in document.markers}
     unknown = [f"no marker {m!r}" for m in markers or () if m not in names]
+    if unknown:
+        unknown.append(f"there are: {', '.join(sorted(names)) or 'none'}")
+    known = {*document.bodies, GROUND}
+    frames = [(f"marker {m.name!r}", "parent", m.body) for m in document.markers]
+    for joint in document.joints:
+        frames.append((f"joint {joint.name!r}", "parent", joint.parent.body))
+        frames.append((f"joint {joint.name!r}", "child", joint.child.body))
+    bodies = ", ".join([GROUND, *document.bodies])
     unknown += [
-        f"marker {m.name!r} on unknown body {m.body!r}"
-        for m in document.markers
-        if m.body not in document.bodies and m.body != GROUND
+        f"{owner}: {end} frame {body!r} is neither a body nor a frame of its own, expected one of "
+        f"{bodies}: correct socket_{end}_frame"
+        for owner, end, body in frames
+        if body not in known
     ]
     if unknown:
         raise MalformedFileError(f"{path}: {'; '.join(unknown)}")
@@ -117,7 +126,11 @@ class _Tree:
         while waiting:
             ready = [j for j in waiting if j.parent.body in self._at]
             if not ready:
-                raise ValueError(f"joints form a cycle: {', '.join(j.name for j in waiting)}")
+                cycle = ", ".join(f"{j.name} ({j.parent.body} to {j.child.body})" for j in waiting)
+                raise ValueError(
+                    f"joints form a cycle: {cycle}; expected a path from every body to {GROUND}: "
+                    "correct socket_parent_frame of one of them"
+                )
             for joint in ready:
                 if joint.child.body in self._at:
                     raise ValueError(f"body {joint.child.body!r} has two parent joints")

@@ -95,8 +95,11 @@ def read_document(path: Path) -> OsimDocument:
     root = read_xml(path)
     model = root.find("Model")
     if root.tag != "OpenSimDocument" or model is None:
+        inside = f" with <{root[0].tag}>" if len(root) and root.tag == "OpenSimDocument" else ""
         raise MalformedFileError(
-            f"{path}: not an OpenSim model (expected OpenSimDocument with a Model)"
+            f"{path}, line {line_of(root)}: not an OpenSim model: found <{root.tag}>{inside}, "
+            "expected <OpenSimDocument> with a <Model>: choose the .osim file of the model, or "
+            "save the model from OpenSim 4 again"
         )
     if model.find("JointSet") is None:
         raise MalformedFileError(
@@ -136,7 +139,7 @@ def read_xml(path: Path) -> ET.Element:
             f"{path}: more than {LARGEST} bytes, which no model has: check the path"
         )
     data = path.read_bytes()
-    builder = ET.TreeBuilder()
+    builder = ET.TreeBuilder(element_factory=_LocatedElement)
     parser = expat.ParserCreate()
 
     def refuse(*_: object) -> None:
@@ -145,8 +148,13 @@ def read_xml(path: Path) -> ET.Element:
             " from OpenSim again"
         )
 
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        element = builder.start(tag, attributes)
+        if isinstance(element, _LocatedElement):
+            element.line = parser.CurrentLineNumber
+
     parser.StartDoctypeDeclHandler = refuse
-    parser.StartElementHandler = builder.start
+    parser.StartElementHandler = start
     parser.EndElementHandler = builder.end
     parser.CharacterDataHandler = builder.data
     try:
@@ -165,6 +173,17 @@ def read_xml(path: Path) -> ET.Element:
     return builder.close()
 
 
+class _LocatedElement(ET.Element):
+    """An element that knows its line."""
+
+    line = 0
+
+
+def line_of(element: ET.Element) -> int:
+    """Return the line of the beginning of an element from `read_xml`."""
+    return element.line if isinstance(element, _LocatedElement) else 0
+
+
 def text_of(element: ET.Element, tag: str, default: str = "") -> str:
     """Return the stripped text of a child element, or `default`."""
     return (element.findtext(tag) or default).strip()
@@ -178,8 +197,13 @@ def numbers_of(element: ET.Element, tag: str, count: int | None = None) -> Array
         values = np.array([np.nan])
         count = count or 0  # text without numbers is an error for any expected count
     if count is not None and (values.size != count or not np.isfinite(values).all()):
-        name = element.get("name", element.tag)
-        raise ValueError(f"{name}: {tag} is {text_of(element, tag)!r}, expected {count} numbers")
+        name, found = element.get("name", element.tag), element.find(tag)
+        expected = "one number" if count == 1 else f"{count} numbers with blanks between them"
+        raise ValueError(
+            f"line {line_of(element if found is None else found)}: {element.tag} {name!r}: {tag} "
+            f"is {text_of(element, tag)!r}, expected {expected}: correct it in this line, or save "
+            "the file from OpenSim again"
+        )
     return values
 
 

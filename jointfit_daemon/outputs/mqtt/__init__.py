@@ -8,7 +8,11 @@ from jointfit_daemon.outputs.mqtt._connection import (
 )
 from jointfit_daemon.outputs.mqtt._outbox import Outbox
 from jointfit_daemon.outputs.mqtt._publisher import LinkHealth, MqttPublisher
-from jointfit_daemon.outputs.mqtt._secret_files import RequestKeyError, request_key_of
+from jointfit_daemon.outputs.mqtt._secret_files import (
+    RequestKeyError,
+    missing_password,
+    request_key_of,
+)
 from jointfit_daemon.outputs.mqtt._signature import (
     SIGNATURE_LIFETIME_US,
     SIGNING_KEYS,
@@ -30,6 +34,7 @@ __all__ = [
     "Outbox",
     "RequestKeyError",
     "SignatureRejectedError",
+    "missing_password",
     "request_key_of",
     "signed",
     "verify",

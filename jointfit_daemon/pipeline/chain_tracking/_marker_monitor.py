@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from jointfit_daemon.model import MarkerFlag
 
@@ -30,8 +31,8 @@ FAR_M = 0.06
 NEAR_M = 0.03
 """Distance below which a faulty marker recovers, m."""
 EXCHANGE_GAIN = 0.2
-"""Ratio of the squared distances after and before an exchange of two labels, below which the labels
-are exchanged."""
+"""Ratio of the squared distances after and before an exchange of labels, below which they are
+exchanged."""
 FAULT_NS = 1_000_000_000
 """Time for which a marker is misplaced, exchanged or hidden before it is flagged, ns."""
 RECOVERY_NS = 2_000_000_000
@@ -165,13 +166,11 @@ class MarkerMonitor:
         distances = np.sqrt(((places - measured) ** 2).sum(axis=1))
 
         far = distances > FAR_M  # False where NaN
-        exchanged = _exchanged_pairs(places, measured, far) if far.any() else []
-        paired = {m for pair in exchanged for m in pair}
-        suspects: dict[str, tuple[int, ...]] = {
-            self._flag(MarkerFlag.EXCHANGED, *pair): pair for pair in exchanged
-        }
+        exchanged = _exchanged_labels(places, measured, far) if far.any() else []
+        grouped = {m for group in exchanged for m in group}
+        suspects = {self._flag(MarkerFlag.EXCHANGED, *group): group for group in exchanged}
         for m in np.flatnonzero(far).tolist():
-            if m not in paired:
+            if m not in grouped:
                 suspects[self._flag(MarkerFlag.MISPLACED, m)] = (m,)
 
         reports = self._recover(t_ns, distances)
@@ -219,11 +218,13 @@ class MarkerMonitor:
 
     def _report(self, markers: tuple[int, ...], distances: Array) -> MarkerReport:
         names = [self.model.markers[m].name for m in markers]
-        shown = " and ".join(f"{1000 * distances[m]:.0f} mm" for m in markers)
+        shown = _joined(f"{1000 * distances[m]:.0f} mm" for m in markers)
         if len(markers) > 1:
+            following = zip(names, names[1:] + names[:1], strict=True)
+            order = _joined(f"{name} is at the place of {other}" for name, other in following)
             text = (
-                f"{' and '.join(names)} look exchanged ({shown} from their places in the model): "
-                "exchange their labels back. Both are excluded until then"
+                f"{_joined(names)} look exchanged ({shown} from their places in the model): "
+                f"{order}. Correct their labels; they are excluded until then"
             )
             return MarkerReport(names[0], MarkerFlag.EXCHANGED, text, {"markers": names})
         segment = self.model.markers[markers[0]].segment
@@ -252,7 +253,7 @@ class MarkerMonitor:
             markers = self._faults.pop(flag)
             self.excluded[list(markers)] = False
             names = [self.model.markers[m].name for m in markers]
-            text = f"{' and '.join(names)}: at the expected place again, and in use"
+            text = f"{_joined(names)}: at the expected place again, and in use"
             reports.append(MarkerReport(names[0], "ok", text, {"markers": names}))
         return reports
 
@@ -292,12 +293,41 @@ class MarkerMonitor:
         return MarkerReport(marker.name, MarkerFlag.MISPLACED, text, data)
 
 
-def _exchanged_pairs(
+def _joined(words: Iterable[str]) -> str:
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
+
+
+def _exchanged_labels(
     places: Array, measured: Array, far: NDArray[np.bool_]
-) -> list[tuple[int, int]]:
-    """Return pairs of far markers that fit much better with each other's label."""
+) -> list[tuple[int, ...]]:
+    """Return groups of far markers that fit much better with each other's labels.
+
+    Each marker of a group is at the place of the next one, and the last at that of the first.
+    """
     rows = np.flatnonzero(far)
     square = ((places[rows, None] - measured[None, rows]) ** 2).sum(axis=-1)
+    # the marker at each place if all labels are assigned anew
+    nearest = linear_sum_assignment(square)[1]
+    place_of = np.argsort(nearest)
+
+    groups: list[tuple[int, ...]] = []
+    left = set(range(len(rows)))
+    for first in range(len(rows)):
+        group = [first]
+        while (following := int(place_of[group[-1]])) != first:
+            group.append(following)
+        if first != min(group) or len(group) == 1:
+            continue
+        if square[place_of[group], group].sum() < EXCHANGE_GAIN * square[group, group].sum():
+            groups.append(tuple(rows[group].tolist()))
+            left -= set(group)
+
+    # A misplaced marker may have spoiled the assignment of two others.
     own = square.diagonal()
     better = square + square.T < EXCHANGE_GAIN * (own[:, None] + own[None])
-    return [(int(rows[i]), int(rows[j])) for i, j in np.argwhere(np.triu(better, 1)).tolist()]
+    for i, j in np.argwhere(np.triu(better, 1)).tolist():
+        if {i, j} <= left:
+            groups.append((int(rows[i]), int(rows[j])))
+            left -= {i, j}
+    return groups

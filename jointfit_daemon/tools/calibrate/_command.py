@@ -135,9 +135,14 @@ async def _guide_phases(
 ) -> dict[str, Any]:
     from rich.console import Console
 
-    from jointfit_daemon.outputs.mqtt import MqttClient
+    from jointfit_daemon.outputs.mqtt import MqttClient, missing_password
 
     console = Console(stderr=True)
+    if (missing := missing_password(rig.mqtt)) is not None:
+        _print_note(
+            f"jointfit calibrate: user {rig.mqtt.username!r} has no password: {missing}. Create "
+            "the file, or correct [mqtt]; connecting without a password"
+        )
     status: dict[str, Any] = {}
     with cancel_on_signal() as stop:
         try:

@@ -96,7 +96,11 @@ def check_unit_norm(path: Path, name: str, q: Array) -> None:
 
 def _check_times(path: Path, t_s: Array) -> None:
     if len(t_s) < FEWEST:
-        raise UnusableInputError(f"{path}: {len(t_s)} rows, expected at least {FEWEST}")
+        rows = "row" if len(t_s) == 1 else "rows"
+        raise UnusableInputError(
+            f"{path}: {len(t_s)} {rows}, expected at least {FEWEST}: export the whole trial, or "
+            "record a longer one"
+        )
 
     steps = np.diff(t_s)
     if not (steps > 0.0).all():

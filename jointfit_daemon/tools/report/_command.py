@@ -34,12 +34,10 @@ def report(
     if not cor_study:
         raise ValueError("no report selected, expected --cor-study")
 
-    for folder in (out, json.parent if json else None):
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-
     if json is not None:
-        check_output("--json", json, (json.suffix,))
+        check_output("--json", json, (json.suffix.lower(),))
+    if out is not None:  # before the computation: it may be impossible
+        out.mkdir(parents=True, exist_ok=True)
 
     _cor_study(out, json, repeats, seed)
 

@@ -308,7 +308,11 @@ def model_of(text: str) -> str:
     ("text", "said"),
     [
         ("<a", "m.osim: "),
-        ("<html/>", "not an OpenSim model"),
+        (
+            "\n<html/>",
+            "m.osim, line 2: not an OpenSim model: found <html>, expected <OpenSimDocument>",
+        ),
+        (model_of("<ScaleTool/>"), "found <OpenSimDocument> with <ScaleTool>.*: choose the .osim"),
         (model_of("<Model name='m'/>"), "before 4.0"),
         (
             "<!DOCTYPE x [<!ENTITY a 'aaaa'><!ENTITY b '&a;&a;'>]>"
@@ -334,8 +338,41 @@ def test_unsupported_elements_are_rejected_by_name(tmp_path: Path, text: str, sa
 
 def test_unknown_names_are_reported_together(tmp_path: Path) -> None:
     path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
-    with pytest.raises(MalformedFileError, match="no marker 'shin'; no marker 'tibia9'"):
+    with pytest.raises(
+        MalformedFileError, match="no marker 'shin'; no marker 'tibia9'; there are: "
+    ):
         read_osim(path, markers=["shin", "tibia9"])
+
+
+def test_a_wrong_number_is_reported_with_its_line_and_remedy(tmp_path: Path) -> None:
+    path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
+    text = re.sub(r"<location>[^<]*<", "<location>1 2<", path.read_text(), count=1)
+    path.write_text(text)
+    line = next(k for k, row in enumerate(text.splitlines(), 1) if "<location>1 2<" in row)
+    said = (
+        rf"small.osim: line {line}: Marker '\w+': location is '1 2', expected 3 numbers .*: correct"
+    )
+    with pytest.raises(MalformedFileError, match=said):
+        read_osim(path)
+
+
+def test_an_unknown_parent_frame_is_named_with_the_bodies(tmp_path: Path) -> None:
+    path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
+    socket = "<socket_parent>/bodyset/femur<"
+    path.write_text(path.read_text().replace(socket, socket.replace("femur", "fumer")))
+    said = (
+        r"parent frame 'fumer' is neither a body .*, expected one of ground, pelvis, femur, tibia"
+    )
+    with pytest.raises(MalformedFileError, match=said):
+        read_osim(path)
+
+
+def test_joints_in_a_cycle_are_named_with_their_bodies(tmp_path: Path) -> None:
+    path = write_osim(tmp_path / "small.osim", [ROOT, HIP, KNEE], MARKERS)
+    text = path.read_text().replace("<socket_parent>/ground<", "<socket_parent>/bodyset/tibia<")
+    path.write_text(text)
+    with pytest.raises(MalformedFileError, match=r"cycle: .* \(tibia to pelvis\).*: correct"):
+        read_osim(path)
 
 
 def test_millimetres_are_rejected_with_or_without_a_declared_unit(tmp_path: Path) -> None:

@@ -155,6 +155,24 @@ def test_exchanged_markers_are_excluded_until_their_labels_are_correct() -> None
     assert states[-1].flags == ()
 
 
+@pytest.mark.parametrize("labels", [("thigh0", "thigh1", "thigh2"), ("thigh0", "shank1", "foot0")])
+def test_three_exchanged_labels_are_named_together_each_with_its_place(
+    labels: tuple[str, str, str],
+) -> None:
+    rows = [NAMES.index(name) for name in labels]
+
+    def rotate(_: float, points: Array) -> Array:
+        points[rows] = points[rows[1:] + rows[:1]]  # each label at the place of the next
+        return points
+
+    states, (notice,) = track(3.0, rotate)
+    assert states[-1].flags == (f"exchanged:{'~'.join(labels)}",)
+    assert notice.data["markers"] == list(labels)
+    a, b, c = labels
+    assert f"{a} is at the place of {b}, {b} is at the place of {c} and {c} is" in notice.text
+    assert np.abs(flexion_errors_deg(states[15:])).max() < 2.0
+
+
 def test_a_marker_on_the_wrong_segment_is_excluded_and_its_segment_is_named() -> None:
     # the marker of the shank is fixed to the thigh, 3 cm from two of its markers
     wrong = replaced("shank1", lambda _, p: 0.5 * (p[4] + p[5]) + (p[6] - p[7]) * 0.2)

@@ -72,6 +72,15 @@ def test_a_report_that_is_not_named_is_not_guessed() -> None:
     assert "--cor-study" in result.stderr
 
 
+def test_a_missing_folder_of_the_results_is_reported_and_nothing_is_created(tmp_path: Path) -> None:
+    result = run(
+        app, [*SHORT, "--out", str(tmp_path / "a"), "--json", str(tmp_path / "b" / "x.json")]
+    )
+    assert result.exit_code == 2
+    assert "does not exist: create it (mkdir -p)" in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("", encoding="utf-8")
     result = run(app, [*SHORT, "--out", str(tmp_path / "file" / "x")])

@@ -1,0 +1,31 @@
+"""TRC files that are cut off, or are no TRC files."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from jointfit_daemon.files.mocap import read_trc
+from jointfit_daemon.files.text import MalformedFileError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("time,x\n0,1\n", "line 1: not a TRC file: found 'time,x', expected PathFileType in the"),
+        ("", "line 1: not a TRC file: found '', expected"),
+        (
+            "PathFileType\t4\t(X/Y/Z)\tm.trc\nDataRate\n",
+            "ends after line 2, expected 5 lines of header and one line per frame: export",
+        ),
+    ],
+)
+def test_each_fault_names_what_was_found(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "m.trc").write_text(text, encoding="utf-8")
+    with pytest.raises(MalformedFileError) as caught:
+        read_trc(tmp_path / "m.trc")
+    assert said in str(caught.value)
