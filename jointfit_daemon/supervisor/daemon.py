@@ -63,6 +63,8 @@ from jointfit_daemon.supervisor.process_exit import ExitLimit
 from jointfit_daemon.supervisor.requests import RequestAuthenticator, parse_request
 from jointfit_daemon.supervisor.state_directory import (
     WRITE_REMEDY,
+    StateDirectoryInUseError,
+    lock_again,
     state_directory,
     write_fault,
 )
@@ -217,20 +219,27 @@ class Daemon:
             self._core.subscribe(self._recorder)
             tasks.create_task(self._recorder.run(), name="recording")
 
-    async def _check_state(self) -> None:
-        """Report a state directory without write access before a calibration needs it."""
+    async def _check_state(self, *, asked: bool = True) -> None:
+        """Report a state directory without write access before a calibration needs it.
+
+        A check that no request or reload `asked` for reports changes only.
+        """
         folder = store_directory(self._rig)
         before, fault = self._state_fault, await asyncio.to_thread(write_fault, folder)
         self._state_fault = fault
-        if fault is not None:
+        if fault is not None and (asked or fault != before):
             self._report(
                 NoticeKind.STATE,
                 f"state directory cannot be written: {fault}. A calibration will be used and "
                 f"published, but lost at a restart: {WRITE_REMEDY}",
                 NoticeLevel.ERROR,
             )
-        elif before is not None:
+        elif fault is None and before is not None:
             self._report(NoticeKind.STATE, "state directory can be written again")
+            try:
+                await asyncio.to_thread(lock_again, state_directory())
+            except StateDirectoryInUseError as error:
+                self._report(NoticeKind.STATE, str(error), NoticeLevel.ERROR)
         self._calibrations.retry()
 
     def _report_not_stored(self, text: str) -> None:
@@ -315,6 +324,9 @@ class Daemon:
             if now_s >= self._health_due_s:
                 self._health_due_s = now_s + self._rig.mqtt.health_s
                 self._publish_health()
+                if self._state_fault is not None and self._state_check.done():
+                    check = self._check_state(asked=False)
+                    self._state_check = self._tasks.create_task(check, name="state check")
 
     def _publish_health(self) -> None:
         health = self._core.core.health(time.monotonic_ns())

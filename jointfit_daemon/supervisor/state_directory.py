@@ -74,6 +74,19 @@ def lock_state(directory: Path) -> int | None:
     return descriptor
 
 
+def lock_again(directory: Path) -> None:
+    """Lock `directory` unless this process holds its lock; as `lock_state`.
+
+    For a directory that could not be written, and so not be locked, at the start.
+    """
+    try:
+        holder = (directory / LOCK).read_text(encoding="ascii", errors="replace").strip()
+    except OSError:
+        holder = ""
+    if holder != str(os.getpid()):
+        lock_state(directory)
+
+
 def make_private(directory: Path) -> None:
     """Remove the permissions of group and others from the files of earlier daemons.
 

@@ -27,6 +27,37 @@ sys.exit(main(["--config", sys.argv[1]]))
 """The daemon with a shorter limit of the stop."""
 
 
+def test_a_state_directory_that_can_be_written_again_is_created_and_locked(tmp_path: Path) -> None:
+    install(tmp_path / "site")
+    rig, blocked = tmp_path / "rig.toml", tmp_path / "blocked"
+    rig.write_text(SMALLEST_RIG.format(port=1) + "health_s = 0.5\n", encoding="utf-8")
+    blocked.write_text("a file, so that no folder can be created", encoding="utf-8")
+    daemon = subprocess.Popen(
+        [sys.executable, "-m", "jointfit_daemon", "--config", str(rig)],
+        env=os.environ
+        | {
+            "PYTHONPATH": f"{tmp_path / 'site'}{os.pathsep}{PROJECT}",
+            "STATE_DIRECTORY": str(blocked / "state"),
+        },
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert daemon.stderr is not None
+        for line in daemon.stderr:
+            if "state directory cannot be written" in line:
+                break
+        blocked.unlink()
+        until, lock = time.monotonic() + 60.0, blocked / "state" / "lock"
+        while not (lock.exists() and lock.read_text(encoding="ascii") == f"{daemon.pid}\n"):
+            assert time.monotonic() < until
+            assert daemon.poll() is None
+            time.sleep(0.05)
+    finally:
+        daemon.terminate()
+        daemon.communicate()
+
+
 @pytest.mark.parametrize("full_pipe", [False, True])
 def test_sigterm_ends_a_daemon_whose_event_loop_hangs(tmp_path: Path, *, full_pipe: bool) -> None:
     install(tmp_path / "site")

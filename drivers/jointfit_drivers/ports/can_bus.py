@@ -149,6 +149,7 @@ class SharedBus:
         *,
         needed: CanKey,
         resembles: Callable[[bytes], bool] = lambda _: False,
+        worked: bool = False,
     ) -> None:
         """Emit every frame with one of `ids`, in chunks of records, until cancelled.
 
@@ -170,6 +171,8 @@ class SharedBus:
             Identifier in `ids` of the frames with measurements.
         resembles : callable
             Whether the data of a frame look like those of `needed`, for a hint in messages.
+        worked : bool
+            Whether the device has sent measurements before: its settings are correct.
 
         Raises
         ------
@@ -203,14 +206,17 @@ class SharedBus:
         except TimeoutError as error:
             if not limit.expired():  # raised by emit: a bug, not silence
                 raise
-            raise DeviceLostError(self._explain_silence(subscriber, resembles)) from error
+            text = self._explain_silence(subscriber, resembles, worked=worked)
+            raise DeviceLostError(text) from error
         finally:
             self._subscribers.remove(subscriber)
             self._route()
             if ended.done() and not ended.cancelled():
                 ended.exception()  # mark as retrieved, in case a cancellation came first
 
-    def _explain_silence(self, subscriber: _Subscriber, resembles: Callable[[bytes], bool]) -> str:
+    def _explain_silence(
+        self, subscriber: _Subscriber, resembles: Callable[[bytes], bool], *, worked: bool
+    ) -> str:
         """Return the missing identifier of a silent device, and those that arrive instead.
 
         The text is the same as long as the findings are the same.
@@ -223,11 +229,10 @@ class SharedBus:
             key for key, t_ns in subscriber.arrived.items() if t_ns > since_ns and key != needed
         )
 
-        # its settings are correct, because all identifiers arrived before
-        if subscriber.is_complete and not others:
-            return (
-                f"{self.channel}: silent for {subscriber.silence_s:g} s: check its power and wiring"
-            )
+        # Its settings are correct, because all identifiers arrived before. The text has no
+        # duration, which grows with every attempt: one silence is one line of the log.
+        if not others and (subscriber.is_complete or (worked and not self._seen)):
+            return f"{self.channel}: silent: check its power and wiring"
 
         found = [f"{ids[key]} ({_hex(key)})" for key in others]
         text = f"{self.channel}: no {what} ({_hex(needed)}) arrives"

@@ -151,6 +151,7 @@ class XcdiImu:
     def __init__(self, settings: XcdiSettings) -> None:
         self._settings = settings
         self._ids = settings.ids.resolved(extended=settings.extended_ids)
+        self._worked = False
         self._silent_s = settings.silence_s  # waiting is cheap; opening the bus again is not
 
     def decoder(self) -> XcdiDecoder:
@@ -184,6 +185,7 @@ class XcdiImu:
                     left -= 1
                     log.debug("%s: %s", settings.id, frame)
             self._silent_s = settings.silence_s
+            self._worked = True
             emit(chunk)
 
         def resembles(data: bytes) -> bool:
@@ -198,5 +200,11 @@ class XcdiImu:
         self._silent_s = min(2 * silence_s, max(settings.silence_s, _LONGEST_SILENCE_S))
         async with shared_bus(settings.can) as bus:
             await bus.pump(
-                settings.id, ids, emit_sample, silence_s, needed=needed, resembles=resembles
+                settings.id,
+                ids,
+                emit_sample,
+                silence_s,
+                needed=needed,
+                resembles=resembles,
+                worked=self._worked,
             )

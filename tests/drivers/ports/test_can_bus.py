@@ -152,6 +152,22 @@ async def test_only_the_silent_sensor_is_lost_and_its_report_lists_received_iden
         await heard.cancel()
 
 
+async def test_a_sensor_that_worked_and_falls_silent_has_one_text_at_all_attempts(
+    tmp_path: Path,
+) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x100)))
+    driver, told = xcdi_driver("S3", bus, 0x100, silence_s=0.2), []
+    async with serving(device):
+        for attempt in range(3):
+            run = DriverRun(driver)
+            if not attempt:
+                await opened(adapter)
+                device.push(0, IDENTITY)
+            told.append(await lost(run))
+    assert told == 3 * [f"{bus.channel}: silent: check its power and wiring"]
+
+
 async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> None:
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     device = XcdiDevice(adapter)
