@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from tests.broker_fixture import Broker
     from tests.system.station import Listener
 
-pytestmark = [pytest.mark.system, pytest.mark.alone]
+pytestmark = pytest.mark.system
 
 NOISY = (
     "--set", "dropout=0.02", "--set", "line_flip_per_byte=0.0004",

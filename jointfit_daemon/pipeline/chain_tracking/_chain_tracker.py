@@ -66,7 +66,7 @@ class ChainTracker:
     """
 
     def __init__(self, loaded: LoadedModel, rate_hz: float, *, refined: bool = False) -> None:
-        self._loaded, self._rate_hz, self._refined = loaded, rate_hz, refined
+        self.loaded, self._rate_hz, self._refined = loaded, rate_hz, refined
         self._model = model = loaded.chain
         self._solver = LiveInverseKinematics(model, OPTIONS)
         self._monitor = MarkerMonitor(model)
@@ -84,7 +84,7 @@ class ChainTracker:
     def serves(self, loaded: LoadedModel, rate_hz: float, *, refined: bool) -> bool:
         """Return whether a new tracker with these arguments would be equal to this one."""
         names = [joint.names for joint in loaded.coordinates]
-        same_names = names == [joint.names for joint in self._loaded.coordinates]
+        same_names = names == [joint.names for joint in self.loaded.coordinates]
         same_settings = (self._rate_hz, self._refined) == (rate_hz, refined)
         return same_settings and same_names and self._model == loaded.chain
 
