@@ -20,6 +20,7 @@ from jointfit_daemon.pipeline._optical_comparison import OpticalComparison
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
 from jointfit_daemon.pipeline.events import (
     CalibrationPhase,
+    CalibrationSelected,
     CalibrationStored,
     ChunkArrived,
     Configured,
@@ -81,6 +82,7 @@ class Core:
         self._seq = 0
         self._empty = 0
         """Number of frames without any sensor."""
+        self._marks = 0
         self._mocap = MocapRouter()
         self._limiter = NoticeLimiter()
         self._session: CalibrationSession
@@ -102,7 +104,8 @@ class Core:
             SourceOpened: self._open_source,
             SourceClosed: self._close_source,
             Tick: lambda _: [],
-            Request: self._update_session,
+            Request: self._answer,
+            CalibrationSelected: self._update_session,
             JobFinished: self._update_session,
             JobProgress: self._update_session,
             CalibrationStored: self._update_session,
@@ -405,10 +408,32 @@ class Core:
         self._collector.add_frame(frame, state.flags)
         return state
 
-    # --- calibration -------------------------------------------------------------------------
+    # --- requests and calibration ------------------------------------------------------------
+
+    def _answer(self, request: Request) -> list[Output]:
+        if request.command in ("calibrate", "static"):
+            return self._update_session(request)
+        if request.command == "mark":
+            return self._mark(request)
+        known = f"unknown request {request.command!r}; known: calibrate, static, mark"
+        return [request.refusal("command", known)]
+
+    def _mark(self, request: Request) -> list[Output]:
+        """Publish a label at the instant of the request."""
+        self._marks += 1
+        t_ns, text = request.t_ns, str(request.arguments.get("text", ""))
+        offset_ns = self._unix_offset_ns
+        t_us = None if offset_ns is None else (t_ns + offset_ns) // 1000
+        name = "" if self._rig is None else self._rig.name
+        data = {"number": self._marks}
+        return [
+            request.reply("ok", {**data, "t_us": t_us, "text": text}),
+            Notice(t_ns, NoticeKind.MARK, name, text, data=data),
+        ]
 
     def _update_session(
-        self, event: Request | JobFinished | JobProgress | CalibrationStored
+        self,
+        event: Request | CalibrationSelected | JobFinished | JobProgress | CalibrationStored,
     ) -> list[Output]:
         """Pass an event to the session, and use its new calibration, if any."""
         before = self._session.calibration
@@ -418,17 +443,18 @@ class Core:
             outputs = self._session.report_job(event)
         elif isinstance(event, CalibrationStored):
             outputs = self._session.set_stored_version(event)
-        elif event.command == "calibrate":
-            outputs = self._session.request(event)
+        elif isinstance(event, CalibrationSelected):
+            outputs = self._session.select(event)
         else:
-            message = f"unknown request {event.command!r}; known: calibrate"
-            return [event.reply("error", {}, {"key": "command", "message": message})]
+            outputs = self._session.request(event)
 
         after = self._session.calibration
         if before and after and after is not before and only_models_differ(before, after):
             self._fuser.replace_models(after)
         elif after is not before:
             self._use_calibration()
+            if isinstance(event, CalibrationSelected):
+                self._fuser.set_calibration_time(event.t_ns - round(event.age_s * 1e9))
         return outputs
 
 

@@ -89,11 +89,15 @@ class Request:
 
     t_ns: int
     command: str
-    """``calibrate``."""
+    """Name of the request; the core processes ``calibrate``, ``static`` and ``mark``."""
     transaction: str
     arguments: Mapping[str, object]
     reply_to: ReplyAddress = field(default_factory=ReplyAddress)
     """Where to publish the reply; not part of a recording."""
+
+    def refusal(self, key: str, message: str) -> Reply:
+        """Return the reply that refuses this request because of one fault."""
+        return self.reply("error", {}, {"key": key, "message": message})
 
     def reply(
         self,
@@ -103,6 +107,19 @@ class Request:
     ) -> Reply:
         """Return the reply to this request."""
         return Reply(self.command, self.transaction, status, data, error, self.reply_to)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationSelected:
+    """A stored calibration was loaded for the request ``use-calibration``."""
+
+    t_ns: int
+    calibration: Calibration
+    version: int
+    """Version from which it was loaded."""
+    age_s: float
+    """Time since its static pose, s: heading uncertainty has grown since."""
+    request: Request
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +176,7 @@ Event = (
     | ChunkArrived
     | Tick
     | Request
+    | CalibrationSelected
     | JobFinished
     | JobProgress
     | CalibrationStored
@@ -181,6 +199,8 @@ class NoticeKind(StrEnum):
     RECORDING = "recording"
     STATE = "state"
     """The state directory."""
+    MARK = "mark"
+    """A label that a client set."""
 
 
 class NoticeLevel(StrEnum):
@@ -290,6 +310,8 @@ class CalibrationReady:
     """A calibration to store; answered with ``CalibrationStored``."""
 
     calibration: Calibration
+    keep_date: bool = False
+    """Whether ``created_utc`` is kept: the calibration is a copy of a stored one."""
 
 
 @dataclass(frozen=True, slots=True)

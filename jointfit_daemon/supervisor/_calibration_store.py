@@ -83,14 +83,16 @@ def calibration_age_s(calibration: Calibration, now: datetime.datetime | None = 
     return max(0.0, elapsed.total_seconds())
 
 
-def save(rig: Rig, calibration: Calibration) -> int:
-    """Write a new version with the present date, and return its number.
+def save(rig: Rig, calibration: Calibration, *, keep_date: bool = False) -> int:
+    """Write a new version, by default with the present date, and return its number.
 
     Raises
     ------
     OSError
         The medium is full, read-only or absent.
     """
+    if keep_date:
+        return store_of(rig).save(calibration)
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     return store_of(rig).save(dataclasses.replace(calibration, created_utc=now))
 
@@ -117,16 +119,16 @@ class CalibrationWriter:
         self._tasks, self._deliver, self._report = tasks, deliver, report
         self._lock = asyncio.Lock()
         self._writing: set[asyncio.Task[None]] = set()
-        self._unwritten: tuple[Rig, Calibration] | None = None
+        self._unwritten: tuple[Rig, Calibration, bool] | None = None
         self._next_try: asyncio.TimerHandle | None = None
         self._store = ""
         self.fault: str | None = None
         """Reason for which the calibration in force is not stored; None if there is none."""
 
-    def start(self, rig: Rig, calibration: Calibration) -> None:
-        """Write a new version to the store of the rig."""
-        self._unwritten, self._store = (rig, calibration), rig.calibration_store
-        self._begin(rig, calibration)
+    def start(self, rig: Rig, calibration: Calibration, *, keep_date: bool = False) -> None:
+        """Write a new version to the store of the rig; `keep_date` as for `save`."""
+        self._unwritten, self._store = (rig, calibration, keep_date), rig.calibration_store
+        self._begin(*self._unwritten)
 
     def retry(self) -> None:
         """Write a calibration that could not be written before, if any, at once."""
@@ -136,8 +138,9 @@ class CalibrationWriter:
         if self._unwritten is not None and not self._writing:
             self._begin(*self._unwritten)
 
-    def _begin(self, rig: Rig, calibration: Calibration) -> None:
-        task = self._tasks.create_task(self._write(rig, calibration), name="store")
+    def _begin(self, rig: Rig, calibration: Calibration, keep_date: bool) -> None:
+        writing = self._write(rig, calibration, keep_date=keep_date)
+        task = self._tasks.create_task(writing, name="store")
         self._writing.add(task)
         task.add_done_callback(self._writing.discard)
 
@@ -147,10 +150,10 @@ class CalibrationWriter:
         if self._next_try is not None:
             self._next_try.cancel()
 
-    async def _write(self, rig: Rig, calibration: Calibration) -> None:
+    async def _write(self, rig: Rig, calibration: Calibration, *, keep_date: bool) -> None:
         async with self._lock:
             try:
-                version = await asyncio.to_thread(save, rig, calibration)
+                version = await asyncio.to_thread(save, rig, calibration, keep_date=keep_date)
             except OSError as error:
                 if (fault := describe_write_error(error, store_directory(rig))) != self.fault:
                     self.fault = fault
@@ -177,7 +180,7 @@ class CalibrationWriter:
         """Return the calibration to use: the newest in the store, or an unwritten newer one."""
         self._store = rig.calibration_store
         if self._unwritten is not None:
-            asked, calibration = self._unwritten
+            asked, calibration, _ = self._unwritten
             same_store = asked.calibration_store == rig.calibration_store
             if same_store and calibration.fits(rig.chain):
                 text = (

@@ -185,10 +185,26 @@ class SourceTasks:
         await self.retire(wanted.values())
         for name, source in wanted.items():
             if name not in self._running:
-                state = self._running[name] = _RunningSource(source)
-                state.task = self._tasks.create_task(
-                    run_source(source, self._deliver, state), name=f"source {name}"
-                )
+                self._run(name, source)
+
+    def _run(self, name: str, source: Source) -> None:
+        state = self._running[name] = _RunningSource(source)
+        state.task = self._tasks.create_task(
+            run_source(source, self._deliver, state), name=f"source {name}"
+        )
+
+    async def restart(self, name: str) -> None:
+        """Close the port of a running source, and open it again with a new driver.
+
+        Raises
+        ------
+        KeyError
+            No source of this name is running.
+        """
+        removed = self._running.pop(name)
+        if removed.task is not None:
+            await stop([removed.task])
+        self._run(name, removed.source)
 
     async def known(self, within_s: float) -> None:
         """Wait until every source has sent a chunk or was reported absent; at most `within_s`."""

@@ -12,6 +12,7 @@ Invariant: the daemon ends by cancellation or by a bug only.
     fit KIND         runs one calibration fit in a worker process      with its result
     store            writes one calibration                            when written
     state check      writes a probe to the state directory             when checked
+    request NAME     executes one request                              when answered
     reload           loads rig.toml again on SIGHUP                    never
 """
 
@@ -23,10 +24,11 @@ import logging
 import math
 import signal
 import time
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.config import ConfigError, load_rig
+from jointfit_daemon.config import ConfigError, Fault, load_rig
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import MqttLogHandler, journal_fields
 from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, MqttPublisher, Outbox
@@ -56,11 +58,16 @@ from jointfit_daemon.supervisor._core_runner import CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
+from jointfit_daemon.supervisor._request_handlers import RequestHandlers
 from jointfit_daemon.supervisor._source_tasks import SourceTasks, stop
 from jointfit_daemon.supervisor._status_line import FrameRateCounter, status_line
 from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
 from jointfit_daemon.supervisor.process_exit import ExitLimit
-from jointfit_daemon.supervisor.requests import RequestAuthenticator, parse_request
+from jointfit_daemon.supervisor.requests import (
+    RequestAuthenticator,
+    RequestDispatcher,
+    parse_request,
+)
 from jointfit_daemon.supervisor.state_directory import (
     WRITE_REMEDY,
     StateDirectoryInUseError,
@@ -88,6 +95,8 @@ KNOWN_S = 2.0
 """Time after the start for which a silent source is awaited, s."""
 FAREWELL_S = 0.5
 """Longest wait for the broker to accept the last messages, s."""
+_STORING = ("calibrate", "static", "use-calibration")
+"""Requests whose results are stored: the state directory is checked at once."""
 STOP_S = 4.8
 """Longest duration of a stop, s; the documentation promises five seconds."""
 _LEVELS = {
@@ -116,6 +125,7 @@ class Daemon:
         self._core = CoreRunner(core, self._clock)
         self._core.subscribe(self)
         self._process, self._systemd = ProcessStatistics(), SystemdNotifier()
+        self._process_health = self._process.health()
         self._progress, self._frame_rate = ProgressMonitor(), FrameRateCounter()
         self._loop_errors = DisconnectErrorFilter()
         self._recorder: EventLogWriter | None = None
@@ -126,8 +136,11 @@ class Daemon:
         self._calibration: CalibrationStatus | None = None
         self._health_due_s = 0.0
         self._reload_requested = asyncio.Event()
+        self._changes = asyncio.Lock()
+        """Held by a change of the configuration or of a source: one at a time."""
         self._tasks: asyncio.TaskGroup
         self._sources: SourceTasks
+        self._requests: RequestDispatcher
         self._fits: FitRunner
         self._calibrations: CalibrationWriter
         self._state_check: asyncio.Task[None]
@@ -185,6 +198,13 @@ class Daemon:
         self._sources = SourceTasks(tasks, self._core.feed)
         self._fits = FitRunner(tasks, self._core.feed)
         self._calibrations = CalibrationWriter(tasks, self._core.feed, self._report_not_stored)
+        handlers = RequestHandlers(self, self._answer_request)
+        self._requests = RequestDispatcher(
+            tasks,
+            self._core.feed,
+            self._publish_reply,
+            handlers.table(),
+        )
         self._start_recording(tasks)
         self._state_check = tasks.create_task(self._check_state(), name="state check")
         self._mqtt = tasks.create_task(self._link.run(), name="mqtt")
@@ -272,8 +292,10 @@ class Daemon:
                 self._fits.start(output)
             case CancelJob():
                 self._fits.cancel()
-            case CalibrationReady(calibration):
-                self._calibrations.start(self._rig, calibration)
+            case CalibrationReady(calibration, keep_date):
+                self._calibrations.start(self._rig, calibration, keep_date=keep_date)
+            case Reply():
+                self._requests.note_reply(output)
             case Notice():
                 fields = journal_fields(output.kind, output.id)
                 log.log(_LEVELS[output.level], "%s: %s", output.id, output.text, extra=fields)
@@ -300,9 +322,36 @@ class Daemon:
             self._topics.output(request)
             return
 
-        self._core.feed(request)
-        if self._state_check.done():  # one check at a time
+        self._requests.receive(request)
+        if request.command in _STORING and self._state_check.done():  # one check at a time
             self._state_check = self._tasks.create_task(self._check_state(), name="state check")
+
+    def _publish_reply(self, reply: Reply) -> None:
+        self._topics.output(reply)  # topics change with the broker
+
+    def _answer_request(self, reply: Reply) -> None:
+        self._publish_reply(reply)
+        self._requests.note_reply(reply)
+
+    @property
+    def rig(self) -> Rig:
+        """The rig in force."""
+        return self._rig
+
+    def feed(self, event: Event) -> None:
+        """Pass one event to the core."""
+        self._core.feed(event)
+
+    async def set_output_rate(self, rate_hz: float) -> None:
+        """Apply the rig in force with another output rate, until the next reload."""
+        async with self._changes:
+            await self._change_to(replace(self._rig, output_rate_hz=rate_hz))
+
+    async def restart_device(self, name: str) -> None:
+        """Close the port of one device, and open it again."""
+        async with self._changes:
+            if name in {source.id for source in self._rig.sources}:  # a reload may have removed it
+                await self._sources.restart(name)
 
     # --- health ------------------------------------------------------------------------------
 
@@ -328,14 +377,20 @@ class Daemon:
                     check = self._check_state(asked=False)
                     self._state_check = self._tasks.create_task(check, name="state check")
 
-    def _publish_health(self) -> None:
-        health = self._core.core.health(time.monotonic_ns())
+    def health(self) -> BridgeHealth:
+        """Return counters and clocks of this instant; those of the process are the last ones."""
+        core = self._core.core.health(time.monotonic_ns())
         link = self._link.health(self._loop_errors.dropped)
         state = StateHealth(self._state_fault, self._calibrations.fault)
         recording = None if self._recorder is None else self._recorder.health()
-        process = self._process.health()
-        self._topics.publish_health(BridgeHealth(health, process, link, state, recording))
+        return BridgeHealth(core, self._process_health, link, state, recording)
 
+    def _publish_health(self) -> None:
+        self._process_health = self._process.health()
+        found = self.health()
+        self._topics.publish_health(found)
+
+        health, link = found.core, found.link
         states = health.frames.sent - health.frames.empty
         rate_hz = self._frame_rate.rate_hz(states, time.monotonic())
         rig, online, connected = self._rig.sources, self._online, link.connected
@@ -357,23 +412,54 @@ class Daemon:
         while True:
             await self._reload_requested.wait()
             self._reload_requested.clear()
-            self._systemd.reloading()
+            with suppress(ConfigError):  # it is reported
+                await self.reload()
 
+    async def reload(self, before_move: Callable[[Rig], None] | None = None) -> Rig | None:
+        """Load rig.toml again and apply it.
+
+        Parameters
+        ----------
+        before_move
+            Called with the new rig if it has another broker or base topic, before the connection
+            to the present broker ends.
+
+        Returns
+        -------
+        Rig or None
+            The new rig; None if `before_move` was called.
+
+        Raises
+        ------
+        ConfigError
+            It is faulty; the running configuration stays in force.
+        """
+        async with self._changes:
+            self._systemd.reloading()
             try:
-                rig = await asyncio.to_thread(load_rig, self._config)
+                rig = await asyncio.to_thread(self._load_rig)
+                moves = before_move is not None and rig.mqtt != self._rig.mqtt
+                if before_move is not None and moves:
+                    before_move(rig)
+                    await self._link.emptied(FAREWELL_S)
+                await self._change_to(rig)
             except ConfigError as fault:
                 text = f"refused, the running configuration stays in force: {fault}"
                 self._report(NoticeKind.RELOAD, text, NoticeLevel.ERROR)
-            except Exception as error:
-                log.exception("reload")
-                text = (
-                    "refused because of a bug, the running configuration stays in force; please "
-                    f"report it: {error!r}"
-                )
-                self._report(NoticeKind.RELOAD, text, NoticeLevel.ERROR)
-            else:
-                await self._change_to(rig)
-            self._systemd.ready()
+                raise
+            finally:
+                self._systemd.ready()
+            return None if moves else rig
+
+    def _load_rig(self) -> Rig:
+        try:
+            return load_rig(self._config)
+        except ConfigError:
+            raise
+        except Exception as error:
+            log.exception("reload")
+            text = f"cannot be read because of a bug, please report it: {error!r}"
+            raise ConfigError(str(self._config), [Fault("rig.toml", text)]) from error
 
     async def _change_to(self, rig: Rig) -> None:
         """Apply `rig`; sources and connections without changes continue."""

@@ -20,6 +20,7 @@ from jointfit_daemon.tools.demo import demo
 from jointfit_daemon.tools.ik import ik
 from jointfit_daemon.tools.markers import markers
 from jointfit_daemon.tools.report import report
+from jointfit_daemon.tools.request import mark, request
 from jointfit_daemon.tools.sample import sample
 from jointfit_daemon.tools.schema import schema
 
@@ -32,7 +33,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (check, demo, calibrate, center, decode, ik, markers, report, sample, schema):
+for command in (
+    check, demo, calibrate, mark, request, center, decode, ik, markers, report, sample, schema
+):  # fmt: skip
     app.command()(command)
 app.add_typer(fuse.app)
 

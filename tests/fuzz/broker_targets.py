@@ -116,6 +116,11 @@ def seeds_request() -> list[bytes]:
         b"calibrate\0jointfit/fuzz/bridge/response/calibrate/a\0\x01\0" + orjson.dumps(item)
         for item in payloads
     ]
+    found += [
+        b'mark\0\0\0{"text":"a"}',
+        b'rate\0\0\0{"hz":50}',
+        b'use-calibration\0\0\0{"version":1}',
+    ]
     return [*found, b"other\0\0\0{}", b"calibrate\0#\0\0" + b"[" * 900, b"calibrate\0a/b\0\0\xff"]
 
 

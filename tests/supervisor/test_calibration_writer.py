@@ -54,11 +54,11 @@ class SlowDisk:
         self._save = _calibration_store.save
         monkeypatch.setattr("jointfit_daemon.supervisor._calibration_store.save", self.save)
 
-    def save(self, rig: Rig, calibration: Calibration) -> int:
+    def save(self, rig: Rig, calibration: Calibration, **options: Any) -> int:
         self.writing += 1
         self.most = max(self.most, self.writing)
         self.go.wait(5)
-        version = self._save(rig, calibration)
+        version = self._save(rig, calibration, **options)
         self.writing -= 1
         return version
 
@@ -87,7 +87,7 @@ async def test_two_calibrations_are_written_one_after_the_other(
 async def test_unwritten_calibration_stays_in_force_over_a_reload(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*_: Any) -> int:
+    def full(*_: Any, **options: Any) -> int:
         raise OSError("no space left")
 
     _calibration_store.save(rig, calibration_of(rig, "old"))
@@ -253,10 +253,10 @@ async def test_failed_write_is_retried(rig: Rig, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr("jointfit_daemon.supervisor._calibration_store.RETRY_S", 0.05)
     save, failures = _calibration_store.save, ["disk full", "disk full", "gone"]
 
-    def failing(*given: Any) -> int:
+    def failing(*given: Any, **options: Any) -> int:
         if failures:
             raise OSError(failures.pop(0))
-        return save(*given)
+        return save(*given, **options)
 
     monkeypatch.setattr("jointfit_daemon.supervisor._calibration_store.save", failing)
     events: list[Event] = []

@@ -23,7 +23,9 @@ def test_the_version_is_the_packages() -> None:
     assert run(app, ["--version"]).stdout.strip() == __version__
 
 
-@pytest.mark.parametrize("command", ["check", "demo", "calibrate", "decode", "ik", "schema"])
+@pytest.mark.parametrize(
+    "command", ["check", "demo", "calibrate", "mark", "request", "decode", "ik", "schema"]
+)
 def test_every_command_explains_itself(command: str) -> None:
     result = run(app, [command, "--help"])
     assert result.exit_code == 0

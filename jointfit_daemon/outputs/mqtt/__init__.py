@@ -17,6 +17,7 @@ from jointfit_daemon.outputs.mqtt._signature import (
     SIGNATURE_LIFETIME_US,
     SIGNING_KEYS,
     SignatureRejectedError,
+    check_age,
     signed,
     verify,
 )
@@ -34,6 +35,7 @@ __all__ = [
     "Outbox",
     "RequestKeyError",
     "SignatureRejectedError",
+    "check_age",
     "missing_password",
     "request_key_of",
     "signed",

@@ -79,11 +79,24 @@ def verify(key: bytes, topic: str, request: Mapping[str, Any], now_us: int) -> t
         raise SignatureRejectedError(
             "signature: made with another key, for another topic, or for other content"
         )
+    check_age(t_us, now_us)
+    return nonce, t_us
+
+
+def check_age(t_us: object, now_us: int) -> None:
+    """Check the time of a request, with or without a signature.
+
+    Raises
+    ------
+    SignatureRejectedError
+        `t_us` is no time, or too far from `now_us`.
+    """
+    if not isinstance(t_us, int) or isinstance(t_us, bool):
+        raise SignatureRejectedError("t_us: expected UNIX time in whole microseconds")
     if abs(off_us := now_us - t_us) > SIGNATURE_LIFETIME_US:
         where = "old" if off_us > 0 else "ahead"
         raise SignatureRejectedError(
             f"t_us: {abs(off_us) / 1e6:.0f} s {where}, at most "
-            f"{SIGNATURE_LIFETIME_US // 1_000_000} s are allowed: sign the request again, and "
-            "compare the clocks of both machines"
+            f"{SIGNATURE_LIFETIME_US // 1_000_000} s are allowed: send the request again with the "
+            "present time, and compare the clocks of both machines"
         )
-    return nonce, t_us

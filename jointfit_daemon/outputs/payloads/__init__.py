@@ -6,6 +6,7 @@ from jointfit_daemon.outputs.payloads._health_encoding import (
     ProcessHealth,
     StateHealth,
 )
+from jointfit_daemon.outputs.payloads._quality_units import quality_payload
 from jointfit_daemon.outputs.payloads._topic_writer import TopicWriter
 
 __all__ = [
@@ -16,4 +17,5 @@ __all__ = [
     "encode",
     "encode_joint",
     "encode_pose",
+    "quality_payload",
 ]

@@ -185,7 +185,7 @@ class TopicWriter:
             "transaction": reply.transaction,
             "status": reply.status,
             "data": reply.data,
-            "error": reply.error,
+            "error": _error(reply),
         }
         self._outbox.event(topic, encode(payload), correlation=address.correlation)
 
@@ -202,6 +202,14 @@ class TopicWriter:
     def _stamped(self, data: Mapping[str, object], t_ns: int | None) -> bytes:
         stamp = {} if t_ns is None else {"t_us": (t_ns + self._clock.offset_ns()) // 1000}
         return encode({"v": PAYLOAD_VERSION} | stamp | dict(data))
+
+
+def _error(reply: Reply) -> dict[str, Any] | None:
+    """Return the error of a reply with its list of faults; a fault of the core is the only one."""
+    if reply.error is None:
+        return None
+    fault = {key: reply.error.get(key) for key in ("key", "message")}
+    return {"faults": [fault], "more": 0} | dict(reply.error)
 
 
 def _info(rig: Rig) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from jointfit_daemon.config import parse_rig
 from jointfit_daemon.limb_model import Calibration
 from jointfit_daemon.model import Chunk, JointState, LimbState, SegmentState
 from jointfit_daemon.pipeline.events import (
+    CalibrationSelected,
     CalibrationStored,
     ChunkArrived,
     Configured,
@@ -73,10 +74,21 @@ def encode_event(event: Event) -> bytes:
     line: dict[str, Any] = {"e": _NAMES[type(event)]}
     for field in fields(event):
         if field.name == "rig":
-            line["table"] = getattr(event, field.name).table
+            rig = getattr(event, field.name)
+            line["table"], line["output_rate_hz"] = rig.table, rig.output_rate_hz
+        elif field.name == "request":
+            line["request"] = _request_form(getattr(event, field.name))
         elif field.name not in _NOT_RECORDED:
             line[field.name] = getattr(event, field.name)
     return orjson.dumps(line, _to_json, _OPTIONS)
+
+
+def _request_form(request: Request) -> dict[str, Any]:
+    return {
+        field.name: getattr(request, field.name)
+        for field in fields(request)
+        if field.name not in _NOT_RECORDED
+    }
 
 
 def decode_event(line: dict[str, Any]) -> Event:
@@ -105,9 +117,14 @@ def _event(line: dict[str, Any]) -> Event:
     if kind == "chunk":
         return ChunkArrived(given["source"], Chunk(given["t_ns"], bytes.fromhex(given["hex"])))
     if kind == "configured":
-        given["rig"] = parse_rig(given.pop("table"), source="event log")
+        rig = parse_rig(given.pop("table"), source="event log")
+        rate_hz = float(given.pop("output_rate_hz", rig.output_rate_hz))
+        given["rig"] = replace(rig, output_rate_hz=rate_hz)
         stored = given["calibration"]
         given["calibration"] = None if stored is None else Calibration.from_dict(stored)
+    if kind == "selected":
+        given["calibration"] = Calibration.from_dict(given["calibration"])
+        given["request"] = Request(**given["request"])
     if kind == "job" and given["result"] is not None:
         given["result"] = FitResult.from_dict(given["result"])
 
@@ -128,6 +145,7 @@ _EVENTS: dict[str, Any] = {
     "opened": SourceOpened,
     "closed": SourceClosed,
     "request": Request,
+    "selected": CalibrationSelected,
     "job": JobFinished,
     "progress": JobProgress,
     "stored": CalibrationStored,

@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
     from jointfit_daemon.pipeline.events import (
+        CalibrationSelected,
         CalibrationStored,
         JobFinished,
         JobProgress,
@@ -190,6 +191,8 @@ class CalibrationSession:
     def request(self, request: Request) -> list[Output]:
         """Start or abort a phase, or revert online learning; the first output is the reply."""
         wanted = str(request.arguments.get("phase", ""))
+        if request.command == "static":
+            wanted = "static"
         if wanted == "revert":
             return self._revert_refits(request)
         if wanted == "abort":
@@ -201,7 +204,7 @@ class CalibrationSession:
         if message is None and wanted_s is not None and not 0.0 < wanted_s <= MAX_PHASE_S:
             key, message = "seconds", f"expected a number above 0 and up to {MAX_PHASE_S}"
         if message is not None:
-            return [request.reply("error", {}, {"key": key, "message": message})]
+            return [request.refusal(key, message)]
 
         phase = CalibrationPhase(wanted)
         self._force = request.arguments.get("force") is True
@@ -216,8 +219,7 @@ class CalibrationSession:
         before = None if now is None else self.refits.revert(now)
         if before is None or self._fit is not None:
             message = "no online learning since the daemon started: there is nothing to revert"
-            error = {"key": "phase", "message": message}
-            return [request.reply("error", {}, error)]
+            return [request.refusal("phase", message)]
 
         self.calibration, self.version = before, None
         text = "online learning reverted and paused until the next functional calibration"
@@ -226,6 +228,38 @@ class CalibrationSession:
             CalibrationReady(before),
             self.status(request.t_ns, text),
         ]
+
+    def select(self, event: CalibrationSelected) -> list[Output]:
+        """Use a stored calibration, and pause online learning until the next movement.
+
+        It is stored again as a new version: the newest version is the one in force.
+        """
+        request, chosen = event.request, event.calibration
+        if self._state not in RESTING:
+            return [request.refusal("version", self._running_text)]
+        if not chosen.fits(self._chain):
+            message = (
+                f"version {event.version} belongs to another limb or other sensors than rig.toml: "
+                "choose a version with `usable` from the answer to `calibrations`"
+            )
+            return [request.refusal("version", message)]
+
+        quality = {**chosen.quality, "restored": {"from_version": event.version}}
+        self.calibration = replace(chosen, quality=quality)
+        self.version, self.refits = None, OnlineRefits(paused=True)
+        text = f"version {event.version} is used again"
+        return [
+            request.reply("ok", {"version": event.version, "phase": self.phase}),
+            CalibrationReady(self.calibration, keep_date=True),
+            self.status(event.t_ns, text),
+        ]
+
+    @property
+    def _running_text(self) -> str:
+        return (
+            f"phase '{self.phase}' is running: wait until it ends, or abort it with"
+            ' `jointfit calibrate RIG.toml --abort` (over MQTT: {"phase":"abort"})'
+        )
 
     def request_refit(self, fresh: OnlineFrames) -> list[Output]:
         """Request a refit of the models to new frames; call only while ``may_learn``."""
@@ -241,10 +275,7 @@ class CalibrationSession:
         if wanted not in COLLECTING:
             return f"expected one of {', '.join(COLLECTING)}, abort; got {wanted!r}"
         if self._state not in RESTING:
-            return (
-                f"phase '{self.phase}' is running: wait until it ends, or abort it with"
-                ' `jointfit calibrate RIG.toml --abort` (over MQTT: {"phase":"abort"})'
-            )
+            return self._running_text
 
         if wanted != "static" and not self._mocap:
             return f"{wanted!r} needs a mocap system: add [mocap] to rig.toml"

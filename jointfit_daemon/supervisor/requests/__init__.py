@@ -1,6 +1,17 @@
-"""Validation and authentication of MQTT requests."""
+"""The requests of MQTT clients: table, validation, authentication, and execution once each."""
 
+from jointfit_daemon.supervisor.requests._arguments import REQUESTS, RequestArguments, RequestKind
 from jointfit_daemon.supervisor.requests._authentication import RequestAuthenticator
-from jointfit_daemon.supervisor.requests._validation import parse_request
+from jointfit_daemon.supervisor.requests._dispatcher import Handler, RequestDispatcher
+from jointfit_daemon.supervisor.requests._validation import error_of, parse_request
 
-__all__ = ["RequestAuthenticator", "parse_request"]
+__all__ = [
+    "REQUESTS",
+    "Handler",
+    "RequestArguments",
+    "RequestAuthenticator",
+    "RequestDispatcher",
+    "RequestKind",
+    "error_of",
+    "parse_request",
+]

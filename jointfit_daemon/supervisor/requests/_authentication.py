@@ -16,6 +16,7 @@ from jointfit_daemon.outputs.mqtt import (
     SIGNING_KEYS,
     RequestKeyError,
     SignatureRejectedError,
+    check_age,
     request_key_of,
     verify,
 )
@@ -60,7 +61,7 @@ class RequestAuthenticator:
         Raises
         ------
         SignatureRejectedError
-            A valid signature is required, and missing or wrong.
+            A valid signature is required, and missing or wrong; or the request has expired.
         """
         if self.fault:
             raise SignatureRejectedError(
@@ -82,4 +83,6 @@ class RequestAuthenticator:
             if len(self._used) >= NONCE_CAPACITY:
                 raise SignatureRejectedError(f"more than {NONCE_CAPACITY} requests within a minute")
             self._used[nonce] = now_ns
+        elif "t_us" in request:
+            check_age(request["t_us"], time.time_ns() // 1000)
         return {name: value for name, value in request.items() if name not in SIGNING_KEYS}

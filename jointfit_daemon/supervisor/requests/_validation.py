@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import re
 import time
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import orjson
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ValidationError
 
 from jointfit_daemon.config import Fault, faults_of
 from jointfit_daemon.nearest_name import nearest_name
 from jointfit_daemon.outputs.mqtt import SignatureRejectedError
 from jointfit_daemon.pipeline.events import Reply, ReplyAddress, Request
+from jointfit_daemon.supervisor.requests._arguments import REQUESTS
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jointfit_daemon.outputs.mqtt import Incoming
     from jointfit_daemon.supervisor.requests._authentication import RequestAuthenticator
 
@@ -40,32 +43,6 @@ _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
 """Permitted command names: other names are not repeated on a topic."""
 _RESPONSE_LEVELS = re.compile(r"[\w.:~-]{1,64}(/[\w.:~-]{1,64}){0,3}", re.ASCII)
 """Levels below ``bridge/response/`` that a client may request."""
-
-
-class _Arguments(BaseModel):
-    """Base of every request: unknown keys are refused, and types are not converted."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-    transaction: str = Field("", max_length=256, description="text of the client, sent back")
-
-
-class CalibrateArguments(_Arguments):
-    """``bridge/request/calibrate``."""
-
-    phase: Literal["align", "static", "functional", "abort", "revert"] = Field(
-        description="phase to start, or `abort`; `revert` reverts online learning"
-    )
-    seconds: float | None = Field(
-        None, gt=0, le=600, description="duration of the phase, s; default: as in rig.toml"
-    )
-    force: bool = Field(
-        False, description="store the result even if it is worse than the calibration in force"
-    )
-
-
-COMMANDS: dict[str, type[_Arguments]] = {"calibrate": CalibrateArguments}
-"""Model of the arguments of every command."""
 
 
 def parse_request(
@@ -103,11 +80,12 @@ def parse_request(
     if fault is not None:
         return _refusal(command, transaction, [fault], reply_to)
 
-    model = COMMANDS.get(command)
-    if model is None:
-        known = f"unknown request; known: {', '.join(COMMANDS)}"
-        fault = Fault("command", known, command, nearest_name(command, COMMANDS))
+    kind = REQUESTS.get(command)
+    if kind is None:
+        known = f"unknown request; known: {', '.join(REQUESTS)}"
+        fault = Fault("command", known, command, nearest_name(command, REQUESTS))
         return _refusal(command, transaction, [fault], reply_to)
+    model = kind.model
     try:
         arguments = model.model_validate(table)
     except ValidationError as error:
@@ -182,17 +160,21 @@ def _response_root(message: Incoming) -> str:
 
 def _refusal(command: str, transaction: str, faults: list[Fault], reply_to: ReplyAddress) -> Reply:
     """Return a reply of limited size that lists `faults`."""
+    return Reply(command, transaction, "error", {}, error_of(faults), reply_to)
+
+
+def error_of(faults: Sequence[Fault]) -> dict[str, Any]:
+    """Return the ``error`` of an answer: the first faults, and the number of the others."""
     lines = [
         {"key": _cut(fault.key, _LONGEST_KEY), "message": _cut(fault.text(), _LONGEST_MESSAGE)}
         for fault in faults[:_MOST_FAULTS]
     ]
-    error: dict[str, Any] = {
+    return {
         "key": ", ".join(line["key"] for line in lines),
         "message": "; ".join(line["message"] for line in lines),
         "faults": lines,
         "more": len(faults) - len(lines),
     }
-    return Reply(command, transaction, "error", {}, error, reply_to)
 
 
 def _cut(text: str, longest: int) -> str:

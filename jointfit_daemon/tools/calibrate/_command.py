@@ -23,6 +23,7 @@ from jointfit_daemon.tools.calibrate._phase_tracker import (
     is_not_stored,
 )
 from jointfit_daemon.tools.calibrate._report import ProgressLines, movement_lines, report
+from jointfit_daemon.tools.calibrate._versions import list_versions, use_version
 from jointfit_daemon.tools.command_group import EXIT_FAILED
 from jointfit_daemon.tools.stop_signals import cancel_on_signal
 
@@ -53,6 +54,15 @@ INSTRUCTIONS = {
 TOPICS = ("calibration", "calibration/progress", "bridge/event", "bridge/state")
 
 
+_List = Annotated[
+    bool, typer.Option("--list", help="List the stored calibrations with their quality.")
+]
+_Use = Annotated[int | None, typer.Option("--use", help="Use this stored version again.", min=1)]
+_Revert = Annotated[
+    bool, typer.Option("--revert", help="Use the newest version before the one in force again.")
+]
+
+
 class StandardInputClosedError(ValueError):
     """Standard input is closed, so the prompt before a phase cannot be answered."""
 
@@ -79,6 +89,9 @@ def calibrate(
         typer.Option(help="Duration of each phase, s. Default: from rig.toml.", max=LONGEST_S),
     ] = None,
     abort: Annotated[bool, typer.Option("--abort", help="Abort the running phase.")] = False,
+    listed: _List = False,
+    use: _Use = None,
+    revert: _Revert = False,
     force: Annotated[
         bool,
         typer.Option("--force", help="Accept a calibration that is worse than the stored one."),
@@ -102,8 +115,14 @@ def calibrate(
         )
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"--seconds {seconds:g}: expected 0 < seconds <= {LONGEST_S:g}")
-    if abort and phase:
-        raise ValueError("--abort ends the running phase: omit --phase")
+    if sum((abort, listed, use is not None, revert, bool(phase))) > 1:
+        raise ValueError("expected one of --phase, --abort, --list, --use and --revert")
+    if listed:
+        list_versions(config, json=json)
+        return
+    if revert or use is not None:
+        use_version(config, use, json=json)
+        return
 
     rig = load_rig(config)
     default = ORDER[1:] if any(s.kind == "mocap" for s in rig.sources) else ("static",)
