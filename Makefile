@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench bench-full docs wheel deb sbom audit lock clean
+.PHONY: help demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench bench-full docs wheel deb sbom vendor audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -73,6 +73,9 @@ deb: $(STAMP)  ## the Debian package in build/packages; for a Raspberry Pi: ARGS
 
 sbom: $(STAMP)  ## what the package carries, as CycloneDX JSON in build/packages
 	@$(BIN)/python packaging/sbom.py $(ARGS)
+
+vendor: $(STAMP)  ## fetch the dashboard's vendored scripts again by npm, and compare their SHA-256
+	@$(BIN)/python packaging/vendor.py
 
 audit: $(STAMP)  ## ask the Python vulnerability service about requirements.lock
 	@$(BIN)/python .ci/audit.py

@@ -34,6 +34,8 @@ def faults(package: Path) -> Iterator[str]:
             for line in (tree / "DEBIAN" / "md5sums").read_text(encoding="utf-8").splitlines()
         )
         yield from (f"{name} is missing" for name in NEEDED if name not in sums)
+        if not any(name.endswith("/tools/dashboard/page/index.html") for name in sums):
+            yield "the page of the dashboard is missing"
         files = [path for path in tree.rglob("*") if path.is_file() and not path.is_symlink()]
         for path in files:
             name = path.relative_to(tree).as_posix()

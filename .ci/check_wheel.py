@@ -11,12 +11,15 @@ import subprocess
 import sys
 import tempfile
 import venv
+import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 LOCK = ROOT / "requirements.lock"
 EXAMPLE = ROOT / "examples" / "knee.toml"
 COMMANDS = (["jointfitd", "--version"], ["jointfit", "--help"], ["jointfit-sim", "--help"])
+PAGE = "jointfit_daemon/tools/dashboard/page"
+"""Folder of the dashboard's page, which is no Python."""
 SHARED = (
     "lib/systemd/system/jointfitd.service",
     "lib/systemd/system/jointfitd@.service",
@@ -55,6 +58,16 @@ def try_out(binaries: Path, work: Path) -> None:
     run(binaries / "jointfitd", "--config", EXAMPLE, "--check", cwd=work)
 
 
+def carry_the_page(wheel: Path) -> None:
+    """End unless the wheel contains every file of the dashboard's page."""
+    with zipfile.ZipFile(wheel) as archive:
+        packed = set(archive.namelist())
+    files = {path for path in (ROOT / PAGE).rglob("*") if path.is_file()}
+    missing = sorted({path.relative_to(ROOT).as_posix() for path in files} - packed)
+    if missing or not files:
+        sys.exit(f"not in {wheel.name}: {missing}")
+
+
 def install(archive: Path, work: Path) -> None:
     """Install into an empty environment and try it."""
     home = work / "venv"
@@ -85,6 +98,7 @@ def main() -> None:
         for one, other in zip((wheel, sdist), build(work / "second"), strict=True):
             if one.read_bytes() != other.read_bytes():
                 sys.exit(f"{one.name}: two builds differ")
+        carry_the_page(wheel)
         run(sys.executable, "-m", "twine", "check", "--strict", sdist, wheel, cwd=work)
         install(wheel, work)
         install_by_pipx(sdist, work)

@@ -15,6 +15,7 @@ from jointfit_daemon.tools.calibrate import calibrate
 from jointfit_daemon.tools.center import center
 from jointfit_daemon.tools.check import check
 from jointfit_daemon.tools.command_group import EXIT_CODES, CommandGroup
+from jointfit_daemon.tools.dashboard import dashboard
 from jointfit_daemon.tools.decode import decode
 from jointfit_daemon.tools.demo import demo
 from jointfit_daemon.tools.ik import ik
@@ -34,7 +35,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    check, demo, calibrate, mark, request, center, decode, ik, markers, report, sample, schema
+    check, demo, dashboard, calibrate, mark, request, center, decode, ik, markers, report, sample,
+    schema,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(fuse.app)

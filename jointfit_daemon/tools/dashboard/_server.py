@@ -1,0 +1,233 @@
+"""Web server of the dashboard: static files, the configuration of the page, and the tunnel.
+
+Invariant: every response forbids scripts, styles and connections from other origins, and only pages
+of this server may use the tunnel.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import ipaddress
+import json
+import logging
+import socket
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+from websockets.typing import Subprotocol
+
+from jointfit_daemon import __version__
+from jointfit_daemon.tools.dashboard._page_files import PageFile, read_page_files
+from jointfit_daemon.tools.dashboard._tunnel import tunnel
+from jointfit_daemon.tools.dashboard.addresses import bracketed
+
+if TYPE_CHECKING:
+    import ssl
+    from collections.abc import AsyncIterator
+
+    from jointfit_daemon.tools.dashboard.addresses import BrokerAddress, ListenAddress
+
+TUNNEL = "/mqtt"
+"""Path of the tunnel."""
+MOST_VIEWERS = 64
+"""Largest number of open tunnels."""
+_PACKET_BYTES = 64 * 1024
+"""Longest WebSocket message of a page; requests have at most 32 KiB."""
+_PING_S = 20.0
+"""Interval of WebSocket pings, s: a page that disappeared is closed within two intervals."""
+
+
+@dataclass(slots=True)
+class DashboardServer:
+    """Serves the page and connects it to a broker."""
+
+    broker: BrokerAddress
+    context: ssl.SSLContext | None = None
+    base: str | None = None
+    """Base topic that the page shows; None: the page searches."""
+    names: tuple[str, ...] = ()
+    """Further host names under which browsers may open the page."""
+    files: dict[str, PageFile] = field(default_factory=read_page_files)
+    _viewers: int = 0
+
+    @contextlib.asynccontextmanager
+    async def listening(self, listen: ListenAddress) -> AsyncIterator[str]:
+        """Serve for the duration of the block; yield the URL of the page.
+
+        Raises
+        ------
+        ValueError
+            The address is in use, or does not belong to this machine.
+        """
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # malformed requests
+        try:
+            listener = _listener(listen)
+        except OSError as error:
+            raise ValueError(
+                f"--listen {bracketed(listen.host)}:{listen.port}: {error.strerror}:"
+                " choose another address or port"
+            ) from error
+
+        async with serve(
+            self._serve_viewer,
+            sock=listener,
+            process_request=self.respond,
+            subprotocols=[Subprotocol("mqtt")],
+            compression=None,  # costs more CPU time and memory than it saves on a local network
+            max_size=_PACKET_BYTES,
+            ping_interval=_PING_S,
+            ping_timeout=_PING_S,
+        ) as server:
+            gc.freeze()
+            yield _url(listen, server)
+
+    async def _serve_viewer(self, websocket: ServerConnection) -> None:
+        self._viewers += 1
+        try:
+            await tunnel(websocket, self.broker, self.context)
+        finally:
+            self._viewers -= 1
+
+    def respond(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return the response to a request; None to open the tunnel."""
+        del connection
+        host = request.headers.get("Host", "")
+        if not self._is_own_name(host):
+            return self._text(
+                HTTPStatus.MISDIRECTED_REQUEST,
+                f"The dashboard does not answer to the name {host[:80]!r}."
+                " Open it by its IP address, or start it with --name.",
+            )
+
+        path = urlsplit(request.path).path
+        if path == TUNNEL:
+            return self._check_tunnel(request, host)
+        if path == "/config.json":
+            return self._response(HTTPStatus.OK, "application/json", self._configuration())
+        found = self.files.get(path)
+        if found is None:
+            return self._text(HTTPStatus.NOT_FOUND, "There is no such page. The dashboard is at /.")
+        return self._file(found, request.headers)
+
+    def _check_tunnel(self, request: Request, host: str) -> Response | None:
+        """Refuse the tunnel to pages of other origins and to ordinary requests."""
+        if request.headers.get("Upgrade", "").lower() != "websocket":
+            return self._text(HTTPStatus.UPGRADE_REQUIRED, "This path is for WebSockets only.")
+        origin = request.headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return self._text(HTTPStatus.FORBIDDEN, "Pages of other origins cannot use the tunnel.")
+        if self._viewers >= MOST_VIEWERS:
+            return self._text(
+                HTTPStatus.SERVICE_UNAVAILABLE, f"{MOST_VIEWERS} pages are open: close some."
+            )
+        return None
+
+    def _is_own_name(self, host: str) -> bool:
+        """Return whether a Host header names this server.
+
+        A name of another site that resolves to this machine (DNS rebinding) would make its pages
+        pages of this origin.
+        """
+        try:
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:
+            return False
+        machine = socket.gethostname().lower()
+        if name in ("localhost", machine, f"{machine}.local", *self.names):
+            return True
+        try:
+            ipaddress.ip_address(name)
+        except ValueError:
+            return False
+        return True
+
+    def _configuration(self) -> bytes:
+        """Return the settings that the page reads at its start."""
+        return json.dumps(
+            {
+                "version": __version__,
+                "broker": self.broker.text,
+                "websocket": self.broker.websocket,
+                "base": self.base,
+            }
+        ).encode()
+
+    def _file(self, found: PageFile, headers: Headers) -> Response:
+        more = {"ETag": found.etag, "Vary": "Accept-Encoding"}
+        if found.etag in headers.get("If-None-Match", ""):
+            return self._response(HTTPStatus.NOT_MODIFIED, found.content_type, b"", more)
+        if "gzip" in headers.get("Accept-Encoding", ""):
+            more["Content-Encoding"] = "gzip"
+            return self._response(HTTPStatus.OK, found.content_type, found.compressed, more)
+        return self._response(HTTPStatus.OK, found.content_type, found.content, more)
+
+    def _text(self, status: HTTPStatus, text: str) -> Response:
+        return self._response(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+
+    def _response(
+        self, status: HTTPStatus, kind: str, body: bytes, more: dict[str, str] | None = None
+    ) -> Response:
+        headers = Headers(
+            {
+                "Content-Type": kind,
+                "Content-Length": str(len(body)),
+                "Connection": "close",
+                "Cache-Control": "no-cache",  # stored, and revalidated by its tag
+                "Content-Security-Policy": self.security_policy,
+                "X-Content-Type-Options": "nosniff",
+                "Referrer-Policy": "no-referrer",
+                "Cross-Origin-Opener-Policy": "same-origin",
+                "Cross-Origin-Resource-Policy": "same-origin",
+            }
+            | (more or {})
+        )
+        return Response(status.value, status.phrase, headers, body)
+
+    @property
+    def security_policy(self) -> str:
+        """Return the Content-Security-Policy: this origin only, no inline script or style."""
+        connect = "'self'"
+        if self.broker.websocket is not None:
+            parts = urlsplit(self.broker.websocket)
+            connect += f" {parts.scheme}://{parts.netloc}"
+        return (
+            "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self';"
+            f" manifest-src 'self'; connect-src {connect};"
+            " base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        )
+
+
+def _listener(listen: ListenAddress) -> socket.socket:
+    """Return a listening socket; it belongs to the first address of a host name."""
+    found = socket.getaddrinfo(listen.host, listen.port, type=socket.SOCK_STREAM)
+    family, _, _, _, address = found[0]
+    return socket.create_server(address[:2], family=family, backlog=128)
+
+
+def _url(listen: ListenAddress, server: Server) -> str:
+    """Return the URL under which a browser opens the page."""
+    host, port = next(iter(server.sockets)).getsockname()[:2]
+    if ipaddress.ip_address(host).is_unspecified:
+        host = own_address()
+    elif listen.host == "localhost":
+        host = "localhost"
+    return f"http://{bracketed(host)}:{port}/"
+
+
+def own_address() -> str:
+    """Return the address of this machine on its network; the loopback address without a network.
+
+    No packet is sent: connecting a UDP socket only selects the interface of the default route.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(("192.0.2.1", 9))  # reserved for documentation (RFC 5737)
+        except OSError:
+            return "127.0.0.1"
+        return str(probe.getsockname()[0])

@@ -1,0 +1,141 @@
+"""Tunnel from a WebSocket of the page to the TCP or TLS port of the broker.
+
+Invariant: the tunnel passes bytes on unread. The page sends its own CONNECT packet, so the accounts
+and access lists of the broker decide, and the tunnel holds no password.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import socket
+import ssl
+from typing import TYPE_CHECKING
+
+from websockets.exceptions import ConnectionClosed
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine
+    from pathlib import Path
+
+    from websockets.asyncio.server import ServerConnection
+
+    from jointfit_daemon.tools.dashboard.addresses import BrokerAddress
+
+BROKER_UNREACHABLE, BROKER_CLOSED = 4502, 4503
+"""Close codes of the WebSocket; the page shows the reason."""
+CONNECT_S = 5.0
+"""Longest wait for the broker to accept the connection, s."""
+_CHUNK_BYTES = 65536
+_REASON_BYTES = 123
+"""Longest reason of a close frame, bytes (RFC 6455, section 5.5)."""
+
+
+async def tunnel(
+    websocket: ServerConnection, broker: BrokerAddress, context: ssl.SSLContext | None
+) -> None:
+    """Connect to the broker and pass bytes in both directions until one side closes."""
+    try:
+        async with asyncio.timeout(CONNECT_S):
+            reader, writer = await asyncio.open_connection(broker.host, broker.port, ssl=context)
+    except (OSError, TimeoutError) as error:
+        await websocket.close(BROKER_UNREACHABLE, close_reason(connection_fault(error)))
+        return
+
+    try:
+        await _first_completed(_upload(websocket, writer), _download(reader, websocket))
+        await websocket.close(BROKER_CLOSED, "the broker closed the connection")
+    finally:
+        writer.close()
+        with contextlib.suppress(OSError):
+            await writer.wait_closed()
+
+
+async def _first_completed(*coroutines: Coroutine[None, None, None]) -> None:
+    """Run until one of the coroutines ends; cancel the others."""
+    tasks = [asyncio.create_task(each, name="dashboard tunnel") for each in coroutines]
+    try:
+        await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+
+
+async def _upload(websocket: ServerConnection, writer: asyncio.StreamWriter) -> None:
+    """Pass the packets of the page to the broker."""
+    with contextlib.suppress(OSError, ConnectionClosed):
+        async for packet in websocket:
+            writer.write(packet if isinstance(packet, bytes) else packet.encode())
+            await writer.drain()
+
+
+async def _download(reader: asyncio.StreamReader, websocket: ServerConnection) -> None:
+    """Pass the bytes of the broker to the page."""
+    with contextlib.suppress(OSError, ConnectionClosed):
+        while chunk := await reader.read(_CHUNK_BYTES):
+            await websocket.send(chunk)
+
+
+def tls_context(broker: BrokerAddress, authority: Path | None) -> ssl.SSLContext | None:
+    """Return the context that verifies the broker, or None for plain TCP.
+
+    Raises
+    ------
+    ValueError
+        `authority` contains no certificate, or the connection does not use TLS.
+    OSError
+        `authority` cannot be read.
+    """
+    if not broker.tls or broker.websocket is not None:
+        if authority is not None:
+            raise ValueError(f"--ca {authority}: expected a broker with TLS, such as mqtts://HOST")
+        return None
+    try:
+        if authority is not None:
+            authority.read_bytes()  # the error of ssl does not contain the path
+        context = ssl.create_default_context(cafile=authority)
+    except ssl.SSLError as error:
+        raise ValueError(f"--ca {authority}: expected a certificate in PEM, found none") from error
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    return context
+
+
+async def broker_fault(broker: BrokerAddress, context: ssl.SSLContext | None) -> str | None:
+    """Return the reason why the broker cannot be reached now; None if it can."""
+    try:
+        async with asyncio.timeout(CONNECT_S):
+            _, writer = await asyncio.open_connection(broker.host, broker.port, ssl=context)
+    except (OSError, TimeoutError) as error:
+        return connection_fault(error)
+    writer.close()
+    with contextlib.suppress(OSError):
+        await writer.wait_closed()
+    return None
+
+
+def connection_fault(error: BaseException) -> str:
+    """Return the cause of a failed connection in words."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"the broker's certificate is refused: {error.verify_message}; set --ca"
+    if isinstance(error, ssl.SSLError):
+        return "the port does not answer to TLS: check the port, or use mqtt://"
+    words: dict[type[BaseException], str] = {
+        TimeoutError: "the host does not answer: check its address and the network",
+        socket.gaierror: "unknown host name: check --broker",
+    }
+    if type(error) in words:
+        return words[type(error)]
+
+    # asyncio reports one error for several addresses of a name, with their texts only.
+    if isinstance(error, ConnectionRefusedError) or "Connect call failed" in str(error):
+        return "connection refused: start the broker, or correct --broker"
+    if isinstance(error, OSError) and error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH):
+        return "no route to the host: check the network"
+    return "the connection failed: check the broker's log"
+
+
+def close_reason(text: str) -> str:
+    """Return `text`, shortened to the longest reason of a close frame."""
+    return text.encode()[:_REASON_BYTES].decode(errors="ignore")

@@ -1,0 +1,70 @@
+// Orthographic camera that looks at the limb from beside its facing direction.
+
+import { dot, mix, norm, rotate, scale, subtract } from "./geometry.js";
+
+const ELEVATION = 0.16;
+const DEFAULT_TURN = -0.6;
+const FOLLOW_S = 0.9;
+const TURN_S = 3;
+
+/** Return a camera; `turn` is the angle of the view about the vertical, rad. */
+export function createCamera() {
+  const camera = {
+    turn: DEFAULT_TURN,
+    target: null,
+    length: 0,
+    facing: null,
+    floor: null,
+
+    /** Follow a limb: centre, size and facing direction change smoothly, or at once if `still`. */
+    follow(points, firstSegment, seconds, still) {
+      const center = scale(points.reduce((sum, p) => sum.map((v, i) => v + p[i]), [0, 0, 0]), 1 / points.length);
+      const lengths = points.slice(1).map((p, i) => norm(subtract(p, points[i])));
+      const length = lengths.reduce((sum, value) => sum + value, 0);
+      const lowest = Math.min(...points.map((p) => p[2])) - 0.14 * length;
+      const first = camera.target === null;
+      const share = (time) => (first || still ? 1 : 1 - Math.exp(-seconds / time));
+
+      camera.target = first ? center : mix(camera.target, center, share(FOLLOW_S));
+      camera.length = first ? length : camera.length + (length - camera.length) * share(FOLLOW_S);
+      // The floor is the lowest point seen; it rises slowly if the limb moved to another place.
+      camera.floor = camera.floor === null ? lowest : Math.min(lowest, camera.floor + 0.02 * seconds);
+      camera.face(firstSegment, share(TURN_S));
+    },
+
+    // The subject's right is the x axis of a segment; facing is perpendicular to it, horizontal.
+    face(q, share) {
+      if (!q) return;
+      const right = rotate(q, [1, 0, 0]);
+      const level = Math.hypot(right[0], right[1]);
+      if (level < 0.3) return;
+      const facing = [-right[1] / level, right[0] / level, 0];
+      const mixed = camera.facing === null ? facing : mix(camera.facing, facing, share);
+      const length = norm(mixed);
+      camera.facing = length > 0.1 ? scale(mixed, 1 / length) : facing;
+    },
+
+    /** Return a function from world points to pixels, with depth (larger is farther away). */
+    projection(width, height) {
+      const f = camera.facing ?? [0, 1, 0];
+      const right = [f[1], -f[0], 0];
+      const [c, s] = [Math.cos(camera.turn), Math.sin(camera.turn)];
+      const across = [f[0] * c + right[0] * s, f[1] * c + right[1] * s, 0];
+      const away = [f[0] * s - right[0] * c, f[1] * s - right[1] * c, 0];
+      const [cosine, sine] = [Math.cos(ELEVATION), Math.sin(ELEVATION)];
+      const pixels = Math.min(height / (camera.length * 1.42), width / (camera.length * 1.3));
+
+      const project = (point) => {
+        const d = subtract(point, camera.target);
+        const distance = dot(d, away);
+        return {
+          x: width / 2 + pixels * dot(d, across),
+          y: height / 2 - pixels * (d[2] * cosine + distance * sine),
+          depth: distance * cosine - d[2] * sine,
+        };
+      };
+      return { project, pixels, sine };
+    },
+  };
+  return camera;
+}

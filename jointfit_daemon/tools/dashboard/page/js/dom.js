@@ -1,0 +1,58 @@
+// Small functions that create and change elements. Text from MQTT is set as text, never as HTML.
+
+const SVG = "http://www.w3.org/2000/svg";
+
+/** Return an element with attributes and children; strings become text. */
+export function createElement(name, attributes = {}, ...children) {
+  return fill(document.createElement(name), attributes, children);
+}
+
+/** Return an SVG element with attributes and children. */
+export function createSvg(name, attributes = {}, ...children) {
+  return fill(document.createElementNS(SVG, name), attributes, children);
+}
+
+function fill(element, attributes, children) {
+  for (const [key, value] of Object.entries(attributes)) {
+    if (key === "onclick") element.addEventListener("click", value);
+    else if (value !== false && value != null) element.setAttribute(key, value === true ? "" : value);
+  }
+  element.append(...children.filter((child) => child != null));
+  return element;
+}
+
+/** Return the element with this id. */
+export const byId = (id) => document.getElementById(id);
+
+/** Set the text of an element if it differs: an equal text must not restart a screen reader. */
+export function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+/** Set the class of an element if it differs. */
+export function setClass(element, name) {
+  if (element.className !== name) element.className = name;
+}
+
+/** Return a table with a caption, a header row and rows of texts or elements. */
+export function createTable(caption, columns, rows) {
+  const cell = (value, column, index) =>
+    createElement(
+      index === 0 ? "th" : "td",
+      { scope: index === 0 ? "row" : null, class: column.text ? "text" : null, dir: "auto" },
+      value instanceof Node ? value : String(value),
+    );
+  return createElement(
+    "div", { class: "scroll", tabindex: "0", role: "region", "aria-label": caption },
+    createElement(
+      "table", {},
+      createElement("caption", {}, caption),
+      createElement("thead", {}, createElement("tr", {},
+        ...columns.map((column) =>
+          createElement("th", { scope: "col", class: column.text ? "text" : null }, column.name)))),
+      createElement("tbody", {},
+        ...rows.map((row) => createElement("tr", {},
+          ...row.map((value, index) => cell(value, columns[index], index))))),
+    ),
+  );
+}

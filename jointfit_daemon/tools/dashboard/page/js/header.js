@@ -1,0 +1,108 @@
+// Header of the page: rig, state in words, broker, clock, and the one button that matters now.
+
+import { byId, createElement, setClass, setText } from "./dom.js";
+import { gatewayNow } from "./store.js";
+import { calibrationSentence, formatClock, isRunning } from "./words.js";
+
+/** Return the state of link, daemon and calibration: level, words, and the loss for the banner. */
+export function pageState(link, store) {
+  if (link.state === "lost") return { level: "error", words: "Connection lost", loss: link.reason };
+  if (link.state === "refused") return { level: "error", words: "Not logged in", loss: link.reason };
+  if (link.state === "connecting") return { level: "", words: "Connecting to the broker" };
+  if (link.base === null) return { level: "", words: "Looking for rigs on the broker" };
+  if (store.bridge === "offline") {
+    return {
+      level: "error", words: "jointfitd is not running",
+      loss: "jointfitd stopped or lost its broker. The page continues when it is back. Check it with: systemctl status jointfitd",
+    };
+  }
+  if (store.bridge !== "online") return { level: "", words: "Waiting for jointfitd" };
+  const phase = store.calibration?.phase;
+  return { level: phase === "aborted" || store.calibration?.kept ? "warning" : "", words: calibrationSentence(store.calibration) };
+}
+
+/** Show the header of a store; `actions` has reconnect, logIn, calibrate and stop. */
+export function createHeader(link, store, configuration, actions) {
+  const button = byId("main-action");
+  let action = null;
+  button.addEventListener("click", () => action?.());
+
+  const update = () => {
+    const state = pageState(link, store);
+    setText(byId("rig-name"), store.info?.rig ?? link.base ?? "jointfitd");
+    document.title = store.info?.rig ? `${store.info.rig} – jointfitd` : "jointfitd";
+    setText(byId("rig-state"), state.words);
+    setClass(byId("rig-state"), `state ${state.level}`.trim());
+    setText(byId("broker-text"), link.state === "connected" ? configuration.broker : `${configuration.broker}: not connected`);
+    updateBanner(state.loss ?? "");
+    let label, kind, enabled;
+    ({ label, kind, enabled = true, action } = mainAction(link, store, actions));
+    setText(button, label);
+    setClass(button, `button ${kind}`);
+    button.disabled = !enabled;
+  };
+  for (const subject of ["bridge", "info", "calibration"]) store.on(subject, update);
+  setInterval(() => {
+    const now = gatewayNow(store);
+    setText(byId("gateway-clock"), formatClock(now ?? NaN));
+  }, 1000);
+  return update;
+}
+
+/** Return label, kind and function of the button that matters now. */
+function mainAction(link, store, actions) {
+  if (link.state === "refused") return { label: "Log in", kind: "primary", action: actions.logIn };
+  if (link.state === "lost") return { label: "Reconnect", kind: "primary", action: actions.reconnect };
+  if (store.bridge !== "online") return { label: "Calibrate", kind: "", enabled: false, action: null };
+  const phase = store.calibration?.phase;
+  if (phase === "fitting") return { label: "Fitting", kind: "", enabled: false, action: null };
+  if (isRunning(phase)) return { label: "Stop", kind: "stop", action: actions.stop };
+  const kind = phase === "calibrated" ? "" : "primary";
+  return { label: "Calibrate", kind, action: actions.calibrate };
+}
+
+function updateBanner(text) {
+  const banner = byId("banner");
+  banner.hidden = text === "";
+  setText(banner, text);
+}
+
+/** Explain a live view without poses: no rig, no daemon, or no calibration. */
+export function updateEmptyState(link, store, configuration, rigs, choose) {
+  const empty = byId("empty");
+  const content = emptyContent(link, store, configuration, rigs, choose);
+  empty.hidden = content === null;
+  const known = (store.pose?.segments && Object.values(store.pose.segments).some((segment) => segment.q)) ?? false;
+  for (const id of ["limb-panel", "angle-panel"]) byId(id).hidden = content !== null && !known;
+  if (content === null) { empty.dataset.kind = ""; return; }
+  if (empty.dataset.kind === content.kind) return; // unchanged: buttons keep their focus
+  empty.dataset.kind = content.kind;
+  empty.replaceChildren(...content.children);
+}
+
+function emptyContent(link, store, configuration, rigs, choose) {
+  if (link.state !== "connected") return null;
+  if (link.base === null && rigs.size > 1) {
+    return { kind: `rigs ${[...rigs.keys()].join()}`, children: [
+      createElement("h2", {}, "Several rigs use this broker"),
+      ...[...rigs].map(([base, info]) =>
+        createElement("button", { class: "button", type: "button", dir: "auto", onclick: () => choose(base) }, `${info.rig} (${base})`)),
+    ] };
+  }
+  if (store.bridge === "unknown") {
+    return { kind: "no daemon", children: [
+      createElement("h2", {}, `Waiting for jointfitd on ${configuration.broker}`),
+      createElement("p", {}, "The broker answers, but no rig publishes on it. Start the daemon with the configuration of the rig:"),
+      createElement("pre", { tabindex: "0" }, createElement("code", {}, "jointfitd --config rig.toml")),
+      createElement("p", { class: "caption" }, "If it runs: its host and port under [mqtt] must be those of this broker, and your account must have the right to read its topics."),
+    ] };
+  }
+  if (store.bridge === "online" && store.calibration?.phase === "uncalibrated") {
+    return { kind: "uncalibrated", children: [
+      createElement("h2", {}, "Not calibrated yet"),
+      createElement("p", {}, "The sensors send data, but their positions on the body are unknown. A calibration takes about two minutes: align the sensors, stand still, move every joint."),
+      createElement("button", { class: "button primary", type: "button", onclick: () => { location.hash = "calibrate"; } }, "Show the three steps"),
+    ] };
+  }
+  return null;
+}

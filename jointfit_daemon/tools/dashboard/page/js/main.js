@@ -1,0 +1,106 @@
+// Start of the page: connects store, link and views.
+
+import { chosenTitle, chosenValue, createAngleView, updateAngleAge } from "./angle_view.js";
+import { createAnnouncer } from "./announcer.js";
+import { createCalibrateView } from "./calibrate_view.js";
+import { createDialogs } from "./dialogs.js";
+import { byId, setText } from "./dom.js";
+import { createHeader, pageState, updateEmptyState } from "./header.js";
+import { createHistoryView } from "./history_view.js";
+import { createLimbView, updateLimbCaption } from "./limb_view.js";
+import { createLink } from "./link.js";
+import { createLogView } from "./log_view.js";
+import { createRequests } from "./requests.js";
+import { createSensorCards } from "./sensor_cards.js";
+import { createSensorsView } from "./sensors_view.js";
+import { createStore } from "./store.js";
+import { createTableView } from "./table_view.js";
+import { connectTabs } from "./tabs.js";
+import { formatNumber } from "./words.js";
+
+const REFRESH_MS = 500;
+const SEARCH_MS = 1200; // rigs with retained information answer within this time
+
+async function readConfiguration() {
+  const parameters = new URLSearchParams(location.search);
+  const answer = await fetch("config.json", { cache: "no-store" }).catch(() => null);
+  const server = answer?.ok ? await answer.json() : { version: "", broker: location.host, websocket: null, base: null };
+  const websocket = parameters.get("broker") ?? server.websocket;
+  return { ...server, websocket, broker: websocket ?? server.broker, base: parameters.get("base") ?? server.base };
+}
+
+async function start() {
+  const configuration = await readConfiguration();
+  const store = createStore();
+  const rigs = new Map();
+  let dialogs = null;
+
+  const link = createLink(configuration, {
+    changed: () => refresh(),
+    message: (topic, payload) => {
+      if (topic.startsWith("bridge/response/")) requests.answer(payload);
+      else store.take(topic, payload);
+    },
+    found: (base, info) => { rigs.set(base, info); refresh(); },
+    login: (reason) => dialogs.askForAccount(reason),
+  });
+  const requests = createRequests(link);
+  dialogs = createDialogs(link, requests);
+
+  const choose = (base) => {
+    store.reset(base);
+    link.choose(base);
+    refresh();
+  };
+  if (configuration.base !== null) choose(configuration.base);
+  // Several rigs may share a broker: the only one is chosen after a short search.
+  setInterval(() => { if (link.base === null && rigs.size === 1) choose(rigs.keys().next().value); }, SEARCH_MS);
+
+  const limb = createLimbView(store);
+  const angle = createAngleView(store);
+  const updateCards = createSensorCards(store);
+  const calibrate = createCalibrateView(store, requests, dialogs.askForKey);
+  createHistoryView(store);
+  const views = { sensors: createSensorsView(store, link), log: createLogView(store), table: createTableView(store) };
+  const updateHeader = createHeader(link, store, configuration, {
+    reconnect: () => link.connect(),
+    logIn: () => dialogs.askForAccount(link.reason),
+    calibrate: () => showView("calibrate"),
+    stop: () => calibrate.request({ phase: "abort" }),
+  });
+  const showView = connectTabs((name) => {
+    limb.visible = angle.visible = name === "live";
+    for (const [key, view] of Object.entries(views)) view.show(key === name);
+  });
+
+  const announce = createAnnouncer(byId("announcer"));
+  function refresh() {
+    updateHeader();
+    updateEmptyState(link, store, configuration, rigs, choose);
+    updateLimbCaption(store);
+    updateAngleAge(angle);
+    updateCards();
+    announce(announcement(link, store, angle));
+    setText(byId("versions"), [`jointfit ${configuration.version}`, store.info ? `jointfitd ${store.info.software}` : ""].filter(Boolean).join(" · "));
+  }
+  setInterval(refresh, REFRESH_MS);
+  for (const subject of ["bridge", "info", "calibration"]) store.on(subject, refresh);
+  store.on("pose", () => { if (byId("limb-panel").hidden) refresh(); });
+  document.addEventListener("visibilitychange", () => { if (!document.hidden) refresh(); });
+
+  // Figures for measurements: messages, and main-thread time of drawing, ms.
+  globalThis.jointfit = { store, link, limb, angle };
+  link.connect();
+}
+
+/** Return the text for screen readers: a change of state, or the angle if that is wanted. */
+function announcement(link, store, angle) {
+  const { words, loss } = pageState(link, store);
+  const state = loss ? `${words}. ${loss}` : words;
+  if (!byId("announce-angle").checked || loss) return state;
+  const [value, sd] = chosenValue(angle);
+  if (value === null) return `${chosenTitle(angle)} unknown`;
+  return `${chosenTitle(angle)} ${formatNumber(value, 0)} degrees${sd === null ? "" : `, plus or minus ${formatNumber(sd, 0)}`}`;
+}
+
+start();

@@ -1,0 +1,64 @@
+// The Sensors view: counters and clocks of every device, the daemon, and the check of axes by hand.
+
+import { byId, createElement, createTable } from "./dom.js";
+import { createAxesCheck } from "./axes_check.js";
+import { summaryOf } from "./sensor_cards.js";
+import { UNKNOWN, formatNumber } from "./words.js";
+
+/** Show the health of a store's devices in a view. */
+export function createSensorsView(store, link) {
+  const view = { visible: false };
+  const tables = createElement("div", { class: "stack" });
+  const check = createAxesCheck(store, link);
+  byId("view-sensors").append(
+    createElement("div", { class: "panel stack" }, tables),
+    check.root,
+  );
+  const update = () => {
+    if (view.visible && !tables.contains(document.activeElement)) tables.replaceChildren(...tablesOf(store));
+  };
+  for (const subject of ["info", "health", "devices"]) store.on(subject, update);
+  view.show = (visible) => {
+    if (view.visible !== visible) check.show(visible);
+    view.visible = visible;
+    update();
+  };
+  return view;
+}
+
+function tablesOf(store) {
+  if (!store.info) return [createElement("p", {}, "No rig was found yet.")];
+  const number = { name: "" };
+  const columns = ["device", "state", "model", "received", "used", "late", "lost", "corrupt", "rate", "delay, median", "delay, 99 %", "clock"]
+    .map((name) => ({ ...number, name, text: ["state", "model", "clock"].includes(name) }));
+  const rows = Object.keys(store.info.devices).map((name) => {
+    const summary = summaryOf(store, name);
+    const health = summary.health ?? {};
+    const info = store.devices.get(name)?.info ?? {};
+    return [
+      summary.place ? `${name} · ${summary.place}` : name,
+      createElement("span", { class: `status ${summary.level}` }, summary.state),
+      [info.model, info.firmware].filter(Boolean).join(" ") || UNKNOWN,
+      ...["received", "used", "late", "lost", "corrupt"].map((key) => formatNumber(health[key], 0)),
+      summary.rate,
+      formatNumber(health.delay_us?.p50 == null ? null : health.delay_us.p50 / 1000, 1, " ms"),
+      formatNumber(health.delay_us?.p99 == null ? null : health.delay_us.p99 / 1000, 1, " ms"),
+      createElement("span", { class: `status ${summary.clockLevel}` }, summary.clock),
+    ];
+  });
+  return [createTable("Devices", columns, rows), createTable("Daemon", [{ name: "item" }, { name: "value", text: true }], daemonRows(store))];
+}
+
+function daemonRows(store) {
+  const health = store.health ?? {};
+  const link = health.link ?? {};
+  const denied = link.denied?.length ? `; refused by the broker: ${link.denied.join(", ")}` : "";
+  return [
+    ["Version", store.info.software ?? UNKNOWN],
+    ["Poses", `${formatNumber(health.frames?.sent, 0)} sent, ${formatNumber(health.frames?.empty, 0)} without sensors, ${formatNumber(health.frames?.skipped, 0)} skipped`],
+    ["Processor and memory", `${formatNumber(health.process?.cpu_pct, 1, " %")}, ${formatNumber(health.process?.rss_bytes == null ? null : health.process.rss_bytes / 1e6, 0, " MB")}`],
+    ["Messages to the broker", `${formatNumber(link.sent, 0)} sent, ${formatNumber(link.dropped, 0)} dropped${denied}`],
+    ["Online learning", health.learning?.reason ? `${health.learning.state}: ${health.learning.reason}` : health.learning?.state ?? UNKNOWN],
+    ["Recording", health.recording?.failure ?? health.recording?.file ?? "off"],
+  ];
+}

@@ -1,0 +1,164 @@
+// State of the rig, from the messages below its base topic (docs/mqtt.md). Names come from a
+// configuration and can be any text, so they are keys of maps, never of plain objects.
+
+const SHOWN_S = 20;
+const EVENTS = 300;
+
+/** Return an empty state. */
+export function createStore() {
+  const listeners = new Map();
+  const store = {
+    base: null,
+    bridge: "unknown",
+    info: null,
+    health: null,
+    calibration: null,
+    calibrations: [],
+    progress: null,
+    devices: new Map(),
+    lastEvents: new Map(),
+    events: [],
+    pose: null,
+    poseReceivedMs: null,
+    optical: null,
+    opticalReceivedMs: null,
+    sensors: null,
+    sensorsReceivedMs: null,
+    poses: [],
+    opticals: [],
+    clockOffsetMs: null,
+    messages: 0,
+
+    /** Call `listener` after every change of a subject. */
+    on(subject, listener) {
+      if (!listeners.has(subject)) listeners.set(subject, []);
+      listeners.get(subject).push(listener);
+    },
+    /** Report a change of a subject. */
+    changed(subject) {
+      for (const listener of listeners.get(subject) ?? []) listener(store);
+    },
+    /** Take one message; `topic` is below the base topic. */
+    take(topic, payload) {
+      store.messages += 1;
+      takeMessage(store, topic, payload);
+    },
+    /** Forget everything that another rig or another connection might contradict. */
+    reset(base) {
+      Object.assign(store, {
+        base, bridge: "unknown", info: null, health: null, calibration: null, progress: null,
+        pose: null, poseReceivedMs: null, optical: null, sensors: null, clockOffsetMs: null,
+        calibrations: [], events: [], poses: [], opticals: [],
+      });
+      store.devices.clear();
+      store.lastEvents.clear();
+      for (const subject of listeners.keys()) store.changed(subject);
+    },
+  };
+  return store;
+}
+
+function takeMessage(store, topic, payload) {
+  switch (topic) {
+    case "pose/ui":
+      return takePose(store, payload);
+    case "optical/pose":
+      store.optical = payload;
+      store.opticalReceivedMs = performance.now();
+      store.opticals.push(payload);
+      dropOld(store.opticals, payload.t_us);
+      return undefined;
+    case "sensors/pose":
+      store.sensors = payload;
+      store.sensorsReceivedMs = performance.now();
+      return store.changed("sensors");
+    case "bridge/state":
+      store.bridge = payload?.state === "online" ? "online" : "offline";
+      return store.changed("bridge");
+    case "bridge/info":
+      store.info = payload;
+      return store.changed("info");
+    case "bridge/health":
+      store.health = payload;
+      return store.changed("health");
+    case "calibration":
+      return takeCalibration(store, payload);
+    case "calibration/progress":
+      store.progress = payload;
+      return store.changed("calibration");
+    case "bridge/event":
+      return takeEvent(store, payload);
+    default:
+      return takeDevice(store, topic, payload);
+  }
+}
+
+function takePose(store, pose) {
+  const now = performance.now();
+  // An older instant is a restart of the daemon or a step of its clock: the curve begins again.
+  if (store.pose && pose.t_us < store.pose.t_us) {
+    store.poses.length = 0;
+    store.opticals.length = 0;
+    store.clockOffsetMs = null;
+  }
+  store.pose = pose;
+  store.poseReceivedMs = now;
+  store.poses.push(pose);
+  dropOld(store.poses, pose.t_us);
+  noteClock(store, pose.t_us, now);
+  store.changed("pose");
+}
+
+// The clocks of browser and gateway may be hours apart: the smallest difference between receipt
+// and instant converts browser time to gateway time.
+function noteClock(store, t_us, nowMs) {
+  const offsetMs = nowMs - t_us / 1000;
+  if (store.clockOffsetMs === null || offsetMs < store.clockOffsetMs) store.clockOffsetMs = offsetMs;
+}
+
+/** Return the present UNIX time of the gateway in microseconds; null while it is unknown. */
+export function gatewayNow(store) {
+  return store.clockOffsetMs === null ? null : (performance.now() - store.clockOffsetMs) * 1000;
+}
+
+function dropOld(entries, newest_us) {
+  const oldest_us = newest_us - (SHOWN_S + 1) * 1e6;
+  let old = 0;
+  while (old < entries.length && entries[old].t_us < oldest_us) old += 1;
+  if (old > 0) entries.splice(0, old);
+}
+
+function takeCalibration(store, calibration) {
+  store.calibration = calibration;
+  if (calibration.phase !== store.progress?.phase) store.progress = null;
+  if (calibration.phase === "calibrated" && calibration.version != null && !calibration.kept) {
+    const known = store.calibrations.filter((entry) => entry.version !== calibration.version);
+    store.calibrations = [calibration, ...known];
+  }
+  store.changed("calibration");
+}
+
+function takeEvent(store, event) {
+  store.events.unshift(event);
+  store.events.length = Math.min(store.events.length, EVENTS);
+  store.lastEvents.set(event.id, event);
+  store.changed("events");
+}
+
+function takeDevice(store, topic, payload) {
+  const found = /^device\/(.+)\/(availability|info)$/.exec(topic);
+  if (!found) return;
+  const device = store.devices.get(found[1]) ?? { availability: "unknown", info: null };
+  if (found[2] === "availability") device.availability = payload?.state ?? "unknown";
+  else device.info = payload;
+  store.devices.set(found[1], device);
+  store.changed("devices");
+}
+
+/** Return the shown time range of the curves, s. */
+export const shownSeconds = SHOWN_S;
+
+/** Return the own value of a name in a payload; names such as "constructor" are names, too. */
+export function valueOf(table, name) {
+  return table && Object.hasOwn(table, name) ? table[name] : undefined;
+}

@@ -1,0 +1,113 @@
+// Numbers, ages and states in words. An unknown value is "–", never 0 and never an old value.
+
+export const UNKNOWN = "–";
+
+/** Return a number with fixed decimals and its unit; "–" if it is unknown. */
+export function formatNumber(value, decimals = 1, unit = "") {
+  if (typeof value !== "number" || !Number.isFinite(value)) return UNKNOWN;
+  const text = value.toFixed(decimals).replace(/^-(0(?:\.0+)?)$/, "$1").replace("-", "−");
+  return `${text}${unit}`;
+}
+
+/** Return a duration in the largest fitting unit. */
+export function formatDuration(seconds) {
+  if (!Number.isFinite(seconds)) return UNKNOWN;
+  if (seconds < 90) return `${Math.max(0, Math.round(seconds))} s`;
+  if (seconds < 5400) return `${Math.round(seconds / 60)} min`;
+  if (seconds < 129600) return `${Math.round(seconds / 3600)} h`;
+  return `${Math.round(seconds / 86400)} days`;
+}
+
+/** Return the time of day of a UNIX time in microseconds. */
+export function formatClock(microseconds) {
+  if (!Number.isFinite(microseconds)) return UNKNOWN;
+  return new Date(microseconds / 1000).toLocaleTimeString([], { hour12: false });
+}
+
+/** Return a name for headings: "left_knee" as "Left knee". Names of any script pass unchanged. */
+export function titleOf(name) {
+  const words = String(name).replaceAll("_", " ");
+  return words.charAt(0).toLocaleUpperCase() + words.slice(1);
+}
+
+/** Return the words of an angle's key: "flexion_deg" as "flexion". */
+export function angleName(key) {
+  return key === "inner_deg" ? "inner angle" : key.replace(/_deg$/, "").replaceAll("_", " ");
+}
+
+const FLAGS = {
+  uncalibrated: "Not calibrated: angles are unknown.",
+  other_chain: "The stored calibration belongs to another limb: calibrate again.",
+  headings_from_static: "Headings come from the static pose: there was no align phase.",
+  same_pose_assumed: "The static pose was recorded without cameras; the same pose as before is assumed.",
+  stuck: "% repeats its value and is not used.",
+  slipped: "% moved on the body and is not used.",
+  pair_disagrees: "The two sensors of % contradict each other: check their straps.",
+  heading_disagrees: "Magnetic disturbance at the %: angles are corrected, headings are uncertain.",
+  heading_unseen: "The limb may have turned about the vertical; joint angles are not affected.",
+  one_sensor: "Only one sensor of % contributes.",
+  held: "No data from the sensors of %: the last orientation is held.",
+  lost: "No data from the sensors of %.",
+  untrained: "% is outside of the movements of the calibration.",
+  extrapolating: "A sensor is late and was extrapolated.",
+  origin_fixed: "The cameras do not see the first joint.",
+  axis_vertical: "% uses the vertical as its axis: the calibration found no joint centre.",
+  facing_unknown: "The flexion axis of % is unknown; the facing direction is used.",
+  uncorrected: "Sensors are used without correction (procedure of the patent).",
+  gimbal: "Gimbal lock: flexion and rotation cannot be separated.",
+};
+const MINOR = new Set(["extrapolating", "headings_from_static", "origin_fixed", "uncorrected"]);
+
+/** Return the sentence of a flag of a pose; an unknown flag is its own text. */
+export function flagSentence(flag) {
+  const [kind, name = ""] = flag.split(/:(.*)/s);
+  return (FLAGS[kind] ?? flag).replace("%", name);
+}
+
+/** Return whether a flag is a remark that needs no action. */
+export const isMinorFlag = (flag) => MINOR.has(flag.split(":")[0]);
+
+const PHASES = {
+  uncalibrated: "Not calibrated",
+  align: "Align phase runs",
+  aligned: "Sensors aligned; the static pose is next",
+  static: "Static phase runs",
+  posed: "Static pose recorded; the functional phase is next",
+  functional: "Functional phase runs",
+  fitting: "Fitting the calibration",
+  aborted: "Calibration aborted",
+};
+const RUNNING = new Set(["align", "static", "functional", "fitting"]);
+
+/** Return whether a calibration phase runs. */
+export const isRunning = (phase) => RUNNING.has(phase);
+
+/** Return the state of the calibration in words. */
+export function calibrationSentence(calibration) {
+  if (!calibration) return "Waiting for the calibration state";
+  const { phase, version, text, kept } = calibration;
+  if (phase === "calibrated") {
+    const stored = version == null ? "not stored yet" : `version ${version}`;
+    return kept ? `Calibrated, ${stored}; the last result was rejected` : `Calibrated, ${stored}`;
+  }
+  if (phase === "aborted" && text) return `Calibration aborted: ${text}`;
+  return PHASES[phase] ?? String(phase);
+}
+
+const CLOCKS = {
+  settling: ["unknown", "settling"],
+  direct: ["ok", "sync line"],
+  echo: ["ok", "synchronised"],
+  passive: ["ok", "fitted"],
+  arrival: ["warning", "no device time"],
+  stale: ["warning", "stale"],
+};
+
+/** Return level and words of the clock quality of a device. */
+export function clockQuality(device) {
+  const [level, words] = CLOCKS[device?.clock] ?? ["unknown", UNKNOWN];
+  const sigma = device?.sigma_us;
+  if (level !== "ok" || typeof sigma !== "number") return [level, words];
+  if (sigma > 2000) return ["warning", `${words}, ± ${formatNumber(sigma / 1000, 1, " ms")}`];
+  return [level, `${words}, ± ${formatNumber(sigma, 0, " µs")}`];
+}

@@ -1,0 +1,228 @@
+"""A rig that only publishes: the topics of a calibrated leg, without daemon, sensors and simulator.
+
+The page is tested with it where no calibration is needed: it starts at once and costs no CPU time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import math
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import aiomqtt
+import orjson
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+PERIOD_S = 0.1
+"""Interval of `pose/ui`, s."""
+THIGH_M, SHANK_M = 0.43, 0.39
+STEP_S = 1.2
+"""Period of the simulated walk, s."""
+
+
+def about_x(angle: float) -> list[float]:
+    """Return the quaternion of a rotation about the x axis, rad."""
+    return [math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]
+
+
+@dataclass
+class PublishedRig:
+    """Payloads of a rig with the joints hip, knee and ankle."""
+
+    name: str = "bench-1"
+    sensors: dict[str, list[str]] = field(
+        default_factory=lambda: {"thigh": ["S1", "S2"], "shank": ["S3", "S4"]}
+    )
+    base: str = "jointfit/bench-1"
+    clock_offset_s: float = 0.0
+    """Clock of the gateway minus clock of this machine, s."""
+    offline: frozenset[str] = frozenset()
+    """Devices without data."""
+    requests: list[dict[str, Any]] = field(default_factory=list)
+    """Requests received."""
+    answer: dict[str, Any] = field(
+        default_factory=lambda: {"status": "accepted", "data": {}, "error": None}
+    )
+
+    @property
+    def devices(self) -> dict[str, dict[str, Any]]:
+        imus = {
+            sensor: {"kind": "imu", "driver": "xbus", "segment": segment}
+            for segment, sensors in self.sensors.items()
+            for sensor in sensors
+        }
+        return imus | {"mocap": {"kind": "mocap", "driver": "natnet", "segment": None}}
+
+    def now_us(self) -> int:
+        return time.time_ns() // 1000 + int(self.clock_offset_s * 1e6)
+
+    def retained(self) -> dict[str, dict[str, Any]]:
+        """Return the retained messages, those of a rig that is online."""
+        messages: dict[str, dict[str, Any]] = {
+            "bridge/info": {
+                "v": 1, "software": "0.1.0", "rig": self.name, "output_rate_hz": 100.0,
+                "side": "right", "joints": ["hip", "knee", "ankle"],
+                "angles": {"knee": "flexion"}, "segments": list(self.sensors),
+                "sensors": self.sensors, "devices": self.devices,
+            },
+            "bridge/health": self.health(),
+            "calibration": self.calibration(),
+        }  # fmt: skip
+        for device in self.devices:
+            state = "offline" if device in self.offline else "online"
+            messages[f"device/{device}/availability"] = {"v": 1, "state": state}
+            messages[f"device/{device}/info"] = {"v": 1, "model": "MTi-3", "firmware": "1.7.0"}
+        return messages | {"bridge/state": {"v": 1, "state": "online"}}
+
+    def health(self) -> dict[str, Any]:
+        def counters(device: str) -> dict[str, Any]:
+            return {
+                "online": device not in self.offline, "received": 81230, "used": 81101,
+                "late": 12, "lost": 8, "corrupt": 0, "sensor": "ok", "clock": "passive",
+                "sigma_us": 19.6, "delay_us": {"p50": 285.0, "p99": 1310.0, "max": 4120.3},
+                "rate_hz": 100.0,
+            }  # fmt: skip
+
+        return {
+            "v": 1, "t_us": self.now_us(),
+            "devices": {name: counters(name) for name in self.devices},
+            "frames": {"sent": 8100, "empty": 0, "skipped": 0},
+            "process": {"cpu_pct": 9.1, "rss_bytes": 91000000},
+            "learning": {"state": "waiting", "reason": "no live camera frames"},
+            "link": {"connected": True, "sent": 9123, "dropped": 0, "denied": []},
+        }  # fmt: skip
+
+    def calibration(self) -> dict[str, Any]:
+        def tilted(degrees: float) -> list[float]:
+            half = math.radians(degrees) / 2
+            return [math.cos(half), 0.0, 0.0, math.sin(half)]
+
+        names = [sensor for group in self.sensors.values() for sensor in group]
+        joint = {"source": "markers", "sd_m": 0.0174, "arc_deg": 91.9}
+        errors = {"anchored": 2.33, "mean": 4.57, "single": 5.33}
+        quality = {
+            "static": {"still_s": 5.05, "spread_deg": dict.fromkeys(names, 0.6584)},
+            "alignment": {
+                name: {"error_deg": 0.25, "rms_deg": 3.0, "lag_ms": None} for name in names
+            },
+            "anatomy": {
+                "joints": dict.fromkeys(("hip", "knee", "ankle"), joint),
+                "lengths_m": dict.fromkeys(self.sensors, 0.4281),
+                "length_sd_m": dict.fromkeys(self.sensors, 0.0215),
+                "length_sources": dict.fromkeys(self.sensors, "markers"),
+            },
+            "holdout": {
+                "method": "anchored",
+                "segments_deg": dict.fromkeys(self.sensors, errors),
+                "flexion_deg": {"knee": errors},
+            },
+            "sensors": {
+                name: {"q_sensor_segment": tilted(15.0 * i), "q_optical_world": [1, 0, 0, 0]}
+                for i, name in enumerate(names)
+            },
+        }
+        return {
+            "v": 1, "t_us": self.now_us(), "phase": "calibrated", "text": "stored as version 3",
+            "version": 3, "kept": None, "quality": quality,
+        }  # fmt: skip
+
+    def poses(self, seq: int) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Return `pose/ui` and `optical/pose` of this instant: a walk."""
+        t_us = self.now_us()
+        angle = 2.0 * math.pi * t_us / 1e6 / STEP_S
+        hip = math.radians(22.0) * math.cos(angle)
+        knee = math.radians(32.0 - 28.0 * math.cos(angle - 1.9))
+        optical_error = math.radians(1.5) * math.sin(angle / 3.0)
+        pose = self._limb(hip, knee)
+        optical = self._limb(hip, knee + optical_error)
+        pose |= {"v": 1, "seq": seq, "t_us": t_us, "mode": "imu+mocap", "sync": "locked"}
+        return pose | {"flags": []}, optical | {"v": 1, "t_us": t_us, "frame": seq}
+
+    def _limb(self, hip: float, knee: float) -> dict[str, Any]:
+        (thigh, shank), p = [*self.sensors], [0.06, 0.02, 0.86]
+        shank_angle = hip - knee
+
+        def below(point: list[float], angle: float, length: float) -> list[float]:
+            return [
+                point[0],
+                point[1] + length * math.sin(angle),
+                point[2] - length * math.cos(angle),
+            ]
+
+        middle = below(p, hip, THIGH_M)
+        end = below(middle, shank_angle, SHANK_M)
+        flexion = math.degrees(knee)
+        return {
+            "segments": {
+                thigh: {"q": about_x(hip), "sd_deg": 0.9, "used": self.sensors[thigh]},
+                shank: {"q": about_x(shank_angle), "sd_deg": 1.6, "used": self.sensors[shank]},
+            },
+            "joints": {
+                "hip": {"p_m": p, "sd_m": 0.0},
+                "knee": {
+                    "p_m": middle, "sd_m": 0.016, "flexion_deg": round(flexion, 2),
+                    "adduction_deg": -0.7, "rotation_deg": 2.1,
+                    "inner_deg": round(180 - flexion, 2),
+                    "sd_deg": 2.1, "flexion_deg_s": 61.2, "adduction_deg_s": 1.8,
+                    "rotation_deg_s": -3.1,
+                },
+                "ankle": {"p_m": end, "sd_m": 0.027},
+            },
+        }  # fmt: skip
+
+
+@contextlib.asynccontextmanager
+async def publishing(rig: PublishedRig, port: int) -> AsyncIterator[None]:
+    """Publish the topics of a rig until the end of the block; reconnect like the daemon."""
+    task = asyncio.create_task(_publish(rig, port), name="published rig")
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.wait([task])
+
+
+async def _publish(rig: PublishedRig, port: int) -> None:
+    will = aiomqtt.Will(f"{rig.base}/bridge/state", b'{"v":1,"state":"offline"}', 1, retain=True)
+    while True:
+        with contextlib.suppress(aiomqtt.MqttError):
+            async with aiomqtt.Client(
+                "127.0.0.1", port, protocol=aiomqtt.ProtocolVersion.V5, will=will
+            ) as client:
+                await client.subscribe(f"{rig.base}/bridge/request/+", qos=1)
+                answers = asyncio.create_task(_answer(rig, client), name="published answers")
+                try:
+                    await _publish_poses(rig, client)
+                finally:
+                    answers.cancel()
+                    await asyncio.wait([answers])
+                    # a client that disconnects orderly has no will
+                    await client.publish(will.topic, will.payload, 1, retain=True)
+        await asyncio.sleep(0.2)
+
+
+async def _publish_poses(rig: PublishedRig, client: aiomqtt.Client) -> None:
+    for topic, payload in rig.retained().items():
+        await client.publish(f"{rig.base}/{topic}", orjson.dumps(payload), 1, retain=True)
+    seq = 0
+    while True:
+        pose, optical = rig.poses(seq)
+        await client.publish(f"{rig.base}/pose/ui", orjson.dumps(pose))
+        await client.publish(f"{rig.base}/optical/pose", orjson.dumps(optical))
+        seq += 1
+        await asyncio.sleep(PERIOD_S)
+
+
+async def _answer(rig: PublishedRig, client: aiomqtt.Client) -> None:
+    with contextlib.suppress(aiomqtt.MqttError):
+        async for message in client.messages:
+            request = orjson.loads(bytes(message.payload))
+            rig.requests.append(request)
+            answer = {"v": 1, "transaction": request.get("transaction"), **rig.answer}
+            topic = message.topic.value.replace("/request/", "/response/")
+            await client.publish(topic, orjson.dumps(answer), 1)

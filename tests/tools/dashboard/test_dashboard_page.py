@@ -1,0 +1,147 @@
+"""The dashboard's page in Chromium, on a rig that only publishes: drawing, words, recovery."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from jointfit_daemon.tools.dashboard._server import DashboardServer
+from jointfit_daemon.tools.dashboard.addresses import BrokerAddress, ListenAddress
+from tests.broker_fixture import HOST
+from tests.tools.dashboard.browser import SIZES, VIEWS, OpenedPage, chromium, opened
+from tests.tools.dashboard.published_rig import PublishedRig, publishing
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from tests.broker_fixture import Broker
+
+pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(150)]
+
+LIMB_PIXELS = """() => {
+  const canvas = document.querySelector('#limb');
+  return canvas.width + ':' + canvas.toDataURL().slice(0, 60000);
+}"""
+
+
+@asynccontextmanager
+async def shown(broker: Broker, rig: PublishedRig, **window: Any) -> AsyncIterator[OpenedPage]:
+    """Yield the page of a rig once it shows an angle."""
+    server = DashboardServer(BrokerAddress(HOST, broker.port))
+    async with (
+        chromium() as browser,
+        publishing(rig, broker.port),
+        server.listening(ListenAddress(HOST, 0)) as url,
+        opened(browser, url, **window) as page,
+    ):
+        await page.until_text("#angle-value", "°")
+        yield page
+
+
+async def test_the_limb_moves_and_the_angle_has_a_standard_deviation(broker: Broker) -> None:
+    async with shown(broker, PublishedRig()) as page:
+        assert await page.text("#rig-name") == "bench-1"
+        assert await page.text("#rig-state") == "Calibrated, version 3"
+        assert await page.text("#angle-title") == "Knee flexion"
+        assert await page.text("#angle-sd") == "± 2.1°"
+        await page.page.wait_for_selector("#chart canvas", state="attached")
+        pictures = set()
+        for _ in range(5):
+            pictures.add(await page.page.evaluate(LIMB_PIXELS))
+            await asyncio.sleep(0.25)
+        assert len(pictures) >= 4
+        await page.until_text("#chart-caption", "difference from the cameras")
+        assert page.foreign == []
+        assert page.errors == []
+
+
+async def test_every_view_is_accessible_and_fits_phone_tablet_and_desktop(broker: Broker) -> None:
+    server = DashboardServer(BrokerAddress(HOST, broker.port))
+    async with (
+        chromium() as browser,
+        publishing(PublishedRig(), broker.port),
+        server.listening(ListenAddress(HOST, 0)) as url,
+    ):
+        for scheme in ("light", "dark"):
+            for size in SIZES:
+                async with opened(browser, url, size=size, scheme=scheme) as page:
+                    await page.until_text("#angle-value", "°")
+                    for view in VIEWS:
+                        await page.show(view)
+                        await page.picture(f"{view}-{size}-{scheme}")
+                        overflow = "document.documentElement.scrollWidth - innerWidth"
+                        assert await page.page.evaluate(overflow) <= 0, (view, size)
+                        if size != "tablet":
+                            assert await page.accessibility_faults() == [], (view, size, scheme)
+                    assert page.errors == []
+
+
+async def test_loss_of_daemon_and_broker_is_named_and_ends_by_itself(broker: Broker) -> None:
+    server = DashboardServer(BrokerAddress(HOST, broker.port))
+    async with (
+        chromium() as browser,
+        server.listening(ListenAddress(HOST, 0)) as url,
+        opened(browser, url) as page,
+    ):
+        await page.until_text("#empty", "Waiting for jointfitd")
+        async with publishing(PublishedRig(), broker.port):
+            await page.until_text("#angle-value", "°")
+            broker.stop()
+            await page.until_text("#banner", f"{HOST}:{broker.port}")
+            await page.until_text("#banner", "start the broker")
+            await page.until_text("#main-action", "Reconnect")
+            broker.start()
+            await page.until_text("#rig-state", "Calibrated, version 3")
+            await page.until_text("#angle-value", "°")
+        await page.until_text("#rig-state", "jointfitd is not running")
+        await page.until_text("#angle-reason", "No pose for")
+        assert await page.text("#angle-value") == "–"
+        async with publishing(PublishedRig(), broker.port):
+            await page.until_text("#angle-value", "°")
+        assert page.errors == []
+
+
+async def test_names_in_any_script_a_missing_sensor_and_a_wrong_clock_are_shown(
+    broker: Broker,
+) -> None:
+    rig = PublishedRig(
+        "膝関節 <b>&</b>",
+        {"бедро": ["датчик 1", "constructor"], "ساق": ["__proto__", "S4"]},
+        clock_offset_s=-9 * 3600,
+        offline=frozenset({"S4"}),
+    )
+    async with shown(broker, rig) as page:
+        assert await page.text("#rig-name") == "膝関節 <b>&</b>"
+        cards = await page.text("#cards")
+        for name in ("датчик 1", "constructor", "__proto__", "ساق"):
+            assert name in cards
+        await page.until_text(".card.error", "S4")
+        await page.until_text(".card.error", "No data: check cable and power")
+        await page.show("table")
+        await page.until_text("#view-table", "Knee flexion")
+        assert page.errors == []
+
+
+async def test_a_request_is_sent_and_a_refusal_is_shown_in_words(broker: Broker) -> None:
+    rig = PublishedRig()
+    rig.answer = {"status": "error", "error": {"message": "S4 sends no data: check its cable"}}
+    async with shown(broker, rig) as page:
+        await page.page.click("#main-action")
+        await page.page.click("text=Start standing")
+        await page.until_text("#view-calibrate .banner", "S4 sends no data: check its cable")
+        assert [request["phase"] for request in rig.requests] == ["static"]
+
+
+async def test_keys_move_between_the_views_and_turn_the_limb(broker: Broker) -> None:
+    async with shown(broker, PublishedRig()) as page:
+        await page.page.focus("#limb")
+        before = await page.page.evaluate("jointfit.limb.camera.turn")
+        await page.page.keyboard.press("ArrowLeft")
+        assert await page.page.evaluate("jointfit.limb.camera.turn") > before
+        await page.page.focus("#tab-live")
+        await page.page.keyboard.press("End")
+        await page.until_text("#view-table", "Joint angles")
+        assert await page.page.get_attribute("#tab-table", "aria-selected") == "true"
