@@ -192,7 +192,12 @@ ANGLE_NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class Chain:
-    """A limb: joints O1 to On+1 from proximal to distal, and the n segments between them."""
+    """A limb: joints O1 to On+1 from proximal to distal, and the n segments between them.
+
+    A branched limb has more ends: joint i is the proximal joint of segment i, and the joints after
+    them are the distal ends of the last segments. A segment follows the one that carries it. The
+    first segment has two distal joints, O1 is the midpoint between them.
+    """
 
     joints: tuple[str, ...]
     segments: tuple[str, ...]
@@ -212,6 +217,13 @@ class Chain:
     """Segment axes equal the world in the static pose; otherwise joint centres define them."""
     conventions: tuple[AngleConvention | None, ...] = ()
     """Configured angle conventions of the joints; None if the name of the joint selects it."""
+    parents: tuple[int | None, ...] = ()
+    """Number of the segment proximal of each joint, None for O1; empty for a limb without
+    branches."""
+    left_joints: tuple[bool, ...] = ()
+    """Whether each joint is a left one; empty if ``left_side`` holds for all."""
+    distals: tuple[str | None, ...] = ()
+    """Body parts distal of the ends of a branched limb, instead of ``distal``; None without one."""
 
 
 class JointAngles(NamedTuple):
@@ -252,6 +264,8 @@ class JointState(NamedTuple):
     """Rates of change of the angles over the last 50 ms, rad/s."""
     convention: AngleConvention = AngleConvention.FLEXION
     """Definition of `angles` and `rates`."""
+    proximal: int | None = None
+    """Number of its proximal segment in a branched limb; None: the one before the joint."""
 
 
 class FusionMode(StrEnum):

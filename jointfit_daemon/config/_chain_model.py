@@ -19,6 +19,7 @@ from jointfit_daemon.calibration.marker_refinement import (
     with_locks,
     with_weights,
 )
+from jointfit_daemon.config._checks import body_parts_of
 from jointfit_daemon.config._fault_messages import Fault
 from jointfit_daemon.files.models import (
     LoadedModel,
@@ -86,11 +87,11 @@ def load_chain_model(
     if named is None or None in named.values():
         return loaded, []  # markers that cannot be read may be those of the model
 
-    parts = [*filter(None, (table.proximal, *(table.segments or ()), table.distal))]
+    parts = body_parts_of(table)
     markers = {part: names for part in parts if (names := (mocap.markers or {}).get(part))}
     faults = [*_check_markers(loaded.chain, markers), *_check_bare_segments(table, markers)]
     carriers, more = _find_carriers(loaded.chain, markers)
-    faults += more or _check_connections(loaded.chain, carriers)
+    faults += more or _check_connections(loaded.chain, carriers, _adjacent(table, carriers))
     known = set(loaded.chain.marker_names)
     if absent := [name for names in markers.values() for name in names if name not in known]:
         remark = f"not in the model, so not tracked by it: {_listed(absent)}"
@@ -214,8 +215,18 @@ def _find_carriers(
     return carriers, faults
 
 
-def _check_connections(model: ChainModel, carriers: Mapping[str, str]) -> list[Fault]:
-    """Check that the model has a joint between the segments of successive parts.
+def _adjacent(table: ChainTable, parts: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Return the pairs of body parts that a joint connects."""
+    if not table.joint:
+        return list(pairwise(parts))
+    pairs = [(joint.parent, joint.child) for joint in table.joint if joint.child]
+    return [pair for pair in pairs if pair[0] in parts and pair[1] in parts]
+
+
+def _check_connections(
+    model: ChainModel, carriers: Mapping[str, str], adjacent: Sequence[tuple[str, str]]
+) -> list[Fault]:
+    """Check that the model has a joint between the segments of adjacent parts.
 
     Segments without markers of the rig may lie between them, such as the talus.
     """
@@ -229,7 +240,7 @@ def _check_connections(model: ChainModel, carriers: Mapping[str, str]) -> list[F
         return path
 
     faults, parts = [], list(carriers)
-    for first, second in pairwise(parts):
+    for first, second in adjacent:
         one, other = carriers[first], carriers[second]
         if one not in above(other) and other not in above(one):
             text = (

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel
 
+from jointfit_daemon.config._branched_limb import check_branches
 from jointfit_daemon.config._fault_messages import Fault
 from jointfit_daemon.config._rig import MOCAP
+from jointfit_daemon.config._tables import JOINTS_HELP
 from jointfit_daemon.limb_model import PatentReading
 from jointfit_daemon.nearest_name import nearest_name
 
@@ -21,7 +23,11 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from jointfit_daemon.config._rig import Source
-    from jointfit_daemon.config._tables import CalibrationTable, ChainTable, MqttSettings
+    from jointfit_daemon.config._tables import (
+        CalibrationTable,
+        ChainTable,
+        MqttSettings,
+    )
     from jointfit_daemon.driver import CanBusSettings, MocapSettings
 
 _FORBIDDEN = "+#/"
@@ -101,11 +107,17 @@ def check_chain(table: ChainTable) -> Iterator[Fault]:
 
     Keys of `table` that had faults are None.
     """
-    for key in ("joints", "segments"):
-        names = getattr(table, key) or ()
-        for name in names:
+    names_of = {"joints": table.joints, "segments": table.segments}
+    if table.joint != ():
+        names_of["joint"] = tuple(joint.name for joint in table.joint or ())
+        yield from check_branches(table)
+    elif table.joints == ():
+        yield Fault("chain.joints", f"missing; {JOINTS_HELP}")
+    for key, names in names_of.items():
+        for name in names or ():
             yield from check_topic_name(f"chain.{key}", name)
-        yield from _repeated(f"chain.{key}", names)
+        if key != "joint":
+            yield from _repeated(f"chain.{key}", names or ())
 
     found = [len(names) for names in (table.joints, table.segments) if names]
     if len(found) == 2 and found[0] != found[1] + 1:  # noqa: PLR2004 - both could be read
@@ -135,6 +147,8 @@ def _check_values_by_name(table: ChainTable) -> Iterator[Fault]:
     joints, segments = table.joints or (), table.segments or ()
     complete = len(joints) == len(segments) + 1
     inner = joints[1:-1] if complete else joints  # only joints between two segments have angles
+    if table.joint:
+        inner = tuple(joint.name for joint in table.joint if joint.child in segments)
     for name in table.angles or {}:
         if inner:
             key = f"chain.angles.{name}"
@@ -210,13 +224,19 @@ def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -
             yield Fault("imu", f"segment {segment!r} has no sensor, expected at least one")
 
 
+def body_parts_of(table: ChainTable) -> list[str]:
+    """Return the segments and the body parts with markers only; keys with faults are None."""
+    ends = [joint.child for joint in table.joint or ()]
+    parts = [table.proximal, *(table.segments or ()), *ends, table.distal]
+    return list(dict.fromkeys(part for part in parts if part))
+
+
 def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator[Fault]:
     """Check the markers and rigid bodies of ``[mocap]``; keys that had faults are None."""
     for kind in ("markers", "rigid_body"):
         for part in getattr(settings, kind) or ():
             if table is not None and table.segments:
-                ends = filter(None, (table.proximal, table.distal))
-                parts = [*dict.fromkeys([*table.segments, *ends])]
+                parts = body_parts_of(table)
                 taken = {*(settings.markers or ()), *(settings.rigid_body or ())}
                 yield from check_known_name(f"mocap.{kind}.{part}", part, parts, "segment", taken)
 
@@ -252,26 +272,36 @@ def check_center_methods(
         for key in keys:
             yield Fault(key, "joint centers need cameras: add [mocap], or remove this key")
         return
-    if chain is None or not chain.joints or not chain.segments or mocap.markers is None:
+    joints = chain is not None and (chain.joints or chain.joint)
+    if chain is None or not joints or not chain.segments or mocap.markers is None:
         return
 
     marked = {*(mocap.markers or ()), *(mocap.rigid_body or ())}
-    parts = [chain.proximal, *chain.segments, chain.distal]
+    sides = _sides_of_joints(chain)
     for key, joint in explicit.items():
-        if faults := check_known_name(key, joint, chain.joints, "joint", chosen):
+        if faults := check_known_name(key, joint, [*sides], "joint", chosen):
             yield from faults
             continue
-        at = chain.joints.index(joint)
-        ends = {"proximal": parts[at]} if at == 0 else {}
-        ends |= {"distal": parts[at + 1]} if at == len(chain.segments) else {}
-        for end, part in ends.items():
+        for part, addition in sides[joint]:
             if part is None:
-                text = f"needs markers on both sides of the joint: add chain.{end} and its markers"
+                text = f"needs markers on both sides of the joint: add {addition} and its markers"
                 yield Fault(key, text, chosen[joint] or joint)
-        for part in parts[at : at + 2]:
+        for part, _ in sides[joint]:
             if part is not None and part not in marked:
                 text = f"needs markers on both sides of the joint: add mocap.markers.{part}"
                 yield Fault(key, text, chosen[joint] or joint)
+
+
+def _sides_of_joints(chain: ChainTable) -> dict[str, list[tuple[str | None, str]]]:
+    """Return the body parts of each joint, None if missing, each with the key that names it."""
+    if chain.joint:
+        return {
+            joint.name: [(joint.parent, ""), (joint.child, f"chain.joint[{joint.name}].child")]
+            for joint in chain.joint
+        }
+    parts = [chain.proximal, *chain.segments, chain.distal]
+    named = [(part, "chain.distal" if at else "chain.proximal") for at, part in enumerate(parts)]
+    return {joint: named[at : at + 2] for at, joint in enumerate(chain.joints)}
 
 
 def check_ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) -> Iterator[Fault]:

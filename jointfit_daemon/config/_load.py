@@ -14,6 +14,7 @@ from pydantic import BaseModel, ValidationError
 
 from jointfit_daemon.calibration import CalibrationSettings
 from jointfit_daemon.config import _bandwidth, _checks
+from jointfit_daemon.config._branched_limb import branched_limb
 from jointfit_daemon.config._bus_faults import complete_bus, likely_interface, unusable_keys
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._readable import contradictions, readable_part
@@ -440,18 +441,23 @@ def _imu_source(name: str, settings: Any, driver: type[Driver]) -> Source:
 
 
 def _chain(table: ChainTable, sources: Sequence[Source]) -> Chain:
+    branched = branched_limb(table) if table.joint else None
+    joints, segments = (table.joints, table.segments) if branched is None else branched[:2]
     return Chain(
-        joints=table.joints,
-        segments=table.segments,
+        joints=joints,
+        segments=segments,
         sensors=tuple(
             tuple(source.id for source in sources if source.segment == segment)
-            for segment in table.segments
+            for segment in segments
         ),
         left_side=table.side == "left",
         origin=table.origin_m,
-        lengths=tuple(table.lengths_m.get(segment) for segment in table.segments),
+        lengths=tuple(table.lengths_m.get(segment) for segment in segments),
         proximal=table.proximal,
         distal=table.distal,
         static_axes=table.axes == "static",
-        conventions=tuple(table.angles.get(joint) for joint in table.joints),
+        conventions=tuple(table.angles.get(joint) for joint in joints),
+        parents=() if branched is None else branched.parents,
+        left_joints=() if branched is None else branched.left,
+        distals=() if branched is None else branched.distals,
     )

@@ -21,6 +21,8 @@ from jointfit_daemon.driver import Settings, host_fault
 from jointfit_daemon.limb_model import Method, Procedure  # noqa: TC001 - pydantic reads them
 from jointfit_daemon.model import AngleConvention  # noqa: TC001 - as above
 
+JOINTS_HELP = "joints from proximal to distal, one more than segments"
+"""Description of the key ``chain.joints``; it is needed unless the limb has branches."""
 _PLAIN, _TLS = 1883, 8883
 """Default ports without and with TLS (IANA: mqtt, secure-mqtt)."""
 
@@ -37,13 +39,32 @@ class RigTable(Settings):
     )
 
 
+class JointTable(Settings):
+    """``[[chain.joint]]``: one joint of a branched limb."""
+
+    name: str = Field(description="name of the joint")
+    parent: str = Field(description="segment proximal of the joint")
+    child: str | None = Field(
+        None,
+        description="segment distal of the joint; at the end of a branch a body part with markers "
+        "only (foot), or none",
+    )
+    side: Literal["right", "left"] | None = Field(
+        None, description="side of the body; default: that of the joint above it"
+    )
+
+
 class ChainTable(Settings):
     """``[chain]``: the limb, from proximal to distal."""
 
-    joints: tuple[str, ...] = Field(
-        min_length=2, description="joints from proximal to distal, one more than segments"
-    )
+    joints: tuple[str, ...] = Field((), min_length=2, description=JOINTS_HELP)
     segments: tuple[str, ...] = Field(min_length=1, description="segments between the joints")
+    joint: tuple[JointTable, ...] = Field(
+        (),
+        min_length=1,
+        description="instead of `joints`: the joints of a limb whose first segment carries a right "
+        "and a left branch",
+    )
     side: Literal["right", "left"] = Field("right", description="side of the body: sign of angles")
     proximal: str | None = Field(
         None, description="body part proximal of the first joint, with markers only (pelvis)"

@@ -11,14 +11,15 @@ from math import hypot, isfinite, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.kinematics.joint_angles import read_joint
-from jointfit_daemon.kinematics.rotation_scalar import rotate_z_one
+from jointfit_daemon.kinematics.rotation_scalar import rotate_one, rotate_z_one
+from jointfit_daemon.limb_model import distal_joints, is_left, proximal_segment
 from jointfit_daemon.model import AngleConvention
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_daemon.fusion._segment_fuser import FusedSegment
-    from jointfit_daemon.model import JointAngles, Vector
+    from jointfit_daemon.model import Chain, JointAngles, Vector
 
 
 class SegmentLength(NamedTuple):
@@ -26,6 +27,32 @@ class SegmentLength(NamedTuple):
 
     length: float | None
     sd: float
+
+
+class JointPlace(NamedTuple):
+    """Place of a joint on its proximal segment."""
+
+    segment: int
+    """Number of the proximal segment."""
+    share: float = 0.0
+    """0 at the distal end of the segment; otherwise the part of its length to the right (+) or left
+    (-) of its origin."""
+
+
+def joint_places(chain: Chain) -> list[JointPlace]:
+    """Return the places of all joints but the first.
+
+    The two distal joints of a branched segment are half its length to the right and left.
+    """
+    places = []
+    for joint in range(1, len(chain.joints)):
+        segment = proximal_segment(chain, joint)
+        if segment is None:
+            raise ValueError(f"joint {chain.joints[joint]} has no proximal segment")
+        branched = len(distal_joints(chain, segment)) > 1
+        side = -0.5 if is_left(chain, joint) else 0.5
+        places.append(JointPlace(segment, side if branched else 0.0))
+    return places
 
 
 class JointAngleEstimate(NamedTuple):
@@ -42,30 +69,40 @@ class JointAngleEstimate(NamedTuple):
 
 
 def joint_positions(
-    origin: Vector, fused: Sequence[FusedSegment], lengths: Sequence[SegmentLength]
+    origin: Vector,
+    fused: Sequence[FusedSegment],
+    lengths: Sequence[SegmentLength],
+    places: Sequence[JointPlace],
 ) -> list[tuple[Vector | None, float | None]]:
     r"""Return position (m) and variance per axis (m²) of every joint, from O1 downwards.
 
-    .. math:: P_{i+1} = P_i - L\,R_i e_z, \qquad
-              \mathrm{tr}\,\Sigma_{i+1} = \mathrm{tr}\,\Sigma_i + 2 L^2 \sigma_i^2 + \sigma_L^2
+    With the proximal joint i of the segment that carries joint j,
 
-    First-order propagation with isotropic orientation errors. Both values are None below a segment
-    of unknown orientation or length.
+    .. math:: P_j = P_i - L\,R_i e_z, \qquad
+              \mathrm{tr}\,\Sigma_j = \mathrm{tr}\,\Sigma_i + 2 L^2 \sigma_i^2 + \sigma_L^2
+
+    Joints to the right or left of the origin of a segment have
+    :math:`P_j = P_i \pm \frac{L}{2} R_i e_x`, and half the length and half its standard deviation
+    in the variance. First-order propagation with isotropic orientation errors. Both values are None
+    below a segment of unknown orientation or length.
     """
-    position: Vector | None = origin
-    trace = 0.0
+    traces = [0.0]
     out: list[tuple[Vector | None, float | None]] = [(origin, 0.0)]
-    for segment, stored in zip(fused, lengths, strict=True):
-        if position is None or segment.q is None or segment.sd is None or stored.length is None:
-            position = None
+    for i, share in places:
+        position, segment, (length, length_sd) = out[i][0], fused[i], lengths[i]
+        if position is None or segment.q is None or segment.sd is None or length is None:
+            traces.append(0.0)
             out.append((None, None))
             continue
 
-        length = stored.length
-        dx, dy, dz = rotate_z_one(segment.q, -length)
-        position = (position[0] + dx, position[1] + dy, position[2] + dz)
-        trace += 2.0 * (length * segment.sd) ** 2 + stored.sd**2
-        out.append((position, trace / 3.0))
+        if share:
+            length, length_sd = share * length, share * length_sd
+            dx, dy, dz = rotate_one(segment.q, (length, 0.0, 0.0))
+        else:
+            dx, dy, dz = rotate_z_one(segment.q, -length)
+        trace = traces[i] + (2.0 * (length * segment.sd) ** 2 + length_sd**2)
+        traces.append(trace)
+        out.append(((position[0] + dx, position[1] + dy, position[2] + dz), trace / 3.0))
     return out
 
 

@@ -13,6 +13,7 @@ from jointfit_daemon.fusion._angle_rates import AngleRates
 from jointfit_daemon.fusion._forward_kinematics import (
     SegmentLength,
     joint_angle_estimate,
+    joint_places,
     joint_positions,
 )
 from jointfit_daemon.fusion._heading_uncertainty import add_heading_sd
@@ -24,6 +25,8 @@ from jointfit_daemon.limb_model import (
     angle_convention,
     configured_length,
     flexion_sign,
+    inner_joints,
+    is_left,
     neighbor,
 )
 from jointfit_daemon.model import (
@@ -85,8 +88,9 @@ class LimbFuser:
         self._alignments: list[tuple[str, Quaternion, Quaternion]] = []
         """Sensor, q_optical_world and q_sensor_segment."""
         self.consistency: ConsistencyMonitor | None = None
-        self._rates = AngleRates()
         self._conventions = [angle_convention(chain, i) for i in range(len(chain.joints))]
+        self._places, self._rates = joint_places(chain), AngleRates()
+        self._inner = {joint.number: joint for joint in inner_joints(chain)}
         self._unknown_joints = tuple(
             JointState(name, None, None, convention=convention)
             for name, convention in zip(chain.joints, self._conventions, strict=True)
@@ -278,31 +282,39 @@ class LimbFuser:
     ) -> tuple[JointState, ...]:
         chain = self._chain
         origin = optical_origin or chain.origin or (0.0, 0.0, 0.0)
-        positions = joint_positions(origin, fused, self._lengths)
+        positions = joint_positions(origin, fused, self._lengths, self._places)
         joints = []
         for i, name in enumerate(chain.joints):
             position, variance = positions[i]
             sd = None if variance is None else sqrt(variance)
-            if not 0 < i < len(fused):  # the ends of the chain have no angles
+            inner = self._inner.get(i)
+            if inner is None:  # the ends of the chain have no angles
                 joints.append(JointState(name, position, sd))
                 continue
 
-            proximal, distal, convention = fused[i - 1], fused[i], self._conventions[i]
+            proximal, distal = fused[inner.proximal], fused[inner.distal]
+            convention, carrier = self._conventions[i], inner.proximal if chain.parents else None
             estimate = joint_angle_estimate(
                 proximal,
                 distal,
                 sign=self._signs[i],
-                left=chain.left_side,
+                left=is_left(chain, i),
                 correlation=self._correlations[i],
                 convention=convention,
             )
             if estimate is None:
-                joints.append(JointState(name, position, sd, convention=convention))
+                joints.append(
+                    JointState(name, position, sd, convention=convention, proximal=carrier)
+                )
                 continue
             if estimate.gimbal and FrameFlag.GIMBAL not in flags:
                 flags.append(FrameFlag.GIMBAL)
-            angles, inner, main_sd, gimbal = estimate
+            angles, included, main_sd, gimbal = estimate
             measured = angles if proximal.used and distal.used else None  # not while held
             rates = self._rates.update(t_ns, name, measured, gimbal=gimbal)
-            joints.append(JointState(name, position, sd, angles, inner, main_sd, rates, convention))
+            joints.append(
+                JointState(
+                    name, position, sd, angles, included, main_sd, rates, convention, carrier
+                )
+            )
         return tuple(joints)

@@ -13,7 +13,15 @@ import numpy as np
 from jointfit_daemon.fusion._cluster_pose import ClusterPose
 from jointfit_daemon.kinematics.joint_angles import read_joint
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
-from jointfit_daemon.limb_model import angle_convention, flexion_sign, restore_cluster
+from jointfit_daemon.limb_model import (
+    angle_convention,
+    body_parts,
+    flexion_sign,
+    inner_joints,
+    is_left,
+    joint_parts,
+    restore_cluster,
+)
 
 if TYPE_CHECKING:
     from jointfit_daemon.kinematics.joint_angles import JointReading
@@ -62,13 +70,16 @@ class OpticalLimb:
 
         centers = [calibration.joint.get(joint) for joint in chain.joints]
         self._centers = [None if item is None else item.center for item in centers]
+        self._inner = {joint.number: joint for joint in inner_joints(chain)}
+        adjacent = joint_parts(chain)
         known = {i for i, center in enumerate(self._centers) if center is not None}
-        for k, part in enumerate((chain.proximal, *chain.segments, chain.distal)):
+        carried = [sorted(i for i in known if k in adjacent[i]) for k in range(len(adjacent) + 1)]
+        for part, joints in zip(body_parts(chain), carried, strict=True):
             stored = None if part is None else calibration.clusters.get(part)
             if part is None or stored is None:
                 self._parts.append(None)
             else:
-                self._parts.append((restore_cluster(part, stored), sorted({k - 1, k} & known)))
+                self._parts.append((restore_cluster(part, stored), joints))
 
     def read(self, frame: MocapFrame) -> OpticalReading:
         """Return the limb in one frame."""
@@ -89,7 +100,7 @@ class OpticalLimb:
 
         segments = [
             None if q is None else multiply_one(q, q_static)
-            for q, q_static in zip(orientations[1:-1], self._static, strict=True)
+            for q, q_static in zip(orientations[1:], self._static, strict=False)
         ]
         return OpticalReading(
             segments,
@@ -112,12 +123,12 @@ class OpticalLimb:
         return [] if found is None else found[1]
 
     def _angles(self, joint: int, segments: list[Quaternion | None]) -> JointReading | None:
-        if not 0 < joint < len(segments):  # the ends of the chain have no angles
+        if (inner := self._inner.get(joint)) is None:  # the ends of the chain have no angles
             return None
-        proximal, distal = segments[joint - 1], segments[joint]
+        proximal, distal = segments[inner.proximal], segments[inner.distal]
         if proximal is None or distal is None:
             return None
-        sign, left = self._signs[joint], self._chain.left_side
+        sign, left = self._signs[joint], is_left(self._chain, joint)
         return read_joint(
             proximal, distal, flexion_sign=sign, left=left, convention=self._conventions[joint]
         )

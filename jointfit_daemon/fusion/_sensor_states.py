@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.kinematics.rotation_scalar import between_one, multiply_one
+from jointfit_daemon.limb_model import inner_joints
 from jointfit_daemon.model import SensorOrientation, SensorStates
 
 if TYPE_CHECKING:
@@ -51,8 +52,8 @@ def sensor_states(
         sensors.append(SensorOrientation(name, q, q_segment))
 
     joints = []
-    for number, name in enumerate(chain.joints[1:-1]):
-        above, below = (state.segments[number + k].q_world_segment for k in (0, 1))
+    for _, name, proximal, distal in inner_joints(chain):
+        above, below = (state.segments[k].q_world_segment for k in (proximal, distal))
         q_joint = None if above is None or below is None else between_one(above, below)
         joints.append((name, q_joint))
     return SensorStates(state.seq, state.t_ns, tuple(sensors), tuple(joints))

@@ -7,7 +7,7 @@ record never contains NaN or infinity. Time of creation and software version are
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, cast
 
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.limb_model._json_form import fields_form
@@ -129,6 +129,10 @@ class Calibration:
     """With ``patent``, every segment has one model, for all of its sensors."""
     chain: RefinedChain | None = None
     """Refined markers of the chain model; None if there are none."""
+    parents: tuple[int | None, ...] = ()
+    """As in `Chain`: segment proximal of each joint; empty for a limb without branches."""
+    left_joints: tuple[bool, ...] = ()
+    """As in `Chain`: sides of the joints of a branched limb."""
 
     @property
     def lag_ns(self) -> dict[str, int]:
@@ -136,13 +140,21 @@ class Calibration:
         return {name: sensor.lag_ns for name, sensor in self.sensor.items()}
 
     def fits(self, chain: Chain) -> bool:
-        """Return whether segments, joints and sensors equal those of a chain."""
-        mine = (self.joints, self.segments, self.chain_sensors)
-        return mine == (chain.joints, chain.segments, chain.sensors)
+        """Return whether segments, joints, sensors and branches equal those of a chain."""
+        mine = (self.joints, self.segments, self.chain_sensors, self.parents, self.left_joints)
+        other = (chain.joints, chain.segments, chain.sensors, chain.parents, chain.left_joints)
+        return mine == other
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form: dicts, lists, numbers, strings, None."""
-        return {"schema": SCHEMA, **fields_form(self)}
+        """Return the JSON form: dicts, lists, numbers, strings, None.
+
+        A limb without branches has no keys of branches, as in earlier versions.
+        """
+        form = {"schema": SCHEMA, **fields_form(self)}
+        for key in ("parents", "left_joints"):
+            if not form[key]:
+                del form[key]
+        return form
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> Calibration:
@@ -165,6 +177,27 @@ class Calibration:
             raise CalibrationSchemaError(
                 f"not a calibration: {type(error).__name__}: {error}"
             ) from error
+
+
+class ChainFields(TypedDict):
+    """Fields of a calibration that identify its chain, see `Calibration.fits`."""
+
+    joints: tuple[str, ...]
+    segments: tuple[str, ...]
+    chain_sensors: tuple[tuple[str, ...], ...]
+    parents: tuple[int | None, ...]
+    left_joints: tuple[bool, ...]
+
+
+def chain_fields(chain: Chain) -> ChainFields:
+    """Return the fields of a calibration that identify its chain."""
+    return {
+        "joints": chain.joints,
+        "segments": chain.segments,
+        "chain_sensors": chain.sensors,
+        "parents": chain.parents,
+        "left_joints": chain.left_joints,
+    }
 
 
 def model_key(sensors: Sequence[str], other: str | None) -> str:
@@ -213,6 +246,8 @@ def _from_dict(data: Mapping[str, Any]) -> Calibration:
         memory=str(data.get("memory", "")),
         procedure=cast("Procedure", data.get("procedure", "corrected")),
         chain=None if data.get("chain") is None else _chain(data["chain"]),
+        parents=tuple(data.get("parents", ())),
+        left_joints=tuple(data.get("left_joints", ())),
     )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jointfit_daemon.calibration.guidance import LiveJointCenters
 from jointfit_daemon.center_of_rotation.spatial import SphereLimits
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import body_parts, restore_cluster, vector
+from jointfit_daemon.limb_model import body_parts, joint_parts, restore_cluster, vector
 from jointfit_daemon.model import RunningCenter, RunningCenters
 from jointfit_daemon.timing.alignment import RateDivider
 
@@ -77,7 +77,8 @@ class MovingCenters:
         self._calibration = calibration
         clusters = {name: restore_cluster(name, c) for name, c in calibration.clusters.items()}
         self._centers = LiveJointCenters(chain, clusters, limits=SphereLimits())
-        above = dict(zip(chain.joints, body_parts(chain), strict=False))
+        parts = body_parts(chain)
+        above = {j: parts[k] for j, (k, _) in zip(chain.joints, joint_parts(chain), strict=True)}
         self._segments = [above[joint] or "" for joint in self._centers.joints]
         self._frames = RateDivider(RATE_HZ)
         self._turns = RateDivider(PUBLISHED_HZ * max(len(self._segments), 1))

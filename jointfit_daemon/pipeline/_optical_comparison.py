@@ -13,7 +13,12 @@ from typing import TYPE_CHECKING
 from jointfit_daemon.fusion import OpticalLimb
 from jointfit_daemon.kinematics.joint_angles import read_joint
 from jointfit_daemon.kinematics.rotation_scalar import angle_between_one, interpolate_one
-from jointfit_daemon.limb_model import angle_convention, flexion_sign
+from jointfit_daemon.limb_model import (
+    angle_convention,
+    flexion_sign,
+    is_left,
+    proximal_segment,
+)
 from jointfit_daemon.model import (
     FrameFlag,
     FusionMode,
@@ -162,11 +167,12 @@ class OpticalComparison:
         if optical is None:
             return joint
         joint = joint._replace(angles=optical.angles, inner=optical.inner)
-        proximal, distal = imu[number - 1], imu[number]
+        above = proximal_segment(self._chain, number)
+        proximal, distal = None if above is None else imu[above], imu[number]
         if proximal is None or distal is None:
             return joint
 
-        sign, left = self._signs[number], self._chain.left_side
+        sign, left = self._signs[number], is_left(self._chain, number)
         measured = read_joint(proximal, distal, flexion_sign=sign, left=left, convention=convention)
         if optical.gimbal or measured.gimbal:  # the angles are not comparable one by one
             return joint

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import orjson
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_MISUSE
+
+if TYPE_CHECKING:
+    from jointfit_daemon.config import Rig
 
 
 def check(
@@ -50,7 +53,7 @@ def check(
     console = Console()
     console.print(table)
     console.print(
-        f"joints {' – '.join(rig.chain.joints)}, {rig.output_rate_hz:g} Hz to "
+        f"joints {_joints(rig)}, {rig.output_rate_hz:g} Hz to "
         f"mqtt://{rig.mqtt.host}:{rig.mqtt.tcp_port}/{rig.mqtt.base}, calibration "
         f"store {rig.calibration_store!r}, method {rig.calibration.method}"
     )
@@ -67,3 +70,7 @@ def check(
     for warning in warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}")
     console.print(f"installed drivers: {', '.join(driver_names())}")
+
+
+def _joints(rig: Rig) -> str:
+    return (", " if rig.chain.parents else " – ").join(rig.chain.joints)

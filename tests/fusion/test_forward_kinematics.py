@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from jointfit_daemon.fusion._forward_kinematics import (
+    JointPlace,
     SegmentLength,
     joint_angle_estimate,
     joint_positions,
@@ -39,7 +40,10 @@ def test_position_standard_deviations_match_monte_carlo() -> None:
     bones = [Rotation.from_rotvec([0.4, 0.1, -0.2]), Rotation.from_rotvec([-0.9, 0.2, 0.3])]
     sds, reaches = (0.03, 0.05), [SegmentLength(0.42, 0.006), SegmentLength(0.4, 0.01)]
     places = joint_positions(
-        (0.1, 0.2, 0.9), [fused(r, sd) for r, sd in zip(bones, sds, strict=True)], reaches
+        (0.1, 0.2, 0.9),
+        [fused(r, sd) for r, sd in zip(bones, sds, strict=True)],
+        reaches,
+        [JointPlace(0), JointPlace(1)],
     )
     n, at = 40_000, np.array([0.1, 0.2, 0.9])
     for i, (bone, sd, reach) in enumerate(zip(bones, sds, reaches, strict=True)):

@@ -2,15 +2,16 @@
 
 All coordinates are in the static world: the optical world during the static pose, common to all
 body parts. The z axis of a segment points from its distal to its proximal joint center, x to the
-right of the subject along the flexion axis, and y = z × x. With static axes, all segments have the
-axes of the world in the static pose. The origin is the proximal joint center. Quantities that could
+right of the subject along the flexion axis, and y = z × x. A segment with two distal joints (the
+pelvis of both legs) has its x axis through them, from left to right, and its origin between them.
+With static axes, all segments have the axes of the world in the static pose. The origin of other
+segments is the proximal joint center. Quantities that could
 not be determined are None and described in `notes`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from math import radians
 from typing import TYPE_CHECKING
 
@@ -27,7 +28,17 @@ from jointfit_daemon.calibration.anatomy._joint_center import (
 from jointfit_daemon.calibration.anatomy._standing_prior import apply_standing_prior
 from jointfit_daemon.center_of_rotation import hinge_axis_sd
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import body_parts, configured_length, flexion_sign, visible
+from jointfit_daemon.limb_model import (
+    body_parts,
+    branch_runs,
+    configured_length,
+    distal_joints,
+    flexion_sign,
+    inner_joints,
+    is_left,
+    joint_parts,
+    visible,
+)
 from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
@@ -65,9 +76,10 @@ class JointCenter:
     covariance: Array
     """Covariance of the position, m², shape (3, 3)."""
     source: str
-    """``fit``, or ``length``: from the other end of a segment and its configured length."""
+    """``fit``; ``length``: from the other end of a segment and its configured length; ``midpoint``:
+    between the two distal joints of a branched segment."""
     fit: CenterEstimate | None
-    """Center of rotation from the movement; None for ``length``."""
+    """Center of rotation from the movement; None for the other sources."""
     gap_rms: float | None
     """RMS distance during the movement between the center fixed in the proximal body part and the
     center fixed in the distal body part, m."""
@@ -76,11 +88,11 @@ class JointCenter:
     def source_text(self) -> str:
         """Origin of the joint center.
 
-        ``markers``; ``markers, static pose`` if the movement left a direction unobserved; or
-        ``configured``: a configured length from another joint.
+        ``markers``; ``markers, static pose`` if the movement left a direction unobserved;
+        ``configured``: a configured length from another joint; or ``midpoint``.
         """
         if self.fit is None:
-            return "configured"
+            return "midpoint" if self.source == "midpoint" else "configured"
         return "markers, static pose" if len(self.fit.unseen) > 0 else "markers"
 
 
@@ -138,8 +150,9 @@ def find_anatomy(
     if unknown := [name for name, found in joints.items() if found is None]:
         notes.append(f"joint centers unknown: {', '.join(unknown)}; configure lengths in rig.toml")
 
-    ends = [(joints[a], joints[b]) for a, b in pairwise(chain.joints)]
-    z = [_long_axis(top, bottom) for top, bottom in ends]
+    ends = [_segment_ends(chain, i, joints) for i in range(len(chain.segments))]
+    branched = [len(distal_joints(chain, i)) > 1 for i in range(len(chain.segments))]
+    z = [_UP if wide else _long_axis(*pair) for wide, pair in zip(branched, ends, strict=True)]
     axes = _flexion_axes(chain, tracks, z)
 
     flags = [
@@ -150,7 +163,8 @@ def find_anatomy(
 
     q_static, lengths, sources = {}, {}, {}
     for i, segment in enumerate(chain.segments):
-        x = _right_axis(chain, i, axes)
+        x = _line_between(*ends[i]) if branched[i] else None
+        x = _right_axis(chain, i, axes) if x is None else x
         if x is None and _jointed(chain, tracks):
             raise CalibrationError(
                 f"{segment}: no adjacent joint flexed enough to determine its flexion axis; "
@@ -170,11 +184,23 @@ def _jointed(
 ) -> dict[str, tuple[ClusterTrack, ClusterTrack]]:
     """Return the two body parts of every joint with visible markers on both sides."""
     parts = [tracks.get(part) if part is not None else None for part in body_parts(chain)]
-    return {
-        joint: (above, below)
-        for joint, above, below in zip(chain.joints, parts, parts[1:], strict=False)
-        if above is not None and below is not None
-    }
+    found = {}
+    for joint, (proximal, distal) in zip(chain.joints, joint_parts(chain), strict=True):
+        above, below = parts[proximal], parts[distal]
+        if above is not None and below is not None:
+            found[joint] = (above, below)
+    return found
+
+
+def _segment_ends(
+    chain: Chain, i: int, joints: Mapping[str, JointCenter | None]
+) -> tuple[JointCenter | None, JointCenter | None]:
+    """Return the proximal and distal joint of a segment; of a branched one, the right and left."""
+    distal = distal_joints(chain, i)
+    if len(distal) == 1:
+        return joints[chain.joints[i]], joints[chain.joints[distal[0]]]
+    right, left = sorted(distal, key=lambda joint: is_left(chain, joint))
+    return joints[chain.joints[right]], joints[chain.joints[left]]
 
 
 def _fit_centers(
@@ -189,8 +215,8 @@ def _fit_centers(
         if method == "sphere":
             fit = joint_center(above, below, start)
         else:
-            i = chain.joints.index(joint)
-            fit = chosen_center(method, above, below, start, (turned[i], turned[i + 1]))
+            a, b = joint_parts(chain)[chain.joints.index(joint)]
+            fit = chosen_center(method, above, below, start, (turned[a], turned[b]))
 
         if fit.refused is None:
             points = above.to_static(below.points)
@@ -210,13 +236,16 @@ def _fit_centers(
         out[joint] = JointCenter(fit.center, on_skin(fit), "fit", fit, gap)
 
     # Combine the centers with the prior that the subject stood upright in the static pose.
-    straight = apply_standing_prior(
-        [None if joint is None else joint.center for joint in out.values()],
-        [None if joint is None else joint.covariance for joint in out.values()],
-    )
-    for name, pair in zip(chain.joints, straight, strict=True):
-        if (center := out[name]) is not None and pair is not None:
-            out[name] = replace(center, center=pair[0], covariance=pair[1])
+    for run in branch_runs(chain):
+        names = [chain.joints[i] for i in run]
+        centers = [out[name] for name in names]
+        straight = apply_standing_prior(
+            [None if joint is None else joint.center for joint in centers],
+            [None if joint is None else joint.covariance for joint in centers],
+        )
+        for name, center, pair in zip(names, centers, straight, strict=True):
+            if center is not None and pair is not None:
+                out[name] = replace(center, center=pair[0], covariance=pair[1])
     return out, notes
 
 
@@ -230,15 +259,23 @@ def place_unobserved(
     """
     whole = [joint for joint, fit in found.items() if len(fit.unseen) == 0]
     settled = {joint: found[joint] for joint in whole}
-    place = {joint: i for i, joint in enumerate(chain.joints)}
+    place = {  # run of joints above each other, and place in it
+        chain.joints[i]: (k, at)
+        for k, run in enumerate(branch_runs(chain))
+        for at, i in enumerate(run)
+    }
+
+    def apart(joint: str, other: str) -> int:
+        (k, at), (n, there) = place[joint], place[other]
+        return abs(at - there) if k == n else len(place)
 
     def distance(joint: str) -> int:
-        return min((abs(place[joint] - place[other]) for other in whole), default=0)
+        return min((apart(joint, other) for other in whole), default=0)
 
     hinges = [joint for joint in chain.joints if joint in found and joint not in settled]
     for joint in sorted(hinges, key=distance):
         # Mean horizontal position of the neighbors, (x, y), m.
-        near = [other for other in chain.joints if abs(place[other] - place[joint]) == 1]
+        near = [other for other in chain.joints if apart(joint, other) == 1]
         beside = [settled[other].center for other in near if other in settled]
         above = np.mean(beside, axis=0)[:2] if beside else None
         settled[joint] = align_vertically(found[joint], above)
@@ -266,18 +303,29 @@ def artefact_covariance(fit: CenterEstimate) -> Array:
 def _with_lengths(
     chain: Chain, fits: dict[str, JointCenter | None]
 ) -> dict[str, JointCenter | None]:
-    """Place missing joint centers vertically above or below known ones by configured lengths."""
+    """Place missing joint centers vertically above or below known ones by configured lengths.
+
+    The origin of a branched segment is the midpoint of its distal joints.
+    """
     joints = dict(fits)
     order = [*range(len(chain.segments)), *reversed(range(len(chain.segments)))]
     for i in order:
-        length = configured_length(chain, i)
-        top, bottom = chain.joints[i], chain.joints[i + 1]
-        if length is None:
+        length, distal = configured_length(chain, i), distal_joints(chain, i)
+        if length is None or len(distal) != 1:
             continue
+        top, bottom = chain.joints[i], chain.joints[distal[0]]
         if (known := joints[top]) is not None and joints[bottom] is None:
             joints[bottom] = _hung(known, -length)
         elif (known := joints[bottom]) is not None and joints[top] is None:
             joints[top] = _hung(known, length)
+
+    for i in range(len(chain.segments)):
+        if len(distal_joints(chain, i)) > 1:
+            one, other = _segment_ends(chain, i, joints)
+            if one is not None and other is not None:
+                center, covariance = one.center + other.center, one.covariance + other.covariance
+                middle = JointCenter(center / 2, covariance / 4, "midpoint", None, None)
+                joints[chain.joints[i]] = middle
     return joints
 
 
@@ -340,13 +388,20 @@ def _flexion_axes(
 
 def _right_axis(chain: Chain, i: int, axes: Mapping[str, FlexionAxis]) -> Array | None:
     """Return the flexion axis of a segment: from inner joints if possible, else from outer ones."""
-    inner = set(chain.joints[1:-1])
-    ends = (chain.joints[i], chain.joints[i + 1])
-    for wanted in ([j for j in ends if j in inner], list(ends), sorted(inner)):
+    inner = {joint.name for joint in inner_joints(chain)}
+    ends = [chain.joints[k] for k in (i, *distal_joints(chain, i))]
+    for wanted in ([j for j in ends if j in inner], ends, sorted(inner)):
         if usable := [axes[j].axis * axes[j].rms for j in wanted if j in axes]:
             mean = np.sum(usable, axis=0)
             return np.asarray(mean / np.linalg.norm(mean))
     return None
+
+
+def _line_between(right: JointCenter | None, left: JointCenter | None) -> Array | None:
+    if right is None or left is None:
+        return None
+    x = right.center - left.center
+    return np.asarray(x / np.linalg.norm(x))
 
 
 def _long_axis(top: JointCenter | None, bottom: JointCenter | None) -> Array:

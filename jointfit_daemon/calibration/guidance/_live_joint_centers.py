@@ -30,7 +30,7 @@ from jointfit_daemon.calibration.anatomy import (
 )
 from jointfit_daemon.calibration.guidance._live_clusters import LiveClusters
 from jointfit_daemon.center_of_rotation.spatial import RunningSphere, centered
-from jointfit_daemon.limb_model import body_parts
+from jointfit_daemon.limb_model import body_parts, branch_runs, joint_parts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -101,7 +101,10 @@ class LiveJointCenters:
         ends = body_parts(chain)
         pairs = [
             (joint, place[above], place[below])
-            for joint, above, below in zip(chain.joints, ends, ends[1:], strict=False)
+            for joint, above, below in (
+                (name, ends[a], ends[b])
+                for name, (a, b) in zip(chain.joints, joint_parts(chain), strict=True)
+            )
             if above is not None and below is not None and {above, below} <= place.keys()
         ]
         self.joints = tuple(joint for joint, _, _ in pairs)
@@ -165,12 +168,14 @@ class LiveJointCenters:
         fits = {joint: fit for joint, (_, fit) in self._latest.items() if fit is not None}
         settled = place_unobserved(self._chain, fits)
 
-        order = self._chain.joints
-        straight = apply_standing_prior(
-            [settled[j].center if j in settled else None for j in order],
-            [on_skin(settled[j]) if j in settled else None for j in order],
-        )
-        placed = dict(zip(order, straight, strict=True))
+        placed: dict[str, tuple[Array, Array] | None] = {}
+        for run in branch_runs(self._chain):
+            order = [self._chain.joints[i] for i in run]
+            straight = apply_standing_prior(
+                [settled[j].center if j in settled else None for j in order],
+                [on_skin(settled[j]) if j in settled else None for j in order],
+            )
+            placed |= zip(order, straight, strict=True)
         found = {joint: one for joint, (one, _) in self._latest.items()}
         for joint, one in found.items():
             if (pair := placed[joint]) is not None:

@@ -30,7 +30,12 @@ from jointfit_daemon.calibration.guidance._movement_instructions import (
 )
 from jointfit_daemon.calibration.guidance._movement_progress import MovementProgress
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
-from jointfit_daemon.limb_model import configured_length
+from jointfit_daemon.limb_model import (
+    configured_length,
+    distal_joints,
+    inner_joints,
+    proximal_segment,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -130,7 +135,7 @@ class MovementGuide:
 
         # Conditions on each joint: center from markers, then flexion measured by sensors.
         joints: dict[str, Mapping[str, object]] = {}
-        inner = self._chain.joints[1:-1]
+        inner = {joint.name for joint in inner_joints(self._chain)}
         for joint in self._chain.joints:
             figures_of_joint: dict[str, object] = {}
             lacking: str | None = None
@@ -160,10 +165,16 @@ class MovementGuide:
         """Return the figures of a joint without a center from markers."""
         i = self._chain.joints.index(joint)
         count = len(self._chain.segments)
-        beside = [configured_length(self._chain, k) for k in (i - 1, i) if 0 <= k < count]
+        beside = [
+            configured_length(self._chain, k)
+            for k in (proximal_segment(self._chain, i), i)
+            if k is not None and k < count
+        ]
         source = "unknown" if beside == [None] * len(beside) else "configured"
         if 0 < i < count:
             source = "sensors"
+        elif i == 0 and len(distal_joints(self._chain, i)) > 1:
+            source = "midpoint"
 
         return {
             "source": source,

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import inner_joints
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -76,9 +77,8 @@ class MovementProgress:
 
     def update(self, latest: Mapping[str, Quaternion]) -> None:
         """Process the newest orientation of each available sensor."""
-        for joint, above, below in zip(
-            self.chain.joints[1:-1], self.chain.sensors, self.chain.sensors[1:], strict=False
-        ):
+        for _, joint, proximal, distal in inner_joints(self.chain):
+            above, below = self.chain.sensors[proximal], self.chain.sensors[distal]
             a = next((sensor for sensor in above if sensor in latest), None)
             b = next((sensor for sensor in below if sensor in latest), None)
             if a is None or b is None:

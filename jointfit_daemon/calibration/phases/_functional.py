@@ -66,6 +66,7 @@ from jointfit_daemon.limb_model import (
     Calibration,
     SegmentCalibration,
     SensorCalibration,
+    chain_fields,
     cluster_record,
     visible,
 )
@@ -155,9 +156,7 @@ def fit_calibration(
     )
     return Calibration(
         method=settings.method,
-        joints=chain.joints,
-        segments=chain.segments,
-        chain_sensors=chain.sensors,
+        **chain_fields(chain),
         sensor=sensors,
         segment=_segments(anatomy, models),
         joint={name: joint_record(found) for name, found in anatomy.joints.items()},

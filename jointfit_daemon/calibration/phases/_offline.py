@@ -33,7 +33,9 @@ from jointfit_daemon.limb_model import (
     JointCalibration,
     SegmentCalibration,
     SensorCalibration,
+    chain_fields,
     flexion_sign,
+    inner_joints,
     neighbor,
     visible,
 )
@@ -155,9 +157,7 @@ def fit_offline(
     identity = as_quaternion(rotation.IDENTITY.tolist())
     return Calibration(
         method=method,
-        joints=chain.joints,
-        segments=chain.segments,
-        chain_sensors=chain.sensors,
+        **chain_fields(chain),
         sensor={
             name: SensorCalibration(identity, as_quaternion(mounts[name].tolist()))
             for group in chain.sensors
@@ -326,7 +326,10 @@ class _Fold:
 
 
 def _inner(chain: Chain) -> Iterable[tuple[str, str, str]]:
-    return zip(chain.joints[1:-1], chain.segments, chain.segments[1:], strict=False)
+    names = chain.segments
+    return [
+        (joint.name, names[joint.proximal], names[joint.distal]) for joint in inner_joints(chain)
+    ]
 
 
 def _flexion(above: Array, below: Array, axis: Array) -> Array:

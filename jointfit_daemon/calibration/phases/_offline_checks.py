@@ -13,6 +13,7 @@ from jointfit_daemon.calibration.phases._training_set import MISALIGNED, identic
 from jointfit_daemon.calibration.registration import fit_sensor_alignment, robust_mean
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.joint_angles import joint_rotation
+from jointfit_daemon.limb_model import inner_joints
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -36,9 +37,11 @@ rad."""
 def unmoved_joint(chain: Chain, trials: Sequence[OfflineTrial]) -> str | None:
     """Return a message on a joint (or single segment) that does not move; None if all move."""
     reference = {s: np.concatenate([t.reference[s] for t in trials]) for s in chain.segments}
-    inner = zip(chain.joints[1:-1], chain.segments, chain.segments[1:], strict=False)
     movements = {
-        joint: joint_rotation(reference[above], reference[below]) for joint, above, below in inner
+        joint.name: joint_rotation(
+            reference[chain.segments[joint.proximal]], reference[chain.segments[joint.distal]]
+        )
+        for joint in inner_joints(chain)
     }
     for name, q in (movements or reference).items():  # single segment without inner joint
         known = q[np.isfinite(q).all(axis=1)]

@@ -10,7 +10,6 @@ frames, differs too much, or if cameras and sensors are inconsistent.
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +33,7 @@ from jointfit_daemon.calibration.soft_tissue import (
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import (
     angle_convention,
+    inner_joints,
     model_key,
     neighbor,
     restore_cluster,
@@ -228,8 +228,9 @@ def _figures(chain: Chain, models: Models, frames: LimbTraining) -> dict[str, fl
     """Return the RMS error of every segment and of the flexion of every inner joint, rad."""
     estimates, truth = _predictions(chain, models, frames), frames.reference
     found = {n: rms(rotation.angle_between(estimates[n], truth[n])) for n in chain.segments}
-    for i, (above, below) in enumerate(pairwise(chain.segments), 1):
-        found[chain.joints[i]] = flexion_error(
+    for i, joint, proximal, distal in inner_joints(chain):
+        above, below = chain.segments[proximal], chain.segments[distal]
+        found[joint] = flexion_error(
             (estimates[above], estimates[below]),
             (truth[above], truth[below]),
             angle_convention(chain, i),

@@ -19,7 +19,13 @@ from jointfit_daemon.calibration._quality import (
 from jointfit_daemon.calibration.anatomy import SKIN_SD_M, artefact_covariance
 from jointfit_daemon.calibration.registration import NO_LAG
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import CalibratedCenter, JointCalibration, body_parts, vector
+from jointfit_daemon.limb_model import (
+    CalibratedCenter,
+    JointCalibration,
+    body_parts,
+    joint_parts,
+    vector,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -105,7 +111,7 @@ def _center_quality(
 ) -> dict[str, CenterQuality]:
     """Return the center of every joint from the movement, in coordinates of both body parts."""
     parts, centers = body_parts(chain), {}
-    for i, joint in enumerate(chain.joints):
+    for joint, adjacent in zip(chain.joints, joint_parts(chain), strict=True):
         found = anatomy.joints[joint]
         if found is None or found.fit is None:
             continue
@@ -113,7 +119,7 @@ def _center_quality(
         covariance = artefact_covariance(fit)
         sides = {
             part: _coordinates(fit, covariance, tracks[part].origin, anatomy.q_static.get(part))
-            for part in parts[i : i + 2]
+            for part in (parts[k] for k in adjacent)
             if part is not None
         }
         observed = 3 - len(fit.unseen)

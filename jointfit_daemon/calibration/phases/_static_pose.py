@@ -31,6 +31,7 @@ from jointfit_daemon.limb_model import (
     MeanModel,
     SegmentCalibration,
     SensorCalibration,
+    chain_fields,
     configured_length,
     equal_weights,
     model_key,
@@ -152,9 +153,7 @@ def fit_static_only(
     }
     return Calibration(
         method="mean",
-        joints=chain.joints,
-        segments=chain.segments,
-        chain_sensors=chain.sensors,
+        **chain_fields(chain),
         sensor=sensors,
         segment={
             name: SegmentCalibration(

@@ -66,6 +66,8 @@ def _faults(c: Calibration) -> Iterator[str]:
     yield from _same("segment", c.segment, c.segments)
     yield from _same("joint", c.joint, c.joints)
 
+    yield from _branches(c)
+
     # Content of each record; names are correct here.
     yield from _sensors(c)
     for name, segment in c.segment.items():
@@ -79,6 +81,31 @@ def _faults(c: Calibration) -> Iterator[str]:
     for name, rho in c.correlations.items():
         if name not in c.joints or not _number(rho, -1.0, 1.0):
             yield f"correlations.{name}: {rho!r}"
+
+
+def _branches(c: Calibration) -> Iterator[str]:
+    """Check that every joint of a branched limb follows the segment that carries it."""
+    if not c.parents and not c.left_joints:
+        return
+    if not len(c.parents) == len(c.left_joints) == len(c.joints) > len(c.segments):
+        yield f"parents and left_joints: expected {len(c.joints)} entries, one for each joint"
+        return
+    if not all(isinstance(left, bool) for left in c.left_joints):
+        yield f"left_joints: {list(c.left_joints)!r:.80}, expected true or false"
+
+    first, *others = c.parents
+    known = [
+        type(parent) is int and 0 <= parent < min(joint, len(c.segments))
+        for joint, parent in enumerate(others, 1)
+    ]
+    if first is not None or not all(known):
+        yield f"parents: {list(c.parents)!r:.80}, expected null and numbers of earlier segments"
+        return
+    counts = [others.count(segment) for segment in range(len(c.segments))]
+    if counts[0] != 2 or any(count != 1 for count in counts[1:]):
+        yield f"parents: {list(c.parents)!r:.80}, expected two joints on the first segment only"
+    elif sum(c.left_joints[j] for j, parent in enumerate(c.parents) if parent == 0) != 1:
+        yield "left_joints: expected one right and one left joint on the first segment"
 
 
 def _sensors(c: Calibration) -> Iterator[str]:

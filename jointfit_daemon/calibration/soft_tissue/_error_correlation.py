@@ -17,7 +17,7 @@ import numpy as np
 from jointfit_daemon.calibration.soft_tissue._kernel_fit import fit_kernel_with_residuals
 from jointfit_daemon.calibration.soft_tissue._limb_fit import mean_of
 from jointfit_daemon.calibration.soft_tissue._segment_training import FEWEST_FRAMES, SegmentTraining
-from jointfit_daemon.limb_model import neighbor
+from jointfit_daemon.limb_model import inner_joints, neighbor
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -40,7 +40,7 @@ def joint_error_correlations(
     if method != "anchored":
         return {}
     found = {}
-    for i, joint in enumerate(chain.joints[1:-1]):
+    for joint in inner_joints(chain):
         # Sensors of each segment, mean of its neighbor, and its reference.
         columns = [
             [
@@ -48,7 +48,7 @@ def joint_error_correlations(
                 mean_of(training, neighbor(chain, k)),
                 training.reference[chain.segments[k]],
             ]
-            for k in (i, i + 1)
+            for k in (joint.proximal, joint.distal)
         ]
         whole = np.all([np.isfinite(q).all(axis=1) for q in (*columns[0], *columns[1])], axis=0)
         if np.count_nonzero(whole) < FEWEST_FRAMES:
@@ -59,7 +59,7 @@ def joint_error_correlations(
             SegmentTraining.of([q[whole] for q in sensors], near[whole], truth[whole], trials)
             for *sensors, near, truth in columns
         )
-        found[joint] = error_correlation(upper, lower)
+        found[joint.name] = error_correlation(upper, lower)
     return found
 
 

@@ -24,6 +24,7 @@ from jointfit_daemon.limb_model import (
     angle_convention,
     equal_weights,
     fuse,
+    inner_joints,
     model_key,
     neighbor,
 )
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.limb_model import SegmentModel
+    from jointfit_daemon.limb_model import InnerJoint, SegmentModel
     from jointfit_daemon.model import Chain
 
 
@@ -151,9 +152,10 @@ def evaluate_methods(
     def orientation_error(i: int, q: Array) -> float | None:
         return _finite(rms(rotation.angle_between(q, truth[i])))
 
-    def joint_error(i: int, above: Array, below: Array) -> float | None:
-        convention = angle_convention(chain, i + 1)
-        return _finite(flexion_error((above, below), (truth[i], truth[i + 1]), convention))
+    def joint_error(joint: InnerJoint, above: Array, below: Array) -> float | None:
+        convention = angle_convention(chain, joint.number)
+        ends = (truth[joint.proximal], truth[joint.distal])
+        return _finite(flexion_error((above, below), ends, convention))
 
     segments = {
         segment: MethodErrors(
@@ -163,14 +165,14 @@ def evaluate_methods(
         for i, segment in enumerate(chain.segments)
     }
     joints = {
-        joint: MethodErrors(
-            **{m: joint_error(i, q[i], q[i + 1]) for m, q in estimates.items()},
+        j.name: MethodErrors(
+            **{m: joint_error(j, q[j.proximal], q[j.distal]) for m, q in estimates.items()},
             sensors={
-                f"{a}+{b}": joint_error(i, last.sensors[a], last.sensors[b])
-                for a, b in zip(chain.sensors[i], chain.sensors[i + 1], strict=False)
+                f"{a}+{b}": joint_error(j, last.sensors[a], last.sensors[b])
+                for a, b in zip(chain.sensors[j.proximal], chain.sensors[j.distal], strict=False)
             },
         )
-        for i, joint in enumerate(chain.joints[1:-1])
+        for j in inner_joints(chain)
     }
     found = HoldoutQuality(method, share, len(last), segments, joints)
     if procedure == "corrected":

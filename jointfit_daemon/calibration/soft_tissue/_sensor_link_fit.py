@@ -30,6 +30,7 @@ from jointfit_daemon.limb_model import (
     LEAST_LEVEL,
     LinkKind,
     SensorLink,
+    inner_joints,
     level_axis,
     neighbor,
     posture_one,
@@ -84,12 +85,12 @@ def fit_links(
     for i, group in enumerate(chain.sensors):
         near = neighbor(chain, i) or group
         links += [_fit("pair", (a, b), near, sensors) for a, b in combinations(group, 2)]
-        if i + 1 < len(chain.sensors):
-            q_a, q_b = (q_static[chain.segments[k]] for k in (i, i + 1))
+        for distal in (joint.distal for joint in inner_joints(chain) if joint.proximal == i):
+            q_a, q_b = (q_static[chain.segments[k]] for k in (i, distal))
             standing = float(_axis_headings(np.array([q_a]), np.array([q_b]))[0])
             links += [
                 _fit("joint", (a, b), (b,), sensors, standing)
-                for a, b in product(group, chain.sensors[i + 1])
+                for a, b in product(group, chain.sensors[distal])
             ]
     return tuple(link for link in links if link is not None)
 

@@ -8,13 +8,13 @@ posture. They are encoded as text; a quaternion component is rounded to 1/32767,
 from __future__ import annotations
 
 from base64 import b64decode, b64encode
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from jointfit_daemon.calibration.soft_tissue._limb_fit import LimbTraining, mean_of
 from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import inner_joints
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -102,7 +102,7 @@ def postures(chain: Chain, training: LimbTraining) -> NDArray[np.int64]:
     seen = [rotation.rotate(rotation.conjugate(means[0]), np.array([0.0, 0.0, 1.0]))]
     seen += [
         rotation.log(rotation.multiply(rotation.conjugate(above), below))
-        for above, below in pairwise(means)
+        for above, below in ((means[j.proximal], means[j.distal]) for j in inner_joints(chain))
     ]
     return np.round(np.concatenate(seen, axis=1) / CELL).astype(np.int64)
 

@@ -32,14 +32,14 @@ from jointfit_daemon.fusion.faults._magnetic_disturbance import (
 )
 from jointfit_daemon.fusion.faults._slip import SlipDetector, pair_corrections, untrained_link
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
-from jointfit_daemon.limb_model import axis_heading_one, up_one
+from jointfit_daemon.limb_model import axis_heading_one, inner_joints, up_one
 from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
 
     from jointfit_daemon.fusion.faults._sensor_monitor import SensorReport
-    from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.limb_model import Calibration, InnerJoint, SensorLink
     from jointfit_daemon.model import Chain, Quaternion, Vector
 
     Inputs = dict[str, Quaternion]
@@ -98,14 +98,9 @@ class ConsistencyMonitor:
             for pair in pairs
             if pair in links
         }
-        poses = [calibration.segment[name].q_static for name in chain.segments]
+        self._inner = inner_joints(chain)
         self._joints = [
-            JointHeadingMonitor(
-                [links[a, b] for a in above for b in below if (a, b) in links],
-                axis_heading_one(poses[i], poses[i + 1]) or 0.0,
-                drifts=any(name in drifting for name in (*above, *below)),
-            )
-            for i, (above, below) in enumerate(zip(chain.sensors, chain.sensors[1:], strict=False))
+            _joint_monitor(chain, joint, calibration, links, drifting) for joint in self._inner
         ]
 
         drifts = any(name in drifting for group in chain.sensors for name in group)
@@ -248,7 +243,8 @@ class ConsistencyMonitor:
         self, t_ns: int, i: int, inputs: Inputs, verticals: Mapping[str, Vector]
     ) -> list[HeadingDifference]:
         joint, differences = self._joints[i], list[HeadingDifference]()
-        consistent = self._consistent[i] and self._consistent[i + 1]
+        above, below = self._inner[i].proximal, self._inner[i].distal
+        consistent = self._consistent[above] and self._consistent[below]
         for link in joint.links:
             if link.a not in inputs or link.b not in inputs or self._tilted(link.a, link.b):
                 continue
@@ -267,7 +263,7 @@ class ConsistencyMonitor:
         a, b, residual, sd = differences[0]
         best = min((d.angle + self._heading_correction(d.a, d.b) for d in differences), key=abs)
         if joint.update(t_ns, residual, best, sd):
-            proximal, distal = self._chain.segments[i : i + 2]
+            proximal, distal = self._chain.segments[above], self._chain.segments[below]
             self._reports.append(
                 heading_report(joint.difference, proximal, distal, inconsistent=joint.inconsistent)
             )
@@ -275,7 +271,7 @@ class ConsistencyMonitor:
         uncorrected = residual + self._heading_correction(a, b)
         if consistent and not joint.inconsistent:
             joint.drift.add_measurement(
-                uncorrected + self._segment_drift[i + 1] - self._segment_drift[i]
+                uncorrected + self._segment_drift[below] - self._segment_drift[above]
             )
         return [HeadingDifference(a, b, uncorrected, sd)]
 
@@ -305,10 +301,10 @@ class ConsistencyMonitor:
     # --- heading drift, once a second --------------------------------------------------------
 
     def _distribute_drifts(self) -> None:
-        """Compute the drift of each sensor: sums along the chain, with mean 0."""
+        """Compute the drift of each sensor: sums along the branches, with mean 0."""
         along = [0.0]
-        for joint in self._joints:
-            along.append(along[-1] + (joint.drift.heading if joint.links else 0.0))
+        for inner, joint in zip(self._inner, self._joints, strict=True):
+            along.append(along[inner.proximal] + (joint.drift.heading if joint.links else 0.0))
         middle = sum(along) / len(along)
         self._segment_drift = [drift - middle for drift in along]
 
@@ -334,21 +330,21 @@ class ConsistencyMonitor:
                 self._reported_drifts.discard(i)
             elif i not in self._reported_drifts and joint.links and size > REPORTED_DRIFT:
                 self._reported_drifts.add(i)
-                proximal, distal = self._chain.segments[i : i + 2]
-                name = self._chain.joints[i + 1]
+                _, name, above, below = self._inner[i]
+                proximal, distal = self._chain.segments[above], self._chain.segments[below]
                 self._reports.append(drift_report(joint.drift.heading, proximal, distal, name))
 
     # --- result ------------------------------------------------------------------------------
 
     def _evaluate(self, inputs: Inputs) -> ConsistencyResult:
         spread, slipped, flags = self._evaluate_pairs(inputs)
-        for i, joint in enumerate(self._joints):
+        for inner, joint in zip(self._inner, self._joints, strict=True):
             variance = joint.extra_variance / 3.0  # heading is one axis of three
             if variance:
-                for k in (i, i + 1):
+                for k in (inner.proximal, inner.distal):
                     spread[k] = sqrt(spread[k] * spread[k] + variance)
             if joint.inconsistent:
-                flags.append(FrameFlag.HEADING_DISAGREES.of(self._chain.joints[i + 1]))
+                flags.append(FrameFlag.HEADING_DISAGREES.of(inner.name))
         if self._common is not None and self._common.sd > REPORTED_DRIFT:
             flags.append(FrameFlag.HEADING_UNSEEN)
 
@@ -419,10 +415,27 @@ class ConsistencyMonitor:
             for pair in pairs
         }
         headings = {
-            self._chain.joints[i + 1]: {
+            inner.name: {
                 "drift_deg": round(degrees(joint.drift.heading), 2) if joint.links else None,
                 "sd_deg": round(degrees(joint.drift.sd), 2) if joint.links else None,
             }
-            for i, joint in enumerate(self._joints)
+            for inner, joint in zip(self._inner, self._joints, strict=True)
         }
         return {"pairs": pairs, "headings": headings}
+
+
+def _joint_monitor(
+    chain: Chain,
+    joint: InnerJoint,
+    calibration: Calibration,
+    links: Mapping[tuple[str, str], SensorLink],
+    drifting: Collection[str],
+) -> JointHeadingMonitor:
+    ends = (joint.proximal, joint.distal)
+    above, below = (chain.sensors[k] for k in ends)
+    standing = axis_heading_one(*(calibration.segment[chain.segments[k]].q_static for k in ends))
+    return JointHeadingMonitor(
+        [links[a, b] for a in above for b in below if (a, b) in links],
+        standing or 0.0,
+        drifts=any(name in drifting for name in (*above, *below)),
+    )

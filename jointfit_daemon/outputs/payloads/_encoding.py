@@ -128,7 +128,9 @@ def encode_optical(state: OpticalState, offset_ns: int) -> bytes:
                 for segment in state.segments
             },
             "joints": {
-                joint.name: _optical_joint(joint, inner=0 < i < len(state.joints) - 1)
+                joint.name: _optical_joint(
+                    joint, inner=0 < i < (len(state.segments) or len(state.joints) - 1)
+                )
                 for i, joint in enumerate(state.joints)
             },
         }
@@ -258,7 +260,7 @@ def _joint(state: LimbState, number: int) -> dict[str, Any]:
         "p_m": _rounded(joint.position, 4),
         "sd_m": _metres(joint.position_sd),
     }
-    inner = 0 < number < len(state.joints) - 1
+    inner = 0 < number < (len(state.segments) or len(state.joints) - 1)
     if not inner and joint.angles is None:
         return shown  # the ends of the chain have no angles
     return shown | {
@@ -274,10 +276,9 @@ def _patent(state: LimbState, number: int) -> dict[str, float | bool | None] | N
     """Return the patent's angles of a joint; None if a segment orientation is unknown."""
     if number >= len(state.segments):
         return None
-    above, below = (
-        state.segments[number - 1].q_world_segment,
-        state.segments[number].q_world_segment,
-    )
+    proximal = state.joints[number].proximal
+    above = state.segments[number - 1 if proximal is None else proximal].q_world_segment
+    below = state.segments[number].q_world_segment
     if above is None or below is None:
         return None
     alpha, beta, gamma, joint, gimbal = read_patent(above, below)

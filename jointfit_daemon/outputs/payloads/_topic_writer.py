@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any
 import orjson
 
 from jointfit_daemon import __version__
-from jointfit_daemon.limb_model import angle_convention
+from jointfit_daemon.limb_model import (
+    angle_convention,
+    body_parts,
+    inner_joints,
+    is_left,
+    joint_parts,
+)
 from jointfit_daemon.model import (
     ChainModelState,
     LimbState,
@@ -49,6 +55,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.model import Chain
     from jointfit_daemon.outputs.mqtt import Outbox
     from jointfit_daemon.outputs.payloads._health_encoding import BridgeHealth
     from jointfit_daemon.outputs.topics import Topic
@@ -212,6 +219,27 @@ def _error(reply: Reply) -> dict[str, Any] | None:
     return {"faults": [fault], "more": 0} | dict(reply.error)
 
 
+def _sides(chain: Chain) -> dict[str, Any]:
+    """Return the side of a limb; of a branched one also its connections."""
+    if not chain.parents:
+        return {"side": "left" if chain.left_side else "right"}
+    parts = body_parts(chain)
+    return {
+        "side": "both",
+        "connections": {
+            name: {
+                "parent": parts[above],
+                "child": parts[below],
+                "side": "left" if is_left(chain, number) else "right",
+            }
+            for number, (name, (above, below)) in enumerate(
+                zip(chain.joints, joint_parts(chain), strict=True)
+            )
+            if number > 0
+        },
+    }
+
+
 def _info(rig: Rig) -> dict[str, Any]:
     """Return the payload of ``bridge/info``."""
     config = orjson.dumps(rig.table, str, orjson.OPT_SORT_KEYS)
@@ -225,11 +253,11 @@ def _info(rig: Rig) -> dict[str, Any]:
         "rig": rig.name,
         "config_sha256": hashlib.sha256(config).hexdigest(),
         "output_rate_hz": rig.output_rate_hz,
-        "side": "left" if rig.chain.left_side else "right",
+        **_sides(rig.chain),
         "joints": rig.chain.joints,
         "angles": {
-            joint: angle_convention(rig.chain, i)
-            for i, joint in enumerate(rig.chain.joints[1:-1], 1)
+            joint.name: angle_convention(rig.chain, joint.number)
+            for joint in inner_joints(rig.chain)
         },
         "segments": rig.chain.segments,
         "sensors": dict(zip(rig.chain.segments, rig.chain.sensors, strict=True)),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jointfit_daemon.limb_model import proximal_segment
 from jointfit_daemon.nearest_name import unknown_name
 from jointfit_daemon.tools.fuse._tables import FEWEST, UnusableInputError, read_recording
 
@@ -145,13 +146,27 @@ def _measured_lengths(
     return found
 
 
+def placed_joints(chain: Chain, lengths: Sequence[float | None]) -> dict[int, str]:
+    """Return number and name of every joint whose position follows from the known lengths.
+
+    If that is the first joint alone, which is the origin, there is none.
+    """
+    placed = {0: chain.joints[0]}
+    for joint in range(1, len(chain.joints)):
+        segment = proximal_segment(chain, joint)
+        if segment is not None and segment in placed and lengths[segment] is not None:
+            placed[joint] = chain.joints[joint]
+    return placed if len(placed) > 1 else {}
+
+
 def left_out_positions(chain: Chain, lengths: Sequence[float | None]) -> str | None:
     """Return a note on the joints without position, with the remedy; None if all are known."""
     known = dict(zip(chain.segments, lengths, strict=True))
     unknown = [segment for segment, length in known.items() if length is None]
     if not unknown:
         return None
-    left_out = chain.joints[chain.segments.index(unknown[0]) + 1 :]
+    placed = placed_joints(chain, lengths)
+    left_out = [name for i, name in enumerate(chain.joints) if i > 0 and i not in placed]
     options = " ".join(f"--length {segment}=METRES" for segment in unknown)
     return (
         f"positions of {', '.join(left_out)} left out, because the length of "

@@ -39,7 +39,8 @@ def calibration_notes(
         )
 
     # a model of `jointfit fuse fit` has no side either, but its user chose the signs
-    if not left and "offline" not in calibration.quality:
+    known = left or bool(calibration.left_joints) or "offline" in calibration.quality
+    if not known:
         notes.append(
             "side assumed to be right, because a stored calibration does not contain it: add --left"
             " for a left limb"

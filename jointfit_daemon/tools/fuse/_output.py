@@ -21,9 +21,9 @@ from jointfit_daemon.files.orientations import (
 )
 from jointfit_daemon.fusion import LimbFuser
 from jointfit_daemon.kinematics.joint_angles import read_patent
-from jointfit_daemon.limb_model import configured_length, visible
+from jointfit_daemon.limb_model import configured_length, inner_joints, visible
 from jointfit_daemon.model import ANGLE_NAMES, AngleConvention, Chain
-from jointfit_daemon.tools.fuse._lengths import left_out_positions
+from jointfit_daemon.tools.fuse._lengths import left_out_positions, placed_joints
 from jointfit_daemon.tools.fuse._notes import calibration_notes
 from jointfit_daemon.tools.opensim_tables import (
     WrittenTable,
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.files.axes import Axis
-    from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.limb_model import Calibration, InnerJoint
     from jointfit_daemon.model import LimbState, Vector
     from jointfit_daemon.tools.fuse._tables import OrientationRecording
 
@@ -120,6 +120,8 @@ def chain_of(
         left_side=left,
         origin=origin,
         lengths=tuple(given.get(segment) for segment in calibration.segments),
+        parents=calibration.parents,
+        left_joints=calibration.left_joints,
     )
 
 
@@ -143,15 +145,14 @@ def fuse_trial(calibration: Calibration, table: OrientationRecording, chain: Cha
         t_ns = round(t_s * 1e9)
         states.append(fuser.fuse(t_ns, t_ns, k, alive))
 
-    # The lengths of all proximal segments are needed; the first joint alone is the origin.
+    # The lengths of the segments up to a joint are needed; the first joint alone is the origin.
     configured = [configured_length(chain, i) for i in range(len(chain.segments))]
     lengths = [
         calibration.segment[name].length if length is None else length
         for name, length in zip(chain.segments, configured, strict=True)
     ]
     note = left_out_positions(chain, lengths)
-    segments_placed = lengths.index(None) if note else len(lengths)
-    placed = chain.joints[: segments_placed + 1] if segments_placed else ()
+    placed = placed_joints(chain, lengths)
 
     flags = Counter(flag for state in states for flag in state.flags)
     return FusedTrial(
@@ -164,27 +165,27 @@ def fuse_trial(calibration: Calibration, table: OrientationRecording, chain: Cha
             name: np.array([state.segments[i].sd for state in states], np.float64)
             for i, name in enumerate(chain.segments)
         },
-        {chain.joints[i]: _joint_over_time(states, i) for i in range(1, len(chain.segments))},
+        {joint.name: _joint_over_time(states, joint) for joint in inner_joints(chain)},
         {
             name: FusedPosition(
                 np.array([state.joints[i].position or _UNKNOWN[:3] for state in states]),
                 np.array([state.joints[i].position_sd for state in states], np.float64),
             )
-            for i, name in enumerate(placed)
+            for i, name in placed.items()
         },
         {flag: count / len(states) for flag, count in sorted(flags.items())},
         (*calibration_notes(calibration, table.q, left=chain.left_side), *filter(None, [note])),
     )
 
 
-def _joint_over_time(states: Sequence[LimbState], number: int) -> FusedAngles:
-    """Return the angles of joint `number`, which lies between two segments."""
-    joints = [state.joints[number] for state in states]
+def _joint_over_time(states: Sequence[LimbState], joint: InnerJoint) -> FusedAngles:
+    """Return the angles of a joint between two segments."""
+    joints = [state.joints[joint.number] for state in states]
     ends = [[segment.q_world_segment for segment in state.segments] for state in states]
     patent = np.array(
         [
             _UNKNOWN if above is None or below is None else read_patent(above, below)
-            for above, below in [(q[number - 1], q[number]) for q in ends]
+            for above, below in [(q[joint.proximal], q[joint.distal]) for q in ends]
         ]
     )
     return FusedAngles(
