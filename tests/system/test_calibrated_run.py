@@ -18,6 +18,7 @@ import pytest
 from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
 from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import Configured, JobFinished, SourceClosed, SourceOpened
+from tests.payload_check import payload_fault
 from tests.system.station import SENSORS, Listener, Station, hang_up, running, stopped
 
 if TYPE_CHECKING:
@@ -61,6 +62,8 @@ class CalibratedRun:
     """Payloads of `optical/centers`."""
     chain: list[dict[str, Any]]
     """Payloads of `optical/chain`."""
+    misfits: dict[str, str]
+    """Last fault of a payload against its model, by topic."""
 
 
 async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
@@ -71,10 +74,13 @@ async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
     optical: list[dict[str, Any]] = []
     centers: list[dict[str, Any]] = []
     chain: list[dict[str, Any]] = []
+    misfits: dict[str, str] = {}
     take = Listener._take
 
     def note(self: Listener, topic: str, payload: Any) -> None:
         found.setdefault(topic, set()).update(keys(payload))
+        if (misfit := payload_fault(topic, payload)) is not None:
+            misfits[topic] = misfit
         if topic == "optical/pose":
             optical.append(payload)
         if topic == "optical/centers":
@@ -104,7 +110,7 @@ async def calibrated_run(folder: Path, port: int) -> CalibratedRun:
             assert code == 0, station.log
 
     (recording,) = (folder / "state" / "recordings").iterdir()
-    return CalibratedRun(station.log, recording, found, optical, centers, chain)
+    return CalibratedRun(station.log, recording, found, optical, centers, chain, misfits)
 
 
 async def calibrate(simulator: Simulator, listener: Listener) -> None:
@@ -169,6 +175,8 @@ async def test_payloads_log_and_replay_of_a_calibrated_run(
     run = await calibrated_run(tmp_path, broker.port)
     with subtests.test("every published key is documented and every documented key is published"):
         compare_keys_with_the_page(run)
+    with subtests.test("every published payload fits its model"):
+        assert run.misfits == {}
     with subtests.test("the log has one line for each phase and no output of the worker"):
         count_phases_in_the_log(run)
     with subtests.test("cameras and IMUs are compared at one instant"):

@@ -1,0 +1,107 @@
+"""Models of the ``data`` of answers, by request."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from jointfit_daemon.outputs.payload_models._streams import Number, Table, Time
+from jointfit_daemon.pipeline.events import CalibrationPhase  # noqa: TC001 - pydantic reads it
+
+
+class PhaseAnswer(Table):
+    """Answer to ``calibrate`` and ``static``."""
+
+    phase: CalibrationPhase
+
+
+class MarkAnswer(Table):
+    """Answer to ``mark``."""
+
+    number: int = Field(description="number of the mark since the start of the daemon")
+    t_us: Time | None
+    text: str
+
+
+class ReloadAnswer(Table):
+    """Answer to ``reload``."""
+
+    rig: str
+    devices: list[str]
+
+
+class RestartDeviceAnswer(Table):
+    """Answer to ``restart-device``."""
+
+    device: str
+
+
+class RateAnswer(Table):
+    """Answer to ``rate``."""
+
+    before_hz: float
+    output_rate_hz: float
+
+
+class StoredVersion(Table):
+    """One stored calibration."""
+
+    version: int
+    created_utc: str | None
+    software: str | None
+    method: str | None
+    procedure: str | None
+    restored_from: int | None
+    functional: bool | None
+    usable: bool
+    segments_deg: dict[str, Number]
+    flexion_deg: dict[str, Number]
+    fault: str | None
+
+
+class CalibrationsAnswer(Table):
+    """Answer to ``calibrations``."""
+
+    store: str
+    in_force: int | None
+    versions: list[StoredVersion]
+    omitted: int
+
+
+class UseCalibrationAnswer(Table):
+    """Answer to ``use-calibration``."""
+
+    version: int
+    phase: CalibrationPhase
+
+
+class CheckLine(Table):
+    """Result of one check."""
+
+    check: str
+    id: str
+    level: Literal["ok", "warning", "error"]
+    text: str
+    remedy: str
+
+
+class SelftestAnswer(Table):
+    """Answer to ``selftest``."""
+
+    level: Literal["ok", "warning", "error"]
+    checks: list[CheckLine]
+
+
+ANSWERS: dict[str, type[Table]] = {
+    "calibrate": PhaseAnswer,
+    "static": PhaseAnswer,
+    "mark": MarkAnswer,
+    "reload": ReloadAnswer,
+    "restart-device": RestartDeviceAnswer,
+    "rate": RateAnswer,
+    "calibrations": CalibrationsAnswer,
+    "use-calibration": UseCalibrationAnswer,
+    "selftest": SelftestAnswer,
+}
+"""Model of the ``data`` of an answer that is no error, by request."""

@@ -1,0 +1,252 @@
+"""Models of states, events, and answers."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import ConfigDict, Field
+
+from jointfit_daemon.outputs.payload_models._streams import Number, Payload, Table, Time
+from jointfit_daemon.pipeline.events import (  # noqa: TC001 - pydantic reads them
+    CalibrationPhase,
+    NoticeKind,
+    NoticeLevel,
+)
+
+
+class State(Payload):
+    """``bridge/state`` and ``device/ID/availability``."""
+
+    state: Literal["online", "offline"]
+
+
+class InfoDevice(Table):
+    """One device of the rig."""
+
+    kind: Literal["imu", "mocap"]
+    driver: str
+    segment: str | None
+
+
+class Info(Payload):
+    """``bridge/info``."""
+
+    software: str
+    rig: str
+    config_sha256: str
+    output_rate_hz: float
+    side: Literal["left", "right"]
+    joints: list[str]
+    angles: dict[str, str] = Field(description="angle convention by joint")
+    segments: list[str]
+    sensors: dict[str, list[str]] = Field(description="sensors by segment")
+    devices: dict[str, InfoDevice]
+    quaternions: str
+    world: str
+    pose_bin: None
+
+
+class Delays(Table):
+    """Delays from sampling to arrival, µs."""
+
+    p50: Number
+    p99: Number
+    max: Number
+
+
+class DeviceCounts(Table):
+    """Counters and clock of one device."""
+
+    online: bool
+    received: int
+    used: int
+    decimated: int
+    idle: int
+    late: int
+    duplicate: int
+    dropped: int
+    pending: int
+    corrupt: int
+    discarded_bytes: int
+    lost: int
+    restarts: int
+    reconnects: int
+    last_age_ms: Number
+    clock: Literal["settling", "direct", "echo", "passive", "arrival", "stale"]
+    epoch: int
+    offset_us: Number
+    skew_ppm: Number
+    sigma_us: Number
+    bound_us: Number
+    latency_prior_us: list[Number]
+    jitter_us: Number
+    delay_us: Delays | None
+    rate_hz: Number
+    sensor: Literal["absent", "ok", "lost", "stuck"] | None = Field(
+        None, description="state of an IMU in fusion"
+    )
+    orientation_filter: dict[str, Any] | None = None
+
+
+class Lag(Table):
+    """Lag of one sensor behind the cameras."""
+
+    lag_ms: Number
+    lag_sigma_ms: Number
+    lag_source: Literal["none", "calibration", "configured"]
+    lag_found_by: str | None
+    tracked_ms: Number
+    tracked_sigma_ms: Number
+    tracked_drift_ppm: Number
+    tracked_refused: str | None
+
+
+class Learning(Table):
+    """Online learning."""
+
+    state: Literal["off", "waiting", "learning", "stopped"]
+    reason: str | None
+    stopped_s: Number
+    kept: int
+
+
+class Frames(Table):
+    """Frames since the start."""
+
+    sent: int
+    empty: int
+    skipped: int
+
+
+class CalibrationInForce(Table):
+    """Phase and version."""
+
+    phase: CalibrationPhase
+    version: int | None
+
+
+class Process(Table):
+    """The process."""
+
+    cpu_pct: float
+    rss_bytes: int | None
+    loop_delay_p99_ms: Number
+
+
+class Link(Table):
+    """Connection to the broker."""
+
+    connected: bool
+    connects: int
+    confirmed: bool
+    denied: list[str]
+    sent: int
+    queued: int
+    dropped: int
+    ignored_requests: int
+    noise: int
+
+
+class StateFaults(Table):
+    """Reasons why data cannot be stored."""
+
+    fault: str | None
+    not_stored: str | None
+
+
+class Recording(Table):
+    """State of the recording."""
+
+    file: str
+    written_bytes: int
+    backlog_bytes: int
+    failure: str | None
+
+
+class Health(Payload):
+    """``bridge/health``."""
+
+    t_us: Time
+    devices: dict[str, DeviceCounts]
+    calibration: CalibrationInForce
+    fusion: dict[str, Any]
+    lags: dict[str, Lag]
+    frames: Frames
+    learning: Learning
+    process: Process
+    link: Link
+    state: StateFaults
+    recording: Recording | None = None
+
+
+class Event(Payload):
+    """``bridge/event``."""
+
+    t_us: Time
+    kind: NoticeKind
+    id: str
+    level: NoticeLevel
+    text: str
+    data: dict[str, Any]
+
+
+class LogLine(Payload):
+    """``bridge/log``."""
+
+    t_us: Time
+    level: str
+    logger: str
+    text: str
+    suppressed: int
+
+
+class CalibrationState(Payload):
+    """``calibration``."""
+
+    t_us: Time
+    phase: CalibrationPhase
+    text: str
+    version: int | None
+    kept: str | None
+    quality: dict[str, Any]
+
+
+class Progress(Payload):
+    """``calibration/progress``."""
+
+    t_us: Time
+    phase: CalibrationPhase
+    progress: float = Field(ge=0, le=1)
+    text: str
+    data: dict[str, Any]
+
+
+class DeviceFacts(Payload):
+    """``device/ID/info``: keys that the device reports; they depend on the driver."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class Fault(Table):
+    """One fault of a request."""
+
+    key: str
+    message: str
+
+
+class Error(Table):
+    """Error of a request."""
+
+    key: str
+    message: str
+    faults: list[Fault]
+    more: int = Field(description="number of faults beyond those listed")
+
+
+class Response(Payload):
+    """``bridge/response/COMMAND``."""
+
+    transaction: str
+    status: Literal["ok", "accepted", "error"]
+    data: dict[str, Any]
+    error: Error | None
