@@ -8,6 +8,10 @@ A sensor is stuck if either
 How long a healthy sensor repeats itself (coarse resolution, slow filter) is estimated from
 repetitions that ended by themselves. A stuck sensor is used again after 0.2 s of movement.
 
+Sensors without noise do not leave or reach rest in the same frame: their sampling instants differ,
+and a delayed sample is extrapolated from rest. A repetition therefore counts only for the time in
+which another sensor varied.
+
 Invariant: only rotations of each sensor against itself are compared, so neither its alignment nor
 its world matters. The cost per frame is O(1).
 """
@@ -122,6 +126,8 @@ class StuckSensorDetector:
         }
         self._items = tuple(self._sensors.items())
         self._window: tuple[int, Orientations] | None = None
+        self._varying_ns: tuple[int, int] | None = None
+        """First and last instant at which a sensor varied, without a pause of all sensors."""
 
     def update(self, t_ns: int, orientations: Orientations) -> list[str]:
         """Add one frame and return the ids of the sensors that are stuck.
@@ -134,13 +140,21 @@ class StuckSensorDetector:
             Orientation by sensor, each in its own world. The detector keeps a reference, so the
             caller must not change it.
         """
-        repeating = []
+        repeating, varying = [], False
         for name, sensor in self._items:
             q = orientations.get(name)
             if q is None:
                 sensor.reset()
             elif sensor.update(t_ns, q, orientations):
                 repeating.append(name)
+            else:
+                varying = True
+        if varying:
+            first_ns, last_ns = self._varying_ns or (t_ns, t_ns)
+            if t_ns - last_ns > REPEAT_AT_REST_NS:  # all sensors were at rest
+                first_ns = t_ns
+            self._varying_ns = first_ns, t_ns
+
         for name in repeating:
             sensor = self._sensors[name]
             sensor.repeating = sensor.repeating or self._is_stuck(
@@ -162,10 +176,11 @@ class StuckSensorDetector:
     ) -> bool:
         """Return whether other sensors turned, or still vary, during a repetition of `sensor`."""
         since_ns, first_ns = sensor.since_ns, sensor.first_ns
-        if since_ns is None or first_ns is None:
+        if since_ns is None or first_ns is None or self._varying_ns is None:
             return False
         length_ns, usual_ns = t_ns - since_ns, NATURAL_FACTOR * sensor.natural_ns
-        if length_ns < max(REPEAT_NS, usual_ns):
+        varied_first_ns, varied_last_ns = self._varying_ns
+        if varied_last_ns - max(since_ns, varied_first_ns) < max(REPEAT_NS, usual_ns):
             return False
 
         # The limb moved.

@@ -51,6 +51,18 @@ def detection_time_ms(frames: Frames, inject: Callable[[Frames], Frames], name: 
     return found
 
 
+@pytest.mark.parametrize("behind", [1, 2, 3])
+def test_sensors_that_leave_a_noiseless_rest_some_frames_apart_are_not_stuck(behind: int) -> None:
+    # the other sensors repeat their last sample while theirs is delayed
+    there = limb(6.0, noise_deg=0.0, speed=0.4)
+    frames = there + [there[-1]] * 100 + there[::-1][:50]
+    detector = StuckSensorDetector(GROUPS)
+    for k, orientations in enumerate(frames):
+        held = frames[k - behind] if k > behind else frames[0]
+        seen = held | {"S2": orientations["S2"]}
+        assert not detector.update(k * STEP, seen), k
+
+
 def hold_value(name: str, first: int) -> Callable[[Frames], Frames]:
     def inject(frames: Frames) -> Frames:
         return [f | {name: frames[min(k, first)][name]} for k, f in enumerate(frames)]
