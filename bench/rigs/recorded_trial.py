@@ -2,24 +2,27 @@
 
 Invariant: three processes exchange only bytes: `jointfit-sim play --trial`, the daemon, and a
 broker. The `pose` messages are compared with the simulator's ground truth at the instants of the
-poses. The daemon calibrates itself on a static pose and the first 60 % of the squats; the last 40 %
-are evaluated. The regressions of the patent run in its procedure: they get the whole trial, fit the
-first 60 % and verify on the rest.
+poses, and with the states of the same session offline. The daemon calibrates itself on a static
+pose and the first 60 % of the squats; the last 40 % are evaluated. The regressions of the patent
+run in its procedure: they get the whole trial, fit the first 60 % and verify on the rest.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 import tempfile
 import time
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
+from bench.rigs.offline_session import calibrate, fuse_session
 from bench.subjects.recorded_knee import FOLDER, Judge, KneeTrial, load, training_frames
 from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import MqttSettings
@@ -30,10 +33,11 @@ from jointfit_daemon.tools.child_processes import daemon, simulator
 from tests.broker_fixture import chosen_broker
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Sequence
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping, Sequence
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.limb_model import Calibration, Method
+    from jointfit_daemon.limb_model import Calibration, Method, Procedure
+    from jointfit_daemon.model import LimbState
     from jointfit_daemon.tools.child_processes import Simulator
 
 SOURCES = {"S1", "S2", "S3", "S4", "mocap"}
@@ -45,13 +49,21 @@ SPARE_S = 1.0
 """Time by which a phase is longer than its motion, for late bytes; the cameras see no bodies, s."""
 SQUATS_HZ, WALKING_HZ = 50.0, 100.0
 SEGMENTS = ("thigh", "shank")
-TRUTH_NS, MATCH_NS = 10_000_000, 1_000_000
+FRAME_NS, MATCH_NS = 10_000_000, 1_000_000
 """Truth and poses refer to multiples of 10 ms of one clock; the rest is rounding."""
-CONNECT_S, PATIENCE_S = 40.0, 90.0
+PLAYS, IN_TIME = 3, 0.9
+"""Largest number of plays, and share of frames in time with which a play counts."""
+FADE_NS = 250_000_000
+"""Time for which the output fades after a sensor was missing, ns."""
+CONNECT_S, PATIENCE_S = 80.0, 300.0
 REGRESSIONS: tuple[str, ...] = get_args(PatentReading)
 """Methods that run in the procedure of the patent."""
 ENDS = {"static": "posed", "functional": "calibrated"}
 """State that ends each phase successfully."""
+
+
+class MachineTooSlowError(Exception):
+    """Every frame of a play was affected by samples that this machine delivered too late."""
 
 
 @dataclass(slots=True)
@@ -114,9 +126,7 @@ class Gateway:
                 await asyncio.sleep(POLL_S)
 
     async def live(self, motion: str, seconds: float) -> None:
-        """Play a motion of `seconds` and record the messages."""
-        self.poses.clear()
-        self.sensors.clear()
+        """Play a motion of `seconds`."""
         await self.play(motion)
         await asyncio.sleep(BLEND_S + seconds + SPARE_S)
 
@@ -170,7 +180,7 @@ def _options(files: Sequence[Path], rate_hz: float, method: Method) -> list[str]
         *(word for name, value in knobs.items() for word in ("--set", f"{name}={value:g}")),
         *("--output-rate-hz", f"{rate_hz:g}", "--method", method, "--axes", "static"),
         *("--static-s", f"{STATIC_S:g}", "--sensors-hz", f"{rate_hz:g}"),
-        *("--procedure", "patent" if method in REGRESSIONS else "corrected"),
+        *("--procedure", _procedure(method)),
     ]
 
 
@@ -179,26 +189,35 @@ async def squats(data: Path, folder: Path, port: int, method: Method) -> Played:
 
     The daemon holds out the last 40 % of its trial itself for the regressions of the patent.
     """
-    files = [data / FOLDER / name for name in ("squats1.npz", "static_bias.json")]
+    files = _files(data, "squats1")
     whole = load(data, "squats1")
     cut, last = training_frames(whole), len(whole) - 1
     end = last if method in REGRESSIONS else cut - 1
+    shutil.rmtree(folder / "state", ignore_errors=True)  # of a play that was repeated
     async with gateway(folder, port, _options(files, SQUATS_HZ, method)) as running:
         await running.connected()
         await running.phase("static", STATIC_S)
         await running.play(f"trial@0-{end / SQUATS_HZ:g}")
         await running.phase("functional", BLEND_S + end / SQUATS_HZ + SPARE_S)
         await running.live(f"trial@{cut / SQUATS_HZ:g}-", (last - cut) / SQUATS_HZ)
-    return _judged(running, data)
+    return _judged(running, data, files, method)
 
 
 async def walking(data: Path, folder: Path, port: int, method: Method) -> Played:
     """Restart with the calibration of the squats in `folder`; walk live."""
-    files = [data / FOLDER / name for name in ("walking1.npz", "static_bias.json")]
+    files = _files(data, "walking1")
     async with gateway(folder, port, _options(files, WALKING_HZ, method)) as running:
         await running.connected(2 * SETTLE_S)  # 1 ms corresponds to half a degree at this speed
         await running.live("trial", 1.3)
-    return _judged(running, data)
+    return _judged(running, data, files, method)
+
+
+def _files(data: Path, trial: str) -> list[Path]:
+    return [data / FOLDER / name for name in (f"{trial}.npz", "static_bias.json")]
+
+
+def _procedure(method: Method) -> Procedure:
+    return "patent" if method in REGRESSIONS else "corrected"
 
 
 # --- evaluation --------------------------------------------------------------------------------
@@ -210,10 +229,12 @@ class Played:
 
     frames: int
     """Number of evaluated poses."""
-    truth: tuple[Array, Array]
-    """Recorded thigh and shank at their instants, q_world_bone, shape (frames, 4)."""
+    recorded: int
+    """Number of frames with all sensors offline."""
     errors: tuple[float, float, float]
     """RMS errors of thigh, shank and knee flexion, deg."""
+    offline: tuple[float, float, float]
+    """The same of the offline session, at the same instants."""
     calibration: Calibration
     health: dict[str, Any]
     """Devices of the daemon's last health message."""
@@ -221,49 +242,91 @@ class Played:
     """Largest angle between a segment of `pose` and the regression of the patent, evaluated from
     `sensors/pose` and the coefficients of `calibration`; None without a regression."""
 
-    def of(self, recorded: KneeTrial) -> KneeTrial:
-        """Return the evaluated frames of the recording: those with the nearest posture."""
-        femur, tibia = (q[:, None] for q in self.truth)
-        apart = rotation.angle_between(femur, recorded.thigh)
-        apart = apart + rotation.angle_between(tibia, recorded.shank)
-        nearest = np.argmin(apart, axis=1)
-        thigh_a, thigh_b, shank_a, shank_b = (q[nearest] for q in recorded.sensors)
-        return KneeTrial(
-            (thigh_a, thigh_b, shank_a, shank_b),
-            recorded.thigh[nearest],
-            recorded.shank[nearest],
-        )
 
-
-def _judged(running: Gateway, data: Path) -> Played:
-    """Evaluate poses at instants of recorded truth, in the frames of the bones."""
-    truth = _recorded_truth(running.folder / "truth.jsonl")
-    unix_ns = time.time_ns() - time.monotonic_ns()
-    rows = []
-    for pose in running.poses:
-        t_ns = pose["t_us"] * 1000 - unix_ns
-        at = round(t_ns / TRUTH_NS) * TRUTH_NS
-        said = [pose["segments"][name]["q"] for name in SEGMENTS]
-        everyone = all(len(pose["segments"][name]["used"]) == 2 for name in SEGMENTS)
-        everyone &= (
-            "extrapolating" not in pose["flags"]
-        )  # a late frame of this host is no error of the method
-        if at in truth and abs(at - t_ns) < MATCH_NS and everyone:
-            rows.append([*said, *truth[at]])
-    calibration = running.calibration()
-    columns = np.array(rows).swapaxes(0, 1)
-    femur, tibia = columns[2:]
-    # the rotation from bone frames to those of the calibration is constant and is removed here
-    frames = [np.array(calibration.segment[name].q_static) for name in SEGMENTS]
-    thigh, shank = (
-        rotation.multiply(q, rotation.conjugate(frame))
-        for q, frame in zip(columns[:2], frames, strict=True)
-    )
+def _judged(running: Gateway, data: Path, files: Sequence[Path], method: Method) -> Played:
+    """Evaluate poses at instants of recorded truth, and the same session offline."""
+    log = running.folder / "truth.jsonl"
+    truth, poses = _recorded_truth(log), _calibrated_poses(running.poses)
     whole = load(data, "squats1")
-    judge = Judge.of(whole.part(slice(0, training_frames(whole))))
-    errors = judge.errors((thigh, shank), KneeTrial((femur,) * 4, femur, tibia))
-    repeated = _repeated_deg(running)
-    return Played(len(rows), (femur, tibia), errors, calibration, running.health, repeated)
+    training = training_frames(whole)
+
+    # The daemon's frames, offline; those that were not received as messages included.
+    instants = sorted(poses)
+    period_ns = min(b - a for a, b in pairwise(instants))
+    grid = range(instants[0], instants[-1] + 1, period_ns)
+    fit = calibrate(_files(data, "squats1"), training, method, _procedure(method))
+    offline = fuse_session(files, log, grid, fit, BLEND_S)
+
+    # Frames with all sensors, live as offline.
+    complete = [t for t in grid if t in truth and _is_complete(*_used(offline[t]))]
+    late = {t for t in poses if _used_live(poses[t])[1] < _used(offline[t])[1]}
+    chosen = [
+        t
+        for t in complete
+        if t in poses
+        and _is_complete(*_used_live(poses[t]))
+        and not any(t - FADE_NS <= missed <= t for missed in late)
+    ]
+    if not chosen:
+        raise MachineTooSlowError(f"{method}: no frame of {files[0].name} with all sensors in time")
+    calibration = running.calibration()
+    femur, tibia = (np.array([truth[t][i] for t in chosen]) for i in range(2))
+    judge = Judge.of(whole.part(slice(0, training)))
+    bones = KneeTrial((femur,) * 4, femur, tibia)
+    # the rotation from bone frames to those of the calibration is constant and is removed here
+    live = _in_bone_frames(
+        [[poses[t]["segments"][name]["q"] for t in chosen] for name in SEGMENTS], calibration
+    )
+    expected = _in_bone_frames(
+        [[offline[t].segments[i].q_world_segment for t in chosen] for i in range(2)], fit
+    )
+    return Played(
+        len(chosen),
+        len(complete),
+        judge.errors(live, bones),
+        judge.errors(expected, bones),
+        calibration,
+        running.health,
+        _repeated_deg(running),
+    )
+
+
+def _calibrated_poses(poses: Iterable[Mapping[str, Any]]) -> dict[int, Mapping[str, Any]]:
+    """Return the poses since the calibration by instant, host time in ns."""
+    unix_ns = time.time_ns() - time.monotonic_ns()
+    found = {}
+    for pose in poses:
+        t_ns = pose["t_us"] * 1000 - unix_ns
+        at = round(t_ns / FRAME_NS) * FRAME_NS
+        if "uncalibrated" not in pose["flags"] and abs(at - t_ns) < MATCH_NS:
+            found[at] = pose
+    return found
+
+
+def _used(state: LimbState) -> tuple[Sequence[str], int]:
+    """Return flags and the number of sensors used."""
+    return state.flags, sum(len(segment.used) for segment in state.segments)
+
+
+def _used_live(pose: Mapping[str, Any]) -> tuple[Sequence[str], int]:
+    return pose["flags"], sum(len(pose["segments"][name]["used"]) for name in SEGMENTS)
+
+
+def _is_complete(flags: Sequence[str], sensors: int) -> bool:
+    """Return whether all sensors were measured at an instant, none extrapolated."""
+    return "extrapolating" not in flags and sensors == len(SOURCES) - 1
+
+
+def _in_bone_frames(
+    segments: Sequence[Sequence[Any]], calibration: Calibration
+) -> tuple[Array, Array]:
+    thigh, shank = (
+        rotation.multiply(
+            np.array(q), rotation.conjugate(np.array(calibration.segment[name].q_static))
+        )
+        for q, name in zip(segments, SEGMENTS, strict=True)
+    )
+    return thigh, shank
 
 
 def _repeated_deg(running: Gateway) -> float | None:
@@ -299,6 +362,28 @@ def _recorded_truth(path: Path) -> dict[int, list[list[float]]]:
 # --- complete runs -----------------------------------------------------------------------------
 
 
+async def _undelayed(
+    play: Callable[[Path, Path, int, Method], Awaitable[Played]],
+    data: Path,
+    folder: Path,
+    port: int,
+    method: Method,
+) -> Played:
+    """Play until this machine delivers enough samples in time, a few times at most; return the
+    play with the largest share."""
+    best: Played | None = None
+    for _ in range(PLAYS):
+        with suppress(MachineTooSlowError):
+            played = await play(data, folder, port, method)
+            if best is None or played.frames * best.recorded > best.frames * played.recorded:
+                best = played
+            if played.frames >= IN_TIME * played.recorded:
+                break
+    if best is None:
+        raise MachineTooSlowError(f"{method}: no frame with all sensors in time; stop other loads")
+    return best
+
+
 async def _everything(
     data: Path, folder: Path, methods: Sequence[Method], walkers: Sequence[Method]
 ) -> dict[tuple[str, Method], Played]:
@@ -309,9 +394,9 @@ async def _everything(
         for method in methods:
             home = folder / method
             home.mkdir()
-            found["squats", method] = await squats(data, home, broker.port, method)
-            if method in walkers:
-                found["walking", method] = await walking(data, home, broker.port, method)
+            for name, play in (("squats", squats), ("walking", walking)):
+                if name == "squats" or method in walkers:
+                    found[name, method] = await _undelayed(play, data, home, broker.port, method)
     finally:
         broker.stop()
     return found
