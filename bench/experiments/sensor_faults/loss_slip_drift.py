@@ -269,9 +269,16 @@ EXPERIMENTS = (
             (
                 "squats",
                 "squats1",
-                "headings while rising from a chair, right leg, placed reference",
+                "seated, right leg, placed reference, 3 of 8 deals: without filter errors, too, "
+                "the soft tissue of thigh and shank turns by another angle than in squats of the "
+                "same knee flexion",
             ),
-            ("walking", "walking1", "thigh in squats, left leg, placed reference"),
+            (
+                "walking",
+                "walking1",
+                "1 of 96 movements: the thigh sensors in squats, left leg, placed reference, whose "
+                "knee flexion exceeds that of the training",
+            ),
         )
     ),
     Experiment(
