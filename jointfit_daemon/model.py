@@ -215,6 +215,8 @@ class Chain:
     """Body part distal of the last joint (foot), with markers only; None without one."""
     static_axes: bool = False
     """Segment axes equal the world in the static pose; otherwise joint centres define them."""
+    planar: bool = False
+    """Whether cameras alone follow a movement in a plane, without sensors and calibration."""
     conventions: tuple[AngleConvention | None, ...] = ()
     """Configured angle conventions of the joints; None if the name of the joint selects it."""
     parents: tuple[int | None, ...] = ()
@@ -476,6 +478,44 @@ class ChainModelState(NamedTuple):
     """The same over the last seconds."""
     flags: tuple[str, ...]
     """`MarkerFlag` with the names of markers."""
+
+
+class PlanarJoint(NamedTuple):
+    """One joint of a planar chain in one frame."""
+
+    name: str
+    position: Vector | None
+    """In the optical world, m; along the normal that of the markers."""
+    error: float | None
+    """Predicted RMS error of the position in the plane, m."""
+    arc: float | None
+    """Arc of the markers about the joint, rad; the larger one of both sides."""
+    refused: str | None
+    """Reason why there is no position, with the remedy."""
+
+
+class Stick(NamedTuple):
+    """One segment of a stick figure."""
+
+    segment: str
+    ends: tuple[Vector | None, ...]
+    """From proximal to distal, m: two joints, or a marker and a joint; None if unknown."""
+
+
+class StickFigure(NamedTuple):
+    """A planar chain in one frame."""
+
+    number: int
+    """Frame number of the camera server."""
+    t_ns: int
+    normal: Vector | None
+    """Unit normal of the plane of movement; None while it is unknown."""
+    off_plane: float | None
+    """RMS distance of the markers from their planes, m."""
+    refused: str | None
+    """Reason why there is no plane."""
+    joints: tuple[PlanarJoint, ...]
+    sticks: tuple[Stick, ...]
 
 
 class MarkerFlag(StrEnum):

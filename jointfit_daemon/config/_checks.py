@@ -37,6 +37,8 @@ _LONGEST_M = 3.0
 """Upper limit of a segment length, m; larger numbers are probably millimetres."""
 _STANDARD_MAX = 0x7FF
 """Largest 11-bit CAN identifier."""
+_LEAST_PLANAR = 2
+"""Smallest number of markers that defines an orientation in a plane."""
 _LEAST_MARKERS = 3
 """Smallest number of markers that defines an orientation."""
 
@@ -220,7 +222,7 @@ def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -
     if any(not isinstance(imu.get("segment"), str) for imu in imus):
         return  # reported; it may be the segment without sensor
     for segment in table.segments:
-        if segment not in worn:
+        if segment not in worn and table.motion != "planar":
             yield Fault("imu", f"segment {segment!r} has no sensor, expected at least one")
 
 
@@ -245,7 +247,8 @@ def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator
     for part, names in readable.items():
         key = f"mocap.markers.{part}"
         yield from _repeated(key, names)
-        if len(set(names)) < _LEAST_MARKERS:
+        planar = table is not None and table.motion == "planar"
+        if not planar and len(set(names)) < _LEAST_MARKERS:
             yield Fault(key, "expected at least three different markers", list(names))
         if part in (settings.rigid_body or {}):
             yield Fault(f"mocap.rigid_body.{part}", "has markers already; give one of the two")
@@ -256,6 +259,46 @@ def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator
         for name in dict.fromkeys(names):
             if (owner := owners.setdefault(name, part)) != part:
                 yield Fault(f"mocap.markers.{part}", f"is a marker of {owner!r} already", name)
+
+
+def check_planar(table: ChainTable, cameras: MocapSettings | None, imus: object) -> Iterator[Fault]:
+    """Check that a planar rig has no sensors, and markers for every joint.
+
+    Keys that had faults are None.
+    """
+    if table.motion != "planar":
+        return
+    if cameras is None:
+        yield Fault("chain.motion", "planar motion needs cameras: add [mocap]", "planar")
+        return
+    if imus:
+        text = "expected none with chain.motion = planar, which cameras alone follow: remove one"
+        yield Fault("imu", text)
+    if table.joint:
+        yield Fault("chain.joint", "planar motion has no branches: use joints, or remove motion")
+    if table.model is not None:
+        yield Fault("chain.model", "is for spatial motion: remove it, or chain.motion")
+    if cameras.rigid_body:
+        text = "planar motion is followed by single markers: name them under mocap.markers"
+        yield Fault("mocap.rigid_body", text, dict(cameras.rigid_body))
+
+    yield from _check_planar_markers(table, cameras)
+
+
+def _check_planar_markers(table: ChainTable, cameras: MocapSettings) -> Iterator[Fault]:
+    markers, segments = cameras.markers or {}, table.segments or ()
+    for part in segments:
+        if len(set(markers.get(part) or ())) < _LEAST_PLANAR:
+            found = list(markers.get(part) or ())
+            text = "expected at least two different markers; only ends (proximal, distal) need one"
+            yield Fault(f"mocap.markers.{part}", text, found)
+    ends = [part for part in (table.proximal, table.distal) if part is not None]
+    for part in ends:
+        if not markers.get(part):
+            yield Fault(f"mocap.markers.{part}", "expected at least one marker")
+    if not ends and len(segments) == 1:
+        text = "planar motion needs two parts: name an end (proximal or distal) or a segment"
+        yield Fault("chain.segments", text, list(segments))
 
 
 def check_center_methods(

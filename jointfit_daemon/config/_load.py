@@ -196,6 +196,8 @@ class _RigReader:
         limb = chain or self.partial.get("chain")
         if limb is not None:
             self.faults += _checks.check_chain(limb)
+            if cameras is not None or "mocap" not in self.table:
+                self.faults += _checks.check_planar(limb, cameras, self.table.get("imu"))
         table = calibration or self.partial.get("calibration")
         self.faults += _checks.check_procedure(table, limb)
         if table is not None:
@@ -456,6 +458,7 @@ def _chain(table: ChainTable, sources: Sequence[Source]) -> Chain:
         proximal=table.proximal,
         distal=table.distal,
         static_axes=table.axes == "static",
+        planar=table.motion == "planar",
         conventions=tuple(table.angles.get(joint) for joint in joints),
         parents=() if branched is None else branched.parents,
         left_joints=() if branched is None else branched.left,

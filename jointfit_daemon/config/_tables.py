@@ -89,6 +89,11 @@ class ChainTable(Settings):
         description="angle conventions of joints; default by the name of the joint: `elevation` "
         "for shoulders, `trunk` for spine and neck, `flexion` for all others",
     )
+    motion: Literal["spatial", "planar"] = Field(
+        "spatial",
+        description="`planar`: cameras alone follow a movement in a plane, with one marker or more "
+        "on end segments and two or more on the others; no [[imu]] and no calibration",
+    )
     model: str | dict[str, Any] | None = Field(
         None,
         description="chain model for inverse kinematics from the markers: an OpenSim model or a "
@@ -286,6 +291,19 @@ class MqttSettings(Settings):
         le=3600,
         description="time constant of the running joint centers of the topic optical/centers, s; "
         "0: none",
+    )
+    sticks_hz: float = Field(
+        25.0,
+        gt=0,
+        le=100,
+        description="greatest rate of the topic optical/sticks of planar rigs, Hz",
+    )
+    sticks_memory_s: float = Field(
+        60.0,
+        ge=5,
+        le=3600,
+        description="time constant of the joint centers of planar rigs, s: older frames lose "
+        "weight",
     )
     joint_hz: float = Field(1.0, gt=0, le=1, description="rate of the topics joint/NAME, Hz")
     health_s: float = Field(10.0, gt=0, le=60, description="interval of the topic bridge/health, s")

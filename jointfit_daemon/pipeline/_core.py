@@ -6,7 +6,6 @@ in the same order give the same outputs, byte for byte, so a recording can be re
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import drifting_imus, heading_warning
@@ -17,6 +16,11 @@ from jointfit_daemon.pipeline._mocap_router import MocapRouter
 from jointfit_daemon.pipeline._moving_centers import MovingCenters
 from jointfit_daemon.pipeline._notice_limiter import NoticeLimiter, unix_step_notices
 from jointfit_daemon.pipeline._optical_comparison import OpticalComparison
+from jointfit_daemon.pipeline._optical_trackers import (
+    chain_tracker,
+    planar_tracker,
+    unused_refinement,
+)
 from jointfit_daemon.pipeline.calibration_session import CalibrationSession
 from jointfit_daemon.pipeline.events import (
     CalibrationPhase,
@@ -56,6 +60,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState
     from jointfit_daemon.pipeline.chain_tracking import ChainTracker
     from jointfit_daemon.pipeline.events import Event, Output
+    from jointfit_daemon.pipeline.planar_chain import PlanarTracker
     from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner
     from jointfit_daemon.timing.clock import Stamp
 
@@ -99,6 +104,7 @@ class Core:
         self._sensors_rate: RateDivider | None = None
         self._moving_centers: MovingCenters | None = None
         self._chain_tracker: ChainTracker | None = None
+        self._planar_tracker: PlanarTracker | None = None
         self._handlers: dict[type, Callable[[Any], list[Output]]] = {
             Configured: self._configure,
             SourceOpened: self._open_source,
@@ -177,7 +183,8 @@ class Core:
             self._grid.reload(rig)
         self._aligner = self._grid.aligner
         if before is None or _cameras(before) != _cameras(rig):
-            self._moving_centers = self._chain_tracker = None
+            self._moving_centers = self._chain_tracker = self._planar_tracker = None
+        self._planar_tracker = planar_tracker(rig, self._planar_tracker)
         if before is None or before.chain != rig.chain:
             self._sensor_monitor = SensorMonitor(rig.chain)
 
@@ -192,7 +199,7 @@ class Core:
             outputs.append(
                 Notice(event.t_ns, NoticeKind.DEVICE, rig.name, warning, NoticeLevel.WARNING)
             )
-        outputs += self._unused_refinement(event.t_ns)
+        outputs += unused_refinement(rig, self._usable, event.t_ns)
         text = "stored calibration loaded" if event.calibration else "no stored calibration"
         return [*outputs, session.status(event.t_ns, text)]
 
@@ -231,24 +238,9 @@ class Core:
         centers = MovingCenters(rig.chain, usable, rig.mqtt.centers_memory_s)
         if self._moving_centers is None or not self._moving_centers.serves(centers):
             self._moving_centers = centers
-        self._chain_tracker = _chain_tracker(rig, usable, self._chain_tracker)
+        self._chain_tracker = chain_tracker(rig, usable, self._chain_tracker)
         wanted = rig.calibration.learn_online
         self._collector = OnlineFrameCollector(rig.chain, usable, wanted=wanted)
-
-    def _unused_refinement(self, t_ns: int) -> list[Output]:
-        """Return a notice if the calibration contains markers of another chain model."""
-        if self._rig is None or (loaded := self._rig.chain_model) is None or self._usable is None:
-            return []
-        chain = self._usable.chain
-        if chain is None or chain.apply(loaded.chain) is not None:
-            return []
-        text = (
-            f"the calibration contains refined markers of another version of the chain model "
-            f"({chain.model!r}): those of the file are used. Repeat the functional phase to refine "
-            "them"
-        )
-        level = NoticeLevel.WARNING
-        return [Notice(t_ns, NoticeKind.CALIBRATION, loaded.chain.name, text, level)]
 
     # --- sources -----------------------------------------------------------------------------
 
@@ -325,6 +317,8 @@ class Core:
                     self._comparison.add_frame(stamp.t_ns, measurement, synced=stamp.synced)
                     if self._moving_centers is not None:
                         outputs += self._moving_centers.add_frame(stamp.t_ns, measurement)
+                    if self._planar_tracker is not None:
+                        outputs += self._planar_tracker.add_frame(stamp.t_ns, measurement)
                     if self._chain_tracker is not None:
                         outputs += self._chain_tracker.add_frame(stamp.t_ns, measurement)
         return outputs
@@ -460,25 +454,6 @@ class Core:
 
 def _cameras(rig: Rig) -> list[Source]:
     return [source for source in rig.sources if source.kind == "mocap"]
-
-
-def _chain_tracker(
-    rig: Rig, calibration: Calibration | None, before: ChainTracker | None
-) -> ChainTracker | None:
-    """Return a tracker of the chain model with its refined markers; `before` if it is equal."""
-    if rig.chain_model is None or rig.mqtt.chain_hz <= 0.0:
-        return None
-    stored = None if calibration is None else calibration.chain
-    refined = None if stored is None else stored.apply(rig.chain_model.chain)
-    loaded = rig.chain_model if refined is None else replace(rig.chain_model, chain=refined)
-    rate_hz, is_refined = rig.mqtt.chain_hz, refined is not None
-    if before is not None and before.serves(loaded, rate_hz, refined=is_refined):
-        return before
-    from jointfit_daemon.pipeline.chain_tracking import (  # noqa: PLC0415 - it loads scipy
-        ChainTracker,
-    )
-
-    return ChainTracker(loaded, rig.mqtt.chain_hz, refined=refined is not None)
 
 
 def _calibration_inputs(rig: Rig) -> tuple[object, ...]:

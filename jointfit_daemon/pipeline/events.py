@@ -16,6 +16,7 @@ from jointfit_daemon.model import (
     OpticalState,
     RunningCenters,
     SensorStates,
+    StickFigure,
 )
 
 if TYPE_CHECKING:
@@ -332,6 +333,7 @@ Output = (
     | ChainModelState
     | SensorStates
     | RunningCenters
+    | StickFigure
     | Notice
     | DeviceStatus
     | DeviceInfo

@@ -133,6 +133,9 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--chain-model", action="store_true",
                       help="write leg.toml, a chain model of the subject, and name it in "
                       "rig.toml")  # fmt: skip
+    play.add_argument("--planar", action="store_true",
+                      help="cameras only, with one marker on pelvis and foot and two on thigh and "
+                      "shank, rigid on the bones, and a rig.toml for planar motion")  # fmt: skip
     play.add_argument("--sample-log", action="store_true",
                       help="write samples.jsonl with the true time of each sample")  # fmt: skip
     play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
@@ -254,12 +257,19 @@ async def _play(options: argparse.Namespace) -> None:
         sync_line=options.sync_line,
         ptp=options.ptp,
         chain_model=options.chain_model,
+        planar=options.planar,
         sample_log=options.sample_log,
     )
     if options.follow and options.trial:
         raise ValueError("--follow needs the motions of the simulator: leave out --trial")
     if options.chain_model and (options.trial or options.no_mocap or options.limb != "leg"):
         raise ValueError("--chain-model is for the simulated leg and its markers: leave it out")
+    if options.planar:
+        if options.trial or options.no_mocap or options.limb != "leg" or options.chain_model:
+            raise ValueError("--planar is for the simulated leg and its markers: leave it out")
+        # the arc of a single marker is hidden by soft-tissue artefact
+        knobs = dataclasses.replace(knobs, marker_soft_tissue_mm=0.0)
+        options.programme = options.programme or "leg_swings"
     subject = _subject(options, knobs)
 
     with play_directory(hardware.directory) as directory:

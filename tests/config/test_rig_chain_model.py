@@ -11,7 +11,7 @@ from jointfit_daemon.config import ConfigError, load_rig, parse_rig
 from jointfit_daemon.files.models import as_data, model_of, write_model
 from jointfit_daemon.limb_model import RefinedChain, chain_fingerprint
 from jointfit_daemon.pipeline import Core
-from jointfit_daemon.pipeline._core import _chain_tracker
+from jointfit_daemon.pipeline._optical_trackers import chain_tracker
 from jointfit_daemon.pipeline.events import Configured, Notice, NoticeLevel
 from tests.limb_model.plain_calibration import plain_calibration
 
@@ -239,16 +239,16 @@ def test_live_model_has_the_refined_markers_of_the_same_model_only(rig: Table) -
     model = loaded.chain_model.chain
     chain = RefinedChain("leg", chain_fingerprint(model), {"T1": (0.2, 0.0, 0.0)})
     calibration = replace(plain_calibration(loaded.chain), chain=chain)
-    tracker = _chain_tracker(loaded, calibration, None)
+    tracker = chain_tracker(loaded, calibration, None)
     assert tracker is not None
     assert tracker.loaded.chain.markers[0].position == (0.2, 0.0, 0.0)
     assert tracker.loaded.chain.markers[1:] == model.markers[1:]
-    assert _chain_tracker(loaded, calibration, tracker) is tracker  # its monitor continues
+    assert chain_tracker(loaded, calibration, tracker) is tracker  # its monitor continues
 
     core = Core()
     assert not [one for one in core.feed(Configured(0, loaded, calibration)) if warned(one)]
     other = replace(calibration, chain=replace(chain, fingerprint="another"))
-    plain = _chain_tracker(loaded, other, tracker)
+    plain = chain_tracker(loaded, other, tracker)
     assert plain is not None
     assert plain.loaded == loaded.chain_model
     (warning,) = [one for one in core.feed(Configured(1, loaded, other)) if warned(one)]

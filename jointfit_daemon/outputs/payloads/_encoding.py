@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         RunningCenters,
         SegmentState,
         SensorStates,
+        StickFigure,
     )
 
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_STRICT_INTEGER | orjson.OPT_NON_STR_KEYS
@@ -198,6 +199,35 @@ def encode_centers(state: RunningCenters, offset_ns: int) -> bytes:
             "t_us": (state.t_ns + offset_ns) // _NS_PER_US,
             "memory_s": state.memory_s,
             "joints": {center.joint: _running_center(center) for center in state.joints},
+        }
+    )
+
+
+def encode_sticks(state: StickFigure, offset_ns: int) -> bytes:
+    """Return the payload of ``optical/sticks``; `offset_ns` as for `encode_pose`."""
+    return encode(
+        {
+            "v": PAYLOAD_VERSION,
+            "t_us": (state.t_ns + offset_ns) // _NS_PER_US,
+            "frame": state.number,
+            "plane": {
+                "normal": _rounded(state.normal, 4),
+                "off_plane_m": _metres(state.off_plane),
+                "refused": state.refused,
+            },
+            "joints": {
+                joint.name: {
+                    "p_m": _rounded(joint.position, 4),
+                    "error_m": _metres(joint.error),
+                    "arc_deg": _degrees(joint.arc),
+                    "refused": joint.refused,
+                }
+                for joint in state.joints
+            },
+            "sticks": {
+                stick.segment: {"ends_m": [_rounded(end, 4) for end in stick.ends]}
+                for stick in state.sticks
+            },
         }
     )
 

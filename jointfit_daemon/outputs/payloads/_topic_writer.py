@@ -25,6 +25,7 @@ from jointfit_daemon.model import (
     OpticalState,
     RunningCenters,
     SensorStates,
+    StickFigure,
 )
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import printable, printable_data
@@ -36,6 +37,7 @@ from jointfit_daemon.outputs.payloads._encoding import (
     encode_optical,
     encode_pose,
     encode_sensors,
+    encode_sticks,
 )
 from jointfit_daemon.outputs.payloads._health_encoding import health_payload
 from jointfit_daemon.outputs.payloads._quality_units import quality_payload
@@ -67,6 +69,7 @@ _STREAMS: dict[type, tuple[Topic, Callable[[Any, int], bytes]]] = {
     ChainModelState: (topics.OPTICAL_CHAIN, encode_chain),
     SensorStates: (topics.SENSORS_POSE, encode_sensors),
     RunningCenters: (topics.OPTICAL_CENTERS, encode_centers),
+    StickFigure: (topics.OPTICAL_STICKS, encode_sticks),
 }
 """Topic and encoder of the outputs with a payload of their own instant."""
 
@@ -114,7 +117,13 @@ class TopicWriter:
         match output:
             case LimbState():
                 self._publish_limb_state(output)
-            case OpticalState() | ChainModelState() | SensorStates() | RunningCenters():
+            case (
+                OpticalState()
+                | ChainModelState()
+                | SensorStates()
+                | RunningCenters()
+                | StickFigure()
+            ):
                 topic, encoder = _STREAMS[type(output)]
                 self._publish(topic, encoder(output, self._clock.offset_ns()))
             case Notice():

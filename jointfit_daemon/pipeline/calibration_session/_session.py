@@ -64,6 +64,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.sources import LagMonitor
 
 
+PLANAR = (
+    "a planar rig has no sensors and needs no calibration: its joints are on the topic "
+    "optical/sticks"
+)
+"""Reason for which a planar rig starts no phase."""
+
+
 class CalibrationSession:
     """Runs the calibrations of one rig, one after another.
 
@@ -200,7 +207,7 @@ class CalibrationSession:
             return [*outputs, request.reply("ok", {"phase": self.phase})]
 
         wanted_s = _seconds(request.arguments.get("seconds"))
-        key, message = "phase", self._refusal(wanted)
+        key, message = "phase", PLANAR if self._chain.planar else self._refusal(wanted)
         if message is None and wanted_s is not None and not 0.0 < wanted_s <= MAX_PHASE_S:
             key, message = "seconds", f"expected a number above 0 and up to {MAX_PHASE_S}"
         if message is not None:

@@ -59,7 +59,7 @@ class ScenePlayer:
     subject
         Source of the motion.
     imus
-        IMU streams by sensor id.
+        IMU streams by sensor id; empty for a scene with cameras only.
     optical
         Stream of the cameras.
     truth
@@ -82,7 +82,7 @@ class ScenePlayer:
     ) -> None:
         self._sync_line = sync_line
         self._subject, self._optical, self._truth = subject, optical, truth
-        self._imus = [imus[name] for name in subject.sensors]
+        self._imus = [imus[name] for name in subject.sensors] if imus else []
         self._streams: list[PlannedStream] = [*self._imus, optical]
         self._origin_ns = origin_ns
         self._planned_ns = origin_ns
@@ -145,13 +145,14 @@ class ScenePlayer:
 
         # observation of the subject at these instants
         imu_s = [self._seconds(t_ns) for t_ns in imu_ns]
+        imu_s = imu_s or [np.empty(0) for _ in self._subject.sensors]
         truth_s = self._seconds(truth_ns)
         observation = self._subject.observe(imu_s, self._seconds(exposures_ns), truth_s)
 
         # measurements and their transmission times
         due_ns = [
             imu.fill(t_s, q)
-            for imu, t_s, q in zip(self._imus, imu_s, observation.sensors, strict=True)
+            for imu, t_s, q in zip(self._imus, imu_s, observation.sensors, strict=bool(self._imus))
         ]
         due_ns.append(self._optical.fill(observation))
         for number, times in enumerate(due_ns):

@@ -46,6 +46,7 @@ def rig_toml(
     plate: bool,
     chain: RigChain = LEG_CHAIN,
     chain_model: str | None = None,
+    planar: bool = False,
 ) -> str:
     """Return the text of a rig.toml.
 
@@ -67,6 +68,8 @@ def rig_toml(
         Joints and segments.
     chain_model
         File name of the chain model; None without one.
+    planar
+        Whether the rig follows a planar movement by cameras alone.
     """
     ends = [
         f'{end} = "{part}"'
@@ -82,6 +85,7 @@ def rig_toml(
         'side = "right"',
         f'axes = "{options.axes}"',
         *ends,
+        *(['motion = "planar"'] if planar else []),
         *([f"lengths_m = {{ {lengths} }}"] if lengths else []),
         *([] if chain_model is None else [f'model = "{chain_model}"']),
     ]

@@ -47,6 +47,8 @@ MODEL_FILE = "leg.toml"
 """Chain model of the subject, with marker position errors of about 1 cm."""
 TRUTH_FILE = "truth.jsonl"
 SAMPLES_FILE = "samples.jsonl"
+PLANAR_MARKERS = {"pelvis": ("P1",), "thigh": ("T1", "T4"), "shank": ("C1", "C4"), "foot": ("F1",)}
+"""Markers of a planar rig: the cameras see others too, which it does not use."""
 OPTICAL = "mocap"
 """Name of the motion-capture server in commands and in the ground-truth log."""
 DOWN_S = 1.0
@@ -76,6 +78,8 @@ class SceneOptions:
     """UDP port of the motion-capture server; 0 selects a free port."""
     chain_model: bool = False
     """Whether a chain model of the simulated subject is written and named in rig.toml."""
+    planar: bool = False
+    """Whether there are no sensors, and rig.toml names the markers of a planar movement."""
     sample_log: bool = False
     """Whether the true sampling time of each sample sent is logged."""
 
@@ -108,7 +112,7 @@ class Scene:
         self._knobs = knobs
         self._hardware = create_hardware(
             knobs,
-            subject.sensors,
+            {} if options.planar else subject.sensors,
             options.directory,
             wires=options.wires,
             can=options.can,
@@ -256,17 +260,18 @@ class Scene:
             self._server.unplug()
 
     def _write_rig(self) -> Path:
-        server = self._server
+        server, planar = self._server, self._options.planar
         path = self._options.directory / RIG_FILE
         text = rig_toml(
             self._options.rig,
             devices=self._hardware.tables,
             mocap=mocap_table(server, sync_line=self._options.sync_line) if server else "",
-            clusters=self._subject.clusters,
+            clusters=PLANAR_MARKERS if planar else self._subject.clusters,
             bones=self._subject.visible_bones,
-            plate="plate" in self._subject.templates,
+            plate="plate" in self._subject.templates and not planar,
             chain=self._subject.chain,
             chain_model=self._write_model(),
+            planar=planar,
         )
         path.write_text(text, encoding="utf-8")
         return path

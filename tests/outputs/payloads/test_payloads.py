@@ -27,9 +27,12 @@ from jointfit_daemon.model import (
     OpticalJoint,
     OpticalSegment,
     OpticalState,
+    PlanarJoint,
     SegmentState,
     SensorOrientation,
     SensorStates,
+    Stick,
+    StickFigure,
     SyncState,
 )
 from jointfit_daemon.outputs.mqtt import LinkHealth, Outbox
@@ -46,6 +49,7 @@ from jointfit_daemon.outputs.payloads._encoding import (
     encode_joint,
     encode_optical,
     encode_sensors,
+    encode_sticks,
 )
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline.events import (
@@ -461,3 +465,33 @@ def test_optical_chain_has_units_by_coordinate_and_null_for_the_unknown() -> Non
         "recent": None,
         "flags": ["lost:T2"],
     }
+
+
+def test_sticks_have_metres_and_null_with_the_reason() -> None:
+    figure = StickFigure(
+        7,
+        5_000_123_000,
+        (0.98712345, 0.16, 0.0),
+        0.00214,
+        None,
+        (
+            PlanarJoint("knee", (0.05961, 0.18851, 0.5), 0.00111, math.radians(97.4), None),
+            PlanarJoint("ankle", None, None, None, "shank: C4 not visible"),
+        ),
+        (Stick("shank", ((0.05961, 0.18851, 0.5), None)),),
+    )
+    assert json.loads(encode_sticks(figure, 1_000_000)) == {
+        "v": 1,
+        "t_us": 5_001_123,
+        "frame": 7,
+        "plane": {"normal": [0.9871, 0.16, 0.0], "off_plane_m": 0.0021, "refused": None},
+        "joints": {
+            "knee": {
+                "p_m": [0.0596, 0.1885, 0.5], "error_m": 0.0011, "arc_deg": 97.4, "refused": None,
+            },
+            "ankle": {
+                "p_m": None, "error_m": None, "arc_deg": None, "refused": "shank: C4 not visible",
+            },
+        },
+        "sticks": {"shank": {"ends_m": [[0.0596, 0.1885, 0.5], None]}},
+    }  # fmt: skip

@@ -1,0 +1,57 @@
+"""Trackers of the cameras that a rig asks for: chain model and planar movement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
+from jointfit_daemon.pipeline.planar_chain import PlanarTracker
+
+if TYPE_CHECKING:
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.pipeline.chain_tracking import ChainTracker
+    from jointfit_daemon.pipeline.events import Output
+
+
+def chain_tracker(
+    rig: Rig, calibration: Calibration | None, before: ChainTracker | None
+) -> ChainTracker | None:
+    """Return a tracker of the chain model with its refined markers; `before` if it is equal."""
+    if rig.chain_model is None or rig.mqtt.chain_hz <= 0.0:
+        return None
+    stored = None if calibration is None else calibration.chain
+    refined = None if stored is None else stored.apply(rig.chain_model.chain)
+    loaded = rig.chain_model if refined is None else replace(rig.chain_model, chain=refined)
+    rate_hz, is_refined = rig.mqtt.chain_hz, refined is not None
+    if before is not None and before.serves(loaded, rate_hz, refined=is_refined):
+        return before
+    from jointfit_daemon.pipeline.chain_tracking import (  # noqa: PLC0415 - it loads scipy
+        ChainTracker,
+    )
+
+    return ChainTracker(loaded, rig.mqtt.chain_hz, refined=refined is not None)
+
+
+def planar_tracker(rig: Rig, before: PlanarTracker | None) -> PlanarTracker | None:
+    """Return a tracker of a planar rig; `before` if it is equal."""
+    if not rig.chain.planar:
+        return None
+    rates = rig.mqtt.sticks_hz, rig.mqtt.sticks_memory_s
+    if before is not None and before.serves(rig.chain, *rates):
+        return before
+    return PlanarTracker(rig.chain, rig.calibration.markers, *rates)
+
+
+def unused_refinement(rig: Rig, calibration: Calibration | None, t_ns: int) -> list[Output]:
+    """Return a notice if the calibration contains markers of another chain model."""
+    loaded, chain = rig.chain_model, None if calibration is None else calibration.chain
+    if loaded is None or chain is None or chain.apply(loaded.chain) is not None:
+        return []
+    text = (
+        "the calibration contains refined markers of another version of the chain model "
+        f"({chain.model!r}): those of the file are used. Repeat the functional phase to refine them"
+    )
+    level = NoticeLevel.WARNING
+    return [Notice(t_ns, NoticeKind.CALIBRATION, loaded.chain.name, text, level)]

@@ -1,0 +1,125 @@
+"""Pose of one segment in the plane of movement, from two or more markers.
+
+The template of the markers is the first frame with all of them. The origin of the segment is the
+template's mean. Complex numbers are points of the plane: x + iy in the coordinates of its basis.
+"""
+
+from __future__ import annotations
+
+from cmath import exp, phase
+from dataclasses import dataclass
+from math import sqrt
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+LOOSE_M = 0.012
+"""RMS residual above which markers are not at their mutual places, m: two markers whose distance
+changed by 24 mm, more than soft-tissue artefact does."""
+LEAST_MARKERS = 2
+"""Markers that define a pose in a plane."""
+_EXCHANGE_RAD = 2.5
+"""Rotation between two frames that only exchanged labels explain, rad."""
+_EXCHANGE_NS = 200_000_000
+"""Longest time between these two frames, ns."""
+_MEMORY = 0.02
+"""Weight of a new frame in the mean square of the residuals and in the share of loose frames."""
+_MOST_LOOSE = 0.1
+"""Largest share of frames with displaced markers of a segment."""
+
+
+class PlanarPose(NamedTuple):
+    """Pose of a segment in the plane: a point z of the segment is at turn · z + origin."""
+
+    turn: complex
+    """Rotation, of absolute value 1."""
+    origin: complex
+    """Position of the segment's origin, m."""
+
+
+class MissingPose(NamedTuple):
+    """Reason why a segment has no pose in a frame."""
+
+    reason: str
+    faulty: bool = False
+    """Whether the visible markers are wrong, so that no joint may be estimated from them."""
+
+
+@dataclass(slots=True)
+class PlanarSegment:
+    """Tracks one segment."""
+
+    markers: tuple[str, ...]
+    template: NDArray[np.complex128] | None = None
+    """Markers in the coordinates of the segment, m; None before the first complete frame."""
+    _square: float = 0.0
+    """Mean square residual of the template, m²."""
+    _loose: float = 0.0
+    """Recent share of frames in which the markers are not at their mutual places."""
+    _angle: float | None = None
+    _angle_ns: int = 0
+
+    @property
+    def rms(self) -> float:
+        """RMS residual of the fit of the template, m."""
+        return sqrt(self._square)
+
+    @property
+    def flat_template(self) -> NDArray[np.float64]:
+        """Template with real coordinates, m, shape (m, 2)."""
+        template = np.zeros(0) if self.template is None else self.template
+        return np.column_stack((template.real, template.imag))
+
+    def clear(self) -> None:
+        """Discard the template: the basis of the plane has changed."""
+        self.template, self._angle = None, None
+        self._square = self._loose = 0.0
+
+    def pose(self, t_ns: int, z: NDArray[np.complex128]) -> PlanarPose | MissingPose:
+        """Return the pose in one frame, or the reason why there is none.
+
+        Parameters
+        ----------
+        t_ns
+            Instant of the frame.
+        z
+            Markers in the plane, m, shape (m,); NaN where missing.
+        """
+        seen = np.isfinite(z)
+        if self.template is None and seen.all():
+            self.template = z - z.mean()
+        if self.template is None or seen.sum() < LEAST_MARKERS:
+            hidden = [name for name, here in zip(self.markers, seen, strict=True) if not here]
+            return MissingPose(f"{', '.join(hidden)} not visible")
+
+        at, template = z[seen].mean(), self.template[seen]
+        middle = template.mean()
+        product = complex(((z[seen] - at) * (template - middle).conj()).sum())
+        turn = exp(1j * phase(product))
+        origin = complex(at - turn * middle)
+        square = float((np.abs(z[seen] - origin - turn * template) ** 2).mean())
+        names = " and ".join(np.array(self.markers)[seen].tolist())
+        loose = sqrt(square) > LOOSE_M
+        self._loose += _MEMORY * (float(loose) - self._loose)
+        if loose or self._loose > _MOST_LOOSE:
+            what = "do not move together: check that they are on one segment"
+            return MissingPose(f"{names} {what}", faulty=True)
+        if self._exchanged(t_ns, phase(product)):
+            return MissingPose(f"{names} look exchanged: correct their labels", faulty=True)
+        self._square += _MEMORY * (square - self._square)
+        return PlanarPose(turn, origin)
+
+    def _exchanged(self, t_ns: int, angle: float) -> bool:
+        """Return whether the segment is turned about relative to the last frame, and follow it."""
+        before, self._angle = self._angle, angle
+        recent = t_ns - self._angle_ns < _EXCHANGE_NS
+        self._angle_ns = t_ns
+        if before is None or not recent:
+            return False
+        exchanged = abs(phase(exp(1j * (angle - before)))) > _EXCHANGE_RAD
+        if exchanged:
+            self._angle = phase(-exp(1j * angle))  # that of the segment with correct labels
+        return exchanged

@@ -1,0 +1,299 @@
+"""Joint positions and stick figure of a planar chain in operation.
+
+Every joint lies between two body parts. Seen from a part with two markers, each marker of its
+neighbor moves on a circle about the joint; a running fit with forgetting gives the center and its
+predicted error. One marker suffices on a part at an end of the chain. Source: Akbarifar et al.,
+Iranian Journal of Biomedical Engineering 15 (2021), 1-11.
+
+Invariant: nothing here depends on an IMU or on a calibration.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from math import exp, inf
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.center_of_rotation import (
+    BodyPoses,
+    CenterEstimate,
+    JointSide,
+    fuse_centers,
+    joint_trajectory,
+)
+from jointfit_daemon.center_of_rotation.planar import RunningCircle, plane_of
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import MAX_FIT_RMS_M, body_parts, vector
+from jointfit_daemon.model import PlanarJoint, Stick, StickFigure
+from jointfit_daemon.pipeline.events import Notice, NoticeKind
+from jointfit_daemon.pipeline.planar_chain._movement_plane import PlaneEstimator
+from jointfit_daemon.pipeline.planar_chain._planar_segment import (
+    LEAST_MARKERS,
+    MissingPose,
+    PlanarPose,
+    PlanarSegment,
+)
+from jointfit_daemon.timing.alignment import RateDivider
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.model import Chain, MocapFrame, MocapLayout, Vector
+    from jointfit_daemon.pipeline.events import Output
+
+LEARNED_HZ = 20.0
+"""Frames per second of the running fits: joints turn by a few degrees between two of them."""
+FITTED_HZ = 2.0
+"""Estimates of the centers per second."""
+OTHER_PLANE_COS = 0.9962
+"""Cosine of the angle between two planes, 5°, beyond which the centers are estimated again: the
+circles of a plane that is 5° off are compressed by 0.4 %."""
+FARTHEST_M = 1000.0
+"""Distance from the origin beyond which a marker counts as missing, m."""
+
+
+@dataclass(slots=True)
+class _Side:
+    """Center of a joint in the coordinates of one of its parts."""
+
+    parent: str
+    child: str
+    circles: list[RunningCircle]
+    """One for each marker of the child."""
+    estimate: CenterEstimate | None = None
+
+    def feed(self, pose: PlanarPose | None, child: NDArray[np.complex128]) -> None:
+        """Process one frame; `child` are its markers in the plane, m, as complex numbers."""
+        if pose is None:
+            local = np.full(len(child), complex(np.nan, np.nan))
+        else:
+            local = (child - pose.origin) * np.conj(pose.turn)
+        for circle, z in zip(self.circles, local, strict=True):
+            circle.feed(float(z.real), float(z.imag))
+
+    def fit(self) -> None:
+        """Estimate the center from the frames so far."""
+        each = [circle.estimate() for circle in self.circles]
+        found = each[0] if len(each) == 1 else fuse_centers(each)
+        if found.refused is None and MAX_FIT_RMS_M < found.residual < inf:
+            reason = (
+                f"the distance of its markers varies by {1e3 * found.residual:.0f} mm RMS, "
+                f"expected at most {1e3 * MAX_FIT_RMS_M:g} mm: check that they are on this segment"
+            )
+            found = replace(found, refused=reason)
+        self.estimate = found
+
+
+@dataclass(slots=True)
+class _Joint:
+    name: str
+    parts: tuple[str, str]
+    sides: list[_Side] = field(default_factory=list)
+
+
+class PlanarTracker:
+    """Follows the joints between body parts with one or two markers.
+
+    Parameters
+    ----------
+    chain : Chain
+        The limb: joints between neighboring parts with markers are followed.
+    markers : mapping of str to tuple of str
+        Markers of every body part.
+    rate_hz : float
+        Greatest number of stick figures per second; above 0.
+    memory_s : float
+        Time constant with which older frames lose weight, s.
+    """
+
+    def __init__(
+        self, chain: Chain, markers: Mapping[str, tuple[str, ...]], rate_hz: float, memory_s: float
+    ) -> None:
+        self._given = chain, rate_hz, memory_s
+        self._forgetting = exp(-1.0 / (LEARNED_HZ * memory_s))
+        parts = [part for part in body_parts(chain) if part is not None and part in markers]
+        self._parts = {part: PlanarSegment(markers[part]) for part in parts}
+        self._joints = [
+            _Joint(chain.joints[i], (a, b))
+            for i, (a, b) in enumerate(pairwise(body_parts(chain)))
+            if a is not None and b is not None and {a, b} <= self._parts.keys()
+        ]
+        self._names = [name for part in self._parts.values() for name in part.markers]
+        self._estimator = PlaneEstimator(len(self._names), self._forgetting)
+        self._plane = self._estimator.estimate()
+        self._basis: Array | None = None
+        self._shown, self._learned = RateDivider(rate_hz), RateDivider(LEARNED_HZ)
+        self._fitted = RateDivider(FITTED_HZ)
+        self._layout: MocapLayout | None = None
+        self._columns: list[int] = []
+
+    def serves(self, chain: Chain, rate_hz: float, memory_s: float) -> bool:
+        """Return whether this tracker has these settings; its markers are those of the cameras."""
+        return self._given == (chain, rate_hz, memory_s)
+
+    def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
+        """Return the stick figure of a live frame, if one is due, and notices."""
+        learned, shown = self._learned.is_due(t_ns), self._shown.is_due(t_ns)
+        if not (learned or shown):
+            return []
+        measured = self._markers(frame)
+        notices: list[Output] = []
+        fitted = learned and self._fitted.is_due(t_ns)
+        if learned:
+            self._estimator.feed(np.concatenate(list(measured.values())))
+        if fitted:
+            notices = self._update_plane(t_ns)
+
+        poses = self._poses(t_ns, measured)
+        if learned and self._basis is not None:
+            self._learn(measured, poses, fit=fitted)
+        return [*notices, self._figure(t_ns, frame, measured, poses)] if shown else notices
+
+    def _markers(self, frame: MocapFrame) -> dict[str, Array]:
+        """Return the markers of every part, m, shape (m, 3); NaN where missing."""
+        if frame.layout is not self._layout:
+            self._layout = frame.layout
+            column = {name: k for k, name in enumerate(frame.layout.markers)}
+            self._columns = [column.get(name, -1) for name in self._names]
+        padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
+        found = padded[self._columns]
+        possible = (np.abs(found) < FARTHEST_M).all(axis=1, keepdims=True)
+        found = np.where(possible, found, np.nan)
+        ends = np.cumsum([len(part.markers) for part in self._parts.values()])[:-1]
+        return dict(zip(self._parts, np.split(found, ends), strict=True))
+
+    def _update_plane(self, t_ns: int) -> list[Output]:
+        """Use the first plane, and another one if the movement has changed its plane."""
+        self._plane = plane = self._estimator.estimate()
+        if plane.normal is None:
+            return []
+        before = None if self._basis is None else np.cross(*self._basis.T)
+        if before is not None and abs(float(before @ plane.normal)) > OTHER_PLANE_COS:
+            return []
+        self._basis = plane_of(plane.normal)
+        for part in self._parts.values():
+            part.clear()
+        for joint in self._joints:
+            joint.sides = [
+                _Side(a, b, [RunningCircle(forgetting=self._forgetting)
+                             for _ in self._parts[b].markers])
+                for a, b in (joint.parts, joint.parts[::-1])
+                if len(self._parts[a].markers) >= LEAST_MARKERS
+            ]  # fmt: skip
+        what = "found" if before is None else "changed: the joint centres are estimated again"
+        data = {"state": "plane", "normal": [round(float(x), 4) for x in plane.normal]}
+        text = f"plane of movement {what}"
+        return [Notice(t_ns, NoticeKind.MARKER, "plane", text, data=data)]
+
+    def _in_plane(self, points: Array) -> NDArray[np.complex128]:
+        basis = self._basis
+        if basis is None:
+            return np.full(len(points), complex(np.nan, np.nan))
+        flat = points @ basis
+        return np.asarray(flat[:, 0] + 1j * flat[:, 1])
+
+    def _poses(
+        self, t_ns: int, measured: Mapping[str, Array]
+    ) -> dict[str, PlanarPose | MissingPose]:
+        """Return the pose of every part with two markers, or the reason why there is none."""
+        if self._basis is None:
+            return {}
+        return {
+            name: part.pose(t_ns, self._in_plane(measured[name]))
+            for name, part in self._parts.items()
+            if len(part.markers) >= LEAST_MARKERS
+        }
+
+    def _learn(
+        self,
+        measured: Mapping[str, Array],
+        poses: Mapping[str, PlanarPose | MissingPose],
+        *,
+        fit: bool,
+    ) -> None:
+        for joint in self._joints:
+            for side in joint.sides:
+                pose, other = poses[side.parent], poses.get(side.child)
+                wrong = isinstance(other, MissingPose) and other.faulty
+                known = pose if isinstance(pose, PlanarPose) and not wrong else None
+                side.feed(known, self._in_plane(measured[side.child]))
+                if fit:
+                    side.fit()
+
+    # --- output ------------------------------------------------------------------------------
+
+    def _figure(
+        self,
+        t_ns: int,
+        frame: MocapFrame,
+        measured: Mapping[str, Array],
+        poses: Mapping[str, PlanarPose | MissingPose],
+    ) -> StickFigure:
+        joints = {joint.name: self._position(joint, measured, poses) for joint in self._joints}
+        normal = None if self._basis is None else np.cross(*self._basis.T)
+        plane = self._plane
+        return StickFigure(
+            frame.number,
+            t_ns,
+            None if normal is None else vector(normal),
+            plane.off_plane,
+            plane.refused if normal is None else None,
+            tuple(joints.values()),
+            tuple(self._stick(part, measured[part], joints) for part in self._parts),
+        )
+
+    def _position(
+        self,
+        joint: _Joint,
+        measured: Mapping[str, Array],
+        poses: Mapping[str, PlanarPose | MissingPose],
+    ) -> PlanarJoint:
+        """Return the joint in this frame, from each part that has a pose and a center."""
+        if self._basis is None:
+            return PlanarJoint(joint.name, None, None, None, self._plane.refused)
+        sides, reasons = [], []
+        for side in joint.sides:
+            pose, estimate = poses[side.parent], side.estimate
+            if isinstance(pose, MissingPose):
+                reasons.append(f"{side.parent}: {pose.reason}")
+            elif estimate is None or estimate.refused is not None:
+                why = "no center yet" if estimate is None else estimate.refused
+                reasons.append(f"{side.child} about {joint.name}, seen from {side.parent}: {why}")
+            else:
+                sides.append(self._joint_side(side, estimate, pose, measured[side.parent]))
+        found = joint_trajectory(sides, 1)
+        if not np.isfinite(found.positions).all():
+            return PlanarJoint(joint.name, None, None, None, "; ".join(reasons))
+        arc = max(side.estimate.arc for side in sides)
+        position, error = vector(found.positions[0]), float(found.error[0])
+        return PlanarJoint(joint.name, position, error, arc, None)
+
+    def _joint_side(
+        self, side: _Side, estimate: CenterEstimate, pose: PlanarPose, seen: Array
+    ) -> JointSide:
+        """Return one frame of a side; the position along the normal is that of the markers."""
+        basis, part = self._basis, self._parts[side.parent]
+        assert basis is not None  # noqa: S101 - there are sides only with a plane
+        normal = np.cross(*basis.T)
+        t = basis @ (pose.origin.real, pose.origin.imag) + normal * np.nanmean(seen @ normal)
+        q = rotation.exp(np.angle(pose.turn) * normal[None])
+        poses = BodyPoses(q, np.asarray(t)[None])
+        return JointSide(poses, basis, part.flat_template, part.rms, estimate)
+
+    def _stick(self, part: str, seen: Array, joints: Mapping[str, PlanarJoint]) -> Stick:
+        """Return the ends of a segment: its joints; at an end of the chain a marker and a joint."""
+        ends: list[Vector | None] = [
+            joints[joint.name].position for joint in self._joints if part in joint.parts
+        ]
+        if len(ends) == 1:
+            here = np.flatnonzero(np.isfinite(seen).all(axis=1))
+            marker = vector(seen[here[0]]) if here.size else None
+            first = part == self._joints[0].parts[0]
+            ends = [marker, *ends] if first else [*ends, marker]
+        return Stick(part, tuple(ends))
