@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from bench.rigs.recorded_trial import Played
     from jointfit_daemon.limb_model import Method
 
-pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(150)]
+pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(330)]
 
 METHODS: tuple[Method, ...] = ("patent12", "mean")
 FRAMES = 270
