@@ -8,15 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from jointfit_daemon.tools.dashboard.addresses import parse_broker, parse_listen
+from jointfit_daemon.tools.dashboard.addresses import LISTEN, parse_broker, parse_listen
 from jointfit_daemon.tools.stop_signals import cancel_on_signal
 
 if TYPE_CHECKING:
-    from jointfit_daemon.tools.dashboard._server import DashboardServer
     from jointfit_daemon.tools.dashboard.addresses import ListenAddress
-
-LISTEN = "127.0.0.1:8080"
-"""Default address: this machine only."""
+    from jointfit_daemon.tools.dashboard.server import DashboardServer
 
 
 def dashboard(
@@ -46,8 +43,8 @@ def dashboard(
     """
     address, target = parse_listen(listen), parse_broker(broker)
 
-    from jointfit_daemon.tools.dashboard._server import DashboardServer
     from jointfit_daemon.tools.dashboard._tunnel import tls_context
+    from jointfit_daemon.tools.dashboard.server import DashboardServer
 
     server = DashboardServer(
         target,

@@ -6,6 +6,8 @@ import ipaddress
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
+LISTEN = "127.0.0.1:8080"
+"""Default address of the page: this machine only."""
 PLAIN_PORT, TLS_PORT = 1883, 8883
 """Registered TCP ports of MQTT without and with TLS."""
 _HIGHEST_PORT = 65535

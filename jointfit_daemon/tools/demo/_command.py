@@ -12,6 +12,7 @@ import orjson
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.dashboard.addresses import LISTEN, parse_listen
 from jointfit_daemon.tools.output_files import check_output
 from jointfit_daemon.tools.stop_signals import StopRequest, cancel_on_signal
 
@@ -47,6 +48,12 @@ def demo(
         Path | None, typer.Option(help="Folder for rig, logs, calibration and ground truth.")
     ] = None,
     picture: Annotated[Path | None, typer.Option(help="Save the final display as SVG.")] = None,
+    web: Annotated[
+        bool, typer.Option("--web", help="Show the run in a web page, until Ctrl-C.")
+    ] = False,
+    listen: Annotated[
+        str, typer.Option(help="Address of the page with --web; 0.0.0.0:8080 for other devices.")
+    ] = LISTEN,
 ) -> None:
     """Run the daemon on simulated hardware; needs no device, broker or root access.
 
@@ -55,7 +62,8 @@ def demo(
     truth. Exits with 1 if a step fails or a target is missed: flexion error of the knee (elbow,
     lumbar joint) 3 degrees RMS, all samples accounted for,
     99 % of frames received within 60 ms. Ctrl-C, SIGTERM and SIGHUP stop the run and print the
-    results so far.
+    results so far. With --web the limb is calibrated and then moves until the run is stopped, with
+    exit code 0; nothing is compared.
     """
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"--seconds {seconds:g}: expected a finite number above 0")
@@ -70,9 +78,18 @@ def demo(
             str(seed),
             *(w for k in knob or [] for w in ("--set", k)),
         ]
+        if web:
+            from jointfit_daemon.tools.demo._web import run_web_demo
+
+            asyncio.run(run_web_demo(folder.resolve(), BASE, options, parse_listen(listen)))
+            return
         run = _run(folder.resolve(), seconds, limb, options, headless=headless, picture=picture)
         figures, stopped = asyncio.run(run)
+    _report(figures, stopped, headless=headless)
 
+
+def _report(figures: dict[str, Any], stopped: StopRequest | None, *, headless: bool) -> None:
+    """Print the result; exit with an error if a target was missed or the run was stopped."""
     missed = missed_targets(figures)
     if stopped is not None:
         outcome = f"interrupted by {stopped.name}"

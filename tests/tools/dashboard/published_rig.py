@@ -30,6 +30,21 @@ def about_x(angle: float) -> list[float]:
     return [math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]
 
 
+STORED = {
+    "in_force": 3,
+    "omitted": 0,
+    "versions": [
+        {
+            "version": version, "created_utc": f"2026-11-2{version}T09:30:00Z", "usable": True,
+            "method": "anchored", "functional": True, "flexion_deg": {"knee": 2.0 + 0.2 * version},
+            "restored_from": None, "fault": None,
+        }
+        for version in (3, 2, 1)
+    ],
+}  # fmt: skip
+"""Data of the answer to the request `calibrations`."""
+
+
 @dataclass
 class PublishedRig:
     """Payloads of a rig with the joints hip, knee and ankle."""
@@ -48,6 +63,11 @@ class PublishedRig:
     answer: dict[str, Any] = field(
         default_factory=lambda: {"status": "accepted", "data": {}, "error": None}
     )
+
+    answers: dict[str, dict[str, Any]] = field(
+        default_factory=lambda: {"calibrations": {"status": "ok", "data": STORED}}
+    )
+    """Answers by command; `answer` to all others."""
 
     @property
     def devices(self) -> dict[str, dict[str, Any]]:
@@ -223,6 +243,8 @@ async def _answer(rig: PublishedRig, client: aiomqtt.Client) -> None:
         async for message in client.messages:
             request = orjson.loads(bytes(message.payload))
             rig.requests.append(request)
-            answer = {"v": 1, "transaction": request.get("transaction"), **rig.answer}
+            command = message.topic.value.rpartition("/")[2]
+            found = rig.answers.get(command, rig.answer)
+            answer = {"v": 1, "transaction": request.get("transaction"), **found}
             topic = message.topic.value.replace("/request/", "/response/")
             await client.publish(topic, orjson.dumps(answer), 1)

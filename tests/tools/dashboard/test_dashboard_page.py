@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.tools.dashboard._server import DashboardServer
+from jointfit_daemon.outputs.mqtt import verify
 from jointfit_daemon.tools.dashboard.addresses import BrokerAddress, ListenAddress
+from jointfit_daemon.tools.dashboard.server import DashboardServer
 from tests.broker_fixture import HOST
 from tests.tools.dashboard.browser import SIZES, VIEWS, OpenedPage, chromium, opened
 from tests.tools.dashboard.published_rig import PublishedRig, publishing
@@ -133,6 +134,42 @@ async def test_a_request_is_sent_and_a_refusal_is_shown_in_words(broker: Broker)
         await page.page.click("text=Start standing")
         await page.until_text("#view-calibrate .banner", "S4 sends no data: check its cable")
         assert [request["phase"] for request in rig.requests] == ["static"]
+
+
+async def test_a_stored_calibration_is_chosen_in_the_history(broker: Broker) -> None:
+    rig = PublishedRig()
+    async with shown(broker, rig) as page:
+        await page.show("history")
+        await page.until_text("#view-history", "in force")
+        await page.page.click("text=Use version 2")
+        await page.until_text("#view-history", "Use version 2")
+        assert rig.requests[1]["version"] == 2
+        await page.show("log")
+        await page.page.fill("#view-log input[maxlength]", "first step")
+        await page.page.keyboard.press("Enter")
+        await page.page.wait_for_function(
+            "() => document.querySelector('#view-log input[maxlength]').value === ''"
+        )
+        assert rig.requests[-1]["text"] == "first step"
+
+
+KEY = "0123456789abcdef0123456789abcdef"
+
+
+async def test_requests_are_signed_with_the_key_that_the_user_enters(broker: Broker) -> None:
+    rig = PublishedRig(clock_offset_s=5 * 3600)
+    rig.answer = {"status": "error", "error": {"message": "this rig accepts signed requests only"}}
+    async with shown(broker, rig) as page:
+        await page.show("calibrate")
+        await page.page.click("text=Start standing")
+        await page.page.fill("#key-value", KEY)
+        rig.answer = {"status": "accepted", "data": {}, "error": None}
+        await page.page.click("#key-send")
+        async with asyncio.timeout(10):
+            while not any("signature" in request for request in rig.requests):
+                await asyncio.sleep(0.05)
+    topic = f"{rig.base}/bridge/request/calibrate"
+    verify(KEY.encode(), topic, rig.requests[-1], rig.now_us())
 
 
 async def test_keys_move_between_the_views_and_turn_the_limb(broker: Broker) -> None:

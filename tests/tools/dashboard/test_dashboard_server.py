@@ -21,7 +21,6 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Origin, Subprotocol
 
 from jointfit_daemon.tools.__main__ import app
-from jointfit_daemon.tools.dashboard._server import DashboardServer
 from jointfit_daemon.tools.dashboard._tunnel import BROKER_CLOSED, BROKER_UNREACHABLE, tls_context
 from jointfit_daemon.tools.dashboard.addresses import (
     BrokerAddress,
@@ -29,6 +28,7 @@ from jointfit_daemon.tools.dashboard.addresses import (
     parse_broker,
     parse_listen,
 )
+from jointfit_daemon.tools.dashboard.server import DashboardServer
 from tests.broker_fixture import HOST, free_port
 
 if TYPE_CHECKING:

@@ -3,7 +3,6 @@
 import { resultOf } from "./calibration_result.js";
 import { byId, createElement, createTable, setText } from "./dom.js";
 import { figuresOfPhase } from "./pose_figures.js";
-import { needsSignature } from "./requests.js";
 import { calibrationSentence, formatNumber, isRunning, titleOf } from "./words.js";
 
 const STEPS = [
@@ -24,9 +23,9 @@ const STEPS = [
 ];
 const SOURCES = { unknown: "not known yet", sensors: "IMUs only" };
 
-/** Show the calibration of a store; `askForKey(send)` asks for the request key. */
-export function createCalibrateView(store, requests, askForKey) {
-  const view = { store, requests, askForKey, message: null, steps: new Map(), drawnFor: null };
+/** Show the calibration of a store; `request(command, content)` sends a request. */
+export function createCalibrateView(store, request) {
+  const view = { store, request, message: null, steps: new Map(), drawnFor: null };
   view.message = createElement("p", { class: "banner", role: "alert", hidden: true });
   view.now = createElement("div", { class: "panel stack", hidden: true });
   view.grid = createElement("div", { class: "steps" });
@@ -35,21 +34,21 @@ export function createCalibrateView(store, requests, askForKey) {
   buildProgress(view);
   const update = () => updateView(view);
   for (const subject of ["info", "calibration", "bridge"]) store.on(subject, update);
+  let phase = null;
+  store.on("calibration", () => {
+    if (store.calibration?.phase === phase) return;
+    phase = store.calibration?.phase;
+    view.message.hidden = true; // the refusal of an earlier request
+  });
   update();
   return { request: (content) => sendRequest(view, content) };
 }
 
-/** Send a calibration request and show a refusal; a rig with a key gets a signed one. */
+/** Send a calibration request and show a refusal. */
 async function sendRequest(view, content) {
   view.message.hidden = true;
   try {
-    const answer = await view.requests.send("calibrate", content);
-    if (answer.status !== "error") return;
-    if (needsSignature(answer.error)) {
-      view.askForKey(() => sendRequest(view, content));
-      return;
-    }
-    showMessage(view, `jointfitd refuses: ${answer.error?.message ?? "no reason given"}`);
+    await view.request("calibrate", content);
   } catch (error) {
     showMessage(view, error.message);
   }

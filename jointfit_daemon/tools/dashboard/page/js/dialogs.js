@@ -8,27 +8,31 @@ export function createDialogs(link, requests) {
     link.logIn(byId("login-user").value, byId("login-password").value);
     byId("login-password").value = "";
   });
-  let resend = null;
+  let entered = null;
   connect("key-dialog", "key-send", "key-cancel", () => {
     requests.key = byId("key-value").value;
     byId("key-value").value = "";
-    resend?.();
+    entered?.resolve();
+  });
+  byId("key-dialog").addEventListener("close", () => {
+    entered?.reject(new Error("The request was not sent: it needs the request key."));
   });
   return {
     askForAccount(reason) {
       setText(byId("login-reason"), reason);
       if (!byId("login").open) byId("login").showModal();
     },
-    askForKey(send) {
-      resend = send;
+    /** Return when a key was entered; throws an Error if the dialog was closed without one. */
+    askForKey() {
       byId("key-dialog").showModal();
+      return new Promise((resolve, reject) => { entered = { resolve, reject }; });
     },
   };
 }
 
 function connect(id, send, cancel, onSend) {
   const dialog = byId(id);
-  const accept = () => { dialog.close(); onSend(); };
+  const accept = () => { onSend(); dialog.close(); };
   byId(send).addEventListener("click", accept);
   byId(cancel).addEventListener("click", () => dialog.close());
   dialog.addEventListener("keydown", (event) => {

@@ -13,7 +13,7 @@ import { createLogView } from "./log_view.js";
 import { createRequests } from "./requests.js";
 import { createSensorCards } from "./sensor_cards.js";
 import { createSensorsView } from "./sensors_view.js";
-import { createStore } from "./store.js";
+import { createStore, gatewayNow } from "./store.js";
 import { createTableView } from "./table_view.js";
 import { connectTabs } from "./tabs.js";
 import { formatNumber } from "./words.js";
@@ -44,7 +44,7 @@ async function start() {
     found: (base, info) => { rigs.set(base, info); refresh(); },
     login: (reason) => dialogs.askForAccount(reason),
   });
-  const requests = createRequests(link);
+  const requests = createRequests(link, () => gatewayNow(store) ?? Date.now() * 1000);
   dialogs = createDialogs(link, requests);
 
   const choose = (base) => {
@@ -52,16 +52,15 @@ async function start() {
     link.choose(base);
     refresh();
   };
-  if (configuration.base !== null) choose(configuration.base);
   // Several rigs may share a broker: the only one is chosen after a short search.
   setInterval(() => { if (link.base === null && rigs.size === 1) choose(rigs.keys().next().value); }, SEARCH_MS);
 
   const limb = createLimbView(store);
   const angle = createAngleView(store);
   const updateCards = createSensorCards(store);
-  const calibrate = createCalibrateView(store, requests, dialogs.askForKey);
-  createHistoryView(store);
-  const views = { sensors: createSensorsView(store, link), log: createLogView(store), table: createTableView(store) };
+  const request = (command, content) => requests.ask(command, content, dialogs.askForKey);
+  const calibrate = createCalibrateView(store, request);
+  const views = { history: createHistoryView(store, request), sensors: createSensorsView(store, link), log: createLogView(store, request), table: createTableView(store) };
   const updateHeader = createHeader(link, store, configuration, {
     reconnect: () => link.connect(),
     logIn: () => dialogs.askForAccount(link.reason),
@@ -90,6 +89,7 @@ async function start() {
 
   // Figures for measurements: messages, and main-thread time of drawing, ms.
   globalThis.jointfit = { store, link, limb, angle };
+  if (configuration.base !== null) choose(configuration.base);
   link.connect();
 }
 

@@ -1,10 +1,10 @@
 // Requests to the daemon (docs/mqtt.md, "Requests"), signed where the rig requires it.
 
-const ANSWER_MS = 6000;
+const ANSWER_MS = 10_000;
 const NOT_AUTHORISED = 135;
 
-/** Return a sender of requests over a link. */
-export function createRequests(link) {
+/** Return a sender of requests over a link; `now()` is the gateway's UNIX time, µs. */
+export function createRequests(link, now) {
   const waiting = new Map();
   const requests = {
     /** Key that signs requests; null while none was entered. */
@@ -15,13 +15,27 @@ export function createRequests(link) {
       waiting.get(payload.transaction)?.(payload);
     },
 
+    /**
+     * Send a request; return the data of the answer. `askForKey` is called if the rig accepts signed
+     * requests only. Throws an Error with a sentence if the request has no effect.
+     */
+    async ask(command, content, askForKey) {
+      const answer = await requests.send(command, content);
+      if (answer.status !== "error") return answer.data ?? {};
+      if (!needsSignature(answer.error)) {
+        throw new Error(`jointfitd refuses: ${answer.error?.message ?? "no reason given"}`);
+      }
+      await askForKey();
+      return requests.ask(command, content, askForKey);
+    },
+
     /** Send a request; return the answer. Throws an Error with a sentence if there is none. */
     async send(command, content) {
       if (!link.client?.connected) throw new Error("The page is not connected to the broker.");
       const transaction = crypto.getRandomValues(new Uint32Array(4)).join("-");
       const request = { ...content, transaction };
       const topic = `bridge/request/${command}`;
-      if (requests.key !== null) await sign(requests.key, `${link.base}/${topic}`, request);
+      if (requests.key !== null) await sign(requests.key, `${link.base}/${topic}`, request, now());
 
       const answered = waitForAnswer(waiting, transaction);
       try {
@@ -57,11 +71,11 @@ function waitForAnswer(waiting, transaction) {
 }
 
 /** Add time, nonce and signature to a request: HMAC-SHA256 of topic, newline and sorted JSON. */
-export async function sign(key, topic, request) {
+export async function sign(key, topic, request, t_us) {
   if (!globalThis.crypto?.subtle) {
     throw new Error("Browsers sign only on https:// pages and on localhost. Open the page there, or use jointfit calibrate.");
   }
-  request.t_us = Date.now() * 1000;
+  request.t_us = Math.round(t_us);
   request.nonce = [...crypto.getRandomValues(new Uint8Array(16))].map(hex).join("");
   const sorted = Object.fromEntries(Object.keys(request).sort().map((name) => [name, request[name]]));
   const text = new TextEncoder().encode(`${topic}\n${JSON.stringify(sorted)}`);
@@ -75,6 +89,6 @@ export async function sign(key, topic, request) {
 const hex = (byte) => byte.toString(16).padStart(2, "0");
 
 /** Return whether an error of the daemon means that a signature is missing or wrong. */
-export function needsSignature(error) {
+function needsSignature(error) {
   return /signed requests only|^signature:/.test(error?.message ?? "");
 }

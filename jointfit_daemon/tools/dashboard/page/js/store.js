@@ -13,7 +13,6 @@ export function createStore() {
     info: null,
     health: null,
     calibration: null,
-    calibrations: [],
     progress: null,
     devices: new Map(),
     lastEvents: new Map(),
@@ -48,7 +47,7 @@ export function createStore() {
       Object.assign(store, {
         base, bridge: "unknown", info: null, health: null, calibration: null, progress: null,
         pose: null, poseReceivedMs: null, optical: null, sensors: null, clockOffsetMs: null,
-        calibrations: [], events: [], poses: [], opticals: [],
+        events: [], poses: [], opticals: [],
       });
       store.devices.clear();
       store.lastEvents.clear();
@@ -131,10 +130,6 @@ function dropOld(entries, newest_us) {
 function takeCalibration(store, calibration) {
   store.calibration = calibration;
   if (calibration.phase !== store.progress?.phase) store.progress = null;
-  if (calibration.phase === "calibrated" && calibration.version != null && !calibration.kept) {
-    const known = store.calibrations.filter((entry) => entry.version !== calibration.version);
-    store.calibrations = [calibration, ...known];
-  }
   store.changed("calibration");
 }
 

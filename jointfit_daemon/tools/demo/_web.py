@@ -1,0 +1,137 @@
+"""The demo in a browser: simulated hardware, the daemon and the dashboard, until Ctrl-C.
+
+The simulated subject follows the calibration phases, so that a user can calibrate in the page.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from jointfit_daemon.tools.calibrate import PhaseAbortedError, PhaseTracker, RequestRefusedError
+from jointfit_daemon.tools.child_processes import daemon, simulator, time_limit
+from jointfit_daemon.tools.dashboard.addresses import BrokerAddress
+from jointfit_daemon.tools.dashboard.server import DashboardServer
+from jointfit_daemon.tools.embedded_broker import HOST, embedded_broker
+from jointfit_daemon.tools.stop_signals import cancel_on_signal
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.outputs.mqtt import MqttClient
+    from jointfit_daemon.tools.child_processes import ChildProcess
+    from jointfit_daemon.tools.dashboard.addresses import ListenAddress
+
+CONNECT_S = 60.0
+"""Time limit for connecting all sources, s."""
+SETTLE_S = 3.0
+"""Time for the device clocks to converge, s."""
+PHASES = (("align", 20.0), ("static", 5.0), ("functional", 47.0))
+"""Phases of the calibration and their durations, s."""
+TOPICS = ("calibration", "calibration/progress", "device/+/availability")
+
+
+async def run_web_demo(
+    folder: Path, base: str, options: Sequence[str], listen: ListenAddress
+) -> None:
+    """Run until a stop signal; print the URL of the page first.
+
+    Parameters
+    ----------
+    folder
+        Folder of rig, logs and calibration.
+    base
+        Base topic.
+    options
+        Options of the simulator.
+    listen
+        Address of the page.
+    """
+    with cancel_on_signal() as stop:
+        try:
+            with embedded_broker(folder) as port:
+                server = DashboardServer(BrokerAddress(HOST, port), base=base)
+                async with server.listening(listen) as url:
+                    print_address(url, listen)
+                    more = ("--follow", "--sensors-hz", "10")
+                    async with simulator(folder, port, base, [*options, *more]) as simulated:
+                        rig_file = Path((await simulated.ready())["rig"])
+                        async with daemon(folder, rig_file) as process:
+                            from jointfit_daemon.config import load_rig  # slow: after the URL
+
+                            await _calibrate(load_rig(rig_file), process)
+                            typer.echo(
+                                "The limb is live. Calibrate again in the page; Ctrl-C stops."
+                            )
+                            while True:
+                                process.check()
+                                simulated.check()
+                                await asyncio.sleep(1.0)
+        except asyncio.CancelledError:
+            if stop.number is None:
+                raise
+
+
+def print_address(url: str, listen: ListenAddress) -> None:
+    """Print the URL; as a QR code too if other devices can open it and segno is installed."""
+    typer.echo(f"dashboard: {url}  (Ctrl-C stops)")
+    if listen.is_local:
+        typer.echo("For a phone in the same network: --listen 0.0.0.0:8080")
+        return
+    try:
+        import segno
+    except ModuleNotFoundError:
+        typer.echo("For a QR code: pip install 'jointfitd[demo]'")
+        return
+    segno.make(url, error="l").terminal(compact=True)
+
+
+async def _calibrate(rig: Rig, process: ChildProcess) -> None:
+    """Run all phases unless the user takes over in the page."""
+    from jointfit_daemon.outputs.mqtt import MqttClient
+
+    online: set[str] = set()
+    async with MqttClient(rig.mqtt) as client:
+        await client.subscribe(*TOPICS)
+        tracker = PhaseTracker(lambda *_: None)
+        listener = asyncio.create_task(_listen(client, tracker, online), name="demo listener")
+        try:
+            async with time_limit(CONNECT_S, "connecting all sources"):
+                while not {source.id for source in rig.sources} <= online:
+                    process.check()
+                    await asyncio.sleep(0.1)
+            await asyncio.sleep(SETTLE_S)
+            for phase, seconds in PHASES:
+                await _run_phase(client, tracker, phase, seconds)
+        except (PhaseAbortedError, RequestRefusedError) as ended:
+            typer.echo(f"calibration: {ended}. Continue in the page.", err=True)
+        finally:
+            listener.cancel()
+            await asyncio.wait([listener])
+
+
+async def _run_phase(client: MqttClient, tracker: PhaseTracker, phase: str, seconds: float) -> None:
+    typer.echo(f"calibration: {phase}, {seconds:g} s")
+    tracker.begin()
+    answer = await client.request("calibrate", {"phase": phase, "seconds": seconds})
+    if answer.get("status") != "accepted":
+        raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
+    await tracker.wait_for_end(phase)
+
+
+async def _listen(client: MqttClient, tracker: PhaseTracker, online: set[str]) -> None:
+    async for topic, payload in client.messages():
+        if not isinstance(payload, dict):
+            continue
+        if topic == "calibration":
+            tracker.on_status(payload)
+        elif topic.endswith("/availability"):
+            _note_device(online, topic.split("/")[1], payload)
+
+
+def _note_device(online: set[str], device: str, payload: dict[str, Any]) -> None:
+    (online.add if payload.get("state") == "online" else online.discard)(device)
