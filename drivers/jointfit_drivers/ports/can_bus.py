@@ -7,7 +7,8 @@ A bus is drained from ``loop.add_reader`` on its descriptor, up to 64 frames per
 without descriptor is read by one thread that delivers batches. python-can's own Notifier is not
 used because it ignores receive errors.
 
-Invariant: python-can stays behind this module, which contains no device and no message format.
+Invariant: drivers use python-can only through this module, which knows no device and no message
+format.
 """
 
 from __future__ import annotations
@@ -44,9 +45,9 @@ _CLAIM_NS = 300_000_000
 together.
 """
 _SEEN = 64
-"""Number of unclaimed identifiers whose data are stored for messages."""
+"""Number of unclaimed identifiers whose data are stored for error messages."""
 _NAMED = 8
-"""Number of unclaimed identifiers listed in a message."""
+"""Number of unclaimed identifiers listed in an error message."""
 _SAMPLES = 4
 """Stored frames of each unclaimed identifier."""
 _EARLY = 16
@@ -65,7 +66,7 @@ class _Subscriber:
     silence_s: float
     needed: CanKey
     others: int
-    """Frames of all devices that had arrived at the time of its subscription."""
+    """Number of frames of all devices that had arrived before its subscription."""
     arrived: dict[CanKey, int] = field(default_factory=dict)
     """Time of the last arrival, ns, of each of its identifiers since its subscription."""
     early: deque[Chunk] = field(default_factory=lambda: deque(maxlen=_EARLY))
@@ -151,17 +152,18 @@ class SharedBus:
         resembles: Callable[[bytes], bool] = lambda _: False,
         worked: bool = False,
     ) -> None:
-        """Emit every frame with one of `ids`, in chunks of records, until cancelled.
+        """Emit every frame with one of `ids`, in chunks of packed frames, until cancelled.
 
-        Error frames and host notes (`host_dropped`, `host_corrupt`) are emitted as well. A note
-        about corrupt bytes goes to one device only, so that the bytes are counted once.
+        Error frames are emitted as well, and so are the records with which this host counts dropped
+        frames (`host_dropped`) and corrupt bytes (`host_corrupt`). A count of corrupt bytes goes to
+        one device only, so that the bytes are counted once.
 
         Parameters
         ----------
         name : str
-            The device, as named in messages.
+            The device, as named in error messages.
         ids : mapping
-            Content of each of its identifiers, for messages.
+            Name of the quantity that each identifier carries, for error messages.
         emit : callable
             An exception of `emit` ends the pump and is raised to the caller.
         silence_s : float
@@ -170,7 +172,8 @@ class SharedBus:
         needed : CanKey
             Identifier in `ids` of the frames with measurements.
         resembles : callable
-            Whether the data of a frame look like those of `needed`, for a hint in messages.
+            Whether the data of a frame look like those of `needed`, for a hint in the error
+            message.
         worked : bool
             Whether the device has sent measurements before: its settings are correct.
 
@@ -229,8 +232,9 @@ class SharedBus:
             key for key, t_ns in subscriber.arrived.items() if t_ns > since_ns and key != needed
         )
 
-        # Its settings are correct, because all identifiers arrived before. The text has no
-        # duration, which grows with every attempt: one silence is one line of the log.
+        # Its settings are correct, because all identifiers arrived before. The text contains no
+        # duration: it would differ at every attempt, and every different text is a new line of
+        # the log.
         if not others and (subscriber.is_complete or (worked and not self._seen)):
             return f"{self.channel}: silent: check its power and wiring"
 
@@ -299,7 +303,7 @@ class SharedBus:
                 shares.setdefault(subscriber, []).append(frame)
                 continue
 
-            # Stored for later subscribers, and for messages.
+            # Stored for later subscribers, and for error messages.
             self.foreign += 1
             self._unclaimed.append((t_ns, frame))
             if key in self._seen or len(self._seen) < _SEEN:

@@ -9,14 +9,15 @@ messages with an orientation are compared, because others may contain time of an
 | follows the last accepted one                 | accepted; skipped counter values were lost      |
 | does not follow                               | held until the next one                         |
 | the next one follows the last accepted one    | the held one was corrupt and is dropped         |
-| the next one follows the held one             | both accepted; a restart if time jumped against |
-|                                               | the counter and the arrivals; a counter jump if |
-|                                               | time advanced by one period                     |
+| the next one follows the held one             | both accepted; a restart if device time jumped  |
+|                                               | but neither counter nor arrival time did; a     |
+|                                               | counter jump if time advanced by one period     |
 | the next one follows neither                  | the held one is dropped, the next one held      |
 
 An eight-bit checksum passes one corrupt message in 256, so a single message proves neither a loss
-nor a restart. Counter and time agree if they differ by less than 2 % plus a few counts at the
-measured rate, modulo the width of the counter. The nominal rate is used for the first samples only.
+nor a restart. Counter and time agree if the counts expected from the time, at the measured rate,
+differ from those counted by at most 2 % plus four, modulo 65536. The nominal rate is used for the
+first samples only.
 
 Invariant: integers in, steps out; every input is accepted.
 """
@@ -29,7 +30,7 @@ from jointfit_protocols.xbus.configuration import TICK_NS, WRAP_32_BIT, WRAP_DAY
 
 _COUNTS = 1 << 16
 _GAP = 1.5
-"""Largest time, periods, between two messages of which only the counter jumped."""
+"""Largest time, in periods, between two messages if only the counter jumped."""
 _PLAUSIBLE_GAP = 3600 * 1_000_000_000 // TICK_NS
 """Longest plausible gap, ticks: one hour, longer than any stall or buffered data."""
 _SLACK_COUNTS = 4
@@ -87,8 +88,8 @@ class XbusContinuity:
 
     def __init__(self, rate_hz: float) -> None:
         self.modulus: int | None = None
-        """Ticks after which device time restarts at 0; None until determined by the model or a
-        wrap."""
+        """Ticks after which device time restarts at 0; None until the device model or the first
+        wrap determines it."""
         self._nominal = 1_000_000_000 / TICK_NS / rate_hz
         self._messages = 0
         self._last: _Point | None = None
@@ -166,7 +167,8 @@ class XbusContinuity:
             return XbusStep(_lost(last, held) + max(turns, 0) * _COUNTS)
         if plausible and (counts is None or ticks <= _GAP * self._period):
             return XbusStep(counter_jumped=counts is not None)
-        # Either message may be corrupt in a few bits; a clock in step with the arrivals goes on.
+        # A few bits of either message may be corrupt: it is a restart only if device time also
+        # disagrees with the arrival times.
         off_ns = abs(held.arrival_ns - last.arrival_ns - ticks * TICK_NS)
         return XbusStep(restarted=off_ns > _PACE_NS)
 

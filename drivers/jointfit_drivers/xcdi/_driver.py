@@ -1,7 +1,8 @@
 """Driver of Xsens MTi-600, Sirius and Avior IMUs on CAN ("XCDI").
 
 This driver only receives. The device is configured once over its UART (CAN is off by factory
-default). Nothing can be requested or set over CAN, so faults are reported with their remedy.
+default). The driver cannot request or set anything over CAN: it only reports a fault and its
+remedy.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _LONGEST_SILENCE_S = 30.0
-"""Longest wait for an absent sensor, s. It stays subscribed, and its first frame is received at
-once."""
+"""Longest silence, s, before the sensor counts as lost; the time doubles with every attempt. The
+sensor stays subscribed meanwhile, so its first frame is received at once."""
 _SAMPLE_BYTES = {DataId.SAMPLE_TIME: 4, DataId.GROUP_COUNTER: 2, DataId.QUATERNION: 8}
 _ID_NAMES = XcdiIds._fields[:5]
 _RAW_FRAMES = 20
@@ -49,18 +50,20 @@ class XcdiIdSettings(Settings):
         None,
         ge=0,
         le=EXTENDED_MAX,
-        description="StatusWord; default: 0x11, moved like the three above if they move together",
+        description="StatusWord; default: 0x11, plus the offset of the three identifiers above if "
+        "all three have the same offset from their defaults",
     )
     error: int | None = Field(
         None,
         ge=0,
         le=EXTENDED_MAX,
-        description="Error; default: 0x01, moved like the three above if they move together",
+        description="Error; default: 0x01, plus the offset of the three identifiers above if all "
+        "three have the same offset from their defaults",
     )
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Refuse identifiers that are not distinct, or whose order would split groups."""
+        """Refuse identifiers that are equal, or whose order would split the frames of a sample."""
         in_order: tuple[Any, ...] = (self.sample_time, self.group_counter, self.quaternion)
         ids = self.resolved()._asdict() if None not in in_order else dict(self)
 
@@ -78,11 +81,15 @@ class XcdiIdSettings(Settings):
             yield (
                 "",
                 "sample_time < group_counter < quaternion: the lowest identifier leaves first, and "
-                "the quaternion must complete its group",
+                "the quaternion must be the last frame of a sample",
             )
 
     def resolved(self, *, extended: bool = False) -> XcdiIds:
-        """Return all identifiers; those left out are derived from a block if there is one."""
+        """Return all identifiers.
+
+        If `status_word` or `error` is omitted, it gets the offset that the other three have in
+        common from their defaults. Without a common offset it is None.
+        """
         base = self.quaternion - DataId.QUATERNION
         is_block = (
             base >= 0
@@ -99,7 +106,7 @@ class XcdiSettings(ImuSettings):
     can: CanBusSettings = Field(description="name of the [can.NAME] table of its bus")
     ids: XcdiIdSettings = Field(
         default_factory=XcdiIdSettings,
-        description="its identifiers; required in effect when two sensors share a bus",
+        description="its identifiers; necessary if another sensor on the bus has the same ones",
     )
     extended_ids: bool = Field(
         False,

@@ -1,7 +1,7 @@
 """Poses of all body parts, one camera frame at a time, in one small batched rigid fit.
 
 Every frame costs the same. A part whose markers do not fit the static pose has no pose in that
-frame, and the most deviating marker is counted.
+frame: its misfit is counted, for the part and for the marker that deviates most.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class LiveClusters:
     Parameters
     ----------
     clusters : mapping of str to MarkerCluster
-        Body parts in the static pose, by name. A rigid body has four virtual points.
+        Body parts in the static pose, by name. A rigid body is represented by four fixed points
+        in place of its markers.
     """
 
     def __init__(self, clusters: Mapping[str, MarkerCluster]) -> None:
@@ -65,7 +66,7 @@ class LiveClusters:
         self.origins = np.array([c.origin for c in self._clusters]).reshape(-1, 3)
         self._bodies = [i for i, c in enumerate(self._clusters) if c.body is not None]
 
-        # Counts of frames with a pose, of misfits, and of the most deviating marker in these.
+        # By part: frames with a pose, and misfits. By marker: misfits in which it deviated most.
         self._frames = 0
         self._good = np.zeros(shape[0], dtype=np.int64)
         self._bad = np.zeros(shape[0], dtype=np.int64)
@@ -82,7 +83,7 @@ class LiveClusters:
         # The last frame.
         self.points = np.full((*shape, 3), np.nan)
         """Markers in the last frame, optical world, m, shape (parts, k, 3); NaN if not visible, or
-        if the markers of the part do not fit it."""
+        if the markers of the part do not fit the static pose."""
         self.R = np.tile(np.eye(3), (shape[0], 1, 1))
         """R_now_static of the last frame, shape (parts, 3, 3); valid only where `placed`."""
         self.p = np.zeros((shape[0], 3))

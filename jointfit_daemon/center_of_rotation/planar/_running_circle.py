@@ -2,7 +2,7 @@
 
 Invariant: the result equals the batch fit of all frames with the same weights. Ten sums determine
 the circle, its covariance and the lag-one correlation of the residuals. The sums are plain floats
-because arrays of nine numbers cost more than the arithmetic.
+because a numpy call on ten numbers takes longer than the arithmetic.
 """
 
 from __future__ import annotations
@@ -42,9 +42,10 @@ class RunningCircle:
     Parameters
     ----------
     forgetting : float
-        Remaining share of a frame's weight one frame later, in (0, 1]; exp(-Δt/τ) forgets over τ.
+        Remaining share of a frame's weight one frame later, in (0, 1]; exp(-Δt/τ) gives the
+        time constant τ.
     window : int, optional
-        Number of most recent valid frames that count. Not together with forgetting.
+        Number of most recent valid frames that count. It cannot be combined with forgetting.
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
     robust : bool
@@ -70,7 +71,9 @@ class RunningCircle:
         if not 0.0 < forgetting <= 1.0:
             raise ValueError(f"forgetting is {forgetting}: a factor in (0, 1] is needed")
         if window is not None and (window < 4 or forgetting < 1.0):
-            raise ValueError("a window needs four frames or more and no forgetting beside it")
+            raise ValueError(
+                "a window needs at least four frames and cannot be combined with forgetting"
+            )
         self._forgetting, self._method, self._robust = forgetting, method, robust
         self._limits = limits or CircleLimits()
         self._window = window
@@ -92,7 +95,7 @@ class RunningCircle:
     def feed(self, x: float, y: float, weight: float = 1.0) -> None:
         """Process one frame in the parent's coordinates, m.
 
-        NaN means missing and is a gap in time, as is a weight that is not above zero.
+        A NaN (missing), or a weight not above zero, leaves a gap in time.
         """
         if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and 0.0 < weight < inf):
             self._pass()
@@ -143,7 +146,7 @@ class RunningCircle:
             self._squares *= mu * mu
         self._before = (0.0, 0.0, 0.0)
         if self._window is not None and self._kept and self._kept[-1][2] > 0.0:
-            self._kept.append((0.0, 0.0, 0.0))  # has no weight, and separates its neighbours
+            self._kept.append((0.0, 0.0, 0.0))  # separates the frames before and after
 
     def _slide(self, frame: Kept) -> None:
         """Remove the oldest frame; recompute sums every `_RESUM_FRAMES` to limit rounding."""
@@ -198,7 +201,7 @@ class RunningCircle:
 
         return CircleMoments(
             w,
-            w * w / self._squares if self._squares > 0.0 else 0.0,  # forgotten for too long
+            w * w / self._squares if self._squares > 0.0 else 0.0,  # all have decayed to zero
             self._origin[0] + xb,
             self._origin[1] + yb,
             cxx,
@@ -214,7 +217,7 @@ class RunningCircle:
         )
 
     def circle(self) -> tuple[float, float, float] | None:
-        """Return center and radius, m, without shrinkage or limits; None if there is no circle."""
+        """Return center and radius, m, before `temper` and the limits; None without a circle."""
         m = self.moments()
         z = m.xx + m.yy
         if m.effective <= 3.0 or m.xx * m.yy - m.xy * m.xy <= ROUNDING * z * z:
