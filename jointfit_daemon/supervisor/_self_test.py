@@ -26,6 +26,9 @@ LEAST_RATE = 0.95
 """Share of the configured sample rate below which a device is reported."""
 MOST_LOST = 0.01
 """Share of lost or corrupt samples above which a device is reported."""
+MOST_DROPPED = 0.05
+"""Dropped messages per message sent above which the link is reported: before the connection is
+made, poses are dropped at every start."""
 CLOCK_SIGMA_NS = 2e6
 """Standard deviation of a stamp above which a clock is reported, ns."""
 LOOP_DELAY_MS = 20.0
@@ -211,8 +214,8 @@ def _broker(health: BridgeHealth) -> Iterator[Check]:
         text = f"the broker refuses {', '.join(link.denied)}"
         remedy = "allow these topics for the daemon in the access list of the broker"
         yield Check("broker", "", "error", text, remedy)
-    elif link.dropped:
-        text = f"{link.dropped} messages were dropped since the start"
+    elif link.dropped > MOST_DROPPED * link.sent:
+        text = f"{link.dropped} messages were dropped since the start, {link.sent} sent"
         remedy = "check the network to the broker and its load"
         yield Check("broker", "", "warning", text, remedy)
     else:
