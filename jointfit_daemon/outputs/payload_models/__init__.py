@@ -34,6 +34,7 @@ PAYLOADS: dict[Topic, type[Payload]] = {
     topics.OPTICAL_CHAIN: _streams.OpticalChain,
     topics.SENSORS_POSE: _streams.SensorsPose,
     topics.OPTICAL_CENTERS: _streams.OpticalCenters,
+    topics.OPTICAL_STICKS: _streams.OpticalSticks,
     topics.JOINT: _streams.JointScalars,
 }
 """Model of every topic that the daemon publishes."""

@@ -212,3 +212,36 @@ class OpticalCenters(Payload):
     t_us: Time
     memory_s: float
     joints: dict[str, RunningCenter]
+
+
+class MovementPlane(Table):
+    """Plane of a planar movement."""
+
+    normal: Vector
+    off_plane_m: Number
+    refused: str | None
+
+
+class PlanarJoint(Table):
+    """Position of one joint of a planar movement."""
+
+    p_m: Vector
+    error_m: Number
+    arc_deg: Number
+    refused: str | None
+
+
+class Stick(Table):
+    """One segment of the stick figure."""
+
+    ends_m: list[Vector]
+
+
+class OpticalSticks(Payload):
+    """``optical/sticks``."""
+
+    t_us: Time
+    frame: int
+    plane: MovementPlane
+    joints: dict[str, PlanarJoint]
+    sticks: dict[str, Stick]
