@@ -90,6 +90,7 @@ def check_branches(table: ChainTable) -> list[Fault]:
     """
     given = {"joints": table.joints, "proximal": table.proximal, "distal": table.distal}
     given["side"] = "left" if table.side == "left" else None
+    given["motion"] = "planar" if table.motion == "planar" else None
     faults = [
         Fault(f"chain.{key}", "is for a limb without branches; remove it, or [[chain.joint]]")
         for key, value in given.items()

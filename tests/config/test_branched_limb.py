@@ -63,8 +63,9 @@ def test_two_legs_share_the_pelvis_in_any_order_of_the_tables(legs: Table) -> No
 
 def test_a_branched_rig_describes_no_line(legs: Table) -> None:
     legs["chain"] |= {"joints": ["hip", "knee"], "proximal": "pelvis", "side": "left"}
+    legs["chain"]["motion"] = "planar"
     found = faults(legs)
-    for key in ("joints", "proximal", "side"):
+    for key in ("joints", "proximal", "side", "motion"):
         expected = f"chain.{key}: is for a limb without branches; remove it, or [[chain.joint]]"
         assert expected in found
 

@@ -31,7 +31,7 @@ from jointfit_simulators.scene._rig_file import rig_toml
 from jointfit_simulators.settings import Knobs, perfect
 
 STYLE = draw_style(LegGeometry(), np.random.default_rng(5))
-NEW = ("arm", "trunk")
+NEW = ("legs", "arm", "trunk")
 EVERY_MOTION = [(limb, name) for limb in NEW for name in LIMBS[limb].motions]
 angle = st.floats(-1.2, 1.2)
 
@@ -140,7 +140,7 @@ def test_observation_agrees_with_the_bones_of_every_limb(limb: str) -> None:
     assert found.truth.joint == main.name == subject.facts["joint"]
     # the angles of the log are those of the bones, by SciPy's sequence
     upper, lower = (found.truth.orientations[p] for p in (main.proximal, main.distal))
-    sign = -1.0 if limb in {"leg", "trunk"} else 1.0
+    sign = -1.0 if limb in {"leg", "legs", "trunk"} else 1.0
     angles = (upper.inv() * lower).as_euler("XYZ") * [sign, 1.0, 1.0]
     np.testing.assert_allclose(found.truth.angles, angles, atol=1e-9)
 
@@ -153,7 +153,8 @@ def test_rig_of_every_limb_contains_its_chain(limb: str) -> None:
         bones=(), plate=True, chain=kind.chain,
     )  # fmt: skip
     table = tomllib.loads(text)
-    assert tuple(table["chain"]["joints"]) == kind.chain.joints
+    assert tuple(table["chain"].get("joints", ())) == kind.chain.joints
+    assert len(table["chain"].get("joint", ())) == len(kind.chain.connections)
     assert set(kind.sensors.values()) == set(kind.chain.segments)
     assert table["chain"].get("proximal") == kind.chain.proximal
     assert table["chain"].get("lengths_m", {}) == kind.chain.lengths_m

@@ -1,4 +1,4 @@
-"""A simulated arm and a simulated trunk: calibration and live angles through the real daemon."""
+"""Simulated arm, trunk and both legs: calibration and live angles through the real daemon."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from tests.system import station as gateway
 from tests.system.station import (
     BASE,
     PATIENCE_S,
+    TOPICS,
     Station,
     in_this_process,
     listening,
@@ -55,22 +56,29 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextlib.asynccontextmanager
-async def playing(folder: Path, port: int, limb: str) -> AsyncIterator[Scene]:
-    knobs = apply_settings(perfect(Knobs()), SETTINGS)
+async def playing(
+    folder: Path,
+    port: int,
+    limb: str,
+    sensors: dict[str, str] | None = None,
+    rates: tuple[str, ...] = (),
+) -> AsyncIterator[Scene]:
+    knobs = apply_settings(perfect(Knobs()), (*SETTINGS, *rates))
     rig = RigOptions(
         output_rate_hz=OUTPUT_HZ,
         mqtt_port=port,
         mqtt_base=BASE,
         axes="static",  # the truth's axes
     )
-    subject = SimulatedSubject(knobs, parse_motion_script("stand"), limb=limb)
+    subject = SimulatedSubject(knobs, parse_motion_script("stand"), sensors=sensors, limb=limb)
     scene = Scene(knobs, subject, SceneOptions(folder, rig=rig), now_ns=time.monotonic_ns())
     async with in_this_process(scene):
         yield scene
 
 
-async def calibrate(scene: Scene, listener: Listener) -> None:
-    for motion, phase, seconds in (("stand", "static", 2.0), ("functional", "functional", 20.0)):
+async def calibrate(scene: Scene, listener: Listener, functional_s: float = 20.0) -> None:
+    phases = (("stand", "static", 2.0), ("functional", "functional", functional_s))
+    for motion, phase, seconds in phases:
         scene.command(f"play {motion}")
         await asyncio.sleep(SETTLE_S)
         status = await listener.phase(phase, seconds, force=True)
@@ -185,4 +193,51 @@ async def test_a_trunk_is_calibrated_and_its_bend_and_twist_are_measured(
     assert max(abs(rotation_deg(bones)) for _, bones in twisted) > 20.0
     assert rms_deg(twisted, "lumbar", "rotation_deg", rotation_deg) < 5.0
     assert all("bending_deg" in pose["joints"]["lumbar"] for pose, _ in twisted)
+    assert "Traceback" not in station.log
+
+
+@pytest.mark.timeout(900)
+async def test_both_legs_with_a_shared_pelvis_are_calibrated_and_walk_in_one_daemon(
+    tmp_path: Path, broker: Broker
+) -> None:
+    station = Station(tmp_path, broker.port)
+    sensors = {name: part for name, part in LIMBS["legs"].sensors.items() if int(name[1:]) % 2}
+    rates = ("rate_hz=25", "mocap_hz=25")
+    async with playing(tmp_path, broker.port, "legs", sensors, rates) as scene:
+        station.write_rig()
+        async with (
+            station.daemon(),
+            listening(station.port, topics=(*TOPICS, "optical/pose")) as listener,
+        ):
+            await listener.connected({*sensors, "mocap"})
+            await listener.until(lambda: "bridge/info" in listener.latest)
+            info = listener.latest["bridge/info"]
+            assert info["side"] == "both"
+            assert info["connections"]["left_hip"] == {
+                "parent": "pelvis", "child": "left_thigh", "side": "left",
+            }  # fmt: skip
+            assert [*info["angles"]] == ["right_hip", "right_knee", "left_hip", "left_knee"]
+            await calibrate(scene, listener, functional_s=32.0)
+
+            squats = await live(scene, listener, tmp_path, "squat")
+            optical = listener.latest["optical/pose"]
+
+    def flexion_deg(side: str, joint: str) -> Callable[[TrueLimbState], float]:
+        parts = ("thigh", "shank") if joint == "knee" else ("pelvis", "thigh")
+        proximal, distal = (p if p == "pelvis" else f"{side}_{p}" for p in parts)
+        sign = -1.0 if joint == "knee" else 1.0
+        return lambda bones: (
+            sign * float(between(bones, proximal, distal).as_euler("XYZ", degrees=True)[0])
+        )
+
+    for side in ("right", "left"):
+        for joint in ("hip", "knee"):
+            true_deg = flexion_deg(side, joint)
+            assert max(true_deg(bones) for _, bones in squats) > 40.0
+            assert rms_deg(squats, f"{side}_{joint}", "flexion_deg", true_deg) < 5.0, (side, joint)
+        assert optical["joints"][f"{side}_ankle"]["p_m"] is not None
+        assert optical["joints"][f"{side}_hip"]["residual"] is not None
+    pose, bones = squats[-1]
+    for joint, center in bones.centers.items():
+        assert math.dist(pose["joints"][joint]["p_m"], center) < 0.06, joint
     assert "Traceback" not in station.log

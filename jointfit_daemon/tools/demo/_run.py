@@ -49,6 +49,11 @@ LIMBS = {
         (("functional", 20.0), ("walk", 9.0), ("squat", 9.0), ("sit_to_stand", 9.0)),
         ("walk", "squat", "sit_to_stand"),
     ),
+    "legs": DemoLimb(
+        "right_knee",
+        (("functional", 32.0), ("walk", 10.0), ("squat", 9.0), ("sit_to_stand", 9.0)),
+        ("walk", "squat", "sit_to_stand"),
+    ),
     "arm": DemoLimb(
         "elbow",
         (("functional", 20.0), ("elbow_flexion", 9.0), ("wrist_circles", 9.0), ("reach", 9.0)),

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 PARTS = ("pelvis", "thigh", "shank", "foot")
 
-COORDINATES = 22
-"""Columns of a coordinate array: the posture of leg and plate at one instant."""
+COORDINATES = 31
+"""Columns of a coordinate array: the posture of limb and plate at one instant."""
 PELVIS_POSITION = slice(0, 3)
 """Position of the pelvis origin (mid-pelvis) in the base world, m."""
 PELVIS_TURN = slice(3, 6)
@@ -37,6 +37,11 @@ PLATE_TURN = slice(18, 21)
 """Rotation vector of the plate, rad."""
 ON_PLATE = 21
 """Place of the sensors: 1 on the plate, 0 on the leg; intermediate values during the transfer."""
+LEFT_HIP = slice(22, 25)
+"""Angles of the left leg, rad, with the signs of the right one; likewise LEFT_KNEE, LEFT_ANKLE."""
+LEFT_KNEE = slice(25, 28)
+LEFT_ANKLE = slice(28, 31)
+LEFT_LEG_ANGLES = slice(22, 31)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """Description of a limb that the simulator can move.
 
-A limb is a chain of at most four body parts. Its posture has the columns of ``_limb.py``: position
-and orientation of the base (pelvis, or thorax of the arm), three angles of each of three joints,
-and the plate.
+A limb is a chain of at most four body parts, or both legs with the pelvis. Its posture has the
+columns of ``_limb.py``: position and orientation of the base (pelvis, or thorax of the arm), three
+angles of each of three joints (of both legs), and the plate.
 
 Invariant: in the static pose every segment frame is parallel to the base world.
 """
@@ -22,15 +22,28 @@ if TYPE_CHECKING:
     from jointfit_simulators.body._motion import StyledMotion
 
 
+class Connection(NamedTuple):
+    """One joint of a branched limb."""
+
+    joint: str
+    parent: str
+    child: str
+    side: str | None = None
+    """``right`` or ``left`` at the begin of a branch."""
+
+
 class RigChain(NamedTuple):
     """The limb as rig.toml describes it, from proximal to distal."""
 
     joints: tuple[str, ...]
+    """Empty for a branched limb."""
     segments: tuple[str, ...]
     proximal: str | None = None
     distal: str | None = None
     lengths_m: Mapping[str, float] = {}
     """Lengths of segments with one joint centre only, which markers do not determine."""
+    connections: tuple[Connection, ...] = ()
+    """Joints of a branched limb."""
 
 
 class MainJoint(NamedTuple):

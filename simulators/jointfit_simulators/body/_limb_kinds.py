@@ -1,4 +1,4 @@
-"""The limbs of the simulator by name: leg, arm, trunk."""
+"""The limbs of the simulator by name: leg, legs, arm, trunk."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from jointfit_simulators.body._arm import ARM
+from jointfit_simulators.body._legs import LEGS
 from jointfit_simulators.body._limb import KNEE, LegGeometry, leg_pose
 from jointfit_simulators.body._limb_kind import LimbKind, MainJoint, RigChain
 from jointfit_simulators.body._motion import MOTIONS
@@ -47,5 +48,10 @@ def leg(geometry: LegGeometry) -> LimbKind:
     )
 
 
-LIMBS: Mapping[str, LimbKind] = {"leg": leg(LegGeometry()), "arm": ARM, "trunk": TRUNK}
+LIMBS: Mapping[str, LimbKind] = {
+    "leg": leg(LegGeometry()),
+    "legs": LEGS,
+    "arm": ARM,
+    "trunk": TRUNK,
+}
 """All limbs by name."""

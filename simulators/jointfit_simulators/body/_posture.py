@@ -120,9 +120,14 @@ def couple_knee(coordinates: Array) -> None:
 
 def vary(style: MovementStyle, t: Array, coordinates: Array) -> None:
     """Add the movement variability of the subject."""
-    deviation = style.variability.at(t)
-    deviation[:, 4:6] *= 0.3  # the knee has little voluntary adduction and rotation
-    coordinates[:, LEG_ANGLES] += deviation
+    coordinates[:, LEG_ANGLES] += deviation(style, t)
+
+
+def deviation(style: MovementStyle, t: Array) -> Array:
+    """Return the movement variability of a leg, rad, shape (n, 9)."""
+    found = style.variability.at(t)
+    found[:, 4:6] *= 0.3  # the knee has little voluntary adduction and rotation
+    return found
 
 
 def ground(style: MovementStyle, coordinates: Array) -> None:

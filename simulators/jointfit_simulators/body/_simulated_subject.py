@@ -52,7 +52,7 @@ class SimulatedSubject:
     sensors
         Sensor ids and their segments; default: those of the limb.
     limb
-        ``leg``, ``arm`` or ``trunk``.
+        ``leg``, ``legs``, ``arm`` or ``trunk``.
     """
 
     visible_bones: tuple[str, ...] = ()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_simulators.body._limb import ANKLE, HIP, KNEE
+from jointfit_simulators.body._limb import ANKLE, HIP, KNEE, LEFT_KNEE
 from jointfit_simulators.body._random_signal import random_vector_signal
 
 if TYPE_CHECKING:
@@ -119,7 +119,8 @@ class SoftTissue:
         self._joints = adjacent[part]
         one_joint = len(self._joints) == 1
         shares = [
-            1.0 if one_joint else knee_share if j is KNEE else 1 - knee_share for j in self._joints
+            1.0 if one_joint else knee_share if j in (KNEE, LEFT_KNEE) else 1 - knee_share
+            for j in self._joints
         ]
         features = [_features(reference, joint) for joint in self._joints]
 

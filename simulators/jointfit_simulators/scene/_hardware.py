@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 WIRES = {
     "S1": "xbus", "S2": "xcdi", "S3": "xbus", "S4": "xcdi", "S5": "xbus", "S6": "xcdi",
+    "S7": "xbus", "S8": "xcdi", "S9": "xbus", "S10": "xcdi",
 }  # fmt: skip
 """Default protocol of each sensor."""
 BUS = "can0"
@@ -52,6 +53,10 @@ _SYNC_TOML = (
 )
 _ID_BLOCK = 0x100
 """Number of CAN identifiers for each sensor."""
+_WIDE_BLOCKS = 7
+"""Largest number of sensors whose blocks have 11-bit identifiers."""
+_NARROW_BLOCK = 0x40
+"""Number of CAN identifiers for each of more sensors."""
 
 
 @dataclass
@@ -106,7 +111,7 @@ def create_hardware(
         else:
             if hardware.bus is None:
                 hardware.bus = _add_bus(hardware, knobs, directory, can)
-            first = _ID_BLOCK * number
+            first = (_ID_BLOCK if len(sensors) <= _WIDE_BLOCKS else _NARROW_BLOCK) * number
             ids = XcdiIds(first + 0x05, first + 0x06, first + 0x21, status_word=None, error=None)
             device = XcdiDevice(hardware.bus, XcdiDeviceOptions(ids=ids, rate_hz=knobs.rate_hz))
             hardware.ports[name] = f"{BUS}:{ids.quaternion:#05x}"

@@ -21,10 +21,11 @@ if TYPE_CHECKING:
 _Motions = tuple[tuple[str, float], ...]
 _FUNCTIONAL: dict[str, _Motions] = {
     "leg": (("functional", 20.0), ("walk", 9.0), ("squat", 9.0), ("sit_to_stand", 9.0)),
+    "legs": (("functional", 32.0), ("walk", 10.0), ("squat", 9.0), ("sit_to_stand", 9.0)),
     "arm": (("functional", 20.0), ("elbow_flexion", 9.0), ("wrist_circles", 9.0), ("reach", 9.0)),
     "trunk": (("functional", 20.0), ("bend", 9.0), ("twist", 9.0), ("side_bend", 9.0)),
 }
-_CALIBRATED = {"leg": "walk", "arm": "reach", "trunk": "bend"}
+_CALIBRATED = {"leg": "walk", "legs": "walk", "arm": "reach", "trunk": "bend"}
 MOTIONS_OF_PHASES: dict[str, dict[str, _Motions]] = {
     limb: {
         "align": (("plate", 20.0),),
@@ -54,7 +55,7 @@ class PhaseFollower:
     report
         Called with a message when the broker connection is lost or restored.
     limb
-        ``leg``, ``arm`` or ``trunk``.
+        ``leg``, ``legs``, ``arm`` or ``trunk``.
     """
 
     def __init__(

@@ -71,24 +71,8 @@ def rig_toml(
     planar
         Whether the rig follows a planar movement by cameras alone.
     """
-    ends = [
-        f'{end} = "{part}"'
-        for end, part in (("proximal", chain.proximal), ("distal", chain.distal))
-        if part in clusters and mocap
-    ]
-    lengths = ", ".join(f"{segment} = {length:g}" for segment, length in chain.lengths_m.items())
-
-    limb = [
-        "[chain]",
-        f"joints = {_names(chain.joints)}",
-        f"segments = {_names(chain.segments)}",
-        'side = "right"',
-        f'axes = "{options.axes}"',
-        *ends,
-        *(['motion = "planar"'] if planar else []),
-        *([f"lengths_m = {{ {lengths} }}"] if lengths else []),
-        *([] if chain_model is None else [f'model = "{chain_model}"']),
-    ]
+    head, *keys = _chain_table(options, clusters if mocap else {}, chain, chain_model)
+    limb = [head, *(['motion = "planar"'] if planar else []), *keys]
     tables = [
         f'[rig]\nname = "{options.name}"\noutput_rate_hz = {options.output_rate_hz:g}\n',
         "\n".join([*limb, ""]),
@@ -112,6 +96,33 @@ def rig_toml(
     )
     tables.append(_mqtt_table(options))
     return "\n".join(tables)
+
+
+def _chain_table(
+    options: RigOptions,
+    tracked: Mapping[str, tuple[str, ...]],
+    chain: RigChain,
+    chain_model: str | None,
+) -> list[str]:
+    """Return the lines of ``[chain]``; body parts without sensors must be `tracked`."""
+    limb = ["[chain]"]
+    if chain.joints:
+        limb.append(f"joints = {_names(chain.joints)}")
+    limb.append(f"segments = {_names(chain.segments)}")
+    if chain.joints:
+        limb.append('side = "right"')
+    limb.append(f'axes = "{options.axes}"')
+    ends = (("proximal", chain.proximal), ("distal", chain.distal))
+    limb += [f'{end} = "{part}"' for end, part in ends if part in tracked]
+
+    lengths = ", ".join(f"{segment} = {length:g}" for segment, length in chain.lengths_m.items())
+    limb += [f"lengths_m = {{ {lengths} }}"] if lengths else []
+    limb += [] if chain_model is None else [f'model = "{chain_model}"']
+    for joint, parent, child, side in chain.connections:
+        limb += ["[[chain.joint]]", f'name = "{joint}"', f'parent = "{parent}"']
+        limb += [f'child = "{child}"'] if child in {*chain.segments, *tracked} else []
+        limb += [] if side is None else [f'side = "{side}"']
+    return limb
 
 
 def _mqtt_table(options: RigOptions) -> str:
