@@ -28,6 +28,14 @@ class InfoDevice(Table):
     segment: str | None
 
 
+class InfoConnection(Table):
+    """One joint of a branched limb."""
+
+    parent: str
+    child: str | None
+    side: Literal["left", "right"]
+
+
 class Info(Payload):
     """``bridge/info``."""
 
@@ -35,7 +43,10 @@ class Info(Payload):
     rig: str
     config_sha256: str
     output_rate_hz: float
-    side: Literal["left", "right"]
+    side: Literal["left", "right", "both"]
+    connections: dict[str, InfoConnection] | None = Field(
+        None, description="joints of a branched limb, whose side is `both`"
+    )
     joints: list[str]
     angles: dict[str, str] = Field(description="angle convention by joint")
     segments: list[str]
