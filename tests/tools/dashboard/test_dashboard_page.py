@@ -55,6 +55,9 @@ async def test_the_limb_moves_and_the_angle_has_a_standard_deviation(broker: Bro
             await asyncio.sleep(0.25)
         assert len(pictures) >= 4
         await page.until_text("#chart-caption", "difference from the cameras")
+        await page.page.wait_for_function("() => jointfit.store.poses.length > 195", timeout=60_000)
+        await page.picture("dashboard")  # the picture of the documentation
+        assert await page.page.evaluate("document.documentElement.scrollHeight - innerHeight") <= 0
         assert page.foreign == []
         assert page.errors == []
 
