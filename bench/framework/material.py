@@ -59,7 +59,7 @@ LIVE_RIG = Material(
 THIS_MACHINE = Material("the machine of the run", "CLOCK_MONOTONIC and CPU time of the process")
 RECORDED_LEGS = Material(
     "1 adult (OpenCap subject 4), both legs; 8 virtual IMUs: orientations of clusters of skin "
-    "markers plus orientation errors of recorded filters, in eight deals",
-    "inverse kinematics of the subject's model without any marker of thighs and shanks, with the "
-    "markers of the model as fitted, and as placed from the static trial",
+    "markers, with eight assignments of recorded filter errors to the sensors",
+    "inverse kinematics of the subject's model without any marker of thighs and shanks, once "
+    "with the model's fitted marker positions, once with those of the static trial",
 )

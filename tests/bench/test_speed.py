@@ -52,7 +52,7 @@ def test_codecs_keep_their_thresholds_and_slcan_is_several_times_cheaper_than_py
         "frame-alignment-time",
     )
     assert len(rows) == 11
-    assert rows["slcan: jointfit over python-can"]["value"] < 0.5
+    assert rows["slcan: time ratio of jointfit to python-can"]["value"] < 0.5
 
 
 @pytest.mark.alone

@@ -153,7 +153,7 @@ def moving(tissue_mm: float, shifts_mm: tuple[float, ...], _: Path) -> list[Resu
                 errors.append(1e3 * shift[1] - mm)
         name = f"knee moved by {mm:g} mm"
         figures.append(
-            Result(f"{name}: wearers with a report", 100.0 * reported / len(WEARERS), unit="%")
+            Result(f"{name}: subjects with a report", 100.0 * reported / len(WEARERS), unit="%")
         )
         if delays:
             figures.append(Result(f"{name}: longest time to the report", max(delays), unit="s"))
@@ -166,7 +166,7 @@ def _rigid(data: Path) -> list[Result]:
     figures = moving(RIGID, (5.0, 20.0), data)
     return [
         replace(one, minimum=100.0)
-        if one.name == "knee moved by 20 mm: wearers with a report"
+        if one.name == "knee moved by 20 mm: subjects with a report"
         else one
         for one in figures
     ]

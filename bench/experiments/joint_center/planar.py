@@ -79,7 +79,9 @@ def equal_steps(_: Path) -> list[Result]:
         p = arc_points(alpha * np.arange(3), 0.2) + rng.normal(0.0, 0.001, (200_000, 3, 2))
         rms = float(np.sqrt((three_frame_center(p) ** 2).sum(axis=1).mean()))
         ratio = rms / float(equal_step_error(alpha, 0.001))
-        figures.append(Result(f"{step}°: simulated over predicted", ratio, 1.01, 0.99, ""))
+        figures.append(
+            Result(f"{step}°: simulated error divided by predicted", ratio, 1.01, 0.99, "")
+        )
     return figures
 
 
@@ -92,11 +94,11 @@ def unequal_noise(_: Path) -> list[Result]:
     t = np.array([0.3, 1.4, 2.9])
     drawn = np.random.default_rng(5).normal(size=(400_000, 3, 2))
     figures = []
-    for label, noise in (("six", SIX_NOISES_M), ("one a frame", SIX_NOISES_M[:, :1])):
+    for label, noise in (("six", SIX_NOISES_M), ("one per frame", SIX_NOISES_M[:, :1])):
         squares = (three_frame_center(arc_points(t, 0.2) + noise * drawn) ** 2).mean(axis=0)
         ratios = np.sqrt(squares / three_frame_mean_squares(t, noise))
         figures += [
-            Result(f"{label}, {axis}: simulated over predicted", float(ratio), 1.01, 0.99, "")
+            Result(f"{label}, {axis}: simulated / predicted", float(ratio), 1.01, 0.99, "")
             for axis, ratio in zip("xy", ratios, strict=True)
         ]
     return figures
@@ -111,7 +113,7 @@ def forms(_: Path) -> list[Result]:
     sides = triangle_error(arc_points(t, 0.3), 0.001)
     bound = np.array([circle_rms_bound(row, 0.001) for row in t])
     return [
-        Result("by side lengths", float(np.abs(sides / angles - 1.0).max()), 1e-10, unit=""),
+        Result("from side lengths", float(np.abs(sides / angles - 1.0).max()), 1e-10, unit=""),
         Result("Cramér-Rao", float(np.abs(bound / angles - 1.0).max()), 1e-10, unit=""),
     ]
 
@@ -166,7 +168,7 @@ def claims(_: Path) -> list[Result]:
     figures = []
     for n, arc, noise in ((100, 22, 0.002), (100, 30, 0.002), *CASES[:3], CASES[4]):
         found = runs_on(n, arc, noise, runs=8000)
-        label = f"n = {n}, {arc}°, {1000 * noise:g} mm: predicted over actual"
+        label = f"n = {n}, {arc}°, {1000 * noise:g} mm: predicted / actual"
         figures.append(Result(label, found.claimed / found.rms, 1.15, 0.85, ""))
     for arc, goal in ((10, 0.01), (15, 0.05)):
         share = float(runs_on(100, arc, 0.002, runs=8000).published.mean())
@@ -190,8 +192,8 @@ def several(_: Path) -> list[Result]:
         weighted.append(combine(each)[0])
         joint.append(geometric_estimate(p, robust=False, limits=WIDE).center)
     return [
-        Result("information-weighted", _rms(weighted) / bound, 1.2, unit="× bound"),
-        Result("all at once", _rms(joint) / bound, 1.2, unit="× bound"),
+        Result("one fit per marker, combined", _rms(weighted) / bound, 1.2, unit="× bound"),
+        Result("one fit of all markers", _rms(joint) / bound, 1.2, unit="× bound"),
     ]
 
 
@@ -205,11 +207,11 @@ def at_the_bound(_: Path) -> list[Result]:
     for arc, goal in ((20, 1.15), (30, 1.15), (45, 1.03), (60, 1.03), (90, 1.03), (180, 1.03)):
         found = runs_on(100, arc, 0.002)
         figures.append(
-            Result(f"{arc}°: shrinkage", upper_rms(found) / found.bound, goal, unit="× bound")
+            Result(f"{arc}°: Hyper, shrunk", upper_rms(found) / found.bound, goal, unit="× bound")
         )
         plain = runs_on(100, arc, 0.002, tempered=False)
         ratio = upper_rms(plain) / plain.bound
-        figures.append(Result(f"{arc}°: plain Hyper", ratio, max(goal, 1.16), unit="× bound"))
+        figures.append(Result(f"{arc}°: Hyper", ratio, max(goal, 1.16), unit="× bound"))
     return figures
 
 
@@ -230,7 +232,7 @@ def ellipses(_: Path) -> list[Result]:
     for n, arc, noise, radius in ELLIPSES:
         found = runs_on(n, arc, noise, radius=radius, runs=10_000, correlated=True)
         share = share_covered(found, n)
-        label = f"n = {n}, {arc:g}°, {1000 * noise:g} mm of {100 * radius:g} cm"
+        label = f"n = {n}, {arc:g}°, noise {1000 * noise:g} mm, radius {100 * radius:g} cm"
         accepted = f"{100 * float(found.published.mean()):.0f} % accepted"
         figures.append(Result(label, share, 0.97, 0.93, "", note=accepted))
     return figures
@@ -296,7 +298,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "circle-error-prediction",
-        "Predicted error of equal steps against 200 000 simulated runs",
+        "Predicted error of three frames at equal angles, against 200 000 simulated runs",
         equal_steps,
         SEEDED,
     ),
@@ -308,13 +310,13 @@ EXPERIMENTS = (
     ),
     Experiment(
         "circle-error-formulas",
-        "Three formulas of the predicted error, largest difference",
+        "Predicted error: largest relative difference from the formula with angles",
         forms,
         SEEDED,
     ),
     Experiment(
         "circle-cramer-rao",
-        "RMS error of circle fits over the Cramér-Rao bound, 4000 runs",
+        "RMS error of circle fits divided by the Cramér-Rao bound, 4000 runs",
         plain_hyper,
         SEEDED,
     ),
@@ -326,19 +328,19 @@ EXPERIMENTS = (
     ),
     Experiment(
         "circle-claimed-error",
-        "Predicted over actual error, 8000 runs, and the acceptance threshold",
+        "Predicted error divided by actual error, 8000 runs, and the acceptance threshold",
         claims,
         SEEDED,
     ),
     Experiment(
         "circle-several-markers",
-        "Centre from four markers on a 20° arc: RMS error over the Cramér-Rao bound",
+        "Centre from four markers on a 20° arc: RMS error divided by the Cramér-Rao bound",
         several,
         SEEDED,
     ),
     Experiment(
         "circle-published-estimates",
-        "Accepted estimates over the Cramér-Rao bound, 20 000 runs",
+        "RMS error of accepted estimates divided by the Cramér-Rao bound, 20 000 runs",
         at_the_bound,
         SEEDED,
         headline=True,

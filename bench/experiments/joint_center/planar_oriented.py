@@ -98,7 +98,9 @@ def short_arc(_: Path) -> list[Result]:
     with_angles, without, refused = rms_errors(20, "slow", 1.0, 200)
     figures = [
         Result("arc of 20°, slow noise of 1°: with angles", 1000 * with_angles, 28.0, unit="mm"),
-        Result("arc of 20°, slow noise of 1°: plain Hyper", 1000 * without, np.inf, unit="mm"),
+        Result(
+            "arc of 20°, slow noise of 1°: Hyper without angles", 1000 * without, np.inf, unit="mm"
+        ),
         Result("arc of 20°, slow noise of 1°: rejected", refused, 0, unit="of 200"),
     ]
     for arc, kind, degrees, goal in ((60, "white", 1.0, 0.999), (60, "slow", 4.5, 1.1)):

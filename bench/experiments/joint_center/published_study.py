@@ -67,14 +67,14 @@ def repeated_rotations(_: Path) -> list[Result]:
             Result(f"{label}: center of mean positions", 1e3 * positions, unit="mm"),
         ]
     shortest = float(found.mean_of_centers[0] / found.center_of_means[0])
-    return [*figures, Result("10°: first over second", shortest, minimum=3.0, unit="")]
+    return [*figures, Result("10°: ratio of the two errors", shortest, minimum=3.0, unit="")]
 
 
 def marker_radius(_: Path) -> list[Result]:
     """Compare the errors at small radii with that at the largest."""
     return [
         Result(
-            f"{100 * radius:.0f} cm: 95th percentile over that at the largest radius",
+            f"{100 * radius:.0f} cm: 95th percentile, relative to the largest radius",
             float(ratio),
             1.2 if radius >= LARGE_RADIUS_M else np.inf,
             unit="",

@@ -74,8 +74,15 @@ def four_markers(_: Path) -> list[Result]:
         fused.append(fuse_centers(single).center)
         joint.append(fit_running(seen).center)
     return [
-        Result("information-weighted, RMS over bound", rms(fused) / bound, 1.2, unit=""),
-        Result("common sums, RMS over bound", rms(joint) / bound, 1.05, unit=""),
+        Result(
+            "one fit per marker, combined: RMS error divided by bound",
+            rms(fused) / bound,
+            1.2,
+            unit="",
+        ),
+        Result(
+            "one fit of all markers: RMS error divided by bound", rms(joint) / bound, 1.05, unit=""
+        ),
     ]
 
 
@@ -123,7 +130,7 @@ def ball_joint(rom: float, goals: tuple[float, ...], runs: int = 200) -> list[Re
         ):
             errors.setdefault(name, []).append(found.center)
     room = 1.15 if runs >= 200 else 1.15 * (1.0 + 1.645 / float(np.sqrt(3.0 * runs)))
-    size, kind = (upper_rms, ", upper 95 % limit") if runs >= 1000 else (rms, "")
+    size, kind = (upper_rms, ", upper 95 % confidence limit") if runs >= 1000 else (rms, "")
     return [
         *(
             Result(f"{name}{kind}", MM * size(found), room * goal, unit="mm")
@@ -206,7 +213,9 @@ def measured(setup: Setup, runs: int, seed: int = 2024) -> list[Result]:
     figures = [Result(f"{setup.name}: coverage", share, 97 + slack, 93 - slack, "%")]
     if len(bounds) == accepted:
         ratio = rms(errors) / float(np.sqrt(np.mean(bounds)))
-        figures.append(Result(f"{setup.name}: RMS over bound", ratio, setup.efficient, unit=""))
+        figures.append(
+            Result(f"{setup.name}: RMS error divided by bound", ratio, setup.efficient, unit="")
+        )
     return [*figures, Result(f"{setup.name}: rejected", 100 * refused / runs, 5.0, unit="%")]
 
 
@@ -246,8 +255,8 @@ SETUPS = (
     Setup("one marker, hinge 45°", hinge(45, CHILD[:1]), white),
     Setup("in a plane 20°", lambda _: fan(20.0), white, 1.1),
     Setup("moving noisy parent", ball(45), from_moving_parent),
-    Setup("noise that lasts, smooth", circling, lasting),
-    Setup("noise that lasts, jerky", ball(45), lasting),
+    Setup("noise correlated over time, smooth movement", circling, lasting),
+    Setup("noise correlated over time, jerky movement", ball(45), lasting),
 )
 
 
@@ -267,7 +276,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "sphere-several-markers",
-        "Centre from four markers around a joint, 20° arc: RMS error over the Cramér-Rao bound",
+        "Centre from four markers at a joint, 20° arc: RMS error divided by the Cramér-Rao bound",
         four_markers,
         SEEDED,
     ),
@@ -285,7 +294,8 @@ EXPERIMENTS = (
     *(
         Experiment(
             f"{BALL_IDS[rom]}-limits",
-            f"Ball joint, range of motion {rom:g}°, 1000 runs: upper 95 % limits of the RMS error",
+            f"Ball joint, range of motion {rom:g}°, 1000 runs: upper 95 % confidence limits of the "
+            "RMS error",
             partial(_ball_joint, rom, goals, 1000),
             SEEDED,
             long=True,

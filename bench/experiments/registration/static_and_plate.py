@@ -192,7 +192,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "board-alignment-integrated",
-        "Alignment of a recorded board; its IMU orientation is the integrated gyroscope",
+        "Alignment of a recorded board; the IMU orientation is the integral of the angular rate",
         integrated_plate,
         BOARD,
         ("broad_excerpts",),

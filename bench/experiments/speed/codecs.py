@@ -194,7 +194,11 @@ def rival_rows(quick: bool) -> list[Result]:
         timed_result("slcan: jointfit, one frame from a pty", _us(ours), "µs", 12, 48),
         timed_result("slcan: python-can, one frame from a pty", _us(theirs), "µs"),
         timed_result(
-            "slcan: jointfit over python-can", round(statistics.median(ratios), 4), "", 0.2, 0.5
+            "slcan: time ratio of jointfit to python-can",
+            round(statistics.median(ratios), 4),
+            "",
+            0.2,
+            0.5,
         ),
     ]
 

@@ -117,7 +117,7 @@ def fusion_rows(quick: bool) -> list[Result]:
     return [
         per_item("fusion: one frame of 4 sensors", fuse, items=n, goal_us=100, quick=quick),
         per_item(
-            "fusion: both corrections in plain NumPy",
+            "fusion: soft-tissue models of both segments, plain NumPy",
             lambda: _plainly(frames),
             items=n,
             goal_us=None,

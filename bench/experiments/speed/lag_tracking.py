@@ -66,7 +66,7 @@ def rows(quick: bool) -> list[Result]:
     loop = loop_s()
     figures = (
         ("lag tracking: one sample or frame in", 1e6 * add, "µs", 5.0),
-        ("lag tracking: steps, a second of 4 sensors and 120 Hz cameras", 1e3 * second, "ms", 50.0),
+        ("lag tracking: all steps for 1 s of 4 sensors, 120 Hz cameras", 1e3 * second, "ms", 50.0),
         ("lag tracking: longest step", 1e3 * most, "ms", 8.0),
     )
     return [

@@ -65,12 +65,12 @@ def rows(quick: bool) -> list[Result]:
             note="16 markers",
         ),
         per_item(
-            "live centers: one estimate, five a second",
+            "live centers: one estimate of one joint",
             lambda: _look(frames),
             items=LOOKS,
             goal_us=5000,
             quick=quick,
-            note="one joint re-estimated",
+            note="five estimates per second",
         ),
     ]
 

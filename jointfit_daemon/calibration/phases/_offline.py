@@ -204,10 +204,10 @@ def evaluate(
     if len(trials) == 1:
         cut = round(len(trials[0].t_s) * (1.0 - holdout))
         folds = [([trials[0].part(slice(None, cut))], trials[0].part(slice(cut, None)))]
-        held_out = f"the last {100 * holdout:.0f} % of the trial, with a fit to the rest"
+        held_out = f"the last {100 * holdout:.0f} % of the trial, after a fit to the rest"
     else:
         folds = [([t for t in trials if t is not left], left) for left in trials]
-        held_out = "one trial after the other, with a fit to the others"
+        held_out = "each trial in turn, after a fit to the others"
 
     rows: list[MethodScore] = []
     reference, t_s = {}, {}
