@@ -120,6 +120,8 @@ class SharedBus:
         """Devices that use the bus."""
         self._subscribers: list[_Subscriber] = []
         self._routes: dict[CanKey, _Subscriber] = {}
+        self._ids: dict[str, Mapping[CanKey, str]] = {}
+        """Identifiers of every device that has subscribed, also while it waits for a retry."""
 
     async def enter(self) -> None:
         """Register a user; the first one opens the bus."""
@@ -200,6 +202,7 @@ class SharedBus:
         if self._failed is not None:
             raise DeviceLostError(str(self._failed))
         self._subscribers.append(subscriber)
+        self._ids[name] = ids
         try:
             async with limit:
                 self._route()
@@ -262,8 +265,12 @@ class SharedBus:
 
     def _route(self) -> None:
         self._routes = {key: each for each in self._subscribers for key in each.ids}
-        self._seen = {key: seen for key, seen in self._seen.items() if key not in self._routes}
+        self._seen = {key: seen for key, seen in self._seen.items() if not self._belongs(key)}
         self._filter()
+
+    def _belongs(self, key: CanKey) -> bool:
+        """Return whether a device of the rig uses the identifier, subscribed or not."""
+        return any(key in ids for ids in self._ids.values())
 
     def _filter(self) -> None:
         """Filter unclaimed frames in the kernel once every device receives its frames."""
@@ -306,7 +313,9 @@ class SharedBus:
             # Stored for later subscribers, and for error messages.
             self.foreign += 1
             self._unclaimed.append((t_ns, frame))
-            if key in self._seen or len(self._seen) < _SEEN:
+            if self._belongs(key):
+                self._others += 1
+            elif key in self._seen or len(self._seen) < _SEEN:
                 self._seen.setdefault(key, deque(maxlen=_SAMPLES)).append(frame.data)
 
         for subscriber, mine in shares.items():

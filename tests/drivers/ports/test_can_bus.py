@@ -152,6 +152,30 @@ async def test_only_the_silent_sensor_is_lost_and_its_report_lists_received_iden
         await heard.cancel()
 
 
+async def test_identifiers_of_a_sensor_that_waits_for_its_retry_are_not_unclaimed(
+    tmp_path: Path,
+) -> None:
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+
+    async def without_orientation() -> None:
+        while True:
+            for start in (0x100, 0x200):
+                frames = [CanFrame(0, start + 5, bytes(4)), CanFrame(0, start + 6, bytes(2))]
+                adapter.send(frames)
+            await asyncio.sleep(0.01)
+
+    async with serving(adapter):
+        first = DriverRun(xcdi_driver("S3", bus, 0x100, silence_s=0.3))
+        second = DriverRun(xcdi_driver("S4", bus, 0x200, silence_s=0.8))
+        await opened(adapter)
+        sending = asyncio.create_task(without_orientation())
+        texts = [await lost(first), await lost(second)]
+        sending.cancel()
+    for text in texts:
+        assert "though sample_time" in text
+        assert "claims" not in text
+
+
 async def test_a_sensor_that_worked_and_falls_silent_has_one_text_at_all_attempts(
     tmp_path: Path,
 ) -> None:
