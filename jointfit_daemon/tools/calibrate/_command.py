@@ -166,7 +166,6 @@ async def _guide_phases(
     with cancel_on_signal() as stop:
         try:
             async with MqttClient(rig.mqtt) as client:
-                await client.subscribe(*TOPICS)
                 for name in phases:
                     if ask and name in INSTRUCTIONS:
                         console.print(
@@ -177,6 +176,9 @@ async def _guide_phases(
                     if seconds is not None:
                         arguments["seconds"] = seconds
                     async with _track_progress(client, console) as tracker:
+                        # Each subscription delivers the retained status, which is not the result.
+                        await client.subscribe(*TOPICS)
+                        await tracker.wait_for_retained()
                         status = await _run_phase(client, tracker, arguments, config)
         except asyncio.CancelledError:
             if stop.number is None:
@@ -195,7 +197,7 @@ async def _run_phase(
     # The request runs in its own task: its answer is needed even if a signal cancels this one.
     request = asyncio.create_task(client.request("calibrate", arguments), name="calibrate request")
     try:
-        answer = await asyncio.shield(request)
+        answer = await _await_answer(client, tracker, request, name)
         if answer.get("status") == "error":
             raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
         if name in IMMEDIATE_REQUESTS:
@@ -207,6 +209,32 @@ async def _run_phase(
         raise
     final = name == "align" or ended.get("kept") is not None
     return dict(ended if final else await tracker.wait_for_store(ended))
+
+
+async def _await_answer(
+    client: MqttClient, tracker: PhaseTracker, request: asyncio.Task[dict[str, Any]], name: str
+) -> dict[str, Any]:
+    """Return the answer to `request`; an empty one if only status messages show its success.
+
+    Raises
+    ------
+    NoAnswerError
+        Neither an answer nor a status of the phase arrived. A request that the daemon may still
+        receive is followed by an abort.
+    """
+    from jointfit_daemon.outputs.mqtt import BrokerLostError, NoAnswerError
+
+    try:
+        return await asyncio.shield(request)
+    except NoAnswerError:
+        if name in IMMEDIATE_REQUESTS:
+            raise
+        if not tracker.has_begun(name):
+            with suppress(NoAnswerError, BrokerLostError):
+                await client.request("calibrate", {"phase": "abort"}, timeout_s=ABORT_S)
+        if not tracker.has_begun(name):
+            raise
+    return {}
 
 
 async def _abort_phase(
@@ -295,7 +323,11 @@ def handle_message(tracker: PhaseTracker, topic: str, payload: dict[str, Any]) -
     text = str(payload.get("text", ""))
     if topic == "calibration":
         tracker.on_status(payload)
-        return None if sys.stderr.isatty() else f"{payload.get('phase')}: {text}"
+        return (
+            None
+            if sys.stderr.isatty() or not tracker.is_requested
+            else f"{payload.get('phase')}: {text}"
+        )
     if topic == "calibration/progress":
         tracker.on_progress(payload)
         return None

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 STORING_S = 1.5
 """Longest wait for the version number of a stored result, s."""
+RETAINED_S = 1.0
+"""Longest wait for the retained status after a subscription, s."""
 OFFLINE_S = 60.0
 """Longest wait for a daemon that is offline, s: more than a restart takes on a Raspberry Pi."""
 
@@ -49,12 +51,27 @@ class PhaseTracker:
     """Whether a task waits for the end of a phase."""
     _offline_until: float | None = None
     """End of the wait for the daemon, s of the event loop; None while it is online."""
+    _requested: bool = False
+    """Whether the phase was requested; earlier messages are retained or of other phases."""
+    _phase_before: object = None
+    """Phase of the last status before the request."""
 
     def on_status(self, payload: Mapping[str, Any]) -> None:
         """Process a message of topic ``calibration``."""
         self.status = payload
-        self._unread.append(payload)
+        if self._requested:
+            self._unread.append(payload)
         self._changed.set()
+
+    @property
+    def is_requested(self) -> bool:
+        """Whether `begin` was called."""
+        return self._requested
+
+    def has_begun(self, phase: str) -> bool:
+        """Return whether a status since the request shows that `phase` was started by it."""
+        began = any(status.get("phase") == phase for status in self._unread)
+        return began and self._phase_before != phase
 
     def on_progress(self, payload: Mapping[str, Any]) -> None:
         """Process a message of topic ``calibration/progress``."""
@@ -84,8 +101,16 @@ class PhaseTracker:
         self._failure = error
         self._changed.set()
 
+    async def wait_for_retained(self) -> None:
+        """Wait for the retained status, which precedes the request; at most `RETAINED_S`."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(RETAINED_S):
+                while not self.status:
+                    await self._next_message()
+
     def begin(self) -> None:
         """Discard the messages received so far."""
+        self._requested, self._phase_before = True, self.status.get("phase")
         self._unread.clear()
         self._changed.clear()
         self._waiting = False

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import pytest
 import typer
 
+from jointfit_daemon.outputs.mqtt import NoAnswerError
 from jointfit_daemon.tools.calibrate import (
     PhaseAbortedError,
     PhaseTracker,
@@ -208,3 +210,53 @@ async def test_wait_for_an_offline_daemon_is_bounded(monkeypatch: pytest.MonkeyP
 async def test_state_of_the_daemon_between_phases_is_not_reported() -> None:
     one = PhaseTracker(lambda *_: None)
     assert [one.on_state(state) for state in ("online", "offline", "online")] == [None] * 3
+
+
+class SilentDaemon:
+    """Stands in for a client whose requests are never answered."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    async def request(self, _: str, arguments: Mapping[str, str], **__: float) -> dict[str, object]:
+        self.asked.append(arguments["phase"])
+        await asyncio.sleep(0.01)
+        raise NoAnswerError("no daemon answers")
+
+
+async def run_static(client: SilentDaemon, *later: str) -> Mapping[str, object]:
+    one = PhaseTracker(lambda *_: None)
+    one.on_status({"phase": "aborted", "text": "the phase of yesterday", "version": 1})
+    running = asyncio.create_task(
+        _command._run_phase(client, one, {"phase": "static"}, Path("rig.toml"))  # type: ignore[arg-type]
+    )
+    await asyncio.sleep(0)
+    for phase in later:
+        one.on_status({"phase": phase, "text": f"it is {phase}", "version": 1})
+    return await running
+
+
+async def test_status_of_the_requested_phase_replaces_a_lost_answer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(_phase_tracker, "STORING_S", 0.01)
+    client = SilentDaemon()
+    ended = await run_static(client, "static", "posed")
+    assert ended["phase"] == "posed"
+    assert client.asked == ["static"], "the phase goes on"
+
+
+async def test_request_without_answer_and_status_is_aborted() -> None:
+    client = SilentDaemon()
+    with pytest.raises(NoAnswerError):
+        await run_static(client)
+    assert client.asked == ["static", "abort"]
+
+
+def test_retained_status_of_the_last_phase_is_not_printed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", SimpleNamespace(isatty=lambda: False))
+    one = PhaseTracker(lambda *_: None)
+    old = {"phase": "aborted", "text": "the phase of yesterday"}
+    assert _command.handle_message(one, "calibration", old) is None
+    one.begin()
+    assert _command.handle_message(one, "calibration", old) == "aborted: the phase of yesterday"
