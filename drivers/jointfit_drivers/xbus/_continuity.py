@@ -10,8 +10,9 @@ messages with an orientation are compared, because others may contain time of an
 | does not follow                               | held until the next one                         |
 | the next one follows the last accepted one    | the held one was corrupt and is dropped         |
 | the next one follows the held one             | both accepted; a restart if device time jumped  |
-|                                               | but neither counter nor arrival time did; a     |
-|                                               | counter jump if time advanced by one period     |
+|                                               | but neither counter nor arrival time did, and   |
+|                                               | no backlog explains it; a counter jump if time  |
+|                                               | advanced by one period                          |
 | the next one follows neither                  | the held one is dropped, the next one held      |
 
 An eight-bit checksum passes one corrupt message in 256, so a single message proves neither a loss
@@ -26,6 +27,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from jointfit_drivers.backlog import BacklogDelay, device_continued
 from jointfit_protocols.xbus.configuration import TICK_NS, WRAP_32_BIT, WRAP_DAY
 
 _COUNTS = 1 << 16
@@ -40,7 +42,9 @@ _SLACK_SHARE = 0.02
 _LEARNED = 10
 """Counts after which the measured rate replaces the nominal one."""
 _PACE_NS = 250_000_000
-"""Largest difference, ns, of elapsed device and arrival time without a restart."""
+"""Largest difference, ns, of elapsed device and arrival time without a restart or a backlog."""
+_LATEST_NS = 30_000_000_000
+"""Longest delay, ns, of the first messages after opening."""
 _DISTINCT = 50_000
 """Longest gap, counts, in which counter and time can disagree.
 
@@ -96,6 +100,7 @@ class XbusContinuity:
         self._held: _Point | None = None
         self._trusted = False  # whether a message followed the last one
         self._sum_ticks = self._sum_counts = 0
+        self._delay = BacklogDelay()
 
     def other(self) -> None:
         """Count an MTData2 without orientation, which also increments the counter."""
@@ -134,6 +139,9 @@ class XbusContinuity:
         step = self._classify(last, held) if trusted else _CONTINUES
         if step.restarted or not trusted:
             self._sum_ticks = self._sum_counts = 0
+            self._delay = BacklogDelay()
+        else:
+            self._delay_to(last, held)
         return step._replace(confirmed=True, lost_since=self._accept(held, point).lost)
 
     def forget(self) -> None:
@@ -141,10 +149,12 @@ class XbusContinuity:
         self._last = self._held = None
         self._trusted = False
         self._sum_ticks = self._sum_counts = 0
+        self._delay = BacklogDelay()
 
     def _accept(self, last: _Point, point: _Point) -> XbusStep:
         """Make `point` the last one and update the measured rate."""
         self._last, self._trusted = point, True
+        self._delay_to(last, point)
 
         counts, ticks = _counts(last, point), self._ticks(last, point)
         # the rate cannot be measured with a clock that does not advance
@@ -167,10 +177,18 @@ class XbusContinuity:
             return XbusStep(_lost(last, held) + max(turns, 0) * _COUNTS)
         if plausible and (counts is None or ticks <= _GAP * self._period):
             return XbusStep(counter_jumped=counts is not None)
-        # A few bits of either message may be corrupt: it is a restart only if device time also
-        # disagrees with the arrival times.
-        off_ns = abs(held.arrival_ns - last.arrival_ns - ticks * TICK_NS)
-        return XbusStep(restarted=off_ns > _PACE_NS)
+        # A few bits of either message may be corrupt, or a backlog ended here: it is a restart only
+        # if device time also disagrees with the arrival times.
+        elapsed_ns = held.arrival_ns - last.arrival_ns
+        delay_ns = self._delay.limit(_PACE_NS, _LATEST_NS)
+        continued = device_continued(delay_ns, ticks * TICK_NS, elapsed_ns, _PACE_NS)
+        return XbusStep(restarted=not continued)
+
+    def _delay_to(self, last: _Point, point: _Point) -> None:
+        """Update the delay with a point of the same clock as the one before it."""
+        ticks = self._ticks(last, point)
+        if ticks is not None:
+            self._delay.feed(ticks * TICK_NS, point.arrival_ns - last.arrival_ns)
 
     def _follows(self, last: _Point, point: _Point) -> bool:
         ticks, counts = self._ticks(last, point), _counts(last, point)

@@ -8,8 +8,9 @@ their widths, and P the measured step of SampleTime per group:
 | c = round(d / P) within 1 % and a few counts            | same clock; c - 1 groups were lost  |
 | no counter, d forward by a few P                        | same clock; round(d / P) - 1 lost   |
 | d or c backward, only one of them 0, or disagreement    | contradiction: the group is held    |
-| the next group continues the held one                   | restart, unless time continued, or  |
-|                                                         | advanced as the host's did          |
+| the next group continues the held one                   | restart, unless time continued,     |
+|                                                         | advanced as the host's did, or      |
+|                                                         | a backlog ended                     |
 | the next group continues the last accepted one          | the held one was corrupt            |
 | three contradictions that continue each other, or       | two sensors share the identifiers   |
 | 14 broken groups, within 20 groups                      |                                     |
@@ -27,6 +28,7 @@ from collections import deque
 from statistics import median
 from typing import NamedTuple
 
+from jointfit_drivers.backlog import BacklogDelay, device_continued
 from jointfit_protocols.xcdi import COUNTER_MODULUS, TICKS_MODULUS
 
 _LEARNED = 10
@@ -39,6 +41,8 @@ _SILENT = 20
 """Least silence, groups, over which SampleTime is compared with host time."""
 _RAN_ON_SHARE = 0.1
 """Largest difference of SampleTime and host time over a silence, share of the silence."""
+_LATEST = 3000
+"""Longest delay, groups, of the first groups after opening."""
 _LONGEST = 20_000
 """Longest gap, groups; beyond, the tolerance would accept any pair."""
 _BLIND = 100
@@ -133,6 +137,8 @@ class XcdiContinuity:
             self._astray = 0
             groups, settled = self._track.groups_to(held), self._track.settled
             restarted = groups is None and settled and not self._track.ran_on_to(held)
+            if not restarted:
+                held.delay = self._track.delay_to(held)
             lost = held.take(ticks, counter, host) + (groups or 1) - 1
             self._track, self._rival = held, None
             return XcdiStep(lost, restarted=restarted, confirmed=True), False
@@ -168,6 +174,8 @@ class _Track:
         self.period = period
         self.settled = period is not None
         """Whether the period was determined from enough steps."""
+        self.delay = BacklogDelay()
+        """Delay of the last group, ticks."""
         self._ticks: int | None = None
         self._host: int | None = None  # arrival of the last group with time, ticks
         self._counter: int | None = None
@@ -223,16 +231,35 @@ class _Track:
     def ran_on_to(self, later: _Track) -> bool:
         """Return whether SampleTime advanced by the time between the arrivals.
 
-        The clock then ran on while the sensor was silent: the sensor did not restart, even if its
-        counter stood still.
+        The clock then ran on while the sensor was silent, or until the end of a backlog: the sensor
+        did not restart, even if its counter stood still.
         """
         if self._ticks is None or later._ticks is None or self.period is None:
             return False
-        if self._host is None or later._host is None:
-            return False
-        advance, elapsed = (later._ticks - self._ticks) % TICKS_MODULUS, later._host - self._host
-        near = abs(advance - elapsed) <= _RAN_ON_SHARE * elapsed
-        return near and elapsed >= _SILENT * self.period
+
+        step = self._step_to(later._ticks, later._host)
+        if step is None:  # the first groups: their delay is unknown
+            advance = (later._ticks - self._ticks) % TICKS_MODULUS
+            return advance <= _LATEST * self.period
+
+        advance, elapsed = step
+        delay = self.delay.limit(_SILENT * self.period, _LATEST * self.period)
+        silence = elapsed + delay
+        near = device_continued(delay, advance, elapsed, _RAN_ON_SHARE * silence)
+        return near and silence >= _SILENT * self.period
+
+    def delay_to(self, later: _Track) -> BacklogDelay:
+        """Return the delay of a later track of the same clock."""
+        step = self._step_to(later._ticks, later._host)
+        if step is not None:
+            self.delay.feed(*step)
+        return self.delay
+
+    def _step_to(self, ticks: int | None, host: int | None) -> tuple[int, int] | None:
+        """Return the steps of SampleTime and of host time; None if one of them is unknown."""
+        if self._ticks is None or ticks is None or self._host is None or host is None:
+            return None
+        return (ticks - self._ticks) % TICKS_MODULUS, host - self._host
 
     def take(self, ticks: int | None, counter: int | None, host: int | None) -> int:
         """Add a group that continues this track; return the groups lost before it."""
@@ -241,6 +268,9 @@ class _Track:
 
         self._groups += count or 0
         self._counted = self._counted and count is not None
+        step = self._step_to(ticks, host)
+        if step is not None:
+            self.delay.feed(*step)
         if ticks is not None and self._ticks is not None:
             d = (ticks - self._ticks) % TICKS_MODULUS
             if not self.settled:

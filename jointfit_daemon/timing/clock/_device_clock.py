@@ -43,8 +43,6 @@ CAUGHT_UP_NS = 50_000
 """Largest distance of a timestamp from its estimate at which the clock becomes synced, ns."""
 AWAY_SLACK_NS = 500_000_000
 """Tolerance of device time after the port was closed, ns: bytes may have been buffered."""
-AWAY_DELAY_NS = 5_000_000_000
-"""Longest delay of the first sample after the port was closed, ns, that is no restart."""
 AWAY_TURNS = 20
 """Least period of the readings in units of that tolerance; with shorter ones a restarted device
 would pass the check by chance in more than one of ten cases.
@@ -359,7 +357,7 @@ class DeviceClock:
         uptime_ns = u % turn_ns if turn_ns else u
         own = self._tick_clock is not None and self._tick_clock.scale == "own"
         counted = self._kind == _TICKS and own and uptime_ns > elapsed_ns + slack_ns
-        if counted and last_u < u and -AWAY_DELAY_NS <= off_ns < 0:
+        if counted and last_u < u and off_ns < 0:
             return None
         return _clock_events.clock_reset_event(u - last_u, elapsed_ns)
 

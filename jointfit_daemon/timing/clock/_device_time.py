@@ -35,6 +35,8 @@ _SILENCE_LEAST_NS = 500_000_000
 """Least silence over which device time is compared with host time, ns: a busy host delays less."""
 _SILENCE_SHARE = 0.1
 """Largest difference of device time and host time over a silence, share of the silence."""
+_BACKLOG_NS = 100_000_000
+"""Least delay of a backlog, ns, and largest delay of the first sample after it."""
 _WRAP_SLACK = 8
 """Counts by which a wrap may differ from the elapsed time while the counter width is unknown."""
 _LATE = 0.65
@@ -65,11 +67,19 @@ def _ran_on(step_ns: int, elapsed_ns: int) -> bool:
     return near and elapsed_ns >= _SILENCE_LEAST_NS
 
 
+def _backlog_ended(ahead_ns: int, u: int, arrival_ns: int, envelope: MinimumDelayFilter) -> bool:
+    """Return whether a sample is punctual after late ones: device time is ahead by their delay."""
+    if ahead_ns <= _BACKLOG_NS or not envelope.settled:
+        return False
+    return abs(envelope.residual(u, arrival_ns - u)) <= _BACKLOG_NS
+
+
 class TickTime:
     """Reader of device timestamps, with wraps and a consistency check against a sample counter.
 
     A step forward shared by the counter is a gap in the same clock. A step not shared by the
-    counter is a restart, unless it equals the silence: the device stopped sending, not its clock.
+    counter is a restart, unless it equals the silence or the delay of a backlog that ended: the
+    device stopped sending, not its clock.
     """
 
     __slots__ = ("_arrival_ns", "_backward", "_clock", "_counter", "_last", "_step", "_turn_ns")
@@ -102,7 +112,7 @@ class TickTime:
         return self.to_ns(unwrap(ticks, last, self._clock.modulus, 0, self._turn_ns))
 
     def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: MinimumDelayFilter  # noqa: ARG002 - the readers' common shape
+        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: MinimumDelayFilter
     ) -> int | None:  # fmt: skip
         """Return the device time, ns, or None for a restart."""
         if ticks is None:
@@ -115,7 +125,10 @@ class TickTime:
                 self._backward += 1
                 fell = self._backward >= BACKWARD_LIMIT or self.to_ns(last - ticks) > FALL_NS
                 return None if fell else self.to_ns(ticks)
-            ran_on = _ran_on(self.to_ns(ticks - last), elapsed)
+            step_ns, u = self.to_ns(ticks - last), self.to_ns(ticks)
+            ran_on = _ran_on(step_ns, elapsed) or _backlog_ended(
+                step_ns - elapsed, u, arrival_ns, envelope
+            )
             if not ran_on and self._contradicted(ticks - last, counter):
                 return None
         self._last, self._arrival_ns, self._backward = ticks, arrival_ns, 0

@@ -247,6 +247,25 @@ def test_a_clock_that_jumps_while_its_counter_does_not_is_a_restart() -> None:
             assert clock.epoch == 1
 
 
+@pytest.mark.parametrize("stall", [0.5, 2.0, 10.0])
+@pytest.mark.parametrize("reopened", [False, True])
+def test_backlog_that_ends_while_the_counter_stands_is_no_restart(
+    stall: float, reopened: bool
+) -> None:
+    clock, silent = DeviceClock(PERIOD), round(stall * S)
+    first = 100 * S // 1000  # the device has run for 100 s
+    for k in range(4000):
+        late = 3000 <= k < 3020  # sampled before the stall, received together after it
+        stood = silent if k >= 3020 else 0
+        arrival = START + (3000 * PERIOD + silent + k if late else k * PERIOD + stood)
+        if k == 3000 and reopened:
+            clock.feed_reopened()
+        ticks = first + (k * PERIOD + stood) // 1000
+        clock.feed_sample(ticks, k, arrival, MICROSECONDS)
+        assert clock.epoch == 0
+    assert not clock.news
+
+
 def test_samples_that_stay_late_are_a_restart_after_two_seconds() -> None:
     """The device paused for 0.3 s and its clock with it, and no counter tells."""
     clock = DeviceClock(PERIOD)
