@@ -2,14 +2,16 @@
 
 Invariant: the size is limited, the oldest message is dropped first, and drops are counted.
 
-Three kinds wait separately. State is retained: the last value of a topic replaces earlier ones, and
-all state is sent again on every connection. Events are sent once, in order. Stream messages are
-useless when late.
+Four kinds wait separately and are sent in this order. A client waits for a response. State is
+retained: the last value of a topic replaces earlier ones, and all state is sent again on every
+connection. Events are sent once, in order. Stream messages are useless when late. All but state
+are dropped when they have waited longer than their expiry.
 """
 
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import deque
 from typing import TYPE_CHECKING
 
@@ -28,6 +30,9 @@ _STREAM_CAPACITY = 200
 _EVENT_CAPACITY = 256
 """Events that may wait: several minutes of a rig with faults."""
 
+_Waiting = tuple[float, Outgoing]
+"""Time at which a message expires, s of the clock, and the message."""
+
 
 class Outbox:
     """Messages for one broker, filled by any code on the event loop, emptied by one writer.
@@ -37,27 +42,32 @@ class Outbox:
     state_topic
         Topic of the daemon's own state. On a new connection it is sent after all other retained
         messages, so that a subscriber of it can rely on them.
+    clock
+        Monotonic time, s, for the expiry of waiting messages.
     """
 
-    def __init__(self, state_topic: str) -> None:
+    def __init__(self, state_topic: str, clock: Callable[[], float] = time.monotonic) -> None:
         self.state_topic = state_topic
         self.dropped = 0
         """Messages dropped without having been sent."""
         self._state: dict[str, bytes] = {}
         self._unsent: dict[str, None] = {}
-        self._events: deque[Outgoing] = deque()
-        self._streams: deque[Outgoing] = deque()
+        self._clock = clock
+        self._responses: deque[_Waiting] = deque()
+        self._events: deque[_Waiting] = deque()
+        self._streams: deque[_Waiting] = deque()
         self._wake = asyncio.Event()
 
     @property
     def queued(self) -> int:
         """Number of waiting messages."""
-        return len(self._unsent) + len(self._events) + len(self._streams)
+        queues = (self._responses, self._events, self._streams)
+        return len(self._unsent) + sum(map(len, queues))
 
     @property
     def has_unsent(self) -> bool:
-        """Whether state or an event is waiting, or is being sent."""
-        return bool(self._unsent or self._events)
+        """Whether a response, state or an event is waiting, or state is being sent."""
+        return bool(self._responses or self._unsent or self._events)
 
     @property
     def retained(self) -> dict[str, bytes]:
@@ -71,21 +81,26 @@ class Outbox:
             self._unsent[topic] = None
             self._wake.set()
 
-    def event(self, topic: str, payload: bytes, *, correlation: bytes | None = None) -> None:
+    def event(self, topic: str, payload: bytes) -> None:
         """Queue a message that is sent once, at QoS 1."""
-        message = Outgoing(topic, payload, 1, False, RESPONSE_EXPIRY_S, None, correlation)
+        message = Outgoing(topic, payload, 1, False, RESPONSE_EXPIRY_S)
         self._push(self._events, _EVENT_CAPACITY, message)
+
+    def respond(self, topic: str, payload: bytes, *, correlation: bytes | None = None) -> None:
+        """Queue the response to a request; it is sent before all other messages, at QoS 1."""
+        message = Outgoing(topic, payload, 1, False, RESPONSE_EXPIRY_S, None, correlation)
+        self._push(self._responses, _EVENT_CAPACITY, message)
 
     def stream(self, topic: str, payload: bytes) -> None:
         """Queue a message that is sent at most once, at QoS 0."""
         message = Outgoing(topic, payload, 0, False, STREAM_EXPIRY_S)
         self._push(self._streams, _STREAM_CAPACITY, message)
 
-    def _push(self, queue: deque[Outgoing], limit: int, message: Outgoing) -> None:
+    def _push(self, queue: deque[_Waiting], limit: int, message: Outgoing) -> None:
         if len(queue) >= limit:
             queue.popleft()
             self.dropped += 1
-        queue.append(message)
+        queue.append((self._clock() + (message.expiry_s or 0), message))
         self._wake.set()
 
     def reconnected(self) -> None:
@@ -98,13 +113,24 @@ class Outbox:
     async def next(self) -> tuple[Outgoing, Callable[[], None]]:
         """Wait for the next message; return it with a callback for the moment it was sent."""
         while True:
+            if (message := self._take(self._responses)) is not None:
+                return message, lambda: None
             if self._unsent:
                 return self._next_state()
             for queue in (self._events, self._streams):
-                if queue:
-                    return queue.popleft(), lambda: None
+                if (message := self._take(queue)) is not None:
+                    return message, lambda: None
             self._wake.clear()
             await self._wake.wait()
+
+    def _take(self, queue: deque[_Waiting]) -> Outgoing | None:
+        """Return the oldest message that has not expired; drop and count those before it."""
+        while queue:
+            expires_s, message = queue.popleft()
+            if self._clock() <= expires_s:
+                return message
+            self.dropped += 1
+        return None
 
     def _next_state(self) -> tuple[Outgoing, Callable[[], None]]:
         topic = next(iter(self._unsent))

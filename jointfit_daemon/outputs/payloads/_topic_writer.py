@@ -203,7 +203,7 @@ class TopicWriter:
             "data": reply.data,
             "error": _error(reply),
         }
-        self._outbox.event(topic, encode(payload), correlation=address.correlation)
+        self._outbox.respond(topic, encode(payload), correlation=address.correlation)
 
     def publish_health(self, health: BridgeHealth) -> None:
         """Publish ``bridge/health``."""

@@ -122,3 +122,26 @@ async def test_every_message_is_sent_waiting_or_counted_as_dropped(
     assert {topic: value for topic, value in wanted.items() if value} == {
         topic: value for topic, value in at_broker.items() if value
     }
+
+
+async def test_responses_overtake_state_events_and_streams() -> None:
+    outbox = Outbox(LIFE)
+    outbox.stream("pose", b"")
+    outbox.event("bridge/event", b"")
+    outbox.retain("bridge/health", b"1")
+    outbox.respond("bridge/response/calibrate", b"")
+    order = [topic for topic, _, _ in await drain(outbox)]
+    assert order == ["bridge/response/calibrate", "bridge/health", "bridge/event", "pose"]
+
+
+async def test_expired_messages_are_dropped_and_counted() -> None:
+    now = [0.0]
+    outbox = Outbox(LIFE, lambda: now[0])
+    outbox.event("bridge/event", b"old")
+    outbox.stream("pose", b"old")
+    now[0] = 31.0
+    outbox.event("bridge/event", b"new")
+    outbox.stream("pose", b"new")
+    sent = [(await outbox.next())[0].payload for _ in range(2)]
+    assert sent == [b"new", b"new"]
+    assert outbox.dropped == 2
