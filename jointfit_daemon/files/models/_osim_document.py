@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 LARGEST = 64 << 20
 """Largest size of a model file, bytes."""
 GROUND = "ground"
+_OPENSIM_4 = 40000
+"""Attribute ``Version`` of the first documents of OpenSim 4."""
 _METRES = "meters"
 
 
@@ -102,6 +104,12 @@ def read_document(path: Path) -> OsimDocument:
             "save the model from OpenSim 4 again"
         )
     if model.find("JointSet") is None:
+        version = root.get("Version", "")
+        if version.isdecimal() and int(version) >= _OPENSIM_4:
+            raise MalformedFileError(
+                f"{path}: the model has no <JointSet>, expected bodies and joints: export the "
+                "whole model from OpenSim"
+            )
         raise MalformedFileError(
             f"{path}: written by OpenSim before 4.0; open it there once and save it again"
         )

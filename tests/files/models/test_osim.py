@@ -313,7 +313,8 @@ def model_of(text: str) -> str:
             "m.osim, line 2: not an OpenSim model: found <html>, expected <OpenSimDocument>",
         ),
         (model_of("<ScaleTool/>"), "found <OpenSimDocument> with <ScaleTool>.*: choose the .osim"),
-        (model_of("<Model name='m'/>"), "before 4.0"),
+        (model_of("<Model name='m'/>"), "the model has no <JointSet>, expected bodies"),
+        ("<OpenSimDocument Version='30000'><Model/></OpenSimDocument>", "before 4.0"),
         (
             "<!DOCTYPE x [<!ENTITY a 'aaaa'><!ENTITY b '&a;&a;'>]>"
             + model_of("<Model>&b;</Model>"),
