@@ -56,6 +56,7 @@ from jointfit_daemon.supervisor._calibration_store import (
 )
 from jointfit_daemon.supervisor._core_runner import CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
+from jointfit_daemon.supervisor._overload_monitor import OverloadMonitor
 from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
 from jointfit_daemon.supervisor._request_handlers import RequestHandlers
@@ -128,6 +129,7 @@ class Daemon:
         self._process_health = self._process.health()
         self._progress, self._frame_rate = ProgressMonitor(), FrameRateCounter()
         self._loop_errors = DisconnectErrorFilter()
+        self._overload = OverloadMonitor()
         self._recorder: EventLogWriter | None = None
         self._online: set[str] = set()
         self._version: int | None = None
@@ -391,6 +393,8 @@ class Daemon:
         self._topics.publish_health(found)
 
         health, link = found.core, found.link
+        if (text := self._overload.warning(found.process, link, time.monotonic())) is not None:
+            log.warning("%s", text)
         states = health.frames.sent - health.frames.empty
         rate_hz = self._frame_rate.rate_hz(states, time.monotonic())
         rig, online, connected = self._rig.sources, self._online, link.connected
