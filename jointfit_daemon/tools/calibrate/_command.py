@@ -43,7 +43,7 @@ LONGEST_S = 600.0
 """Longest phase that can be requested, s, as in the request's schema."""
 ORDER = ("align", "static", "functional")
 IMMEDIATE_REQUESTS = {
-    "abort": "no phase is running now; current state: ",
+    "abort": "the running phase, if any, was aborted; current state: ",
     "revert": "online learning reverted; current state: ",
 }
 INSTRUCTIONS = {
