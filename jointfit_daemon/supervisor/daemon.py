@@ -22,6 +22,7 @@ import asyncio
 import gc
 import logging
 import math
+import os
 import signal
 import time
 from contextlib import suppress
@@ -133,7 +134,10 @@ class Daemon:
         self._recorder: EventLogWriter | None = None
         self._online: set[str] = set()
         self._version: int | None = None
-        """Version of the calibration in force in the last log line."""
+        self._state_fault: str | None = None
+        self._state_lock: int | None = (
+            None  # of a state directory that could not be locked at the start
+        )
         self._state_fault: str | None = None
         self._calibration: CalibrationStatus | None = None
         self._health_due_s = 0.0
@@ -195,6 +199,8 @@ class Daemon:
         finally:
             logging.getLogger().removeHandler(warnings)
             loop.remove_signal_handler(signal.SIGHUP)
+            if self._state_lock is not None:
+                os.close(self._state_lock)
 
     async def _start(self, tasks: asyncio.TaskGroup) -> None:
         self._sources = SourceTasks(tasks, self._core.feed)
@@ -259,7 +265,7 @@ class Daemon:
         elif fault is None and before is not None:
             self._report(NoticeKind.STATE, "state directory can be written again")
             try:
-                await asyncio.to_thread(lock_again, state_directory())
+                self._state_lock = await asyncio.to_thread(lock_again, state_directory())
             except StateDirectoryInUseError as error:
                 self._report(NoticeKind.STATE, str(error), NoticeLevel.ERROR)
         self._calibrations.retry()

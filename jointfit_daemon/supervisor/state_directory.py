@@ -74,8 +74,8 @@ def lock_state(directory: Path) -> int | None:
     return descriptor
 
 
-def lock_again(directory: Path) -> None:
-    """Lock `directory` unless this process holds its lock; as `lock_state`.
+def lock_again(directory: Path) -> int | None:
+    """Lock `directory` as `lock_state` does, unless this process holds its lock (None).
 
     For a directory that could not be written, and so not be locked, at the start.
     """
@@ -83,8 +83,7 @@ def lock_again(directory: Path) -> None:
         holder = (directory / LOCK).read_text(encoding="ascii", errors="replace").strip()
     except OSError:
         holder = ""
-    if holder != str(os.getpid()):
-        lock_state(directory)
+    return lock_state(directory) if holder != str(os.getpid()) else None
 
 
 def make_private(directory: Path) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def settings(folder: Path, **more: Any) -> XbusSettings:
     return XbusSettings(
         id="S1", segment="thigh", driver="xbus", port=str(folder / "imu"), baud=115_200,
-        silence_s=0.4, **more,
+        silence_s=0.5, **more,
     )  # fmt: skip
 
 
