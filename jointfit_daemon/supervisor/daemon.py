@@ -135,10 +135,7 @@ class Daemon:
         self._online: set[str] = set()
         self._version: int | None = None
         self._state_fault: str | None = None
-        self._state_lock: int | None = (
-            None  # of a state directory that could not be locked at the start
-        )
-        self._state_fault: str | None = None
+        self._state_lock: int | None = None  # set if the directory was not writable at the start
         self._calibration: CalibrationStatus | None = None
         self._health_due_s = 0.0
         self._reload_requested = asyncio.Event()
