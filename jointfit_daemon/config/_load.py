@@ -336,7 +336,7 @@ class _RigReader:
             if driver is not None and known is not None:
                 if known.id is None:
                     known = known.model_copy(update={"id": _checks.imu_name(imu, at)})
-                source = _imu_source(imu["driver"], known, driver)
+                source = _imu_source(str(imu.get("driver")), known, driver)
                 self.imus_read.append(source)
                 unknown = imu.keys() - driver.Settings.model_fields.keys()
                 if (least := _bandwidth.least_load(known, unknown)) is not None:
@@ -379,15 +379,15 @@ class _RigReader:
         self, key: str, table: dict[str, Any], base: type[BaseModel]
     ) -> type[Driver] | None:
         name = table.get("driver")
-        if not isinstance(name, str):
-            return None  # missing or not a text: the settings model reports it
+        if not isinstance(name, str):  # the settings model reports it
+            return _likely_driver(None, table, base)
 
         try:
             driver = find_driver(name)
         except UnknownDriverError:
             faults = _checks.check_known_name(f"{key}.driver", name, driver_names(), "driver")
             self.faults += faults
-            return _similar_driver(faults[0].near, base)
+            return _likely_driver(faults[0].near, table, base)
         except Exception as error:  # noqa: BLE001 - a broken plug-in is a fault of the rig
             self.faults.append(Fault(f"{key}.driver", f"cannot be loaded: {error!r}", name))
             return None
@@ -395,7 +395,7 @@ class _RigReader:
         if not issubclass(driver.Settings, base):
             what = "motion capture" if base is ImuSettings else "an IMU"
             self.faults.append(Fault(f"{key}.driver", f"is a driver for {what}", name))
-            return None
+            return _likely_driver(None, table, base)
         return driver
 
     def _settings(
@@ -429,13 +429,33 @@ class _RigReader:
         return Source(MOCAP, "mocap", table["driver"], rate, None, settings, driver)
 
 
-def _similar_driver(name: str | None, base: type[BaseModel]) -> type[Driver] | None:
-    """Return the driver that a misspelled name resembles, to check the other keys of its table."""
+def _likely_driver(
+    near: str | None, table: Mapping[str, Any], base: type[BaseModel]
+) -> type[Driver] | None:
+    """Return the driver that is probably meant, to check the other keys of its table.
+
+    It is the one that a misspelled name resembles (`near`), otherwise the one that knows more than
+    any other of the keys which not all drivers have.
+    """
+    drivers = {name: driver for name in driver_names() if (driver := _loadable(name, base))}
+    if near in drivers:
+        return drivers[near]
+
+    special = table.keys() - base.model_fields.keys()
+    known = {name: len(special & drivers[name].Settings.model_fields.keys()) for name in drivers}
+    most = [name for name in known if known[name] == max(known.values())]
+    if len(most) != 1:
+        return None
+    # A name that resembles no driver may be one that is not installed, with keys of its own.
+    return drivers[most[0]] if known[most[0]] or "driver" not in table else None
+
+
+def _loadable(name: str, base: type[BaseModel]) -> type[Driver] | None:
     try:
-        driver = None if name is None else find_driver(name)
+        driver = find_driver(name)
     except Exception:  # noqa: BLE001 - a broken plug-in is a fault of its users only
         return None
-    return driver if driver is not None and issubclass(driver.Settings, base) else None
+    return driver if issubclass(driver.Settings, base) else None
 
 
 def _imu_source(name: str, settings: Any, driver: type[Driver]) -> Source:

@@ -324,3 +324,15 @@ def test_a_bus_that_the_daemon_would_refuse_is_a_fault(keys: str, line: str) -> 
 def test_the_check_prints_no_message_of_python_can(capfd: pytest.CaptureFixture[str]) -> None:
     complaints(in_bus(RIG, 'interface = "neovi"\nchannel = "0"'))
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("line", ["", 'driver = "natnet"', 'driver = "other"', "driver = xbus"])
+def test_a_wrong_driver_does_not_hide_the_faults_of_other_keys(tmp_path: Path, line: str) -> None:
+    slow = RIG.replace('port = "/dev/ttyUSB0"', 'port = "/dev/ttyUSB0"\nbaud = 9600')
+    result = check(tmp_path, slow.replace('driver = "xbus"', line))
+    assert "the line carries 9600" in result.stderr
+
+
+def test_unknown_keys_of_a_driver_that_may_not_be_installed_are_no_faults() -> None:
+    other = MOCAP.replace("natnet", "vendor").replace("server", "network")
+    assert not any("network" in fault for fault in complaints(RIG + other))
