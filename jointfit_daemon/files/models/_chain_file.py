@@ -51,10 +51,13 @@ def read_model(path: Path) -> ChainModel:
     Raises
     ------
     MalformedFileError
-        Damaged file, unknown keys, values of the wrong type, segments that do not form a chain,
-        or lengths that cannot be metres.
+        No such file by its name, damaged, unknown keys, values of the wrong type, segments that
+        do not form a chain, or lengths that cannot be metres.
     """
-    data = read_json(path) if path.suffix.lower() == ".json" else read_toml(path)
+    kind = path.suffix.lower()
+    if kind not in {".toml", ".json"}:
+        raise MalformedFileError(f"{path}: no chain model: expected a .osim, .toml or .json file")
+    data = read_json(path) if kind == ".json" else read_toml(path)
     return model_of(data, str(path), path.stem)
 
 

@@ -150,7 +150,7 @@ class CalibrationSession:
         """Add one orientation; call only while ``collecting``."""
         recording = self._recording
         if recording is not None and recording.add_sample(sensor, t_ns, q_world_sensor):
-            text = f"{sensor} moved: stillness is timed from the start again"
+            text = "moved: stillness is timed from the start again"
             return [Notice(t_ns, NoticeKind.CALIBRATION, sensor, text)]
         return []
 

@@ -136,3 +136,8 @@ def test_samples_of_other_lengths_are_named(tmp_path: Path) -> None:
     path.write_text('[[segment]]\nname = "a"\njoint = "coupled"\npath = [[0, 1, 0, 0, 0]]\n')
     with pytest.raises(MalformedFileError, match="path must be a list of samples, 8 numbers each"):
         read_model(path)
+
+
+def test_file_of_another_kind_is_no_model(tmp_path: Path) -> None:
+    with pytest.raises(MalformedFileError, match=r"squats\.trc: no chain model: expected a \.osim"):
+        read_model(tmp_path / "squats.trc")
