@@ -54,17 +54,16 @@ class Running:
         """Run the daemon for the block."""
         self.daemon = Daemon(self.folder / "rig.toml", parse_rig(self.table), Core())
         self.daemon._core.subscribe(self)
-        outgoing = self.daemon._outbox.event
+        outgoing = self.daemon._outbox.respond
 
-        def publish(topic: str, payload: bytes, **more: Any) -> None:
+        def respond(topic: str, payload: bytes, **more: Any) -> None:
             found = orjson.loads(payload)
-            if "/bridge/response/" in topic:
-                self.topics.append(topic)
-                answer = {key: found[key] for key in ("transaction", "status", "data", "error")}
-                self.replies.append(Reply(topic.rpartition("/")[2], **answer))
+            self.topics.append(topic)
+            answer = {key: found[key] for key in ("transaction", "status", "data", "error")}
+            self.replies.append(Reply(topic.rpartition("/")[2], **answer))
             outgoing(topic, payload, **more)
 
-        self.daemon._outbox.event = publish  # type: ignore[method-assign]
+        self.daemon._outbox.respond = respond  # type: ignore[method-assign]
         task = asyncio.create_task(self.daemon.run(), name="daemon")
         try:
             await self.until(lambda: hasattr(self.daemon, "_requests"))
