@@ -1,5 +1,19 @@
 """`jointfit dashboard`: the web page of a rig, and a tunnel from the page to the broker."""
 
-from jointfit_daemon.tools.dashboard._command import dashboard
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jointfit_daemon.tools.dashboard._command import dashboard
 
 __all__ = ["dashboard"]
+
+
+def __getattr__(name: str) -> Any:
+    """Return the command, imported on demand: the server runs without the command line."""
+    if name != "dashboard":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from jointfit_daemon.tools.dashboard._command import dashboard
+
+    return dashboard

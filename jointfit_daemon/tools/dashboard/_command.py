@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
+import json
+import os
+import sys
+from dataclasses import asdict
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from jointfit_daemon.tools.dashboard.addresses import LISTEN, parse_broker, parse_listen
-from jointfit_daemon.tools.stop_signals import cancel_on_signal
-
-if TYPE_CHECKING:
-    from jointfit_daemon.tools.dashboard.addresses import ListenAddress
-    from jointfit_daemon.tools.dashboard.server import DashboardServer
 
 
 def dashboard(
@@ -44,40 +42,19 @@ def dashboard(
     address, target = parse_listen(listen), parse_broker(broker)
 
     from jointfit_daemon.tools.dashboard._tunnel import tls_context
-    from jointfit_daemon.tools.dashboard.server import DashboardServer
+    from jointfit_daemon.tools.dashboard.server import open_listener
 
-    server = DashboardServer(
-        target,
-        tls_context(target, ca),
-        base=base.strip("/") if base else None,
-        names=tuple(each.lower() for each in name or ()),
-    )
-    asyncio.run(_serve(server, address))
-
-
-async def _serve(server: DashboardServer, listen: ListenAddress) -> None:
-    """Serve until a stop signal; print the URL, and a broker that cannot be reached."""
-    from jointfit_daemon.tools.dashboard._tunnel import broker_fault
-
-    with cancel_on_signal() as stop:
-        try:
-            async with server.listening(listen) as url:
-                typer.echo(f"dashboard: {url}  (broker {server.broker.text}; Ctrl-C stops)")
-                if not listen.is_local:
-                    typer.echo(
-                        "Every device that can open this page can also use the broker: protect the"
-                        " broker with accounts (docs/security.md).",
-                        err=True,
-                    )
-                if server.broker.websocket is None:
-                    fault = await broker_fault(server.broker, server.context)
-                    if fault is not None:
-                        typer.echo(
-                            f"broker {server.broker.text}: {fault}. The page connects as soon as"
-                            " it answers.",
-                            err=True,
-                        )
-                await asyncio.Event().wait()
-        except asyncio.CancelledError:
-            if stop.number is None:
-                raise
+    tls_context(target, ca)  # reports a faulty certificate
+    listener = open_listener(address)
+    listener.set_inheritable(True)
+    settings = {
+        "descriptor": listener.fileno(),
+        "listen": asdict(address),
+        "broker": asdict(target),
+        "ca": None if ca is None else str(ca),
+        "base": base.strip("/") if base else None,
+        "names": [each.lower() for each in name or ()],
+    }
+    # The libraries of the command line take a third of the memory of a server that runs for days.
+    module = "jointfit_daemon.tools.dashboard"
+    os.execv(sys.executable, [sys.executable, "-m", module, json.dumps(settings)])  # noqa: S606 - itself

@@ -57,26 +57,27 @@ class DashboardServer:
     _viewers: int = 0
 
     @contextlib.asynccontextmanager
-    async def listening(self, listen: ListenAddress) -> AsyncIterator[str]:
+    async def listening(
+        self, listen: ListenAddress, listener: socket.socket | None = None
+    ) -> AsyncIterator[str]:
         """Serve for the duration of the block; yield the URL of the page.
+
+        Parameters
+        ----------
+        listen
+            Address of the page.
+        listener
+            Its socket; None opens it.
 
         Raises
         ------
         ValueError
-            The address is in use, or does not belong to this machine.
+            As `open_listener`.
         """
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # malformed requests
-        try:
-            listener = _listener(listen)
-        except OSError as error:
-            raise ValueError(
-                f"--listen {bracketed(listen.host)}:{listen.port}: {error.strerror}:"
-                " choose another address or port"
-            ) from error
-
         async with serve(
             self._serve_viewer,
-            sock=listener,
+            sock=open_listener(listen) if listener is None else listener,
             process_request=self.respond,
             subprotocols=[Subprotocol("mqtt")],
             compression=None,  # costs more CPU time and memory than it saves on a local network
@@ -203,11 +204,23 @@ class DashboardServer:
         )
 
 
-def _listener(listen: ListenAddress) -> socket.socket:
-    """Return a listening socket; it belongs to the first address of a host name."""
-    found = socket.getaddrinfo(listen.host, listen.port, type=socket.SOCK_STREAM)
-    family, _, _, _, address = found[0]
-    return socket.create_server(address[:2], family=family, backlog=128)
+def open_listener(listen: ListenAddress) -> socket.socket:
+    """Return a listening socket; it belongs to the first address of a host name.
+
+    Raises
+    ------
+    ValueError
+        The address is in use, or does not belong to this machine.
+    """
+    try:
+        found = socket.getaddrinfo(listen.host, listen.port, type=socket.SOCK_STREAM)
+        family, _, _, _, address = found[0]
+        return socket.create_server(address[:2], family=family, backlog=128)
+    except OSError as error:
+        raise ValueError(
+            f"--listen {bracketed(listen.host)}:{listen.port}: {error.strerror}:"
+            " choose another address or port"
+        ) from error
 
 
 def _url(listen: ListenAddress, server: Server) -> str:

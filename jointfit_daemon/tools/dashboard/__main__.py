@@ -1,0 +1,59 @@
+"""The server of `jointfit dashboard`, which starts it with its settings as JSON."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import sys
+from pathlib import Path
+
+from jointfit_daemon.tools.dashboard._tunnel import broker_fault, tls_context
+from jointfit_daemon.tools.dashboard.addresses import BrokerAddress, ListenAddress
+from jointfit_daemon.tools.dashboard.server import DashboardServer
+from jointfit_daemon.tools.stop_signals import cancel_on_signal
+
+
+def main() -> None:
+    """Serve on the socket that the command opened, until a stop signal."""
+    settings = json.loads(sys.argv[1])
+    broker = BrokerAddress(**settings["broker"])
+    authority = None if settings["ca"] is None else Path(settings["ca"])
+    server = DashboardServer(
+        broker,
+        tls_context(broker, authority),
+        base=settings["base"],
+        names=tuple(settings["names"]),
+    )
+    listener = socket.socket(fileno=settings["descriptor"])
+    asyncio.run(_serve(server, ListenAddress(**settings["listen"]), listener))
+
+
+async def _serve(server: DashboardServer, listen: ListenAddress, listener: socket.socket) -> None:
+    """Serve until a stop signal; print the URL, and a broker that cannot be reached."""
+    with cancel_on_signal() as stop:
+        try:
+            async with server.listening(listen, listener) as url:
+                print(f"dashboard: {url}  (broker {server.broker.text}; Ctrl-C stops)", flush=True)
+                if not listen.is_local:
+                    print(
+                        "Every device that can open this page can also use the broker: protect the"
+                        " broker with accounts (docs/security.md).",
+                        file=sys.stderr,
+                    )
+                if server.broker.websocket is None:
+                    fault = await broker_fault(server.broker, server.context)
+                    if fault is not None:
+                        print(
+                            f"broker {server.broker.text}: {fault}. The page connects as soon as"
+                            " it answers.",
+                            file=sys.stderr,
+                        )
+                await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            if stop.number is None:
+                raise
+
+
+if __name__ == "__main__":
+    main()
