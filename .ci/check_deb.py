@@ -17,7 +17,8 @@ MACHINES = {"amd64": 62, "arm64": 183}
 NEEDED = (
     "usr/bin/jointfitd", "usr/lib/systemd/system/jointfitd.service",
     "usr/lib/udev/rules.d/70-jointfitd.rules", "usr/share/man/man1/jointfitd.1.gz",
-    "usr/share/doc/jointfitd/copyright", "usr/share/doc/jointfitd/changelog.Debian.gz",
+    "usr/share/bash-completion/completions/jointfit.bash", "usr/share/doc/jointfitd/copyright",
+    "usr/share/doc/jointfitd/changelog.Debian.gz",
 )  # fmt: skip
 
 

@@ -31,7 +31,6 @@ app = typer.Typer(
     help="Check a rig, calibrate it, decode captures, process recordings, run a demo.",
     epilog=EXIT_CODES,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 for command in (

@@ -11,6 +11,7 @@ import orjson
 import typer
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame, SyncPulse
+from jointfit_daemon.tools.completion import complete_driver
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -73,7 +74,12 @@ class CaptureSummary:
 
 
 def decode(
-    protocol: Annotated[str, typer.Argument(help="Driver: xbus, xcdi, natnet, or another.")],
+    protocol: Annotated[
+        str,
+        typer.Argument(
+            help="Driver: xbus, xcdi, natnet, or another.", autocompletion=complete_driver
+        ),
+    ],
     file: Annotated[Path, typer.Argument(help="Raw bytes, pcapng, or `candump -L` log.")],
     *,
     jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object per item.")] = False,

@@ -10,6 +10,7 @@ import orjson
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.completion import complete_request
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -20,7 +21,11 @@ _Json = Annotated[bool, typer.Option("--json", help="Print the whole answer as o
 
 def request(
     name: Annotated[
-        str, typer.Argument(help="Request, as selftest; the documentation has a table.")
+        str,
+        typer.Argument(
+            help="Request, as selftest; the documentation has a table.",
+            autocompletion=complete_request,
+        ),
     ],
     arguments: Annotated[
         str, typer.Argument(help='Its arguments as a JSON object, as {"device":"S1"}.')

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ from jointfit_daemon.tools.__main__ import app
 from jointfit_daemon.tools.command_group import ON_DEMAND_ERRORS
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "knee.toml"
+COMPLETION = EXAMPLE.parents[1] / "packaging" / "completions" / "jointfit.bash"
 run = CliRunner().invoke
 
 
@@ -31,6 +33,44 @@ def test_every_command_explains_itself(command: str) -> None:
     result = run(app, [command, "--help"])
     assert result.exit_code == 0
     assert "Usage" in result.stdout
+
+
+def completions(*words: str) -> list[str]:
+    """Return what bash offers after Tab at the end of the words."""
+    line = " ".join(map(shlex.quote, ("jointfit", *words)))
+    script = f"""
+        . {COMPLETION}
+        COMP_WORDS=({line}) COMP_CWORD={len(words)}
+        _jointfit_completion jointfit
+        printf '%s\\n' "${{COMPREPLY[@]}}"
+    """
+    environment = {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin"}
+    command = ["bash", "--norc", "-c", script]
+    return subprocess.check_output(command, text=True, env=environment).split()
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (["cal"], ["calibrate"]),
+        (["calibrate", "--phase", "st"], ["static"]),
+        (["decode", "natn"], ["natnet"]),
+        (["request", "self"], ["selftest"]),
+        (["schema", "bridge/request/mar"], ["bridge/request/mark"]),
+        (["demo", "--limb", "ar"], ["arm"]),
+        (["check", "--js"], ["--json"]),
+    ],
+)
+def test_bash_completes_commands_options_and_their_values(
+    words: list[str], offered: list[str]
+) -> None:
+    assert completions(*words) == offered
+
+
+def test_the_packaged_completion_is_what_the_command_line_prints() -> None:
+    environment = {"_JOINTFIT_COMPLETE": "source_bash"}
+    printed = run(app, [], env=environment, prog_name="jointfit").stdout
+    assert COMPLETION.read_text(encoding="utf-8").split() == printed.split()
 
 
 @pytest.mark.parametrize(("module", "name"), [row[1:] for row in ON_DEMAND_ERRORS])

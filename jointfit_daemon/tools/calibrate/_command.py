@@ -46,6 +46,7 @@ IMMEDIATE_REQUESTS = {
     "abort": "the running phase, if any, was aborted; current state: ",
     "revert": "online learning reverted; current state: ",
 }
+_PHASES = (*ORDER, *IMMEDIATE_REQUESTS)
 INSTRUCTIONS = {
     "align": "Fix all sensors to the plate and rotate the plate by hand about all three axes.",
     "static": "Put on all sensors and markers. Stand upright and still.",
@@ -74,6 +75,10 @@ class OutputLostError(Exception):
     """Standard error is closed, for example because the terminal was closed."""
 
 
+def _complete_phase(incomplete: str) -> list[str]:
+    return [name for name in _PHASES if name.startswith(incomplete)]
+
+
 def calibrate(
     config: Annotated[Path, typer.Argument(help="The rig.toml of the daemon.")] = Path("rig.toml"),
     *,
@@ -81,7 +86,8 @@ def calibrate(
         list[str] | None,
         typer.Option(
             help="align, static, functional, abort or revert; repeatable. Default: static, and"
-            " functional if rig.toml has a motion-capture source."
+            " functional if rig.toml has a motion-capture source.",
+            autocompletion=_complete_phase,
         ),
     ] = None,
     seconds: Annotated[
@@ -108,11 +114,9 @@ def calibrate(
     """
     from jointfit_daemon.config import load_rig
 
-    wrong = [name for name in phase or () if name not in (*ORDER, *IMMEDIATE_REQUESTS)]
+    wrong = [name for name in phase or () if name not in _PHASES]
     if wrong:
-        raise ValueError(
-            f"--phase {wrong[0]}: expected one of {', '.join((*ORDER, *IMMEDIATE_REQUESTS))}"
-        )
+        raise ValueError(f"--phase {wrong[0]}: expected one of {', '.join(_PHASES)}")
     if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
         raise ValueError(f"--seconds {seconds:g}: expected 0 < seconds <= {LONGEST_S:g}")
     if sum((abort, listed, use is not None, revert, bool(phase))) > 1:

@@ -7,6 +7,8 @@ from typing import Annotated, Any
 import orjson
 import typer
 
+from jointfit_daemon.tools.completion import complete_topic
+
 
 def schema(
     topic: Annotated[
@@ -14,6 +16,7 @@ def schema(
         typer.Argument(
             help="A topic below the base, as pose or bridge/request/mark. Default: rig.toml.",
             show_default=False,
+            autocompletion=complete_topic,
         ),
     ] = "",
     *,
