@@ -8,7 +8,8 @@ import socket
 import sys
 from pathlib import Path
 
-from jointfit_daemon.tools.dashboard._tunnel import broker_fault, tls_context
+from jointfit_daemon.tools.dashboard._certificates import broker_context, page_context
+from jointfit_daemon.tools.dashboard._tunnel import broker_fault
 from jointfit_daemon.tools.dashboard.addresses import BrokerAddress, ListenAddress
 from jointfit_daemon.tools.dashboard.server import DashboardServer
 from jointfit_daemon.tools.stop_signals import cancel_on_signal
@@ -18,12 +19,16 @@ def main() -> None:
     """Serve on the socket that the command opened, until a stop signal."""
     settings = json.loads(sys.argv[1])
     broker = BrokerAddress(**settings["broker"])
-    authority = None if settings["ca"] is None else Path(settings["ca"])
+    authority, certificate, key = (
+        None if settings[name] is None else Path(settings[name])
+        for name in ("ca", "certificate", "key")
+    )
     server = DashboardServer(
         broker,
-        tls_context(broker, authority),
+        broker_context(broker, authority),
         base=settings["base"],
         names=tuple(settings["names"]),
+        page_context=page_context(certificate, key),
     )
     listener = socket.socket(fileno=settings["descriptor"])
     asyncio.run(_serve(server, ListenAddress(**settings["listen"]), listener))
@@ -36,11 +41,7 @@ async def _serve(server: DashboardServer, listen: ListenAddress, listener: socke
             async with server.listening(listen, listener) as url:
                 print(f"dashboard: {url}  (broker {server.broker.text}; Ctrl-C stops)", flush=True)
                 if not listen.is_local:
-                    print(
-                        "Every device that can open this page can also use the broker: protect the"
-                        " broker with accounts (docs/security.md).",
-                        file=sys.stderr,
-                    )
+                    print(exposure(encrypted=server.page_context is not None), file=sys.stderr)
                 if server.broker.websocket is None:
                     fault = await broker_fault(server.broker, server.context)
                     if fault is not None:
@@ -53,6 +54,20 @@ async def _serve(server: DashboardServer, listen: ListenAddress, listener: socke
         except asyncio.CancelledError:
             if stop.number is None:
                 raise
+
+
+def exposure(*, encrypted: bool) -> str:
+    """Return the warning of a page that other devices can open."""
+    text = (
+        "Every device that can open this page can also use the broker: protect the broker with"
+        " accounts (docs/security.md)."
+    )
+    if not encrypted:
+        text += (
+            " Without TLS, everyone on the network can read passwords and messages: set"
+            " --certificate and --key."
+        )
+    return text
 
 
 if __name__ == "__main__":

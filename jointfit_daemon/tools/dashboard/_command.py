@@ -29,6 +29,12 @@ def dashboard(
     ca: Annotated[
         Path | None, typer.Option(help="Certificate of the broker's authority, for mqtts://.")
     ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(help="Certificate of this machine: serves the page by HTTPS.")
+    ] = None,
+    key: Annotated[
+        Path | None, typer.Option(help="Private key of --certificate, if in a file of its own.")
+    ] = None,
     name: Annotated[
         list[str] | None,
         typer.Option(help="Host name under which browsers open the page; repeatable."),
@@ -41,10 +47,10 @@ def dashboard(
     """
     address, target = parse_listen(listen), parse_broker(broker)
 
-    from jointfit_daemon.tools.dashboard._tunnel import tls_context
+    from jointfit_daemon.tools.dashboard._certificates import broker_context, page_context
     from jointfit_daemon.tools.dashboard.server import open_listener
 
-    tls_context(target, ca)  # reports a faulty certificate
+    broker_context(target, ca), page_context(certificate, key)  # report faulty files
     listener = open_listener(address)
     listener.set_inheritable(True)
     settings = {
@@ -52,6 +58,8 @@ def dashboard(
         "listen": asdict(address),
         "broker": asdict(target),
         "ca": None if ca is None else str(ca),
+        "certificate": None if certificate is None else str(certificate),
+        "key": None if key is None else str(key),
         "base": base.strip("/") if base else None,
         "names": [each.lower() for each in name or ()],
     }

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 
 from websockets.exceptions import ConnectionClosed
 
+from jointfit_daemon.tools.dashboard._certificates import verification_fault
+
 if TYPE_CHECKING:
     from collections.abc import Coroutine
-    from pathlib import Path
 
     from websockets.asyncio.server import ServerConnection
 
@@ -43,9 +44,10 @@ async def tunnel(
         await websocket.close(BROKER_UNREACHABLE, close_reason(connection_fault(error)))
         return
 
+    answered = asyncio.Event()
     try:
-        await _first_completed(_upload(websocket, writer), _download(reader, websocket))
-        await websocket.close(BROKER_CLOSED, "the broker closed the connection")
+        await _first_completed(_upload(websocket, writer), _download(reader, websocket, answered))
+        await websocket.close(BROKER_CLOSED, close_reason(_closure(broker, answered)))
     finally:
         writer.close()
         with contextlib.suppress(OSError):
@@ -71,35 +73,29 @@ async def _upload(websocket: ServerConnection, writer: asyncio.StreamWriter) -> 
             await writer.drain()
 
 
-async def _download(reader: asyncio.StreamReader, websocket: ServerConnection) -> None:
-    """Pass the bytes of the broker to the page."""
+async def _download(
+    reader: asyncio.StreamReader, websocket: ServerConnection, answered: asyncio.Event
+) -> None:
+    """Pass the bytes of the broker to the page; set `answered` at the first of them.
+
+    A page that reads slowly fills the buffers of reader and WebSocket. Then nothing is read until
+    it continues, and the broker queues or drops its messages.
+    """
     with contextlib.suppress(OSError, ConnectionClosed):
         while chunk := await reader.read(_CHUNK_BYTES):
+            answered.set()
             await websocket.send(chunk)
 
 
-def tls_context(broker: BrokerAddress, authority: Path | None) -> ssl.SSLContext | None:
-    """Return the context that verifies the broker, or None for plain TCP.
-
-    Raises
-    ------
-    ValueError
-        `authority` contains no certificate, or the connection does not use TLS.
-    OSError
-        `authority` cannot be read.
-    """
-    if not broker.tls or broker.websocket is not None:
-        if authority is not None:
-            raise ValueError(f"--ca {authority}: expected a broker with TLS, such as mqtts://HOST")
-        return None
-    try:
-        if authority is not None:
-            authority.read_bytes()  # the error of ssl does not contain the path
-        context = ssl.create_default_context(cafile=authority)
-    except ssl.SSLError as error:
-        raise ValueError(f"--ca {authority}: expected a certificate in PEM, found none") from error
-    context.minimum_version = ssl.TLSVersion.TLSv1_2
-    return context
+def _closure(broker: BrokerAddress, answered: asyncio.Event) -> str:
+    """Return why the broker closed the connection, as far as the tunnel can observe it."""
+    if answered.is_set():
+        return "the broker closed the connection"
+    # TLS 1.3 checks the certificate of the client after the client's side of the handshake.
+    cause = (
+        "it may require a client certificate" if broker.tls else "a port with TLS needs mqtts://"
+    )
+    return f"it closed the connection before it answered: {cause}; see its log"
 
 
 async def broker_fault(broker: BrokerAddress, context: ssl.SSLContext | None) -> str | None:
@@ -118,8 +114,8 @@ async def broker_fault(broker: BrokerAddress, context: ssl.SSLContext | None) ->
 def connection_fault(error: BaseException) -> str:
     """Return the cause of a failed connection in words."""
     if isinstance(error, ssl.SSLCertVerificationError):
-        return f"the broker's certificate is refused: {error.verify_message}; set --ca"
-    if isinstance(error, ssl.SSLError):
+        return verification_fault(error)
+    if isinstance(error, ssl.SSLError | ConnectionResetError):  # reset in the handshake of TLS
         return "the port does not answer to TLS: check the port, or use mqtt://"
     words: dict[type[BaseException], str] = {
         TimeoutError: "the host does not answer: check its address and the network",

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 TUNNEL = "/mqtt"
 """Path of the tunnel."""
+_METHODS = ("GET", "HEAD")
 MOST_VIEWERS = 64
 """Largest number of open tunnels."""
 _PACKET_BYTES = 64 * 1024
@@ -53,6 +54,8 @@ class DashboardServer:
     """Base topic that the page shows; None: the page searches."""
     names: tuple[str, ...] = ()
     """Further host names under which browsers may open the page."""
+    page_context: ssl.SSLContext | None = None
+    """Certificate and key of this machine, for HTTPS; None: HTTP."""
     files: dict[str, PageFile] = field(default_factory=read_page_files)
     _viewers: int = 0
 
@@ -78,15 +81,17 @@ class DashboardServer:
         async with serve(
             self._serve_viewer,
             sock=open_listener(listen) if listener is None else listener,
+            ssl=self.page_context,
             process_request=self.respond,
             subprotocols=[Subprotocol("mqtt")],
+            server_header=None,
             compression=None,  # costs more CPU time and memory than it saves on a local network
             max_size=_PACKET_BYTES,
             ping_interval=_PING_S,
             ping_timeout=_PING_S,
         ) as server:
             gc.freeze()
-            yield _url(listen, server)
+            yield _url(listen, server, "http" if self.page_context is None else "https")
 
     async def _serve_viewer(self, websocket: ServerConnection) -> None:
         self._viewers += 1
@@ -98,30 +103,47 @@ class DashboardServer:
     def respond(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the response to a request; None to open the tunnel."""
         del connection
-        host = request.headers.get("Host", "")
-        if not self._is_own_name(host):
+        method = getattr(request, "method", "GET")  # old versions of websockets parse GET only
+        response = self._refusal(request, method) or self._answer(request, method)
+        if method == "HEAD" and response is not None:
+            response.body = b""  # the headers remain, with the length of the content
+        return response
+
+    def _refusal(self, request: Request, method: str) -> Response | None:
+        """Return the refusal of a request that no path accepts, if there is one."""
+        host = request.headers.get_all("Host")
+        if _path(request.path) is None or len(host) != 1:
+            return self._text(HTTPStatus.BAD_REQUEST, "Expected a path and one Host header.")
+        if not self._is_own_name(host[0]):
             return self._text(
                 HTTPStatus.MISDIRECTED_REQUEST,
-                f"The dashboard does not answer to the name {host[:80]!r}."
+                f"The dashboard does not answer to the name {host[0][:80]!r}."
                 " Open it by its IP address, or start it with --name.",
             )
+        if method not in _METHODS:
+            refusal = self._text(HTTPStatus.METHOD_NOT_ALLOWED, "The page can only be read.")
+            refusal.headers["Allow"] = ", ".join(_METHODS)
+            return refusal
+        return None
 
-        path = urlsplit(request.path).path
+    def _answer(self, request: Request, method: str) -> Response | None:
+        path = _path(request.path)
         if path == TUNNEL:
-            return self._check_tunnel(request, host)
+            return self._check_tunnel(request, method)
         if path == "/config.json":
             return self._response(HTTPStatus.OK, "application/json", self._configuration())
-        found = self.files.get(path)
+        found = self.files.get(path or "")
         if found is None:
             return self._text(HTTPStatus.NOT_FOUND, "There is no such page. The dashboard is at /.")
         return self._file(found, request.headers)
 
-    def _check_tunnel(self, request: Request, host: str) -> Response | None:
+    def _check_tunnel(self, request: Request, method: str) -> Response | None:
         """Refuse the tunnel to pages of other origins and to ordinary requests."""
-        if request.headers.get("Upgrade", "").lower() != "websocket":
+        if method != "GET" or "websocket" not in _tokens(request.headers, "Upgrade"):
             return self._text(HTTPStatus.UPGRADE_REQUIRED, "This path is for WebSockets only.")
-        origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        # Programs send no origin; browsers always do, and a page cannot change it.
+        origins, host = request.headers.get_all("Origin"), request.headers["Host"].lower()
+        if any(_authority(origin) != host for origin in origins):
             return self._text(HTTPStatus.FORBIDDEN, "Pages of other origins cannot use the tunnel.")
         if self._viewers >= MOST_VIEWERS:
             return self._text(
@@ -161,9 +183,13 @@ class DashboardServer:
 
     def _file(self, found: PageFile, headers: Headers) -> Response:
         more = {"ETag": found.etag, "Vary": "Accept-Encoding"}
-        if found.etag in headers.get("If-None-Match", ""):
+        # The page sends whole files only: a Range header is ignored, as RFC 9110 permits.
+        known = _tokens(headers, "If-None-Match")
+        if "*" in known or found.etag.lower().removeprefix("w/") in {
+            tag.removeprefix("w/") for tag in known
+        }:
             return self._response(HTTPStatus.NOT_MODIFIED, found.content_type, b"", more)
-        if "gzip" in headers.get("Accept-Encoding", ""):
+        if "gzip" in _tokens(headers, "Accept-Encoding"):
             more["Content-Encoding"] = "gzip"
             return self._response(HTTPStatus.OK, found.content_type, found.compressed, more)
         return self._response(HTTPStatus.OK, found.content_type, found.content, more)
@@ -204,6 +230,29 @@ class DashboardServer:
         )
 
 
+def _path(target: str) -> str | None:
+    """Return the path of a request target; None if there is none."""
+    try:
+        return urlsplit(target).path or None
+    except ValueError:
+        return None
+
+
+def _authority(origin: str) -> str | None:
+    """Return host and port of an origin; None if it has none."""
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return None
+
+
+def _tokens(headers: Headers, name: str) -> set[str]:
+    """Return the elements of all headers of a name, in lower case; without those of weight 0."""
+    elements = ",".join(headers.get_all(name)).lower().split(",")
+    parts = [element.replace(" ", "").split(";") for element in elements]
+    return {token for token, *weight in parts if weight not in (["q=0"], ["q=0.0"], ["q=0.000"])}
+
+
 def open_listener(listen: ListenAddress) -> socket.socket:
     """Return a listening socket; it belongs to the first address of a host name.
 
@@ -223,14 +272,14 @@ def open_listener(listen: ListenAddress) -> socket.socket:
         ) from error
 
 
-def _url(listen: ListenAddress, server: Server) -> str:
+def _url(listen: ListenAddress, server: Server, scheme: str) -> str:
     """Return the URL under which a browser opens the page."""
     host, port = next(iter(server.sockets)).getsockname()[:2]
     if ipaddress.ip_address(host).is_unspecified:
         host = own_address()
     elif listen.host == "localhost":
         host = "localhost"
-    return f"http://{bracketed(host)}:{port}/"
+    return f"{scheme}://{bracketed(host)}:{port}/"
 
 
 def own_address() -> str:

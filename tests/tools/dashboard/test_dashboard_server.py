@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gzip
 import hashlib
 import json
-import shutil
 import socket
-import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.typing import Origin, Subprotocol
 
 from jointfit_daemon.tools.__main__ import app
-from jointfit_daemon.tools.dashboard._tunnel import BROKER_CLOSED, BROKER_UNREACHABLE, tls_context
+from jointfit_daemon.tools.dashboard._tunnel import BROKER_CLOSED, BROKER_UNREACHABLE
 from jointfit_daemon.tools.dashboard.addresses import (
     BrokerAddress,
     ListenAddress,
@@ -32,8 +31,6 @@ from jointfit_daemon.tools.dashboard.server import DashboardServer
 from tests.broker_fixture import HOST, free_port
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from tests.broker_fixture import Broker
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -176,35 +173,60 @@ async def test_a_broker_that_ends_closes_the_tunnel_with_its_own_code(
     assert closed.value.rcvd.code == BROKER_CLOSED
 
 
-@pytest.fixture(scope="session")
-def authority(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a self-signed certificate for the loopback interface."""
-    if shutil.which("openssl") is None:
-        pytest.skip("openssl is not installed (Debian: apt install openssl)")
-    folder = tmp_path_factory.mktemp("authority")
-    subprocess.run(
-        ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:P-256",
-         "-nodes", "-days", "2", "-subj", "/CN=broker", "-addext", "subjectAltName=IP:127.0.0.1",
-         "-keyout", "broker.key", "-out", "broker.crt"],
-        cwd=folder, check=True, capture_output=True,
-    )  # fmt: skip
-    return folder
+async def test_a_page_that_does_not_read_holds_the_broker_back_instead_of_filling_memory() -> None:
+    sent_bytes = 0
+
+    async def flood(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        nonlocal sent_bytes
+        with contextlib.suppress(OSError):
+            while True:
+                writer.write(bytes(65536))
+                await writer.drain()
+                sent_bytes += 65536
+
+    broker = await asyncio.start_server(flood, HOST, 0)
+    port = broker.sockets[0].getsockname()[1]
+    async with DashboardServer(BrokerAddress(HOST, port)).listening(LISTEN) as url:
+        host, page_port = url.removeprefix("http://").rstrip("/").split(":")
+        _, writer = await asyncio.open_connection(host, int(page_port), limit=1)
+        writer.write(
+            b"GET /mqtt HTTP/1.1\r\nHost: localhost\r\n"
+            b"Upgrade: websocket\r\nConnection: Upgrade\r\n"
+            b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n"
+            b"Sec-WebSocket-Protocol: mqtt\r\n\r\n"
+        )
+        before = -1
+        async with asyncio.timeout(10):
+            while sent_bytes == 0 or sent_bytes != before:
+                before = sent_bytes
+                await asyncio.sleep(0.2)
+        writer.transport.abort()
+    broker.close()
+    # Buffers of the kernel for two connections on the loopback have some megabytes each.
+    assert sent_bytes < 32e6
 
 
-async def test_the_tunnel_verifies_a_broker_with_tls(
-    start_mosquitto: Callable[[str], Broker], authority: Path
+async def test_a_packet_that_is_too_long_closes_the_tunnel(embedded_broker: Broker) -> None:
+    address = BrokerAddress(HOST, embedded_broker.port)
+    async with (
+        DashboardServer(address).listening(LISTEN) as url,
+        open_tunnel(url) as websocket,
+    ):
+        await websocket.send(bytes(70_000))
+        with pytest.raises(ConnectionClosed) as closed:
+            await websocket.recv()
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 1009
+
+
+async def test_the_number_of_open_tunnels_is_limited(
+    embedded_broker: Broker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    broker = start_mosquitto(
-        f"certfile {authority / 'broker.crt'}\nkeyfile {authority / 'broker.key'}\n"
-    )
-    address = parse_broker(f"mqtts://{HOST}:{broker.port}")
-    context = tls_context(address, authority / "broker.crt")
-    async with DashboardServer(address, context).listening(LISTEN) as url:
-        assert await round_trip(url) == b"x" * 20_000
-    async with DashboardServer(address, tls_context(address, None)).listening(LISTEN) as url:
-        code, reason = await close_of_tunnel(url)
-        assert code == BROKER_UNREACHABLE
-        assert "certificate is refused" in reason
+    monkeypatch.setattr(f"{DashboardServer.__module__}.MOST_VIEWERS", 1)
+    address = BrokerAddress(HOST, embedded_broker.port)
+    async with DashboardServer(address).listening(LISTEN) as url, open_tunnel(url):
+        with pytest.raises(InvalidStatus, match="503"):
+            await open_tunnel(url).__aenter__()
 
 
 @pytest.mark.parametrize(
