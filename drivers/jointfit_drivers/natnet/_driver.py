@@ -13,11 +13,15 @@ from typing import TYPE_CHECKING, ClassVar
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.natnet._decoder import NatNetDecoder
+from jointfit_drivers.natnet._server_search import find_servers
 from jointfit_drivers.natnet._session import NatNetSession
 from jointfit_drivers.natnet._settings import NatNetSettings
 from jointfit_drivers.ports.udp_socket import local_address
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.device_search import FoundServer
     from jointfit_daemon.driver import Emit, Wire
 
 
@@ -33,6 +37,13 @@ class NatNetMocap:
     def decoder(self) -> NatNetDecoder:
         """Return the decoder from datagrams to optical frames in SI units."""
         return NatNetDecoder(self._settings)
+
+    @classmethod
+    async def find_servers(
+        cls, hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
+    ) -> list[FoundServer]:
+        """Return the NatNet servers that answer; see `jointfit_daemon.device_search`."""
+        return await find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
 
     async def run(self, emit: Emit) -> None:
         """Connect to the server and read until cancelled.

@@ -1,0 +1,164 @@
+"""Search for NatNet servers: DISCOVERY to a network, CONNECT to a named host.
+
+A named host is also asked for its model, so that the names of its rigid bodies and markers are
+known. Servers in unicast send frames after CONNECT; DISCONNECT ends them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import TYPE_CHECKING
+
+from typing_extensions import override
+
+from jointfit_daemon.device_search import FoundServer
+from jointfit_drivers.natnet._binding import bind_model
+from jointfit_drivers.ports.network_cards import network_cards
+from jointfit_drivers.ports.udp_socket import local_address
+from jointfit_protocols import natnet
+from jointfit_protocols.natnet import NatNetMessageId
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+COMMAND_PORT = 1510
+"""Usual command port of Motive."""
+_TRIES = 3
+"""Requests to a host or network, because a datagram may be lost."""
+_LOOPBACK = "127.0.0.1"
+_REQUEST = natnet.Connect(264, "jointfitd", (1, 0, 0, 0), (3, 0, 0, 0))
+
+
+class _Answers(asyncio.DatagramProtocol):
+    """Answers at one local address, by the server that sent them."""
+
+    def __init__(self) -> None:
+        self.servers: dict[tuple[str, int], natnet.ServerInfo] = {}
+        self.models: dict[tuple[str, int], natnet.ModelDefinition] = {}
+        self.changed = asyncio.Event()
+
+    @override
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        info = self.servers.get(addr)
+        message = natnet.decode(data, (3, 0) if info is None else info.bitstream)
+        if isinstance(message, natnet.ServerInfo):
+            self.servers[addr] = message
+            self.changed.set()
+        elif isinstance(message, natnet.ModelDefinition) and info is not None:
+            self.models[addr] = message
+            self.changed.set()
+
+    @override
+    def error_received(self, exc: Exception) -> None:
+        """Ignore refusals: the host does not answer."""
+
+
+async def find_servers(
+    hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
+) -> list[FoundServer]:
+    """Return the NatNet servers that answer; see `ServerSearch.find_servers`."""
+    loop = asyncio.get_running_loop()
+    targets = []
+    for host in hosts:
+        try:
+            addresses = await loop.getaddrinfo(host, None, family=socket.AF_INET)
+        except (OSError, UnicodeError) as error:
+            raise OSError(f"{host}: no such host: {error}: expected an address or a name") from None
+        address = str(addresses[0][4][0])
+        targets.append((local_address(address, None), address))
+
+    async with asyncio.TaskGroup() as group:
+        named = [
+            group.create_task(_ask_host(local, address, port or COMMAND_PORT, wait_s))
+            for local, address in targets
+        ]
+        networks = [
+            group.create_task(_ask_network(local, address, port or COMMAND_PORT, wait_s))
+            for local, address in (_networks() if broadcast else ())
+        ]
+    # A named host also answers the broadcast; the first answer has its names.
+    found = [server for task in (*named, *networks) for server in task.result()]
+    unique = {(server.server, server.port): server for server in reversed(found)}
+    return sorted(unique.values(), key=lambda server: (server.server, server.port))
+
+
+def _networks() -> list[tuple[str, str]]:
+    """Return local and broadcast address of each network; a server may also run on this host."""
+    cards = [(card.address, card.broadcast) for card in network_cards()]
+    return [(_LOOPBACK, _LOOPBACK), *((local, to) for local, to in cards if to is not None)]
+
+
+async def _ask_host(local: str, address: str, port: int, wait_s: float) -> list[FoundServer]:
+    """Return the server at an address with the names in its model; empty without an answer."""
+    loop = asyncio.get_running_loop()
+    transport, answers = await loop.create_datagram_endpoint(_Answers, local_addr=(local, 0))
+    server = (address, port)
+
+    try:
+        for request, replies in (
+            (_REQUEST, answers.servers),
+            (natnet.Bare(NatNetMessageId.REQUEST_MODELDEF), answers.models),
+        ):
+            for _ in range(_TRIES):
+                transport.sendto(natnet.encode(request), server)
+                if await _replied(answers, server, replies, wait_s / _TRIES):
+                    break
+        transport.sendto(natnet.encode(natnet.Bare(NatNetMessageId.DISCONNECT)), server)
+    finally:
+        transport.close()
+    return _found(local, answers)
+
+
+async def _replied(
+    answers: _Answers,
+    server: tuple[str, int],
+    replies: Mapping[tuple[str, int], object],
+    wait_s: float,
+) -> bool:
+    """Return whether the server is in `replies` within `wait_s`."""
+    try:
+        async with asyncio.timeout(wait_s):
+            while server not in replies:
+                answers.changed.clear()
+                await answers.changed.wait()
+    except TimeoutError:
+        return False
+    return True
+
+
+async def _ask_network(local: str, address: str, port: int, wait_s: float) -> list[FoundServer]:
+    """Return the servers in the network of one card."""
+    loop = asyncio.get_running_loop()
+    transport, answers = await loop.create_datagram_endpoint(
+        _Answers, local_addr=(local, 0), allow_broadcast=True
+    )
+    try:
+        for _ in range(_TRIES):
+            transport.sendto(natnet.encode(natnet.Discovery(_REQUEST)), (address, port))
+            await asyncio.sleep(wait_s / _TRIES)
+    finally:
+        transport.close()
+    return _found(local, answers)
+
+
+def _found(local: str, answers: _Answers) -> list[FoundServer]:
+    found = []
+    for address, info in answers.servers.items():
+        model = answers.models.get(address)
+        layout = None if model is None else bind_model(model, {}, {}).layout
+        found.append(
+            FoundServer(
+                driver="natnet",
+                server=address[0],
+                port=address[1],
+                interface=local,
+                application=info.application,
+                version=".".join(map(str, info.application_version)),
+                protocol="NatNet {}.{}".format(*info.bitstream),
+                transport="multicast" if info.multicast else "unicast",
+                bodies=() if layout is None else layout.bodies,
+                markers=() if layout is None else layout.markers,
+            )
+        )
+    return found

@@ -1,0 +1,59 @@
+"""Network cards of this host with their IPv4 addresses, from the kernel's interface requests.
+
+Only the first address of a card is known to these requests.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import socket
+import struct
+from ipaddress import IPv4Address, IPv4Network
+from typing import NamedTuple
+
+_SIOCGIFFLAGS, _SIOCGIFADDR, _SIOCGIFBRDADDR, _SIOCGIFNETMASK = 0x8913, 0x8915, 0x8919, 0x891B
+_IFF_UP, _IFF_BROADCAST, _IFF_LOOPBACK = 0x1, 0x2, 0x8
+_NAME_BYTES = 15
+_ADDRESS = slice(20, 24)
+"""IPv4 address in ``struct ifreq``, after name, family and port."""
+
+
+class NetworkCard(NamedTuple):
+    """One network card that is up and has an IPv4 address."""
+
+    name: str
+    address: str
+    network: IPv4Network
+    broadcast: str | None
+    """Broadcast address of the network; None if it has none, as for loopback."""
+    loopback: bool
+
+    def reaches(self, host: str) -> bool:
+        """Return whether `host` is in the network of this card, so that no router is between."""
+        return IPv4Address(host) in self.network
+
+
+def network_cards() -> list[NetworkCard]:
+    """Return the network cards of this host in the order of the kernel."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
+        for _, name in socket.if_nameindex():
+            request = struct.pack("256s", name.encode()[:_NAME_BYTES])
+            try:
+                raw = fcntl.ioctl(control, _SIOCGIFFLAGS, request)
+                (flags,) = struct.unpack_from("H", raw, 16)
+                address = _read(control, _SIOCGIFADDR, request)
+                mask = _read(control, _SIOCGIFNETMASK, request)
+                reply = _read(control, _SIOCGIFBRDADDR, request)
+            except OSError:  # no IPv4 address
+                continue
+            if flags & _IFF_UP:
+                network = IPv4Network((address, mask), strict=False)
+                broadcast = reply if flags & _IFF_BROADCAST else None
+                loopback = bool(flags & _IFF_LOOPBACK)
+                found.append(NetworkCard(name, address, network, broadcast, loopback))
+    return found
+
+
+def _read(control: socket.socket, number: int, request: bytes) -> str:
+    return socket.inet_ntoa(fcntl.ioctl(control, number, request)[_ADDRESS])

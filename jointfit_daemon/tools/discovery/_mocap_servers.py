@@ -1,0 +1,63 @@
+"""Servers of motion capture, found by the drivers that use them."""
+
+from __future__ import annotations
+
+import logging
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Any, cast
+
+from jointfit_daemon.device_search import FoundServer
+from jointfit_daemon.driver import ENTRY_POINT_GROUP, driver_names, find_driver
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from jointfit_daemon.device_search import ServerSearch
+    from jointfit_daemon.driver import Driver
+
+log = logging.getLogger(__name__)
+
+__all__ = ["FoundServer", "find_mocap_servers", "installed_drivers"]
+
+
+def installed_drivers() -> Iterator[tuple[str, type[Driver]]]:
+    """Yield name and class of every driver that can be imported; log a warning for the others."""
+    for name in driver_names():
+        try:
+            yield name, find_driver(name)
+        except Exception as error:  # noqa: BLE001 - a broken plug-in must not hide the others
+            package = next(iter(entry_points(group=ENTRY_POINT_GROUP, name=name))).value
+            log.warning("driver %s: %s cannot be imported: %s", name, package, error)
+
+
+async def find_mocap_servers(
+    hosts: Sequence[str] = (),
+    *,
+    broadcast: bool = False,
+    port: int | None = None,
+    wait_s: float = 1.0,
+) -> list[FoundServer]:
+    """Return the servers of motion capture that answer to one of the installed drivers.
+
+    Parameters
+    ----------
+    hosts
+        Names or addresses to ask.
+    broadcast
+        Whether to ask all hosts in the networks of this host, by one datagram for each network.
+    port
+        Command port; default: the usual one of each system.
+    wait_s
+        Time to wait for answers, s.
+
+    Raises
+    ------
+    OSError
+        A host is unknown, or the network cannot be used.
+    """
+    found: list[FoundServer] = []
+    for _, driver in installed_drivers():
+        if hasattr(driver, "find_servers"):
+            search = cast("ServerSearch", cast("Any", driver))
+            found += await search.find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
+    return found
