@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+import orjson
 import pytest
 from typer.testing import CliRunner
 
@@ -48,8 +49,9 @@ def test_a_folder_with_something_in_it_is_refused_unless_forced(tmp_path: Path) 
     assert "--force" in refused.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
-    forced = CliRunner().invoke(app, ["sample", str(tmp_path), "--force", "--seed", "2"])
+    forced = CliRunner().invoke(app, ["sample", str(tmp_path), "--force", "--seed", "2", "--json"])
     assert forced.exit_code == 0, forced.output
+    assert set(orjson.loads(forced.stdout)["files"]) < {path.name for path in tmp_path.iterdir()}
     assert (tmp_path / "mine.txt").read_text() == "mine"
     assert (tmp_path / "rig.toml").exists()
 

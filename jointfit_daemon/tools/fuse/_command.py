@@ -13,6 +13,7 @@ import orjson
 import typer
 
 from jointfit_daemon.nearest_name import unknown_name
+from jointfit_daemon.tools.activity import show_activity
 from jointfit_daemon.tools.fuse import _report
 from jointfit_daemon.tools.output_files import check_output, check_plot
 from jointfit_daemon.tools.text_output import check_choice, echo_json
@@ -108,7 +109,8 @@ def evaluate(
         trials, segment, joints, static, markers=markers, up=up
     )
     _refuse_unmoved(limb, read)
-    found = evaluate(limb.chain, read, mounts, holdout=holdout)
+    with show_activity("evaluating"):
+        found = evaluate(limb.chain, read, mounts, holdout=holdout)
     for warning in trial_warnings:
         typer.echo(f"warning: {warning}", err=True)
     if json:
@@ -157,22 +159,22 @@ def fit(
     files = [_pair(text) for text in (*trials, static) if text is not None]
     lengths = _lengths.segment_lengths(length or (), files, limb)
     mounts = mounts or {s: mean.q for s, mean in mounts_of(limb.chain, read).items()}
-    calibration = fit_offline(
-        limb.chain,
-        read,
-        mounts,
-        cast("Any", method),
-        lengths=lengths,
-        notes=tuple(trial_warnings),
-        software=__version__,
-        created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
+    with show_activity("fitting"):
+        calibration = fit_offline(
+            limb.chain,
+            read,
+            mounts,
+            cast("Any", method),
+            lengths=lengths,
+            notes=tuple(trial_warnings),
+            software=__version__,
+            created_utc=datetime.now(UTC).isoformat(timespec="seconds"),
+        )
     out.write_bytes(orjson.dumps(calibration.to_dict(), option=orjson.OPT_INDENT_2) + b"\n")
     frames = sum(len(trial.t_s) for trial in read)
     if json:
-        lengths_m = {segment: found.length for segment, found in lengths.items()}
-        shown = {"model": str(out), "frames": frames, "notes": trial_warnings}
-        echo_json(shown | {"lengths_m": lengths_m})
+        shown = {"lengths_m": {segment: found.length for segment, found in lengths.items()}}
+        echo_json({"model": str(out), "frames": frames, "notes": trial_warnings} | shown)
     else:
         typer.echo(_report.fit_summary(calibration, frames))
         typer.echo(f"wrote {out}", err=True)
@@ -220,7 +222,8 @@ def apply(
         origin=_lengths.parse_origin(origin),
     )
     table = read_available_sensors(sensors, chain, axis, without or ())
-    found = _output.fuse_trial(calibration, table, chain)
+    with show_activity("fusing"):
+        found = _output.fuse_trial(calibration, table, chain)
     tables = _output.write_fused(out, found, table, axis)
     found = replace(found, notes=(*found.notes, *table_notes(tables)))
     if json:

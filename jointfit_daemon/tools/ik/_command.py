@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from jointfit_daemon.tools.activity import show_activity
 from jointfit_daemon.tools.command_group import EXIT_FAILED
 from jointfit_daemon.tools.output_files import check_output
 from jointfit_daemon.tools.text_output import check_choice, echo_json
@@ -93,7 +94,8 @@ def ik(
         up=up,
     )
     try:
-        found = solve_trial(asked)
+        with show_activity("solving"):
+            found = solve_trial(asked)
     except RefinementError as refused:
         typer.echo(f"jointfit ik: refused: {refused}", err=True)
         raise typer.Exit(EXIT_FAILED) from None

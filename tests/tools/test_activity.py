@@ -1,0 +1,47 @@
+"""The moving bar: seen on a terminal, absent from pipes, gone after an error."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+
+import pytest
+
+from jointfit_daemon.tools.activity import show_activity
+
+PROGRAM = """
+import time
+from jointfit_daemon.tools.activity import show_activity
+with show_activity("fitting"):
+    time.sleep(0.3)
+"""
+
+
+def test_a_terminal_shows_the_label_and_the_elapsed_time() -> None:
+    parent, child = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "80"}
+    command = [sys.executable, "-c", PROGRAM]
+    with subprocess.Popen(command, stderr=child, env=environment) as process:
+        os.close(child)
+        shown = b""
+        while True:
+            try:
+                shown += os.read(parent, 4096)
+            except OSError:  # the program ended
+                break
+    os.close(parent)
+    assert process.returncode == 0
+    assert b"fitting" in shown
+    assert b"0:00:00" in shown
+
+
+def test_a_pipe_receives_nothing() -> None:
+    done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, check=True)
+    assert done.stderr == done.stdout == b""
+
+
+def test_errors_pass_through() -> None:
+    with pytest.raises(ValueError, match="broken"), show_activity("fitting"):
+        raise ValueError("broken")
