@@ -245,6 +245,22 @@ class TlsSettings(Settings):
         return key
 
 
+class HomeAssistantSettings(Settings):
+    """``[mqtt.home_assistant]``: if present, the daemon announces itself to Home Assistant."""
+
+    enabled: bool = Field(True, description="`false` removes the rig from Home Assistant")
+    prefix: str = Field(
+        "homeassistant", min_length=1, description="discovery prefix, as in Home Assistant"
+    )
+
+    @field_validator("prefix")
+    @classmethod
+    def _check_prefix(cls, prefix: str) -> str:
+        if "" in prefix.split("/") or {"+", "#"} & set(prefix):
+            raise ValueError("expected a topic: levels separated by /, none empty, without + and #")
+        return prefix
+
+
 class MqttSettings(Settings):
     """``[mqtt]``."""
 
@@ -307,6 +323,9 @@ class MqttSettings(Settings):
     )
     joint_hz: float = Field(1.0, gt=0, le=1, description="rate of the topics joint/NAME, Hz")
     health_s: float = Field(10.0, gt=0, le=60, description="interval of the topic bridge/health, s")
+    home_assistant: HomeAssistantSettings | None = Field(
+        None, description="discovery by Home Assistant; default: none"
+    )
 
     @field_validator("host")
     @classmethod

@@ -164,13 +164,14 @@ class Daemon:
 
     async def _move_to_broker(self, before: Rig, rig: Rig) -> None:
         """Disconnect from the old broker, and send all retained messages to the new one."""
+        await self._link.emptied(FAREWELL_S)  # messages that clear a topic, among others
         await stop([self._mqtt])
         known = self._outbox.retained
         self._core.unsubscribe(self._topics)
         self._use_broker(rig)
         for topic, payload in known.items():
             leaf = topic.removeprefix(before.mqtt.base)
-            if payload and not leaf.startswith("/bridge/"):
+            if payload and leaf != topic and not leaf.startswith("/bridge/"):
                 self._outbox.retain(rig.mqtt.base + leaf, payload)
         self._mqtt = self._tasks.create_task(self._link.run(), name="mqtt")
 

@@ -81,6 +81,11 @@ class Outbox:
             self._unsent[topic] = None
             self._wake.set()
 
+    def repeat(self, prefix: str) -> None:
+        """Send the retained values of all topics that begin with `prefix` again."""
+        self._unsent |= dict.fromkeys(topic for topic in self._state if topic.startswith(prefix))
+        self._wake.set()
+
     def event(self, topic: str, payload: bytes) -> None:
         """Queue a message that is sent once, at QoS 1."""
         message = Outgoing(topic, payload, 1, False, RESPONSE_EXPIRY_S)

@@ -115,6 +115,8 @@ class MqttPublisher:
             own.append(topics.POSE.name(settings.base))
         self._echoes = {topic: _TopicEcho() for topic in own}
 
+        discovery = settings.home_assistant
+        self._birth = "" if discovery is None else f"{discovery.prefix}/status"
         self._checked_s: dict[str, float] = {}
         self._connection: MqttConnection | None = None
         self.connected = False
@@ -195,8 +197,8 @@ class MqttPublisher:
     def _contested(self) -> str:
         return (
             f"broker {self._settings.host}:{self._settings.tcp_port}: another client uses the "
-            f"client id {client_identifier(self._base)!r}, probably a second jointfitd with base "
-            f"{self._base}: stop one of them, or give each rig its own name"
+            f"client id {topics.client_identifier(self._base)!r}, probably a second jointfitd with "
+            f"base {self._base}: stop one of them, or give each rig its own name"
         )
 
     async def _gave_way(self, lasted_s: float) -> bool:
@@ -223,7 +225,7 @@ class MqttPublisher:
             reason = (
                 f"broker {self._settings.host}:{self._settings.tcp_port}: the connection ended "
                 "without a reason: the broker stopped, the network failed, or another client uses "
-                f"the client id {client_identifier(self._base)!r}"
+                f"the client id {topics.client_identifier(self._base)!r}"
             )
         self._report(reason)
 
@@ -239,7 +241,7 @@ class MqttPublisher:
         TaskGroup appears cancelled from then on.
         """
         will = Outgoing(self._outbox.state_topic, OFFLINE, 1, retain=True)
-        name = client_identifier(self._base)
+        name = topics.client_identifier(self._base)
         async with MqttConnection(
             self._settings, name, will=will, farewell=will, admit=self._admit
         ) as connection:
@@ -300,12 +302,17 @@ class MqttPublisher:
             )
 
     async def _subscribe(self, connection: MqttConnection) -> None:
-        refused = await connection.subscribe([f"{self._requests}+", *self._echoes], live=True)
+        wanted = [f"{self._requests}+", *self._echoes, *filter(None, [self._birth])]
+        refused = await connection.subscribe(wanted, live=True)
         for topic in refused:
             log.warning("mqtt: the broker refuses the subscription to %s: check its ACL", topic)
 
     async def _listen(self, connection: MqttConnection) -> None:
         async for message in connection.messages():
+            if message.topic == self._birth:
+                if message.payload == b"online":  # Home Assistant was started
+                    self._outbox.repeat(self._birth.removesuffix("status"))
+                continue
             echo = self._echoes.get(message.topic)
             if echo is None:
                 self._on_request(message)
@@ -328,7 +335,7 @@ class MqttPublisher:
 
     def _admit(self, topic: str, retained: bool) -> bool:
         """Return whether a message is passed on; count and log an ignored request."""
-        if topic in self._echoes:
+        if topic in self._echoes or topic == self._birth:
             return True
         if retained:
             reason = "it is retained and would run at every start: send requests without retain"
@@ -380,14 +387,3 @@ class _TopicEcho:
     def clear(self) -> None:
         self.sent.clear()
         self.arrived.clear()
-
-
-def client_identifier(base: str) -> str:
-    """Return the daemon's client id.
-
-    It is fixed, so that a new process takes over the connection of a dead one. It has letters,
-    digits and dashes only: rumqttd fails on a slash.
-    """
-    return "jointfitd-" + "".join(
-        letter if letter.isascii() and letter.isalnum() else "-" for letter in base
-    )

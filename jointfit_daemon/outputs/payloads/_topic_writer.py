@@ -28,6 +28,7 @@ from jointfit_daemon.model import (
     StickFigure,
 )
 from jointfit_daemon.outputs import topics
+from jointfit_daemon.outputs.home_assistant import discovery_payload, discovery_topic
 from jointfit_daemon.outputs.log import printable, printable_data
 from jointfit_daemon.outputs.payloads._encoding import (
     encode,
@@ -92,6 +93,8 @@ class TopicWriter:
         self._pose_topic = topics.POSE.name(self._base)
         self._pose_ui_topic = topics.POSE_UI.name(self._base)
         self._devices: tuple[str, ...] = ()
+        self._discovery: str | None = None
+        self._components: dict[str, Any] = {}
         self.configure(rig)
 
     def configure(self, rig: Rig) -> None:
@@ -108,6 +111,30 @@ class TopicWriter:
         self._devices = devices
 
         self._publish(topics.BRIDGE_INFO, encode(_info(rig)))
+        self._announce(rig)
+
+    def _announce(self, rig: Rig) -> None:
+        """Publish the discovery message of Home Assistant; remove it if it is switched off."""
+        topic, settings = discovery_topic(rig.mqtt), rig.mqtt.home_assistant
+        if self._discovery is not None and topic != self._discovery:
+            self._outbox.retain(self._discovery, b"")
+            self._components = {}
+        self._discovery = topic
+        if topic is None or settings is None:
+            return
+        if not settings.enabled:
+            self._outbox.retain(topic, b"")
+            return
+
+        # Home Assistant removes an entity of which only the platform is left.
+        payload = discovery_payload(rig)
+        removed = {
+            key: {"platform": component["platform"]}
+            for key, component in self._components.items()
+            if key not in payload["components"]
+        }
+        self._components = payload["components"]
+        self._outbox.retain(topic, encode(payload | {"components": self._components | removed}))
 
     def event(self, event: Event) -> None:
         """Ignore the inputs of the core."""
