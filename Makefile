@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench bench-full docs wheel deb sbom vendor audit lock clean
+.PHONY: help demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -60,6 +60,9 @@ bench: $(STAMP)  ## headline experiments and a quick one of every kind, 10 minut
 
 bench-full: $(STAMP)  ## all experiments, about an hour; writes bench/results and the pages of docs
 	@$(BIN)/python -m bench --full $(ARGS)
+
+pictures: $(STAMP)  ## make the generated pictures of the documentation again, docs/pictures
+	@$(BIN)/python -m tests.pictures
 
 docs: $(STAMP)  ## the documentation as a site, warnings are errors
 	@$(BIN)/python -m bench.framework.pages
