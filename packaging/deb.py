@@ -39,7 +39,7 @@ COMMANDS = {
     "jointfit-sim": "jointfit_simulators.__main__",
 }
 MAINTAINER = "The jointfitd authors <jointfitd@users.noreply.github.com>"
-EXTRAS = "demo,c3d"
+EXTRAS = "demo,c3d,metrics"
 """Pure Python, or with wheels for both architectures."""
 LAUNCHER = """\
 #!/usr/lib/jointfitd/bin/python3 -I

@@ -8,11 +8,17 @@ from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._load import load_rig, parse_rig
 from jointfit_daemon.config._rig import Rig, Source
 from jointfit_daemon.config._schema import rig_schema
-from jointfit_daemon.config._tables import MqttSettings, RecordingSettings, TlsSettings
+from jointfit_daemon.config._tables import (
+    MetricsSettings,
+    MqttSettings,
+    RecordingSettings,
+    TlsSettings,
+)
 
 __all__ = [
     "ConfigError",
     "Fault",
+    "MetricsSettings",
     "MqttSettings",
     "RecordingSettings",
     "Rig",

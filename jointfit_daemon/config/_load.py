@@ -23,6 +23,7 @@ from jointfit_daemon.config._syntax import read_table, without_unreadable
 from jointfit_daemon.config._tables import (
     CalibrationTable,
     ChainTable,
+    MetricsSettings,
     MqttSettings,
     RecordingSettings,
     RigTable,
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
 
 Model = TypeVar("Model", bound=BaseModel)
 
-SECTIONS = ("rig", "chain", "imu", "can", "mocap", "calibration", "mqtt", "recording")
+SECTIONS = ("rig", "chain", "imu", "can", "mocap", "calibration", "mqtt", "recording", "metrics")
 
 
 def load_rig(path: Path) -> Rig:
@@ -141,6 +142,7 @@ class _RigReader:
         recording = None
         if "recording" in self.table:
             recording = self._section("recording", RecordingSettings)
+        metrics = self._section("metrics", MetricsSettings) if "metrics" in self.table else None
 
         buses = self._buses()
         limb = chain or self.partial.get("chain")
@@ -183,6 +185,7 @@ class _RigReader:
             calibration_store=calibration.store,
             mqtt=mqtt.model_copy(update={"base": base}),
             recording=recording,
+            metrics=metrics,
             table=self.table,
         )
 

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.calibration import CalibrationSettings
-    from jointfit_daemon.config._tables import MqttSettings, RecordingSettings
+    from jointfit_daemon.config._tables import MetricsSettings, MqttSettings, RecordingSettings
     from jointfit_daemon.driver import Driver
     from jointfit_daemon.files.models import LoadedModel
     from jointfit_daemon.model import Chain
@@ -48,6 +48,7 @@ class Rig:
     calibration_store: str
     mqtt: MqttSettings
     recording: RecordingSettings | None
+    metrics: MetricsSettings | None
     chain_model: LoadedModel | None
     """Chain model for inverse kinematics from the markers; None without one."""
     table: Mapping[str, Any]

@@ -25,6 +25,8 @@ JOINTS_HELP = "joints from proximal to distal, one more than segments"
 """Description of the key ``chain.joints``; it is needed unless the limb has branches."""
 _PLAIN, _TLS = 1883, 8883
 """Default ports without and with TLS (IANA: mqtt, secure-mqtt)."""
+_LAST_PORT = 65535
+"""Largest TCP port."""
 
 
 class RigTable(Settings):
@@ -364,3 +366,34 @@ class RecordingSettings(Settings):
     directory: str = Field(
         "recordings", min_length=1, description="folder, relative to $STATE_DIRECTORY"
     )
+
+
+class MetricsSettings(Settings):
+    """``[metrics]``: if present, the daemon offers metrics for Prometheus."""
+
+    listen: str = Field(
+        "127.0.0.1:9464",
+        description="address and port of http://HOST:PORT/metrics; whoever reaches it can read "
+        "the metrics",
+    )
+
+    @field_validator("listen")
+    @classmethod
+    def _check_listen(cls, listen: str) -> str:
+        host, separator, port = listen.rpartition(":")
+        host = host.removeprefix("[").removesuffix("]")
+        if not separator or not port.isascii() or not port.isdigit() or int(port) > _LAST_PORT:
+            raise ValueError("expected HOST:PORT, such as 127.0.0.1:9464")
+        if (fault := host_fault(host)) is not None:
+            raise ValueError(fault)
+        return listen
+
+    @property
+    def host(self) -> str:
+        """Address or name."""
+        return self.listen.rpartition(":")[0].removeprefix("[").removesuffix("]")
+
+    @property
+    def port(self) -> int:
+        """TCP port; 0 for any free one."""
+        return int(self.listen.rpartition(":")[2])

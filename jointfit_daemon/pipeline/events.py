@@ -198,6 +198,7 @@ class NoticeKind(StrEnum):
     CALIBRATION = "calibration"
     RELOAD = "reload"
     RECORDING = "recording"
+    METRICS = "metrics"
     STATE = "state"
     """The state directory."""
     MARK = "mark"

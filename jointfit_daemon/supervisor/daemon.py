@@ -9,6 +9,7 @@ Invariant: the daemon ends by cancellation or by a bug only.
     ready            notifies systemd when every source is known       once notified
     health           publishes health, resets the watchdog             never
     recording        writes the event log                              when the disk is full
+    metrics          answers Prometheus, in a thread                   never
     fit KIND         runs one calibration fit in a worker process      with its result
     store            writes one calibration                            when written
     state check      writes a probe to the state directory             when checked
@@ -34,7 +35,6 @@ from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import MqttLogHandler, journal_fields
 from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, MqttPublisher, Outbox
 from jointfit_daemon.outputs.payloads import BridgeHealth, StateHealth, TopicWriter
-from jointfit_daemon.outputs.recording import EventLogWriter
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
@@ -57,6 +57,7 @@ from jointfit_daemon.supervisor._calibration_store import (
 )
 from jointfit_daemon.supervisor._core_runner import CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
+from jointfit_daemon.supervisor._optional_sinks import start_metrics, start_recording
 from jointfit_daemon.supervisor._overload_monitor import OverloadMonitor
 from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
@@ -84,6 +85,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.mqtt import Incoming
+    from jointfit_daemon.outputs.recording import EventLogWriter
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.supervisor._core_runner import CoreInterface
 
@@ -211,7 +213,9 @@ class Daemon:
             self._publish_reply,
             handlers.table(),
         )
-        self._start_recording(tasks)
+        rig, core, report = self._rig, self._core, self._report
+        self._recorder = start_recording(rig, core, tasks, report)
+        start_metrics(rig, self.health, core, tasks, report)
         self._state_check = tasks.create_task(self._check_state(), name="state check")
         self._mqtt = tasks.create_task(self._link.run(), name="mqtt")
 
@@ -229,21 +233,6 @@ class Daemon:
         await self._sources.known(KNOWN_S)
         self._publish_health()
         self._systemd.ready()
-
-    def _start_recording(self, tasks: asyncio.TaskGroup) -> None:
-        recording = self._rig.recording
-        if recording is None:
-            return
-        folder = state_directory() / recording.directory
-        try:
-            self._recorder = EventLogWriter(folder, self._rig.name)
-        except OSError as fault:
-            text = f"recording is off: cannot create a file in {folder}: {fault.strerror}"
-            self._report(NoticeKind.RECORDING, text, NoticeLevel.ERROR)
-        else:
-            log.info("recording events in %s", self._recorder.path)
-            self._core.subscribe(self._recorder)
-            tasks.create_task(self._recorder.run(), name="recording")
 
     async def _check_state(self, *, asked: bool = True) -> None:
         """Report a state directory without write access before a calibration needs it.
@@ -472,10 +461,10 @@ class Daemon:
     async def _change_to(self, rig: Rig) -> None:
         """Apply `rig`; sources and connections without changes continue."""
         before, self._rig = self._rig, rig
-        if before.recording != rig.recording:
-            self._report(
-                NoticeKind.RELOAD, "a change of [recording] requires a restart", NoticeLevel.WARNING
-            )
+        for key in ("recording", "metrics"):
+            if getattr(before, key) != getattr(rig, key):
+                text = f"a change of [{key}] requires a restart"
+                self._report(NoticeKind.RELOAD, text, NoticeLevel.WARNING)
         await self._sources.retire(rig.sources)
 
         self._topics.configure(rig)  # clears topics of removed devices before any are moved

@@ -1,0 +1,77 @@
+"""Sinks that rig.toml switches on: the recording and the metrics.
+
+Invariant: one that cannot start is reported, and the daemon runs without it.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Protocol
+
+from jointfit_daemon.outputs.recording import EventLogWriter
+from jointfit_daemon.pipeline.events import NoticeKind, NoticeLevel
+from jointfit_daemon.supervisor.state_directory import state_directory
+
+if TYPE_CHECKING:
+    from asyncio import TaskGroup
+    from collections.abc import Callable
+
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.outputs.payloads import BridgeHealth
+    from jointfit_daemon.supervisor._core_runner import CoreRunner
+
+log = logging.getLogger(__name__)
+
+
+class Report(Protocol):
+    """Reports a state of the daemon."""
+
+    def __call__(self, kind: NoticeKind, text: str, level: NoticeLevel) -> None:
+        """Publish and log it."""
+
+
+def start_recording(
+    rig: Rig, core: CoreRunner, tasks: TaskGroup, report: Report
+) -> EventLogWriter | None:
+    """Start to record the events of the core; return the writer, or None without one."""
+    if rig.recording is None:
+        return None
+    folder = state_directory() / rig.recording.directory
+    try:
+        recorder = EventLogWriter(folder, rig.name)
+    except OSError as fault:
+        text = f"recording is off: cannot create a file in {folder}: {fault.strerror}"
+        report(NoticeKind.RECORDING, text, NoticeLevel.ERROR)
+        return None
+    log.info("recording events in %s", recorder.path)
+    core.subscribe(recorder)
+    tasks.create_task(recorder.run(), name="recording")
+    return recorder
+
+
+def start_metrics(
+    rig: Rig,
+    health: Callable[[], BridgeHealth],
+    core: CoreRunner,
+    tasks: TaskGroup,
+    report: Report,
+) -> None:
+    """Start the server of the metrics, if rig.toml names its address."""
+    if rig.metrics is None:
+        return
+    from jointfit_daemon.outputs.metrics import (  # noqa: PLC0415 - modules of an HTTP server
+        FrameStatistics,
+        MetricsError,
+        MetricsServer,
+    )
+
+    frames = FrameStatistics()
+    server = MetricsServer(rig.metrics, rig.name, health, frames)
+    try:
+        server.start()
+    except MetricsError as fault:
+        report(NoticeKind.METRICS, f"metrics are off: {fault}", NoticeLevel.ERROR)
+    else:
+        log.info("metrics at %s", server.url)
+        core.subscribe(frames)
+        tasks.create_task(server.run(), name="metrics")
