@@ -19,7 +19,7 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from jointfit_daemon.outputs.mqtt._error_messages import broker_fault, session_fault
+from jointfit_daemon.outputs.mqtt._error_messages import NO_ANSWER, broker_fault, session_fault
 from jointfit_daemon.outputs.mqtt._packet_limit import PacketLimitSocket
 from jointfit_daemon.outputs.mqtt._secret_files import password_of
 from jointfit_daemon.outputs.mqtt._tls import TlsFilesError, tls_context, tls_remedy
@@ -35,6 +35,9 @@ KEEPALIVE_S = 5
 """Keep-alive interval, s: an unresponsive broker is detected within 1.5 intervals."""
 ANSWER_S = 3.0
 """Limit of one exchange with the broker, s."""
+WINDOW = 16
+"""Messages that may be sent before the first one is acknowledged: brokers usually allow 20 or more,
+and a broker may announce a smaller number (MQTT 5.0, 3.2.2.3.3)."""
 SUBSCRIBED_S = 30.0
 """Limit of a subscription, s: a broker may send thousands of stored messages before it confirms."""
 GOODBYE_S = 1.0
@@ -193,18 +196,10 @@ class MqttConnection:
         """Number of incoming packets dropped because of their size."""
         return self._client.oversized
 
-    async def publish(self, message: Outgoing) -> str | None:
-        """Publish; return once the broker (QoS 1) or the kernel (QoS 0) has accepted the message.
-
-        Returns
-        -------
-        str or None
-            The broker's reason for refusing the message; only with MQTT 5 and at QoS 1.
-        """
-        self._client.refusal = None
+    async def publish(self, message: Outgoing) -> None:
+        """Publish; return once the broker (QoS 1) or the kernel (QoS 0) has accepted it."""
         with self._session_errors(f"{message.topic}: "):
             await self._publish(message)
-        return self._client.refusal
 
     async def _publish(self, message: Outgoing) -> None:
         await self._client.publish(
@@ -214,6 +209,25 @@ class MqttConnection:
             message.retain,
             self._properties(message) if self._modern else None,
         )
+
+    async def send(self, message: Outgoing, accepted: Callable[[str | None], None]) -> None:
+        """Send a message; return without its acknowledgement, in the order of the calls.
+
+        Waits while `WINDOW` messages, or fewer if the broker allows fewer, are unacknowledged. If
+        an acknowledgement does not arrive within `ANSWER_S`, `messages` raises the error.
+
+        Parameters
+        ----------
+        message
+            The message.
+        accepted
+            Called once the broker (QoS 1) or the kernel (QoS 0) has accepted the message, with the
+            broker's reason for refusing it or None. The reason requires MQTT 5 and QoS 1. Not
+            called if the connection ends before.
+        """
+        properties = self._properties(message) if self._modern else None
+        with self._session_errors(f"{message.topic}: "):
+            await self._client.send(message, properties, accepted)
 
     async def subscribe(self, topics: Sequence[str], *, live: bool = False) -> list[str]:
         """Subscribe and return the topics that the broker refused.
@@ -363,7 +377,7 @@ class _Client(aiomqtt.Client):
     """aiomqtt's client with a limit on incoming packets and immediate detection of failures.
 
     It can be abandoned while it connects, fails at once if the connection breaks during the
-    handshake, and stores the reason for which the broker refused a message.
+    handshake, and sends several messages before the first one is acknowledged.
     """
 
     _abandoned = False
@@ -377,8 +391,11 @@ class _Client(aiomqtt.Client):
         **options: Any,
     ) -> None:
         super().__init__(*arguments, **options)
-        self.refusal: str | None = None
-        """Reason for which the broker refused the last message; one is sent at a time."""
+        self._unacknowledged: dict[int, tuple[float, Callable[[str | None], None]]] = {}
+        """Time limit, s, and callback of each message sent, by message id, the oldest first."""
+        self._acknowledged = asyncio.Event()
+        self._limit_timer: asyncio.TimerHandle | None = None
+        self._window = WINDOW
         self._longest_bytes, self._admit = longest_bytes, admit
         self._limited: PacketLimitSocket | None = None
         self._disconnected.add_done_callback(self._fail_handshake)
@@ -407,6 +424,8 @@ class _Client(aiomqtt.Client):
     def abandon(self) -> None:
         """Close the socket at once; otherwise a failed attempt keeps it open for seconds."""
         self._abandoned = True
+        if self._limit_timer is not None:
+            self._limit_timer.cancel()
         if self._misc_task is not None:
             self._misc_task.cancel()
         opened: Any = self._client.socket()
@@ -459,11 +478,50 @@ class _Client(aiomqtt.Client):
         with contextlib.suppress(OSError):  # closed, or not supported
             sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
+    def _on_connect(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
+        self, client: Any, userdata: Any, flags: Any, reason_code: Any, properties: Any = None
+    ) -> None:
+        """Store how many unacknowledged messages the broker allows."""
+        self._window = min(WINDOW, getattr(properties, "ReceiveMaximum", WINDOW))
+        super()._on_connect(client, userdata, flags, reason_code, properties)
+
+    async def send(
+        self, message: Outgoing, properties: Any, accepted: Callable[[str | None], None]
+    ) -> None:
+        """Send a message as soon as the window of unacknowledged messages has room."""
+        while len(self._unacknowledged) >= self._window:
+            self._acknowledged.clear()
+            await self._acknowledged.wait()
+
+        sent = self._client.publish(
+            message.topic, message.payload, message.qos, message.retain, properties
+        )
+        if sent.rc:
+            raise aiomqtt.MqttCodeError(sent.rc)
+        self._unacknowledged[sent.mid] = (self._loop.time() + ANSWER_S, accepted)
+        if self._limit_timer is None:
+            self._limit_timer = self._loop.call_later(ANSWER_S, self._check_limit)
+
+    def _check_limit(self) -> None:
+        """End the connection if the oldest message has waited too long; else check again later.
+
+        One timer for all messages, since starting one per message takes longer than sending it.
+        """
+        self._limit_timer = None
+        if not self._unacknowledged:
+            return
+        limit_s, _ = next(iter(self._unacknowledged.values()))
+        if self._loop.time() < limit_s:
+            self._limit_timer = self._loop.call_at(limit_s, self._check_limit)
+        elif not self._disconnected.done():
+            self._disconnected.set_exception(aiomqtt.MqttError(NO_ANSWER))
+
     def _on_publish(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
         self, client: Any, userdata: Any, mid: int, reason_code: Any, properties: Any
     ) -> None:
-        if reason_code.is_failure:
-            self.refusal = str(reason_code)
+        if (message := self._unacknowledged.pop(mid, None)) is not None:
+            self._acknowledged.set()
+            message[1](str(reason_code) if reason_code.is_failure else None)
         super()._on_publish(client, userdata, mid, reason_code, properties)
 
 

@@ -16,6 +16,7 @@ CONNECTION_CLOSED = (
     " as configured in [mqtt]"
 )
 CONNECTION_LOST = "the connection was lost: check that the broker runs, and the network"
+NO_ANSWER = "the broker does not answer in time: check its log, and the network"
 
 _SYSTEM_ERRORS = {
     errno.ECONNREFUSED: (
@@ -81,7 +82,7 @@ def session_fault(error: BaseException) -> str:
     """
     text = str(error)
     if text == "Operation timed out":
-        return "the broker does not answer in time: check its log, and the network"
+        return NO_ANSWER
     if (found := _CODE.search(text)) and int(found[1]) in _SESSION_LOST:
         return CONNECTION_LOST
     return text

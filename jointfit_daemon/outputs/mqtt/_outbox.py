@@ -4,8 +4,11 @@ Invariant: the size is limited, the oldest message is dropped first, and drops a
 
 Four kinds wait separately and are sent in this order. A client waits for a response. State is
 retained: the last value of a topic replaces earlier ones, and all state is sent again on every
-connection. Events are sent once, in order. Stream messages are useless when late. All but state
-are dropped when they have waited longer than their expiry.
+connection. Events are sent in order. Stream messages are useless when late. All but state are
+dropped when they have waited longer than their expiry.
+
+Several messages can be sent before the first one is acknowledged. After a loss of the connection,
+responses and events without an acknowledgement are sent again, so they may arrive twice.
 """
 
 from __future__ import annotations
@@ -13,6 +16,8 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
+from functools import partial
+from itertools import count
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.outputs.mqtt._connection import Outgoing
@@ -56,6 +61,9 @@ class Outbox:
         self._responses: deque[_Waiting] = deque()
         self._events: deque[_Waiting] = deque()
         self._streams: deque[_Waiting] = deque()
+        self._unacknowledged: dict[int, tuple[deque[_Waiting], _Waiting] | None] = {}
+        """Messages being sent, in order, with the queue that they came from; None for state."""
+        self._numbers = count()
         self._wake = asyncio.Event()
 
     @property
@@ -66,8 +74,11 @@ class Outbox:
 
     @property
     def has_unsent(self) -> bool:
-        """Whether a response, state or an event is waiting, or state is being sent."""
-        return bool(self._responses or self._unsent or self._events)
+        """Whether a response, state or an event is waiting or being sent."""
+        if self._responses or self._unsent or self._events:
+            return True
+        sending = self._unacknowledged.values()
+        return any(origin is None or origin[0] is not self._streams for origin in sending)
 
     @property
     def retained(self) -> dict[str, bytes]:
@@ -87,7 +98,7 @@ class Outbox:
         self._wake.set()
 
     def event(self, topic: str, payload: bytes) -> None:
-        """Queue a message that is sent once, at QoS 1."""
+        """Queue a message that is sent at least once, at QoS 1."""
         message = Outgoing(topic, payload, 1, False, RESPONSE_EXPIRY_S)
         self._push(self._events, _EVENT_CAPACITY, message)
 
@@ -109,42 +120,61 @@ class Outbox:
         self._wake.set()
 
     def reconnected(self) -> None:
-        """Queue all state again, since the broker may have lost it; drop waiting streams."""
+        """Queue all state again, since the broker may have lost it; drop streams.
+
+        Responses and events that were sent without an acknowledgement are queued again, too.
+        """
+        for origin in reversed(self._unacknowledged.values()):
+            if origin is not None:
+                queue, waiting = origin
+                queue.appendleft(waiting)
+        self._unacknowledged.clear()
+
         self._unsent = dict.fromkeys(sorted(self._state, key=self.state_topic.__eq__))
         self.dropped += len(self._streams)
         self._streams.clear()
         self._wake.set()
 
     async def next(self) -> tuple[Outgoing, Callable[[], None]]:
-        """Wait for the next message; return it with a callback for the moment it was sent."""
+        """Wait for the next message; return it with a callback for its acknowledgement."""
         while True:
-            if (message := self._take(self._responses)) is not None:
-                return message, lambda: None
+            if (waiting := self._take(self._responses)) is not None:
+                return waiting[1], self._hand_out((self._responses, waiting))
             if self._unsent:
                 return self._next_state()
             for queue in (self._events, self._streams):
-                if (message := self._take(queue)) is not None:
-                    return message, lambda: None
+                if (waiting := self._take(queue)) is not None:
+                    return waiting[1], self._hand_out((queue, waiting))
             self._wake.clear()
             await self._wake.wait()
 
-    def _take(self, queue: deque[_Waiting]) -> Outgoing | None:
+    def _take(self, queue: deque[_Waiting]) -> _Waiting | None:
         """Return the oldest message that has not expired; drop and count those before it."""
         while queue:
-            expires_s, message = queue.popleft()
-            if self._clock() <= expires_s:
-                return message
+            waiting = queue.popleft()
+            if self._clock() <= waiting[0]:
+                return waiting
             self.dropped += 1
         return None
 
+    def _hand_out(self, origin: tuple[deque[_Waiting], _Waiting] | None) -> Callable[[], None]:
+        """Store a message until it is acknowledged; return the callback for that moment."""
+        number = next(self._numbers)
+        self._unacknowledged[number] = origin
+        return partial(self._acknowledge, number)
+
+    def _acknowledge(self, number: int) -> None:
+        self._unacknowledged.pop(number, None)
+
     def _next_state(self) -> tuple[Outgoing, Callable[[], None]]:
         topic = next(iter(self._unsent))
+        del self._unsent[topic]
         payload = self._state[topic]
+        acknowledge = self._hand_out(None)
 
-        def sent() -> None:
-            if self._state.get(topic) is payload:  # otherwise a newer value waits
-                self._unsent.pop(topic, None)
-                if not payload:
-                    del self._state[topic]
+        def acknowledged() -> None:
+            acknowledge()
+            if not payload and self._state.get(topic) is payload:
+                del self._state[topic]
 
-        return Outgoing(topic, payload, 1, True), sent
+        return Outgoing(topic, payload, 1, True), acknowledged

@@ -10,6 +10,7 @@ import asyncio
 import logging
 import random
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.outputs import topics
@@ -278,13 +279,18 @@ class MqttPublisher:
                     self._checked_s[topic] = now_s + CHECK_S
                     message = replace(message, qos=1)
 
-            refusal = await connection.publish(message)
-            sent()
-            self.sent += 1
-            if message.qos and self._modern:
-                self._note_acknowledgement(message.topic, refusal)
-            if (echo := self._echoes.get(message.topic)) is not None:
-                echo.sent.set()
+            await connection.send(message, partial(self._note_acceptance, message, sent))
+
+    def _note_acceptance(
+        self, message: Outgoing, sent: Callable[[], None], refusal: str | None
+    ) -> None:
+        """Note that the broker, or at QoS 0 the kernel, has accepted or refused `message`."""
+        sent()
+        self.sent += 1
+        if message.qos and self._modern:
+            self._note_acknowledgement(message.topic, refusal)
+        if (echo := self._echoes.get(message.topic)) is not None:
+            echo.sent.set()
 
     def _note_acknowledgement(self, topic: str, refusal: str | None) -> None:
         """Note whether the broker accepted a message on `topic`; log a change."""

@@ -11,7 +11,7 @@ LIFE = "base/bridge/state"
 
 actions = st.lists(
     st.tuples(
-        st.sampled_from(["retain", "event", "stream", "send", "reconnect"]),
+        st.sampled_from(["retain", "event", "stream", "respond", "send", "lose", "reconnect"]),
         st.sampled_from(["a", "b", LIFE]),
         st.binary(max_size=2),
     ),
@@ -82,6 +82,32 @@ async def test_reconnect_drops_and_counts_waiting_streams() -> None:
     assert outbox.dropped == 1
 
 
+async def test_unacknowledged_responses_and_events_are_sent_again_in_order() -> None:
+    outbox = Outbox(LIFE)
+    for number in range(4):
+        outbox.event("bridge/event", b"%d" % number)
+    outbox.respond("bridge/response/calibrate", b"r")
+    outbox.stream("pose", b"")
+    given = [await outbox.next() for _ in range(6)]
+    assert not outbox.queued
+    assert outbox.has_unsent
+    given[2][1]()  # event 1 is acknowledged before event 0 and the response
+    outbox.event("bridge/event", b"4")
+    outbox.reconnected()
+    assert [payload for _, payload, _ in await drain(outbox)] == [b"r", b"0", b"2", b"3", b"4"]
+    assert outbox.dropped == 1  # the pose
+    assert not outbox.has_unsent
+
+
+async def test_outbox_is_not_empty_before_the_last_acknowledgement() -> None:
+    outbox = Outbox(LIFE)
+    outbox.retain("a", b"1")
+    _, done = await outbox.next()
+    assert outbox.has_unsent
+    done()
+    assert not outbox.has_unsent
+
+
 async def test_cleared_topic_is_sent_empty_once() -> None:
     outbox = Outbox(LIFE)
     outbox.retain("device/S1/info", b"x")
@@ -103,13 +129,14 @@ async def test_every_message_is_sent_waiting_or_counted_as_dropped(
             outbox.retain(topic, payload)
         elif action == "reconnect":
             outbox.reconnected()
-        elif action != "send":
+        elif action not in {"send", "lose"}:
             given_out += 1
             getattr(outbox, action)(topic, payload)
         elif outbox.queued:
             message, done = await outbox.next()
-            done()
-            sent += not message.retain
+            if action == "send":  # otherwise its acknowledgement never comes
+                done()
+                sent += not message.retain
     at_broker = {}
     outbox.reconnected()
     while outbox.queued:
