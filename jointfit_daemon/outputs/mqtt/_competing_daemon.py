@@ -1,9 +1,13 @@
 """Detection of another daemon with the same client id, and the wait for its end.
 
 A broker ends the older of two connections with one client id, so two daemons with the same base
-topic would end each other's connection repeatedly. The daemon that was connected first takes its
-connection back. The newer daemon gives way: it connects with another client id and waits until the
-other daemon is gone.
+topic would end each other's connection repeatedly. Before its first connection, a daemon therefore
+connects with another client id and looks for messages of another daemon. If it finds one, it
+publishes nothing and waits for its end.
+
+Two daemons that start together do not find each other, and the broker may have lost the state of a
+daemon. Then the daemon that was connected first takes its connection back. The newer daemon gives
+way: it connects with another client id and waits until the other daemon is gone.
 
 Neither daemon knows when the other one connected. Each compares the duration of its own first
 connection with a limit that doubles with every further loss. The first connection of the newer
@@ -17,7 +21,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.outputs import topics
-from jointfit_daemon.outputs.mqtt._connection import MqttConnection
+from jointfit_daemon.outputs.mqtt._connection import ANSWER_S, MqttConnection
 
 if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
@@ -30,6 +34,9 @@ daemon's reconnection."""
 UNEXPLAINED = 3
 """Short connections in a row, without a reason from the broker, that raise the suspicion: MQTT
 3.1.1 has no reasons, and some MQTT 5 brokers send none."""
+STORED_S = 0.1
+"""Time to wait for the stored state of a daemon after two exchanges with the broker, s: some
+brokers send stored messages after the confirmation of the subscription."""
 GLANCE_S = 2.0
 """Time to wait for a pose of a suspected daemon, s."""
 SETTLED_S = 5.0
@@ -74,6 +81,36 @@ class TakeoverDetector:
     def give_way(self) -> None:
         """Count as the newer daemon from now on, also after a restart of the broker."""
         self._first_s, self._losses = 0.0, 0
+
+
+async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
+    """Return whether a daemon with this base publishes: its state is stored, and a message arrives.
+
+    A broker that is cut off from a daemon stores ``online`` for some seconds after its end.
+
+    Raises
+    ------
+    BrokerLostError
+        The connection failed.
+    """
+    base = settings.base
+    state = topics.BRIDGE_STATE.name(base)
+    loop = asyncio.get_running_loop()
+    async with MqttConnection(settings) as observer:
+        try:
+            async with asyncio.timeout(ANSWER_S) as patience:
+                await observer.subscribe([state])
+                await observer.subscribe([topics.POSE.name(base)], live=True)
+                patience.reschedule(loop.time() + STORED_S)
+                async for message in observer.messages():
+                    if message.topic != state:
+                        return True
+                    if message.payload == offline:
+                        return False
+                    patience.reschedule(loop.time() + GLANCE_S)
+        except TimeoutError:
+            pass
+    return False
 
 
 async def is_publishing(settings: MqttSettings, within_s: float) -> bool:

@@ -7,6 +7,7 @@ passed on synchronously, at a limited rate, and never from a retained message.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import random
 from dataclasses import dataclass, replace
@@ -20,6 +21,7 @@ from jointfit_daemon.outputs.mqtt._competing_daemon import (
     SHORT_S,
     TakeoverDetector,
     await_departure,
+    is_in_use,
     is_publishing,
 )
 from jointfit_daemon.outputs.mqtt._connection import (
@@ -210,10 +212,23 @@ class MqttPublisher:
             return False
 
         self._takeovers.give_way()
+        await self._pause()
+        return True
+
+    async def _await_other_daemon(self) -> None:
+        """Wait, before the first connection, until no other daemon publishes below this base.
+
+        A connection takes over the client id, and the broker then publishes the will of the other
+        daemon. A fault of the broker is reported by the attempt that follows.
+        """
+        with contextlib.suppress(BrokerLostError):
+            if await is_in_use(self._settings, OFFLINE):
+                await self._pause()
+
+    async def _pause(self) -> None:
         log.error("mqtt: %s. Publishing is paused until the other client is gone", self._contested)
         await await_departure(self._settings, OFFLINE)
         log.warning("mqtt: the other client with this client id is gone: connecting")
-        return True
 
     def _report_loss(self, reason: str, lasted_s: float) -> None:
         """Log why the last attempt or connection ended."""
@@ -241,6 +256,9 @@ class MqttPublisher:
         Each connection has a task of its own: in Python 3.11 a task that contained a failed
         TaskGroup appears cancelled from then on.
         """
+        if self.connects == 0:
+            await self._await_other_daemon()
+
         will = Outgoing(self._outbox.state_topic, OFFLINE, 1, retain=True)
         name = topics.client_identifier(self._base)
         async with MqttConnection(

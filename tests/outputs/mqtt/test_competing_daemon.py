@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from jointfit_daemon.config import MqttSettings
-from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, MqttPublisher, Outbox
+from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, Incoming, MqttPublisher, Outbox
 from jointfit_daemon.outputs.mqtt._competing_daemon import (
     NEWCOMER_S,
     SHORT_S,
     TakeoverDetector,
 )
+from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
+from jointfit_daemon.outputs.topics import OFFLINE, ONLINE
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -61,6 +63,7 @@ def refusals(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [message for message in messages if "Publishing is paused" in message]
 
 
+@pytest.mark.usefixtures("unseen")
 @pytest.mark.system
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
 async def test_newer_daemon_waits_until_the_first_is_gone(
@@ -90,6 +93,59 @@ async def test_newer_daemon_waits_until_the_first_is_gone(
     assert "client id 'jointfitd-jointfit-bench', probably a second jointfitd" in refusal
 
 
+@pytest.mark.parametrize("version", ["5", "3.1.1"])
+async def test_newer_daemon_publishes_nothing_and_leaves_the_first_connected(
+    broker: Broker, version: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    port = broker.port_of(version)
+    more: dict[str, Any] = {"version": version}
+    settings = MqttSettings(host="127.0.0.1", port=port, base=BASE, **more)
+    async with daemon_link(port, version) as older, MqttConnection(settings) as watcher:
+        await until(lambda: older.sent > 2)
+        await watcher.subscribe([f"{BASE}/bridge/#", f"{BASE}/device/#"], live=True)
+
+        async with daemon_link(port, version) as newcomer:
+            newcomer._outbox.retain(f"{BASE}/device/S1/availability", b"offline")
+            await until(lambda: bool(refusals(caplog)))
+            await asyncio.sleep(0.2)
+            assert (older.connects, newcomer.connects) == (1, 0)
+        await asyncio.sleep(0.1)
+        assert older.connects == 1
+
+        # With MQTT 3.1.1 the messages that were stored before arrive as retained.
+        reader, new = watcher.messages(), list[Incoming]()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(0.1):
+                while True:
+                    new.append(await anext(reader))
+        assert [message for message in new if version == "5" or not message.retained] == []
+
+
+@pytest.mark.parametrize("stored", [ONLINE, OFFLINE])
+async def test_stored_state_of_a_dead_daemon_does_not_stop_a_new_one(
+    broker: Broker, stored: bytes, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("jointfit_daemon.outputs.mqtt._competing_daemon.GLANCE_S", 0.2)
+    settings = MqttSettings(host="127.0.0.1", port=broker.port, base=BASE)
+    async with MqttConnection(settings) as earlier:
+        await earlier.publish(Outgoing(f"{BASE}/bridge/state", stored, 1, retain=True))
+    async with daemon_link(broker.port, "5") as link:
+        await until(lambda: link.connected, 3)
+    assert not refusals(caplog)
+
+
+@pytest.fixture
+def unseen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no daemon find another one before it connects, as if both started together."""
+
+    async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
+        del settings, offline
+        return False
+
+    monkeypatch.setattr("jointfit_daemon.outputs.mqtt._publisher.is_in_use", is_in_use)
+
+
+@pytest.mark.usefixtures("unseen")
 @pytest.mark.system
 @pytest.mark.parametrize("version", ["5", "3.1.1"])
 async def test_first_of_two_daemons_that_start_together_continues(
@@ -118,6 +174,7 @@ async def test_first_of_two_daemons_that_start_together_continues(
 CONNACK, TAKEN_OVER = b"\x20\x03\x00\x00\x00", b"\xe0\x02\x8e\x00"
 
 
+@pytest.mark.usefixtures("unseen")
 async def test_takeover_reason_of_the_broker_suffices(caplog: pytest.LogCaptureFixture) -> None:
     """mosquitto 2.0.11 and iotcore give no reason; later releases of mosquitto do."""
     serving: list[asyncio.Task[None] | None] = []
