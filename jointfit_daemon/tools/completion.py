@@ -25,6 +25,21 @@ def complete_request(incomplete: str) -> list[str]:
     return _beginning_with(incomplete, REQUESTS)
 
 
+def complete_serial_port(incomplete: str) -> list[str]:
+    """Return the paths of serial ports that begin with `incomplete`."""
+    from jointfit_daemon.tools.discovery import find_serial_ports
+
+    ports = find_serial_ports()
+    return _beginning_with(incomplete, [path for p in ports for path in (p.path, p.device)])
+
+
+def complete_can_interface(incomplete: str) -> list[str]:
+    """Return the CAN interfaces that begin with `incomplete`."""
+    from jointfit_daemon.tools.discovery import find_can_interfaces
+
+    return _beginning_with(incomplete, [interface.name for interface in find_can_interfaces()])
+
+
 def complete_topic(incomplete: str) -> list[str]:
     """Return the topics and requests with a JSON Schema that begin with `incomplete`."""
     from jointfit_daemon.outputs.payload_models import PAYLOADS

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any
 
 import orjson
 import typer
@@ -135,13 +135,11 @@ def _print_table(found: dict[str, object], warnings: list[str]) -> None:
 
 
 def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
-    """Return driver settings for decoding; required keys of the connection get placeholders."""
-    from pydantic import BaseModel, ValidationError
-
-    from jointfit_daemon.config import faults_of
+    """Return driver settings for decoding, from the options ``--set``."""
     from jointfit_daemon.files.text import MAX_NESTING, find_structure_fault, parse_toml
+    from jointfit_daemon.tools.decoder_settings import decoder_settings
 
-    given: dict[str, Any] = {"driver": name}
+    given: dict[str, Any] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not equals:
@@ -158,18 +156,7 @@ def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
             raise ValueError(f"--set {fault}")
         given |= table
 
-    for key, info in driver.Settings.model_fields.items():
-        if info.is_required() and key not in given:
-            kinds = [info.annotation, *get_args(info.annotation)]
-            if any(isinstance(kind, type) and issubclass(kind, BaseModel) for kind in kinds):
-                given[key] = {"interface": "virtual", "channel": "file"}
-            else:
-                given[key] = "file" if str in kinds else 1
-    try:
-        return driver.Settings.model_validate(given)
-    except ValidationError as error:
-        faults = faults_of(error, driver.Settings, name)
-        raise ValueError("; ".join(fault.text() for fault in faults)) from None
+    return decoder_settings(driver, name, given)
 
 
 def _row(item: Decoded) -> dict[str, object]:

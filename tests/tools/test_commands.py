@@ -27,7 +27,18 @@ def test_the_version_is_the_packages() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    ["check", "demo", "dashboard", "calibrate", "mark", "request", "decode", "ik", "schema"],
+    [
+        "check",
+        "probe",
+        "demo",
+        "dashboard",
+        "calibrate",
+        "mark",
+        "request",
+        "decode",
+        "ik",
+        "schema",
+    ],
 )
 def test_every_command_explains_itself(command: str) -> None:
     result = run(app, [command, "--help"])

@@ -64,7 +64,10 @@ async def find_servers(
         try:
             addresses = await loop.getaddrinfo(host, None, family=socket.AF_INET)
         except (OSError, UnicodeError) as error:
-            raise OSError(f"{host}: no such host: {error}: expected an address or a name") from None
+            why = getattr(error, "strerror", None) or error
+            raise OSError(
+                f"{host}: no such host ({why}): set the address of the server, such as 192.168.1.20"
+            ) from None
         address = str(addresses[0][4][0])
         targets.append((local_address(address, None), address))
 

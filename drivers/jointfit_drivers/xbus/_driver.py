@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from jointfit_drivers.ports.serial_port import SerialPort
 from jointfit_drivers.xbus._decoder import XbusDecoder
-from jointfit_drivers.xbus._handshake import XbusHandshake
+from jointfit_drivers.xbus._handshake import LINE_SPEEDS, XbusHandshake
 from jointfit_drivers.xbus._raw_orientation import RawOrientation
 from jointfit_drivers.xbus._settings import XbusSettings
 from jointfit_drivers.xbus._sync_lines import trigger_wires
@@ -31,6 +31,7 @@ class XbusImu:
 
     Settings: ClassVar[type[XbusSettings]] = XbusSettings
     wire: ClassVar[Wire] = "stream"
+    usual_bauds: ClassVar[tuple[int, ...]] = tuple(dict.fromkeys((115_200, *LINE_SPEEDS)))
 
     def __init__(self, settings: XbusSettings) -> None:
         self._settings = settings

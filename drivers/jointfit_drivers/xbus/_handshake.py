@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_OTHER_SPEEDS = (921_600, 115_200, 460_800, 230_400, 2_000_000, 57_600, 38_400, 19_200, 9_600)
+LINE_SPEEDS = (921_600, 115_200, 460_800, 230_400, 2_000_000, 57_600, 38_400, 19_200, 9_600)
 """Line speeds to search, bit/s: factory settings and common choices first."""
 _LISTEN_S = 0.15
 """Time at each speed of the search, s. An acknowledgement takes 10 ms at 9600 baud."""
@@ -233,7 +233,7 @@ class XbusHandshake:
 
     async def _other_speed(self) -> int | None:
         """Return the speed at which the device answers; it continues to measure as before."""
-        for baud in _OTHER_SPEEDS:
+        for baud in LINE_SPEEDS:
             if baud == self._settings.baud:
                 continue
             try:

@@ -22,7 +22,7 @@ from jointfit_protocols.orientation import OrientationGate
 from jointfit_protocols.xcdi import QUATERNION_SCALE, DataId, XcdiIds, decode, id_block
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
 
     from jointfit_daemon.driver import Emit
     from jointfit_daemon.model import Chunk
@@ -154,6 +154,37 @@ class XcdiImu:
 
     Settings: ClassVar[type[XcdiSettings]] = XcdiSettings
     wire: ClassVar[Wire] = "can"
+
+    @classmethod
+    def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterator[dict[str, Any]]:
+        """Yield the identifiers of sensors that may send what was received.
+
+        A candidate is a Quaternion (8 bytes) with the next lower GroupCounter (2 bytes) and the
+        next lower SampleTime (4 bytes), because a sensor needs ascending identifiers. Both byte
+        orders are candidates. See `jointfit_daemon.device_search`.
+        """
+        for (quaternion, extended), size in sorted(seen.items()):
+            if size != _SAMPLE_BYTES[DataId.QUATERNION]:
+                continue
+            numbers = {"quaternion": quaternion}
+            upper = quaternion
+            for name, data_id in (
+                ("group_counter", DataId.GROUP_COUNTER),
+                ("sample_time", DataId.SAMPLE_TIME),
+            ):
+                lower = [
+                    number
+                    for (number, long), count in seen.items()
+                    if long == extended and count == _SAMPLE_BYTES[data_id] and number < upper
+                ]
+                if not lower:
+                    break
+                upper = numbers[name] = max(lower)
+            else:
+                ids = {name: numbers[name] for name in sorted(numbers, key=numbers.__getitem__)}
+                long_ids = {"extended_ids": True} if extended else {}
+                yield {"ids": ids, **long_ids}
+                yield {"ids": ids, **long_ids, "byte_order": "little"}
 
     def __init__(self, settings: XcdiSettings) -> None:
         self._settings = settings

@@ -60,6 +60,11 @@ def read_candump(data: bytes) -> Iterator[Chunk]:
             yield Chunk(t_ns, record)
 
 
+def pack_can_frame(t_ns: int, number: int, data: bytes, *, extended: bool = False) -> bytes:
+    """Return the record of one data frame with identifier `number`, received at `t_ns`."""
+    return _RECORD.pack(t_ns, number, _EXTENDED * extended, len(data), data)
+
+
 def _record(line: bytes) -> tuple[int, bytes] | None:
     """Return time and record of one line; None if it is not a classic CAN frame."""
     match = _LINE.fullmatch(line)

@@ -5,19 +5,41 @@ the named device only, and write nothing to it.
 """
 
 from jointfit_daemon.tools.discovery._can_interfaces import (
+    CanChannel,
     CanInterface,
     configured_can_channels,
     find_can_interfaces,
 )
-from jointfit_daemon.tools.discovery._mocap_servers import FoundServer, find_mocap_servers
+from jointfit_daemon.tools.discovery._can_listening import CanIdentifier, CanTraffic, listen_can
+from jointfit_daemon.tools.discovery._mocap_servers import (
+    FoundServer,
+    find_mocap_servers,
+    installed_drivers,
+)
+from jointfit_daemon.tools.discovery._serial_listening import (
+    SerialTraffic,
+    listen_serial,
+    usual_bauds,
+)
 from jointfit_daemon.tools.discovery._serial_ports import SerialPortInfo, find_serial_ports
+from jointfit_daemon.tools.discovery._traffic import DecodedDevice, decode_traffic
 
 __all__ = [
+    "CanChannel",
+    "CanIdentifier",
     "CanInterface",
+    "CanTraffic",
+    "DecodedDevice",
     "FoundServer",
     "SerialPortInfo",
+    "SerialTraffic",
     "configured_can_channels",
+    "decode_traffic",
     "find_can_interfaces",
     "find_mocap_servers",
     "find_serial_ports",
+    "installed_drivers",
+    "listen_can",
+    "listen_serial",
+    "usual_bauds",
 ]

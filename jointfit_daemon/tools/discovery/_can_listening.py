@@ -1,0 +1,172 @@
+"""Reception on one CAN network interface, and the sensors that the drivers decode there.
+
+Invariant: nothing is sent, and nothing is set. A controller in normal mode acknowledges frames of
+others, as it does for every program.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import socket
+import struct
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, cast
+
+from jointfit_daemon.files.captures import pack_can_frame
+from jointfit_daemon.model import Chunk
+from jointfit_daemon.tools.discovery._mocap_servers import installed_drivers
+from jointfit_daemon.tools.discovery._traffic import DecodedDevice, decode_traffic
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Mapping
+
+    from jointfit_daemon.device_search import CanSearch
+    from jointfit_daemon.driver import Driver
+
+_FRAME = struct.Struct("=IB3x8s")
+_EXTENDED_FLAG, _REMOTE_FLAG, _ERROR_FLAG = 1 << 31, 1 << 30, 1 << 29
+_STANDARD_MASK, _EXTENDED_MASK = 0x7FF, 0x1FFF_FFFF
+_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER = 101, 2
+_POLL_S = 0.1
+_FAULTS = {
+    errno.ENODEV: "no such CAN interface: plug the adapter in, or choose one that `jointfit probe`"
+    " lists",
+    errno.ENXIO: "no such CAN interface: plug the adapter in, or choose one that `jointfit probe`"
+    " lists",
+    errno.ENETDOWN: "the interface is down: sudo ip link set {name} up type can bitrate 1000000",
+    errno.EAFNOSUPPORT: "no CAN in this kernel: sudo modprobe can_raw",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class CanIdentifier:
+    """One identifier that was received."""
+
+    id: int
+    extended: bool
+    """Whether it has 29 bits."""
+    data_bytes: int
+    """Number of data bytes of the last frame."""
+    frames: int
+    rate_hz: float | None
+    """Frames a second; None if fewer than two arrived."""
+    driver: str | None = None
+    """Driver of the sensor that uses it; None if unknown."""
+
+
+@dataclass(frozen=True, slots=True)
+class CanTraffic:
+    """Result of the reception on one interface."""
+
+    interface: str
+    fault: str | None
+    """Reason why it cannot be opened, with its remedy; None if it was opened."""
+    identifiers: tuple[CanIdentifier, ...] = ()
+    devices: tuple[DecodedDevice, ...] = ()
+    error_frames: int = 0
+    """Error frames of the controller."""
+
+
+def listen_can(
+    interface: str, *, listen_s: float = 1.5, progress: Callable[[float], None] | None = None
+) -> CanTraffic:
+    """Receive on a SocketCAN interface, and decode the frames with the installed drivers.
+
+    Parameters
+    ----------
+    interface
+        Name of the network interface.
+    listen_s
+        Time to listen, s.
+    progress
+        Called with the share of the work that is done, 0 to 1.
+    """
+    try:
+        received = _receive(interface, listen_s, progress)
+    except OSError as error:
+        text = _FAULTS.get(error.errno or 0, error.strerror or str(error))
+        return CanTraffic(interface, f"{interface}: {text.format(name=interface)}")
+
+    arrivals: dict[tuple[int, bool], list[tuple[int, int]]] = {}
+    chunks = []
+    errors = 0
+    for t_ns, can_id, data in received:
+        extended = bool(can_id & _EXTENDED_FLAG)
+        number = can_id & (_EXTENDED_MASK if extended else _STANDARD_MASK)
+        if can_id & _ERROR_FLAG:
+            errors += 1
+            continue
+        if not can_id & _REMOTE_FLAG:
+            arrivals.setdefault((number, extended), []).append((t_ns, len(data)))
+            chunks.append(Chunk(t_ns, pack_can_frame(t_ns, number, data, extended=extended)))
+
+    sizes = {key: found[-1][1] for key, found in arrivals.items()}
+    devices = tuple(_decode(sizes, chunks))
+    owners = {key: device.driver for device in devices for key in _keys(device.settings)}
+    identifiers = tuple(
+        _identifier(key, found, owners.get(key)) for key, found in sorted(arrivals.items())
+    )
+    return CanTraffic(interface, None, identifiers, devices, errors)
+
+
+def _decode(sizes: Mapping[tuple[int, bool], int], chunks: list[Chunk]) -> Iterator[DecodedDevice]:
+    """Yield the sensors that the installed drivers decode; each identifier has one owner."""
+    used: set[tuple[int, bool]] = set()
+    for name, driver in installed_drivers():
+        for table in _tables(driver, sizes):
+            keys = _keys(table)
+            device = None if keys & used else decode_traffic(driver, name, table, chunks)
+            if device is not None and device.samples:
+                used |= keys
+                yield device
+
+
+def _tables(
+    driver: type[Driver], sizes: Mapping[tuple[int, bool], int]
+) -> Iterable[Mapping[str, Any]]:
+    """Return the tables that a driver proposes; the default table if it proposes none."""
+    if driver.wire != "can" or not sizes:
+        return ()
+    if hasattr(driver, "candidate_tables"):
+        return cast("CanSearch", cast("Any", driver)).candidate_tables(sizes)
+    return ({},)
+
+
+def _keys(table: Mapping[str, Any]) -> set[tuple[int, bool]]:
+    """Return the identifiers in the key ``ids`` of a table."""
+    extended = bool(table.get("extended_ids"))
+    return {(number, extended) for number in (table.get("ids") or {}).values()}
+
+
+def _identifier(
+    key: tuple[int, bool], found: list[tuple[int, int]], driver: str | None
+) -> CanIdentifier:
+    span_ns = found[-1][0] - found[0][0]
+    rate_hz = (len(found) - 1) * 1e9 / span_ns if span_ns > 0 else None
+    return CanIdentifier(*key, found[-1][1], len(found), rate_hz, driver)
+
+
+def _receive(
+    interface: str, listen_s: float, progress: Callable[[float], None] | None
+) -> list[tuple[int, int, bytes]]:
+    """Return arrival, identifier with flags, and data of every frame within `listen_s`."""
+    found = []
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as receiver:
+        try:
+            socket.if_nametoindex(interface)
+        except OSError as error:  # CPython sets no error number here
+            raise OSError(errno.ENODEV, os.strerror(errno.ENODEV)) from error
+        receiver.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _EXTENDED_MASK)
+        receiver.bind((interface,))
+        began = time.monotonic()
+        while (passed := time.monotonic() - began) < listen_s:
+            if progress is not None:
+                progress(passed / listen_s)
+            ready, _, _ = select.select([receiver], [], [], min(listen_s - passed, _POLL_S))
+            if ready:
+                can_id, size, data = _FRAME.unpack(receiver.recv(_FRAME.size))
+                found.append((time.monotonic_ns(), can_id, data[:size]))
+    return found

@@ -1,0 +1,175 @@
+"""Reception on one serial port, at the usual speeds of the installed drivers.
+
+Invariant: nothing is sent, and the settings of the port are restored. A port is opened for reading
+only; the kernel raises DTR and RTS, which resets some boards.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import os
+import select
+import termios
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.model import Chunk
+from jointfit_daemon.tools.discovery._mocap_servers import installed_drivers
+from jointfit_daemon.tools.discovery._traffic import DecodedDevice, decode_traffic
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+_DEFAULT_BAUDS = (115_200,)
+_READ_BYTES = 4096
+_POLL_S = 0.05
+_FAULTS = {
+    errno.ENOENT: "is absent: plug it in, or choose one that `jointfit probe` lists",
+    errno.EACCES: "permission denied: sudo usermod -aG dialout $USER, then log in again",
+    errno.EPERM: "permission denied: sudo usermod -aG dialout $USER, then log in again",
+    errno.EBUSY: "is used by another program: stop it (fuser names it)",
+    errno.ENOTTY: "is no serial port: choose one that `jointfit probe` lists",
+    errno.EIO: "has no hardware behind it: choose one that `jointfit probe` lists",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SerialTraffic:
+    """Result of the reception on one port."""
+
+    port: str
+    fault: str | None
+    """Reason why it cannot be opened, with its remedy; None if it was opened."""
+    received_bytes: dict[int, int]
+    """Number of received bytes by speed."""
+    baud: int | None = None
+    """Speed at which a driver decodes the data, baud."""
+    devices: tuple[DecodedDevice, ...] = ()
+    """The driver that decodes the data; several only if their formats are alike."""
+
+
+def usual_bauds() -> tuple[int, ...]:
+    """Return the speeds of all installed drivers of byte streams, the most frequent first."""
+    speeds: list[tuple[int, ...]] = [
+        getattr(driver, "usual_bauds", _DEFAULT_BAUDS)
+        for _, driver in installed_drivers()
+        if driver.wire == "stream"
+    ]
+    longest = max(map(len, speeds), default=0)
+    # One speed of every driver in turn, so that each default comes before any rare speed.
+    turns = [bauds[k] for k in range(longest) for bauds in speeds if k < len(bauds)]
+    return tuple(dict.fromkeys(turns))
+
+
+def listen_serial(
+    port: str,
+    *,
+    listen_s: float = 1.5,
+    bauds: Sequence[int] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> SerialTraffic:
+    """Receive on a port at one speed after the other until a driver decodes the data.
+
+    A port that is silent at one speed is not tried at others, because at a wrong speed bytes
+    arrive, too.
+
+    Parameters
+    ----------
+    port
+        Path of the device file, or a link to it.
+    listen_s
+        Time at each speed, s.
+    bauds
+        Speeds to try; default: those of the installed drivers.
+    progress
+        Called with the share of the work that is done, 0 to 1.
+    """
+    tried = tuple(usual_bauds() if bauds is None else bauds)
+    received: dict[int, int] = {}
+    try:
+        with _open(port) as descriptor:
+            for k, baud in enumerate(tried):
+                _set_speed(descriptor, baud)
+                chunks = list(_receive(descriptor, listen_s))
+                received[baud] = sum(len(chunk.data) for chunk in chunks)
+                if progress is not None:
+                    progress((k + 1) / len(tried))
+                if not received[baud]:
+                    break
+                devices = _decode(baud, chunks)
+                if devices:
+                    return SerialTraffic(port, None, received, baud, devices)
+    except OSError as error:
+        text = _FAULTS.get(error.errno or 0, f"{error.strerror or error}: check the cable")
+        return SerialTraffic(port, f"{port}: {text}", received)
+    return SerialTraffic(port, None, received)
+
+
+def _decode(baud: int, chunks: Sequence[Chunk]) -> tuple[DecodedDevice, ...]:
+    """Return the devices that one of the installed drivers decodes; most samples first."""
+    found = []
+    for name, driver in installed_drivers():
+        if driver.wire == "stream":
+            fields = driver.Settings.model_fields
+            table: dict[str, Any] = {"baud": baud} if "baud" in fields else {}
+            found.append(decode_traffic(driver, name, table, chunks))
+    return tuple(sorted(filter(None, found), key=lambda device: -device.samples))
+
+
+@contextlib.contextmanager
+def _open(port: str) -> Iterator[int]:
+    """Open for reading, exclusively; restore the settings of the port at the end."""
+    descriptor = os.open(port, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        if not os.isatty(descriptor):
+            raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
+        fcntl.ioctl(descriptor, termios.TIOCEXCL)
+        before = _attributes(descriptor)
+        try:
+            yield descriptor
+        finally:
+            with contextlib.suppress(termios.error, OSError):  # unplugged
+                termios.tcsetattr(descriptor, termios.TCSANOW, before)
+                fcntl.ioctl(descriptor, termios.TIOCNXCL)
+    finally:
+        os.close(descriptor)
+
+
+def _attributes(descriptor: int) -> list[Any]:
+    try:
+        return termios.tcgetattr(descriptor)
+    except termios.error as error:
+        raise OSError(*error.args) from error
+
+
+def _set_speed(descriptor: int, baud: int) -> None:
+    """Set a raw line, 8N1, without flow control, and discard what arrived at another speed."""
+    speed = getattr(termios, f"B{baud}", None)
+    if speed is None:
+        raise OSError(errno.EINVAL, f"{baud} baud is no speed of this system")
+    _, _, cflag, _, _, _, characters = _attributes(descriptor)
+    cflag &= ~(termios.CSIZE | termios.PARENB | termios.CSTOPB | termios.CRTSCTS)
+    cflag |= termios.CS8 | termios.CREAD | termios.CLOCAL
+    try:
+        termios.tcsetattr(descriptor, termios.TCSANOW, [0, 0, cflag, 0, speed, speed, characters])
+        termios.tcflush(descriptor, termios.TCIFLUSH)
+    except termios.error as error:
+        raise OSError(*error.args) from error
+
+
+def _receive(descriptor: int, listen_s: float) -> Iterator[Chunk]:
+    """Yield what arrives within `listen_s`, stamped after the read."""
+    until = time.monotonic() + listen_s
+    while (left := until - time.monotonic()) > 0:
+        ready, _, _ = select.select([descriptor], [], [], min(left, _POLL_S))
+        if ready:
+            try:
+                data = os.read(descriptor, _READ_BYTES)
+            except BlockingIOError:
+                continue
+            if not data:
+                raise OSError(errno.ENODEV, "unplugged")
+            yield Chunk(time.monotonic_ns(), data)

@@ -1,0 +1,126 @@
+"""Recognition of received bytes or frames: every driver decodes them with its own decoder.
+
+Invariant: pure, apart from the import of drivers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.model import DeviceEvent, ImuSample
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from jointfit_daemon.driver import Driver
+    from jointfit_daemon.model import Chunk
+
+LEAST_SAMPLES = 3
+"""Samples that identify a driver: noise may pass one checksum."""
+LEAST_MESSAGES = 5
+"""Messages that identify a driver whose device sends no orientation."""
+MOST_FOREIGN = 0.1
+"""Largest share of bytes outside of messages for a device that sends no orientation."""
+_USUAL_RATES = (
+    1,
+    5,
+    10,
+    20,
+    25,
+    30,
+    40,
+    50,
+    60,
+    75,
+    80,
+    100,
+    120,
+    150,
+    200,
+    250,
+    300,
+    400,
+    500,
+    1000,
+)
+"""Rates of devices, Hz. A short reception measures the rate with an error of a few percent."""
+_NEAR = 0.06
+"""Largest relative difference between a measured and a usual rate."""
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedDevice:
+    """One device whose data a driver decodes."""
+
+    driver: str
+    settings: dict[str, Any]
+    """Keys of its table in rig.toml, besides those of the connection."""
+    messages: int
+    """Well-formed messages."""
+    samples: int
+    """Orientations."""
+    rate_hz: float | None
+    """Measured rate of the orientations, Hz; None if fewer than two arrived."""
+    discarded_bytes: int
+    """Bytes that belong to no message; after the start, the rest of one is usual."""
+    properties: dict[str, Any] = field(default_factory=dict)
+    """Properties that the device sent, such as its model."""
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def usual_rate_hz(self) -> int | None:
+        """The rate for rig.toml: the usual one near the measured one, or whole Hz."""
+        if self.rate_hz is None:
+            return None
+        nearest = min(_USUAL_RATES, key=lambda rate: abs(rate - (self.rate_hz or 0)))
+        if abs(nearest - self.rate_hz) <= _NEAR * nearest:
+            return nearest
+        return max(1, round(self.rate_hz))
+
+
+def decode_traffic(
+    driver: type[Driver], name: str, table: Mapping[str, Any], chunks: Sequence[Chunk]
+) -> DecodedDevice | None:
+    """Return the device whose data are in `chunks`; None if `driver` does not decode them.
+
+    Parameters
+    ----------
+    driver, name
+        Class and name of the driver.
+    table
+        Keys of its table that matter for decoding.
+    chunks
+        Received bytes or records of frames, with their arrival.
+    """
+    from jointfit_daemon.tools.decoder_settings import decoder_settings
+
+    try:
+        decoder = driver(decoder_settings(driver, name, table)).decoder()
+    except ValueError:  # a candidate that its own settings exclude
+        return None
+    items = [item for chunk in chunks for item in decoder.feed(chunk)] + decoder.flush()
+
+    samples = [item for item in items if isinstance(item, ImuSample)]
+    events = [item for item in items if isinstance(item, DeviceEvent)]
+    received = sum(len(chunk.data) for chunk in chunks)
+    clean = decoder.discarded_bytes <= MOST_FOREIGN * received
+    if len(samples) < LEAST_SAMPLES and not (decoder.messages >= LEAST_MESSAGES and clean):
+        return None
+
+    rate_hz = None
+    if len(samples) > 1 and (span_ns := samples[-1].arrival_ns - samples[0].arrival_ns) > 0:
+        rate_hz = (len(samples) - 1) * 1e9 / span_ns
+    properties = {k: v for event in events if event.kind == "info" for k, v in event.data.items()}
+    return DecodedDevice(
+        driver=name,
+        settings=dict(table),
+        messages=decoder.messages,
+        samples=len(samples),
+        rate_hz=rate_hz,
+        discarded_bytes=decoder.discarded_bytes,
+        properties=properties,
+        warnings=tuple(
+            dict.fromkeys(event.text for event in events if event.kind in ("warning", "error"))
+        ),
+    )

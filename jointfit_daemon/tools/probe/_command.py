@@ -1,0 +1,206 @@
+"""Command `jointfit probe`: lists devices, and listens where it is told to."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.completion import complete_can_interface, complete_serial_port
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.tools.discovery import CanTraffic, FoundServer, SerialTraffic
+    from jointfit_daemon.tools.probe._probe_report import ProbeReport
+
+_MOST_PORT = 65_535
+
+
+def probe(
+    *,
+    serial: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Serial port to listen on, PATH; repeatable.", autocompletion=complete_serial_port
+        ),
+    ] = None,
+    can: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="CAN interface to listen on, NAME; repeatable.",
+            autocompletion=complete_can_interface,
+        ),
+    ] = None,
+    mocap: Annotated[
+        list[str] | None,
+        typer.Option(help="Motion-capture server to ask, HOST or HOST:PORT; repeatable."),
+    ] = None,
+    network: Annotated[
+        bool,
+        typer.Option("--network", help="Search the network for servers by one broadcast."),
+    ] = False,
+    listen_s: Annotated[
+        float,
+        typer.Option("--listen", help="Time at each speed and interface, s.", min=0.1, max=60.0),
+    ] = 1.0,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """List serial ports, CAN interfaces and motion-capture servers; listen where requested.
+
+    Opens only the named ports, interfaces and hosts, and changes no setting of a device. A port is
+    read at the usual speeds of the installed drivers until one of them decodes the data. Prints
+    lines for rig.toml. Exit codes: 0 everything named was recognized; 1 a named port, interface or
+    server was not; 2 invalid options.
+    """
+    hosts = [_host_and_port(text) for text in mocap or ()]
+
+    import orjson
+
+    from jointfit_daemon.tools.probe._probe_report import report_lines
+
+    report = _report(serial or (), can or (), hosts, network=network, listen_s=listen_s)
+    if json:
+        typer.echo(orjson.dumps(report, option=orjson.OPT_NON_STR_KEYS))
+    else:
+        for line in report_lines(report):
+            typer.echo(line)
+        for fault in report.faults:
+            typer.echo(fault, err=True)
+    if report.faults:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _host_and_port(text: str) -> tuple[str, int | None]:
+    from jointfit_daemon.driver import host_fault
+
+    host, colon, number = text.partition(":")
+    port = int(number) if number.isascii() and number.isdigit() else 0
+    if colon and not 1 <= port <= _MOST_PORT:
+        raise ValueError(f"--mocap {text}: expected HOST or HOST:PORT, such as 192.168.1.20:1510")
+    if (fault := host_fault(host)) is not None:
+        raise ValueError(f"--mocap {text}: {fault}")
+    return host, port or None
+
+
+def _report(
+    ports: Sequence[str],
+    interfaces: Sequence[str],
+    hosts: Sequence[tuple[str, int | None]],
+    *,
+    network: bool,
+    listen_s: float,
+) -> ProbeReport:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from jointfit_daemon.tools import discovery
+    from jointfit_daemon.tools.probe._probe_report import ProbeReport
+    from jointfit_daemon.tools.probe._rig_lines import rig_lines
+
+    found_ports = discovery.find_serial_ports()
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+
+        def listen_at(name: str) -> dict[str, object]:
+            task = bar.add_task(f"listening on {name}", total=1.0)
+            return {"progress": lambda share: bar.update(task, completed=share)}
+
+        heard = [
+            discovery.listen_serial(port, listen_s=listen_s, **listen_at(port))  # type: ignore[arg-type]  # one key
+            for port in ports
+        ]
+        buses = [
+            discovery.listen_can(name, listen_s=listen_s, **listen_at(name))  # type: ignore[arg-type]  # one key
+            for name in interfaces
+        ]
+        servers: list[FoundServer] = []
+        faults = _faults(heard, buses, listen_s)
+        if hosts or network:
+            bar.add_task("asking motion-capture servers", total=None)
+            servers, unanswered = asyncio.run(_servers(hosts, network=network, wait_s=listen_s))
+            faults += unanswered
+
+    return ProbeReport(
+        serial_ports=found_ports,
+        can_interfaces=discovery.find_can_interfaces(),
+        can_channels=discovery.configured_can_channels(),
+        serial=heard,
+        can=buses,
+        mocap_servers=servers,
+        faults=faults,
+        rig_toml=rig_lines(found_ports, heard, buses, servers),
+    )
+
+
+async def _servers(
+    hosts: Sequence[tuple[str, int | None]], *, network: bool, wait_s: float
+) -> tuple[list[FoundServer], list[str]]:
+    """Return the servers that answered, and the fault of each host that did not."""
+    from jointfit_daemon.tools.discovery import find_mocap_servers
+
+    found: list[FoundServer] = []
+    faults = []
+    for host, port in hosts:
+        try:
+            answered = await find_mocap_servers([host], port=port, wait_s=wait_s)
+        except OSError as error:
+            faults.append(str(error))
+            continue
+        found += answered
+        if not answered:
+            faults.append(
+                f"{host}: no motion-capture server answered: start its streaming, check address, "
+                "port and firewall (`jointfit doctor --config rig.toml` names the cause)"
+            )
+
+    if network:
+        try:
+            answered = await find_mocap_servers(broadcast=True, wait_s=wait_s)
+        except OSError as error:
+            faults.append(f"--network: the search failed: {error}: check the network cards")
+        else:
+            known = {(server.server, server.port) for server in found}
+            found += [each for each in answered if (each.server, each.port) not in known]
+            if not answered:
+                faults.append(
+                    "--network: no motion-capture server answered: routers and firewalls stop "
+                    "broadcasts; name the server with --mocap HOST"
+                )
+    return found, faults
+
+
+def _faults(
+    serial: Sequence[SerialTraffic], can: Sequence[CanTraffic], listen_s: float
+) -> list[str]:
+    """Return why a port or interface was not recognized, with the remedy."""
+    faults = []
+    for port in serial:
+        if port.fault is not None:
+            faults.append(port.fault)
+        elif not any(port.received_bytes.values()):
+            faults.append(
+                f"{port.port}: no byte in {listen_s:g} s: check power and cable; a device that "
+                "waits for a command (and an SLCAN adapter) is silent until the daemon opens it"
+            )
+        elif not port.devices:
+            faults.append(
+                f"{port.port}: {sum(port.received_bytes.values())} bytes, but no installed driver "
+                "decodes them: check the speed of the device, or write a driver"
+            )
+    for bus in can:
+        if bus.fault is not None:
+            faults.append(bus.fault)
+        elif not bus.identifiers:
+            faults.append(
+                f"{bus.interface}: no frame in {listen_s:g} s: check power, the termination of the "
+                "bus and the bit rate of the sensors"
+            )
+        elif not bus.devices:
+            faults.append(
+                f"{bus.interface}: {len(bus.identifiers)} identifiers, but no installed driver "
+                "decodes them: check the messages that the sensors are configured to send"
+            )
+    return faults

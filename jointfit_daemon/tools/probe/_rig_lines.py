@@ -1,0 +1,118 @@
+"""Lines of rig.toml for recognized devices."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import orjson
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from jointfit_daemon.tools.discovery import (
+        CanTraffic,
+        DecodedDevice,
+        FoundServer,
+        SerialPortInfo,
+        SerialTraffic,
+    )
+
+_USB_SERIAL = "cdc_acm"
+"""Driver of the kernel for devices that are on USB themselves, without a line of their own."""
+
+
+def rig_lines(
+    ports: Sequence[SerialPortInfo],
+    serial: Sequence[SerialTraffic],
+    can: Sequence[CanTraffic],
+    servers: Sequence[FoundServer],
+) -> str:
+    """Return tables of rig.toml; names of sensors and segments are to be replaced."""
+    tables = [*_buses(can), *_sensors(ports, serial, can), *_cameras(servers)]
+    note = "# Replace id and segment: a segment of [chain] for each sensor.\n"
+    return note + "\n".join(tables) if tables else ""
+
+
+def _buses(can: Sequence[CanTraffic]) -> Iterator[str]:
+    for traffic in can:
+        if traffic.devices:
+            name = _bus_name(traffic.interface)
+            keys = {"interface": "socketcan", "channel": traffic.interface}
+            yield _table(f"[can.{name}]", keys)
+
+
+def _bus_name(interface: str) -> str:
+    """Return the interface as a key of TOML."""
+    bare = interface.isascii() and interface.replace("_", "").replace("-", "").isalnum()
+    return interface if bare else _value(interface)
+
+
+def _sensors(
+    ports: Sequence[SerialPortInfo], serial: Sequence[SerialTraffic], can: Sequence[CanTraffic]
+) -> Iterator[str]:
+    number = 0
+    for traffic in serial:
+        for device in traffic.devices[:1]:
+            number += 1
+            info = _port_info(ports, traffic.port)
+            keys: dict[str, Any] = {"port": traffic.port if info is None else info.path}
+            keys |= device.settings
+            if info is not None and info.driver == _USB_SERIAL and _has_transport(device.driver):
+                keys["transport"] = "usb"
+            yield _imu(number, device, keys)
+    for bus in can:
+        for device in bus.devices:
+            number += 1
+            yield _imu(number, device, {"can": bus.interface, **device.settings})
+
+
+def _port_info(ports: Sequence[SerialPortInfo], path: str) -> SerialPortInfo | None:
+    name = Path(path).resolve().name
+    return next((port for port in ports if Path(port.device).name == name), None)
+
+
+def _has_transport(driver: str) -> bool:
+    from jointfit_daemon.driver import find_driver
+
+    return "transport" in find_driver(driver).Settings.model_fields
+
+
+def _imu(number: int, device: DecodedDevice, connection: dict[str, Any]) -> str:
+    keys: dict[str, Any] = {
+        "id": f"imu{number}",
+        "segment": "SEGMENT",
+        "driver": device.driver,
+        **connection,
+    }
+    if device.usual_rate_hz is not None:
+        keys["rate_hz"] = device.usual_rate_hz
+    return _table("[[imu]]", keys)
+
+
+def _cameras(servers: Sequence[FoundServer]) -> Iterator[str]:
+    for server in servers[:1]:  # a rig has one
+        keys: dict[str, Any] = {"driver": server.driver, "server": server.server}
+        keys |= _other_port(server)
+        yield _table("[mocap]", keys) + "".join(
+            f"# rigid_body.SEGMENT = {_value(name)}\n" for name in server.bodies
+        )
+
+
+def _other_port(server: FoundServer) -> dict[str, Any]:
+    """Return the command port if it is not the default of the driver."""
+    from jointfit_daemon.driver import find_driver
+
+    field = find_driver(server.driver).Settings.model_fields.get("command_port")
+    return {} if field is None or field.default == server.port else {"command_port": server.port}
+
+
+def _table(header: str, keys: dict[str, Any]) -> str:
+    return "".join([f"{header}\n", *(f"{key} = {_value(value)}\n" for key, value in keys.items())])
+
+
+def _value(value: Any) -> str:
+    """Return a value in TOML; its strings and numbers are those of JSON."""
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = 0x{number:X}' for key, number in value.items())} }}"
+    return orjson.dumps(value).decode()
