@@ -1,6 +1,7 @@
-"""The dashboard with the daemon and simulated hardware: calibration through the page, and its cost.
+"""The dashboard with the daemon and simulated hardware: a calibration with cameras, and its cost.
 
-The run writes the measured cost to ``build/dashboard/cost.json``.
+The run writes screenshots of every view and the measured cost (``cost.json``) to
+``build/dashboard``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import pytest
 
 from tests.broker_fixture import HOST
 from tests.system.station import BASE, FIT_PATIENCE_S, Station
-from tests.tools.dashboard.browser import PICTURES, OpenedPage, chromium, opened
+from tests.tools.dashboard.browser import PICTURES, SIZES, VIEWS, OpenedPage, chromium, opened
 
 if TYPE_CHECKING:
     from playwright.async_api import Browser
@@ -26,17 +27,36 @@ if TYPE_CHECKING:
 
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(400)]
 
-SHORT = (("static_s = 5", "static_s = 3"),)
-"""Duration of the static phase, s."""
-OPTIONS = ("--follow", "--no-mocap", "--sensors-hz", "10", "--rate", "50", "--output-rate-hz", "50")
-"""Options of the simulator: IMUs only, because the fits of a functional phase take minutes beside
-a browser on a loaded machine."""
+OPTIONS = (
+    *("--follow", "--sensors-hz", "10", "--rate", "50", "--output-rate-hz", "50"),
+    *("--align-s", "8", "--static-s", "3", "--functional-s", "25"),
+)
+"""Options of the simulator: short phases, and slow sensors for the sake of a loaded machine."""
 MEASURED_S = 10.0
 """Duration of the measurement of cost, s."""
 ALL_ONLINE = """() => {
   const states = [...jointfit.store.devices.values()].map((device) => device.availability);
-  return states.filter((state) => state === 'online').length === 4;
+  return states.filter((state) => state === 'online').length === 5;
 }"""
+OPTICAL_PIXELS = """() => {
+  const color = getComputedStyle(document.documentElement).getPropertyValue('--optical').trim();
+  const [r, g, b] = [1, 3, 5].map((i) => parseInt(color.slice(i, i + 2), 16));
+  const canvas = document.querySelector('#limb');
+  const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  let count = 0;
+  for (let i = 0; i < data.length; i += 4) {
+    const [x, y, z] = [data[i] - r, data[i + 1] - g, data[i + 2] - b];
+    if (Math.abs(x) + Math.abs(y) + Math.abs(z) < 24) count += 1;
+  }
+  return count;
+}"""
+"""Number of pixels of the limb in the colour of the cameras."""
+KNEES = "jointfit.store.poses.map((pose) => pose.joints.knee.flexion_deg).filter((x) => x !== null)"
+READY = {
+    "live": "difference from the cameras", "calibrate": "Held-out error", "history": "in force",
+    "sensors": "z of the world up", "table": "Knee flexion",
+}  # fmt: skip
+"""A text of each view when it is complete."""
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -65,13 +85,74 @@ def memory_mb(process: asyncio.subprocess.Process) -> float:
 
 
 async def calibrate(page: OpenedPage) -> None:
-    """Calibrate by the buttons of the page."""
+    """Calibrate with cameras by the buttons of the page: refusal, stop and reload included."""
     await page.page.click("#main-action")
+    await page.page.click(".rail >> text=Move")
+    await page.page.click("text=Start moving")
+    await page.until_text("#view-calibrate .banner", "needs a static pose first")
+    await page.page.click(".rail >> text=Align")
+    await page.page.click("text=Start aligning")
+    await page.until_text("#rig-state", "Calibrating: turn the plate")
+    await page.page.click("text=Stop this step")
+    await page.until_text("#view-calibrate", "This step was stopped")
+
+    await page.page.click("text=Try again")
+    await page.until_text(".percent", "%")
+    await page.page.reload()
+    await page.until_text(".step.running .percent", "%")
+    await page.until_text("#rig-state", "Sensors aligned", FIT_PATIENCE_S)
     await page.page.click("text=Start standing")
-    await page.until_text("#rig-state", "Calibrated, version 1", FIT_PATIENCE_S)
-    await page.until_text("#view-calibrate", "Static pose, still for")
-    await page.picture("calibration")
+    await page.until_text("#rig-state", "the movement is next", FIT_PATIENCE_S)
+
+    await page.page.click("text=Start moving")
+    await page.until_text(".missing", "of 12 flexions so far")
+    await page.until_text(".joints", "± ")
+    assert "Predicted errors of the joint centres" in await page.text(".joints")
+    assert await page.page.locator(".pose.wanted").count() >= 1
     assert await page.accessibility_faults() == []
+    await page.until_text("#rig-state", "Calibrated, version 1", 60 + FIT_PATIENCE_S)
+    await page.until_text("#view-calibrate", "Held-out error against the cameras")
+    assert "Knee flexion" in await page.text(".good")
+
+
+async def revert(page: OpenedPage) -> None:
+    """Record another static pose, then use the first calibration again, in the history."""
+    await page.page.click(".rail >> text=Stand still")
+    await page.page.click("text=Start standing")
+    await page.until_text("#rig-state", "Calibrated, version 2", FIT_PATIENCE_S)
+    await page.show("history")
+    await page.page.click("text=Use version 1")
+    await page.until_text("#rig-state", "Calibrated, version 3")
+    await page.until_text("#view-history", "copy of version 1, in force")
+
+
+async def see_the_limb_move(page: OpenedPage) -> None:
+    """Wait for a limb of IMUs and cameras that walks."""
+    await page.show("live")
+    await page.until_text("#angle-value", "°")
+    await page.page.wait_for_selector("#legend-optical", state="visible")
+    await page.until_text("#chart-caption", "difference from the cameras")
+    await page.page.wait_for_function(f"() => ({OPTICAL_PIXELS})() > 100")
+    await page.page.wait_for_function(
+        f"() => {{ const x = {KNEES}; return Math.max(...x) - Math.min(...x) > 30; }}"
+    )
+
+
+async def photograph(browser: Browser, url: str) -> None:
+    """Save every view of the calibrated rig, and check that it fits and is accessible."""
+    for scheme in ("light", "dark"):
+        for size in SIZES:
+            async with opened(browser, url, size=size, scheme=scheme) as page:
+                await page.until_text("#angle-value", "°")
+                for view in VIEWS:
+                    await page.show(view)
+                    await page.until_text(f"#view-{view}", READY.get(view, ""))
+                    await page.picture(f"run-{view}-{size}-{scheme}")
+                    overflow = "document.documentElement.scrollWidth - innerWidth"
+                    assert await page.page.evaluate(overflow) <= 0, (view, size)
+                    assert await page.accessibility_faults() == [], (view, size, scheme)
+                assert page.errors == []
+                assert page.foreign == []
 
 
 async def measured(
@@ -111,7 +192,7 @@ async def test_a_rig_is_calibrated_in_the_page_and_survives_daemon_and_broker(
     tmp_path: Path, broker: Broker
 ) -> None:
     station = Station(tmp_path, broker.port, OPTIONS)
-    async with chromium() as browser, station.simulator(*SHORT):
+    async with chromium() as browser, station.simulator():
         server, url = await start_server(broker)
         try:
             async with opened(browser, url) as page:
@@ -120,20 +201,17 @@ async def test_a_rig_is_calibrated_in_the_page_and_survives_daemon_and_broker(
                     await page.until_text("#empty", "Not calibrated yet", 60)
                     await page.page.wait_for_function(ALL_ONLINE, timeout=60_000)
                     await calibrate(page)
-                    await page.show("live")
-                    await page.until_text("#angle-value", "°")
-                    await page.until_text("#chart-caption", "Last 20 s")
-                    await page.picture("calibrated")
+                    await see_the_limb_move(page)
                     cost = await measured(browser, page, server)
-                    await page.show("sensors")
-                    await page.until_text("#view-sensors", "Turn one sensor by hand")
-                    await page.picture("axes")
-                    await page.show("live")
+                    await page.show("calibrate")
+                    await revert(page)
+                    await photograph(browser, url)
                     assert daemon.process is not None
                     daemon.process.send_signal(signal.SIGKILL)
                     await page.until_text("#rig-state", "jointfitd is not running")
                 async with station.daemon():
-                    await page.until_text("#rig-state", "Calibrated, version 1", 60)
+                    await page.until_text("#rig-state", "Calibrated, version 3", 60)
+                    await page.show("live")
                     await page.until_text("#angle-value", "°", 60)
                     broker.stop()
                     await page.until_text("#banner", "start the broker")

@@ -203,8 +203,11 @@ async def publishing(rig: PublishedRig, port: int) -> AsyncIterator[None]:
     try:
         yield
     finally:
-        task.cancel()
-        await asyncio.wait([task])
+        # Until Python 3.12 asyncio.wait_for discards a cancellation if its future completes in the
+        # same step, and an error while the client disconnects replaces it: cancel until it ends.
+        while not task.done():
+            task.cancel()
+            await asyncio.wait([task], timeout=1.0)
 
 
 async def _publish(rig: PublishedRig, port: int) -> None:
@@ -219,8 +222,9 @@ async def _publish(rig: PublishedRig, port: int) -> None:
                 try:
                     await _publish_poses(rig, client)
                 finally:
-                    answers.cancel()
-                    await asyncio.wait([answers])
+                    while not answers.done():
+                        answers.cancel()
+                        await asyncio.wait([answers], timeout=1.0)
                     # a client that disconnects orderly has no will
                     await client.publish(will.topic, will.payload, 1, retain=True)
         await asyncio.sleep(0.2)

@@ -134,6 +134,7 @@ async def test_a_request_is_sent_and_a_refusal_is_shown_in_words(broker: Broker)
     rig.answer = {"status": "error", "error": {"message": "S4 sends no data: check its cable"}}
     async with shown(broker, rig) as page:
         await page.page.click("#main-action")
+        await page.page.click(".rail >> text=Stand still")
         await page.page.click("text=Start standing")
         await page.until_text("#view-calibrate .banner", "S4 sends no data: check its cable")
         assert [request["phase"] for request in rig.requests] == ["static"]
@@ -166,6 +167,7 @@ async def test_requests_are_signed_with_the_key_that_the_user_enters(broker: Bro
     rig.answer = {"status": "error", "error": {"message": "this rig accepts signed requests only"}}
     async with shown(broker, rig) as page:
         await page.show("calibrate")
+        await page.page.click(".rail >> text=Stand still")
         await page.page.click("text=Start standing")
         await page.page.fill("#key-value", KEY)
         rig.answer = {"status": "accepted", "data": {}, "error": None}

@@ -1,44 +1,34 @@
-// The calibration, step by step: poses drawn, progress, predicted errors, and the missing movement.
+// The calibration as steps, one at a time: poses drawn, what to do, progress, refusals, result.
 
+import { guidanceOf, stepsOf } from "./calibration_steps.js";
+import { createProgress } from "./calibration_progress.js";
 import { resultOf } from "./calibration_result.js";
-import { byId, createElement, createTable, setText } from "./dom.js";
-import { figuresOfPhase } from "./pose_figures.js";
-import { calibrationSentence, formatNumber, isRunning, titleOf } from "./words.js";
+import { byId, createElement, setText } from "./dom.js";
+import { createFigures } from "./pose_figures.js";
+import { isRunning } from "./words.js";
 
-const STEPS = [
-  {
-    phase: "align", title: "Align the sensors", button: "Start aligning",
-    text: "Fix all sensors to the plate. Turn the plate by hand about all three axes until the time is over. Needed once per laboratory.",
-    optical: true,
-  },
-  {
-    phase: "static", title: "Stand still", button: "Start standing",
-    text: "Put on all sensors and markers. Stand upright and still, with straight joints, facing one way.",
-  },
-  {
-    phase: "functional", title: "Move every joint", button: "Start moving",
-    text: "Move every joint through its whole range, in view of the cameras: walk, squat, sit down and stand up, circle the hip.",
-    optical: true,
-  },
-];
-const SOURCES = { unknown: "not known yet", sensors: "IMUs only" };
+const RESULT = "result";
 
 /** Show the calibration of a store; `request(command, content)` sends a request. */
 export function createCalibrateView(store, request) {
-  const view = { store, request, message: null, steps: new Map(), drawnFor: null };
-  view.message = createElement("p", { class: "banner", role: "alert", hidden: true });
-  view.now = createElement("div", { class: "panel stack", hidden: true });
-  view.grid = createElement("div", { class: "steps" });
-  view.result = createElement("div", { class: "panel stack", hidden: true });
-  byId("view-calibrate").append(view.message, view.now, view.grid, view.result);
-  buildProgress(view);
+  const view = { store, request, steps: [], builtFor: null, chosen: null, recorded: null, phase: null };
+  view.rail = createElement("ol", { class: "rail", "aria-label": "Steps of the calibration" });
+  view.message = createElement("p", { class: "banner", role: "alert", dir: "auto", hidden: true });
+  view.stage = createElement("div", { class: "stage" });
+  view.result = createElement("div", { class: "panel stack result", hidden: true });
+  byId("view-calibrate").append(view.rail, view.message, view.stage, view.result);
+  view.progress = createProgress(() => sendRequest(view, { phase: "abort" }));
+
   const update = () => updateView(view);
-  for (const subject of ["info", "calibration", "bridge"]) store.on(subject, update);
-  let phase = null;
+  for (const subject of ["info", "bridge"]) store.on(subject, update);
   store.on("calibration", () => {
-    if (store.calibration?.phase === phase) return;
-    phase = store.calibration?.phase;
-    view.message.hidden = true; // the refusal of an earlier request
+    const phase = store.calibration?.phase;
+    if (phase !== view.phase) {
+      view.phase = phase;
+      view.chosen = null; // a new phase shows its own step
+      view.message.hidden = true; // the refusal of an earlier request
+    }
+    update();
   });
   update();
   return { request: (content) => sendRequest(view, content) };
@@ -50,124 +40,163 @@ async function sendRequest(view, content) {
   try {
     await view.request("calibrate", content);
   } catch (error) {
-    showMessage(view, error.message);
+    view.message.hidden = false;
+    setText(view.message, error.message);
   }
-}
-
-function showMessage(view, text) {
-  view.message.hidden = false;
-  setText(view.message, text);
-}
-
-function buildProgress(view) {
-  view.progressTitle = createElement("h2", {});
-  view.progressPercent = createElement("span", { class: "digits" });
-  view.bar = createElement("progress", { max: "1", "aria-label": "Progress of the phase" });
-  view.progressText = createElement("p", { class: "now", dir: "auto" });
-  view.missing = createElement("ul", { class: "missing", "aria-label": "Missing movement" });
-  view.details = createElement("div", {});
-  view.stop = createElement("button", { class: "button stop", type: "button", onclick: () => sendRequest(view, { phase: "abort" }) }, "Stop this phase");
-  view.now.append(
-    createElement("div", { class: "progress-head" }, view.progressTitle, view.progressPercent),
-    view.bar, view.progressText, view.missing, view.details, view.stop,
-  );
 }
 
 function updateView(view) {
-  updateSteps(view);
-  updateProgress(view);
+  const { info, calibration } = view.store;
+  build(view);
+  if (!info) return;
+  view.recorded = recordedPhase(calibration) ?? view.recorded;
+  const shown = shownStep(view);
+  for (const step of view.steps) step.panel.hidden = step.phase !== shown;
+  view.result.hidden = shown !== RESULT;
+  updateRail(view, shown);
+
+  const running = isRunning(calibration?.phase);
+  for (const step of view.steps) updateStep(view, step, running);
   updateResult(view);
 }
 
-function hasCameras(info) {
-  return Object.values(info?.devices ?? {}).some((device) => device.kind === "mocap");
+/** Return the phase that is or was recorded last, if the status names it. */
+function recordedPhase(calibration) {
+  const { phase, text = "" } = calibration ?? {};
+  if (["align", "static", "functional"].includes(phase)) return phase;
+  return /^(?:fitting the )?(align|static|functional)\b/.exec(text)?.[1] ?? null;
 }
 
-function updateSteps(view) {
-  const { info, calibration } = view.store;
-  const key = JSON.stringify([info?.joints, hasCameras(info)]);
-  if (info && view.drawnFor !== key) {
-    view.drawnFor = key;
-    view.steps.clear();
-    const steps = STEPS.filter((step) => !step.optical || hasCameras(info));
-    view.grid.replaceChildren(...steps.map((step, i) => createStep(view, step, i + 1, steps.length)));
+/** Return the step on the screen: the running one, the chosen one, or the next. */
+function shownStep(view) {
+  const { phase, version, kept } = view.store.calibration ?? {};
+  const known = (name) => (view.steps.some((step) => step.phase === name) ? name : view.steps[0]?.phase);
+  if (isRunning(phase)) return known(view.recorded);
+  if (view.chosen !== null) return view.chosen;
+  if (phase === "calibrated" || kept) return RESULT;
+  if (phase === "aborted") return known(view.recorded ?? "static");
+  const next = { uncalibrated: "align", aligned: "static", posed: "functional" }[phase];
+  if (phase === "posed" && !view.steps.some((step) => step.phase === next)) return RESULT;
+  return version == null ? known(next) : RESULT;
+}
+
+// The steps are built once for a limb and its cameras, so that buttons keep their focus.
+function build(view) {
+  const { info } = view.store;
+  const cameras = Object.values(info?.devices ?? {}).some((device) => device.kind === "mocap");
+  const key = JSON.stringify([info?.joints, info?.segments, cameras]);
+  if (!info || view.builtFor === key) return;
+  view.builtFor = key;
+  view.steps = stepsOf(info, cameras).map((step, i, all) => createStep(view, step, i + 1, all.length));
+  view.stage.replaceChildren(...view.steps.map((step) => step.panel));
+  const entries = [...view.steps, { phase: RESULT, short: "Result" }];
+  view.entries = entries.map((entry, i) => createRailEntry(view, entry, i + 1));
+  view.rail.replaceChildren(...view.entries.map((entry) => entry.item));
+}
+
+function createRailEntry(view, { phase, short }, number) {
+  const mark = createElement("span", { class: "rail-number", "aria-hidden": "true" }, String(number));
+  const note = createElement("span", { class: "hidden" });
+  const choose = () => { view.chosen = phase; updateView(view); };
+  const button = createElement("button", { type: "button", onclick: choose }, mark, createElement("span", { class: "rail-title" }, short), note);
+  return { phase, number, mark, note, button, item: createElement("li", {}, button) };
+}
+
+function updateRail(view, shown) {
+  const done = finishedSteps(view.store.calibration);
+  const running = isRunning(view.store.calibration?.phase);
+  for (const { phase, number, mark, note, button } of view.entries) {
+    button.classList.toggle("done", done.has(phase));
+    if (phase === shown) button.setAttribute("aria-current", "step");
+    else button.removeAttribute("aria-current");
+    button.disabled = running && phase !== shown;
+    setText(mark, done.has(phase) ? "✓" : String(number));
+    setText(note, done.has(phase) ? " done" : "");
   }
-  const phase = calibration?.phase;
-  for (const [name, step] of view.steps) {
-    step.root.classList.toggle("running", name === phase);
-    step.button.disabled = view.store.bridge !== "online" || isRunning(phase);
-    const next = { uncalibrated: "align", aligned: "static", posed: "functional" }[phase];
-    step.button.className = name === next ? "button primary" : "button";
-  }
+}
+
+/** Return the steps that the calibration in force, or the one in progress, contains. */
+function finishedSteps(calibration) {
+  const { phase, quality, version } = calibration ?? {};
+  const done = new Set();
+  if (quality?.alignment) done.add("align");
+  if (quality?.static) done.add("static");
+  if (quality?.holdout || quality?.anatomy) done.add("functional");
+  if (phase === "calibrated" || version != null) done.add(RESULT);
+  return done;
 }
 
 function createStep(view, step, number, count) {
-  const button = createElement("button", { class: "button", type: "button", onclick: () => sendRequest(view, { phase: step.phase }) }, step.button);
-  const root = createElement(
-    "article", { class: "panel step" },
-    createElement("p", { class: "number" }, `Step ${number} of ${count}`),
-    createElement("h3", {}, step.title),
-    createElement("div", { class: "figures" }, ...figuresOfPhase(step.phase, view.store.info.joints)),
-    createElement("p", {}, step.text),
-    button,
-  );
-  view.steps.set(step.phase, { root, button });
-  return root;
-}
-
-function updateProgress(view) {
-  const { calibration, progress } = view.store;
-  const running = isRunning(calibration?.phase);
-  view.now.hidden = !running;
-  if (!running) return;
-  const current = progress?.phase === calibration.phase ? progress : null;
-  setText(view.progressTitle, calibrationSentence(calibration));
-  setText(view.progressPercent, current ? formatNumber(100 * current.progress, 0, " %") : "");
-  if (current) view.bar.value = current.progress;
-  else view.bar.removeAttribute("value");
-  setText(view.progressText, current?.text ?? calibration.text ?? "");
-  view.stop.hidden = calibration.phase === "fitting";
-
-  const missing = current?.data?.missing ?? [];
-  const known = [...view.missing.children].map((item) => item.textContent);
-  if (JSON.stringify(known) !== JSON.stringify(missing)) {
-    view.missing.replaceChildren(...missing.map((text) => createElement("li", { dir: "auto" }, text)));
-  }
-  const joints = current?.data?.joints;
-  view.details.replaceChildren(...(joints ? [createJointTable(joints, current.data.parts ?? {})] : []));
-}
-
-function createJointTable(joints, parts) {
-  const columns = [{ name: "joint centre" }, { name: "predicted error" }, { name: "by more movement" }, { name: "arc" }, { name: "from", text: true }, { name: "state", text: true }];
-  const rows = Object.entries(joints).map(([name, joint]) => [
-    titleOf(name),
-    joint.predicted_error_mm == null ? "–" : `± ${formatNumber(joint.predicted_error_mm, 0, " mm")}`,
-    joint.noise_error_mm == null ? "–" : `± ${formatNumber(joint.noise_error_mm, 1, " mm")}`,
-    formatNumber(joint.arc_deg, 0, "°"),
-    SOURCES[joint.source] ?? joint.source,
-    createElement("span", { class: `status ${joint.met ? "ok" : "unknown"}` }, joint.met ? "enough" : "needs more movement"),
-  ]);
-  const seen = Object.entries(parts).map(([name, part]) => `${name} ${formatNumber(part.seen_pct, 0, " %")}`).join(", ");
-  return createElement(
+  const figures = createFigures(step.figures);
+  const start = createElement("button", { class: "button primary", type: "button", onclick: () => sendRequest(view, { phase: step.phase }) }, step.button);
+  const skip = step.phase === "align" && count > 1
+    ? createElement("button", { class: "button", type: "button", onclick: () => { view.chosen = "static"; updateView(view); } }, "Skip: aligned before")
+    : null;
+  const again = createElement("p", { class: "banner warning", dir: "auto", hidden: true });
+  const instructions = createElement(
     "div", { class: "stack" },
-    createTable("Joint centres so far", columns, rows),
-    seen ? createElement("p", { class: "caption" }, `Seen by the cameras: ${seen}`) : null,
+    again,
+    createElement("ol", { class: "tasks" }, ...step.tasks.map((task) => createElement("li", {}, task))),
+    createElement("p", { class: "caption" }, step.note),
+    createElement("div", { class: "actions" }, start, skip),
   );
+  const work = createElement("div", { class: "stack work" });
+  const panel = createElement(
+    "article", { class: "panel step", "aria-labelledby": `step-${step.phase}` },
+    figures.root,
+    createElement(
+      "div", { class: "stack step-text" },
+      createElement("p", { class: "number" }, `Step ${number} of ${count}`),
+      createElement("h2", { id: `step-${step.phase}`, class: "step-title" }, step.title),
+      instructions, work,
+    ),
+  );
+  return { ...step, panel, figures, start, again, instructions, work };
+}
+
+function updateStep(view, step, running) {
+  const { bridge, calibration, progress } = view.store;
+  if (step.panel.hidden) return;
+  step.start.disabled = bridge !== "online";
+  step.panel.classList.toggle("running", running);
+  step.instructions.hidden = running;
+  step.work.hidden = !running;
+  if (running) {
+    if (view.progress.root.parentNode !== step.work) step.work.append(view.progress.root);
+    view.progress.update(calibration, progress);
+  }
+  const missing = running && progress?.phase === calibration.phase ? progress.data?.missing ?? [] : [];
+  step.figures.highlight(missing.length > 0 ? guidanceOf(missing[0]).remedy : "");
+
+  const aborted = calibration?.phase === "aborted" && view.recorded === step.phase;
+  step.again.hidden = !aborted;
+  if (aborted) setText(step.again, abortSentence(calibration));
+  setText(step.start, aborted ? "Try again" : step.button);
+}
+
+function abortSentence({ text, version }) {
+  const kept = version == null ? "" : ` Version ${version} stays in force.`;
+  if (/^abort requested/.test(text)) return `This step was stopped.${kept}`;
+  const reason = String(text).replace(/^(align|static|functional): /, "");
+  return `This step ended without a result: ${reason.replace(/\.?$/, ".")}${kept}`;
 }
 
 function updateResult(view) {
   const { calibration } = view.store;
-  const content = calibration ? resultOf(calibration) : null;
   const text = JSON.stringify(calibration);
-  view.result.hidden = content === null;
-  if (content === null || view.resultFor === text) return;
+  if (view.result.hidden || view.resultFor === text) return;
   view.resultFor = text;
+  const content = calibration ? resultOf(calibration) : null;
+  if (content === null) {
+    view.result.replaceChildren(createElement("h2", {}, "No result yet"), createElement("p", {}, "The result of the calibration appears here after the last step."));
+    return;
+  }
   const buttons = [];
   if (calibration.kept) {
-    buttons.push(createElement("p", {}, "To use a worse result all the same, repeat the phase and accept it:"));
+    buttons.push(createElement("p", {}, "To use a worse result all the same, repeat the movement and accept it:"));
     buttons.push(createElement("button", { class: "button", type: "button", onclick: () => sendRequest(view, { phase: "functional", force: true }) }, "Move again and accept the result"));
   }
-  if (calibration.quality?.online) {
+  if (calibration.quality?.online?.rounds > 0) {
     buttons.push(createElement("button", { class: "button", type: "button", onclick: () => sendRequest(view, { phase: "revert" }) }, "Discard online learning"));
   }
   view.result.replaceChildren(...content, ...buttons);

@@ -5,17 +5,16 @@ import { UNKNOWN, formatNumber, titleOf } from "./words.js";
 
 const millimetres = (metres) => (metres == null ? UNKNOWN : `± ${formatNumber(metres * 1000, 0, " mm")}`);
 
+const sorted = (table) => Object.entries(table ?? {}).sort(([a], [b]) => a.localeCompare(b, undefined, { numeric: true }));
+
 /** Return the elements that describe a calibration status; null if there is no result. */
 export function resultOf(calibration) {
-  const { phase, kept, quality, text } = calibration;
-  if (phase === "aborted") {
-    return [createElement("h2", {}, "The phase was aborted"), createElement("p", { class: "bad", dir: "auto" }, text)];
-  }
+  const { phase, kept, quality } = calibration;
   if (phase === "aligned") {
     return [createElement("h2", {}, "Sensors aligned"), createElement("p", {}, "Put the sensors on the body, then stand still."), ...alignmentTable(quality)];
   }
-  if (phase === "posed") return [createElement("h2", {}, "Static pose recorded"), ...staticTable(quality)];
-  if (phase !== "calibrated") return null;
+  if (phase === "posed" && calibration.version == null) return [createElement("h2", {}, "Static pose recorded"), ...staticTable(quality)];
+  if (phase !== "calibrated" && calibration.version == null) return null;
   const title = calibration.version == null ? "Calibration in force" : `Calibration in force: version ${calibration.version}`;
   return [
     createElement("h2", {}, title),
@@ -58,13 +57,13 @@ function holdoutTable(quality) {
 function staticTable(quality) {
   const pose = quality?.static;
   if (!pose) return [];
-  const rows = Object.entries(pose.spread_deg ?? {}).map(([name, spread]) => [name, formatNumber(spread, 1, "°")]);
+  const rows = sorted(pose.spread_deg).map(([name, spread]) => [name, formatNumber(spread, 1, "°")]);
   return [createTable(`Static pose, still for ${formatNumber(pose.still_s, 1)} s`, [{ name: "sensor" }, { name: "movement" }], rows)];
 }
 
 function alignmentTable(quality) {
   const alignment = quality?.alignment;
   if (!alignment) return [];
-  const rows = Object.entries(alignment).map(([name, sensor]) => [name, formatNumber(sensor.error_deg, 1, "°"), formatNumber(sensor.rms_deg, 1, "°"), formatNumber(sensor.lag_ms, 1, " ms")]);
+  const rows = sorted(alignment).map(([name, sensor]) => [name, formatNumber(sensor.error_deg, 1, "°"), formatNumber(sensor.rms_deg, 1, "°"), formatNumber(sensor.lag_ms, 1, " ms")]);
   return [createTable("Alignment on the plate", [{ name: "sensor" }, { name: "error" }, { name: "residual" }, { name: "lag" }], rows)];
 }

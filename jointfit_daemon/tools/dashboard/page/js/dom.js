@@ -56,3 +56,19 @@ export function createTable(caption, columns, rows) {
     ),
   );
 }
+
+/**
+ * Show a table in `root`. Where the root shows a table of the same shape, only the cells that differ
+ * change, so that a button with the focus and the scroll position stay.
+ */
+export function patchTable(root, fresh) {
+  const [before, after] = [root, fresh].map((element) => [...element.querySelectorAll("th, td, caption")]);
+  const same = before.length === after.length && before.every((cell, i) => cell.className === after[i].className && cell.tagName === after[i].tagName);
+  if (!same || before.length === 0) {
+    root.replaceChildren(fresh);
+    return;
+  }
+  before.forEach((cell, i) => {
+    if (cell.innerHTML !== after[i].innerHTML && !cell.contains(document.activeElement)) cell.replaceChildren(...after[i].childNodes);
+  });
+}

@@ -55,7 +55,7 @@ function mainAction(link, store, actions) {
   if (link.state === "lost") return { label: "Reconnect", kind: "primary", action: actions.reconnect };
   if (store.bridge !== "online") return { label: "Calibrate", kind: "", enabled: false, action: null };
   const phase = store.calibration?.phase;
-  if (phase === "fitting") return { label: "Fitting", kind: "", enabled: false, action: null };
+  if (phase === "fitting") return { label: "Computing", kind: "", enabled: false, action: null };
   if (isRunning(phase)) return { label: "Stop", kind: "stop", action: actions.stop };
   const kind = phase === "calibrated" ? "" : "primary";
   return { label: "Calibrate", kind, action: actions.calibrate };
@@ -100,8 +100,8 @@ function emptyContent(link, store, configuration, rigs, choose) {
   if (store.bridge === "online" && store.calibration?.phase === "uncalibrated") {
     return { kind: "uncalibrated", children: [
       createElement("h2", {}, "Not calibrated yet"),
-      createElement("p", {}, "The sensors send data, but their positions on the body are unknown. A calibration takes about two minutes: align the sensors, stand still, move every joint."),
-      createElement("button", { class: "button primary", type: "button", onclick: () => { location.hash = "calibrate"; } }, "Show the three steps"),
+      createElement("p", {}, "The sensors send data, but their positions on the body are unknown. A calibration takes about two minutes: turn the sensors on a plate, stand still, move every joint."),
+      createElement("button", { class: "button primary", type: "button", onclick: () => { location.hash = "calibrate"; } }, "Show the steps"),
     ] };
   }
   return null;

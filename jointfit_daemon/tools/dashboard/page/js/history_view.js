@@ -1,11 +1,8 @@
 // Stored calibrations, newest first, and the choice of the one in force.
 
 import { resultOf } from "./calibration_result.js";
-import { byId, createElement, createTable, setText } from "./dom.js";
+import { byId, createElement, setText } from "./dom.js";
 import { UNKNOWN, formatNumber, isRunning, titleOf } from "./words.js";
-
-const COLUMNS = ["version", "made", "error on held-out movement", "method", "state", ""]
-  .map((name, i) => ({ name, text: i > 0 }));
 
 /** Show the stored calibrations of a rig; `request(command, content)` sends a request. */
 export function createHistoryView(store, request) {
@@ -47,33 +44,43 @@ async function readList(view) {
 }
 
 function listContent(view, data) {
-  if (data.versions.length === 0) return [createElement("h2", {}, "Stored calibrations"), createElement("p", {}, "No calibration is stored yet.")];
+  const title = createElement("h2", {}, "Stored calibrations");
+  if (data.versions.length === 0) return [title, createElement("p", {}, "No calibration is stored yet.")];
   const busy = isRunning(view.store.calibration?.phase);
-  const rows = data.versions.map((entry) => [
-    String(entry.version),
-    entry.created_utc ? new Date(entry.created_utc).toLocaleString([], { dateStyle: "medium", timeStyle: "short" }) : UNKNOWN,
-    errorsOf(entry),
-    entry.method ?? UNKNOWN,
-    stateOf(entry, data.in_force),
-    entry.usable && entry.version !== data.in_force
-      ? createElement("button", { class: "button", type: "button", disabled: busy, onclick: () => useVersion(view, entry.version) }, `Use version ${entry.version}`)
-      : "",
-  ]);
-  const content = [createTable("Stored calibrations", COLUMNS, rows)];
+  const entries = data.versions.map((entry) => createEntry(view, entry, data.in_force, busy));
+  const content = [title, createElement("ul", { class: "versions" }, ...entries)];
   if (data.omitted > 0) content.push(createElement("p", { class: "caption" }, `${data.omitted} older versions are stored, too: jointfit calibrate --list`));
   return content;
 }
 
+function createEntry(view, entry, inForce, busy) {
+  const made = entry.created_utc ? new Date(entry.created_utc).toLocaleString([], { dateStyle: "medium", timeStyle: "short" }) : UNKNOWN;
+  const use = entry.usable && entry.version !== inForce
+    ? createElement("button", { class: "button", type: "button", disabled: busy, onclick: () => useVersion(view, entry.version) }, `Use version ${entry.version}`)
+    : "";
+  return createElement(
+    "li", {},
+    createElement("h3", {}, `Version ${entry.version}`),
+    createElement("time", { datetime: entry.created_utc }, made),
+    createElement("span", {}, errorsOf(entry)),
+    createElement("span", {}, stateOf(entry, inForce)),
+    createElement("span", { class: "use" }, use),
+  );
+}
+
+/** Return the error on held-out movement, and the method that it belongs to. */
 function errorsOf(entry) {
-  const errors = Object.entries(entry.flexion_deg ?? {}).map(([joint, error]) => `${titleOf(joint)} flexion ${formatNumber(error, 1)}°`);
-  return errors.join(", ") || "not measured";
+  const errors = Object.entries(entry.flexion_deg ?? {}).map(([joint, error]) => `${titleOf(joint)} flexion ${formatNumber(error, 1)}° RMS`);
+  if (errors.length === 0) return entry.fault ? "" : "Made without cameras: error not measured";
+  return `${errors.join(", ")}, held out (${entry.method})`;
 }
 
 function stateOf(entry, inForce) {
   if (entry.fault) return createElement("span", { class: "status error" }, entry.fault);
-  if (entry.version === inForce) return createElement("span", { class: "status ok" }, "in force");
+  const origin = entry.restored_from == null ? "" : `copy of version ${entry.restored_from}`;
+  if (entry.version === inForce) return createElement("span", { class: "status ok" }, [origin, "in force"].filter(Boolean).join(", "));
   if (!entry.usable) return createElement("span", { class: "status unknown" }, "of another limb");
-  return entry.restored_from == null ? "stored" : `copy of version ${entry.restored_from}`;
+  return origin || "stored";
 }
 
 async function useVersion(view, version) {

@@ -69,13 +69,13 @@ export const isMinorFlag = (flag) => MINOR.has(flag.split(":")[0]);
 
 const PHASES = {
   uncalibrated: "Not calibrated",
-  align: "Align phase runs",
+  align: "Calibrating: turn the plate",
   aligned: "Sensors aligned; the static pose is next",
-  static: "Static phase runs",
-  posed: "Static pose recorded; the functional phase is next",
-  functional: "Functional phase runs",
-  fitting: "Fitting the calibration",
-  aborted: "Calibration aborted",
+  static: "Calibrating: stand still",
+  posed: "Static pose recorded; the movement is next",
+  functional: "Calibrating: move every joint",
+  fitting: "Calibrating: computing the result",
+  aborted: "Calibration stopped",
 };
 const RUNNING = new Set(["align", "static", "functional", "fitting"]);
 
@@ -90,7 +90,9 @@ export function calibrationSentence(calibration) {
     const stored = version == null ? "not stored yet" : `version ${version}`;
     return kept ? `Calibrated, ${stored}; the last result was rejected` : `Calibrated, ${stored}`;
   }
-  if (phase === "aborted" && text) return `Calibration aborted: ${text}`;
+  if (phase === "aborted" && version != null) return `Calibrated, version ${version}; the last step was stopped`;
+  if (phase === "posed" && version != null) return `Calibrated, version ${version}; static pose recorded`;
+  if (phase === "aborted" && text && !text.startsWith("abort requested")) return `Calibration stopped: ${text}`;
   return PHASES[phase] ?? String(phase);
 }
 
