@@ -58,8 +58,14 @@ class PublishedRig:
     """Clock of the gateway minus clock of this machine, s."""
     offline: frozenset[str] = frozenset()
     """Devices without data."""
+    version: int = 1
+    """Version of the payloads."""
+    account: tuple[str | None, str | None] = (None, None)
+    """User name and password of the broker."""
+    silent: bool = False
+    """Whether the rig hangs: it sends no poses, but keeps its connection."""
     requests: list[dict[str, Any]] = field(default_factory=list)
-    """Requests received."""
+    """Requests received, without the check of rights that a page sends once."""
     answer: dict[str, Any] = field(
         default_factory=lambda: {"status": "accepted", "data": {}, "error": None}
     )
@@ -215,7 +221,12 @@ async def _publish(rig: PublishedRig, port: int) -> None:
     while True:
         with contextlib.suppress(aiomqtt.MqttError):
             async with aiomqtt.Client(
-                "127.0.0.1", port, protocol=aiomqtt.ProtocolVersion.V5, will=will
+                "127.0.0.1",
+                port,
+                protocol=aiomqtt.ProtocolVersion.V5,
+                will=will,
+                username=rig.account[0],
+                password=rig.account[1],
             ) as client:
                 await client.subscribe(f"{rig.base}/bridge/request/+", qos=1)
                 answers = asyncio.create_task(_answer(rig, client), name="published answers")
@@ -232,12 +243,15 @@ async def _publish(rig: PublishedRig, port: int) -> None:
 
 async def _publish_poses(rig: PublishedRig, client: aiomqtt.Client) -> None:
     for topic, payload in rig.retained().items():
+        payload["v"] = rig.version
         await client.publish(f"{rig.base}/{topic}", orjson.dumps(payload), 1, retain=True)
     seq = 0
     while True:
         pose, optical = rig.poses(seq)
-        await client.publish(f"{rig.base}/pose/ui", orjson.dumps(pose))
-        await client.publish(f"{rig.base}/optical/pose", orjson.dumps(optical))
+        pose["v"] = optical["v"] = rig.version
+        if not rig.silent:
+            await client.publish(f"{rig.base}/pose/ui", orjson.dumps(pose))
+            await client.publish(f"{rig.base}/optical/pose", orjson.dumps(optical))
         seq += 1
         await asyncio.sleep(PERIOD_S)
 
@@ -246,7 +260,8 @@ async def _answer(rig: PublishedRig, client: aiomqtt.Client) -> None:
     with contextlib.suppress(aiomqtt.MqttError):
         async for message in client.messages:
             request = orjson.loads(bytes(message.payload))
-            rig.requests.append(request)
+            if request.get("count") != 1:
+                rig.requests.append(request)
             command = message.topic.value.rpartition("/")[2]
             found = rig.answers.get(command, rig.answer)
             answer = {"v": 1, "transaction": request.get("transaction"), **found}

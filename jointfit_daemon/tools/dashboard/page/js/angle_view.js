@@ -1,12 +1,13 @@
 // The angle of the chosen joint: large number, standard deviation, and the curve of the last 20 s.
 
 import { byId, createElement, setClass, setText } from "./dom.js";
-import { shownSeconds, valueOf } from "./store.js";
-import { UNKNOWN, angleName, flagSentence, formatNumber, isMinorFlag, titleOf } from "./words.js";
+import { poseAgeMs, shownSeconds, valueOf } from "./store.js";
+import { UNKNOWN, angleName, flagSentence, formatNumber, isMinorFlag, isolate, titleOf } from "./words.js";
 
 const NUMBER_MS = 200;
 const STALE_MS = 1500;
 const OPTICAL_GAP_US = 150_000;
+const GAP_PERIODS = 3.5; // a longer pause than these periods interrupts the curve
 const STORED_CHOICE = "jointfit-angle";
 
 /** Show the angle of a store; return the view. */
@@ -37,8 +38,12 @@ function update(view, atOnce) {
   if (!store.pose || !view.visible) return;
   const began = performance.now();
   updateChoices(view);
-  if (view.choice === null) return;
-  if (atOnce || began - view.lastNumber >= NUMBER_MS) {
+  if (view.choice === null) {
+    setText(byId("angle-reason"), noAngleReason(store));
+    return;
+  }
+  // A new theme or size draws the panel again; an old number must not return with it.
+  if (poseAgeMs(store) < STALE_MS && (atOnce || began - view.lastNumber >= NUMBER_MS)) {
     view.lastNumber = began;
     updateNumber(view);
   }
@@ -65,7 +70,7 @@ function updateChoices(view) {
   view.choices = wanted;
   const select = byId("angle-choice");
   select.replaceChildren(...options.map(([name, key]) =>
-    createElement("option", { value: JSON.stringify([name, key]) }, `${titleOf(name)} · ${angleName(key)}`)));
+    createElement("option", { value: JSON.stringify([name, key]) }, `${isolate(titleOf(name))} · ${angleName(key)}`)));
   const stored = sessionStorage.getItem(STORED_CHOICE);
   const known = options.some((option) => JSON.stringify(option) === stored);
   select.value = known ? stored : JSON.stringify(options[0]);
@@ -74,7 +79,7 @@ function updateChoices(view) {
 
 /** Return the chosen joint and angle in words, such as "Knee flexion". */
 export function chosenTitle(view) {
-  return view.choice === null ? "Joint angle" : `${titleOf(view.choice[0])} ${angleName(view.choice[1])}`;
+  return view.choice === null ? "Joint angle" : `${isolate(titleOf(view.choice[0]))} ${angleName(view.choice[1])}`;
 }
 
 /** Return the present value and standard deviation of the chosen angle, null if unknown. */
@@ -116,8 +121,16 @@ function reasonOf(view, value, sd) {
 export function curvesOf(store, [name, key]) {
   const newest = store.pose.t_us;
   const [times, values, upper, lower, optical] = [[], [], [], [], []];
+  const gap_us = GAP_PERIODS * usualPeriod(store.poses);
   let next = 0;
+  let last_us = Infinity;
   for (const pose of store.poses) {
+    if (pose.t_us - last_us > gap_us) {
+      // Daemon, broker or network were lost: an unknown value ends the line.
+      times.push((last_us + gap_us / 2 - newest) / 1e6);
+      for (const series of [values, upper, lower, optical]) series.push(null);
+    }
+    last_us = pose.t_us;
     const joint = valueOf(pose.joints, name) ?? {};
     const value = joint[key] ?? null;
     const sd = sdOf(joint, key);
@@ -129,6 +142,18 @@ export function curvesOf(store, [name, key]) {
     optical.push(opticalAt(store.opticals, next, pose.t_us, name, key));
   }
   return [times, values, upper, lower, optical];
+}
+
+/** Return the median interval of poses, µs. */
+function usualPeriod(poses) {
+  const intervals = poses.slice(1).map((pose, i) => pose.t_us - poses[i].t_us).sort((a, b) => a - b);
+  return intervals[Math.floor(intervals.length / 2)] ?? Infinity;
+}
+
+function noAngleReason(store) {
+  if (!store.info) return "The angles are unknown: no message on bridge/info was received.";
+  if (store.info.segments.length < 2) return "A limb of one segment has no joint angle. The Table view has its orientation.";
+  return "The pose contains no joint angle.";
 }
 
 /** Return the angle of the cameras at an instant, between the two frames around it. */
@@ -210,8 +235,9 @@ function angleRange(low, high) {
 /** Mark a number and a curve that are out of date. */
 export function updateAngleAge(view) {
   const { store } = view;
-  const ageMs = store.poseReceivedMs === null ? null : performance.now() - store.poseReceivedMs;
-  const stale = ageMs !== null && ageMs > STALE_MS;
+  const ageMs = poseAgeMs(store);
+  if (store.pose === null) setText(byId("angle-reason"), "No pose was received.");
+  const stale = store.pose !== null && ageMs > STALE_MS;
   byId("angle-panel").classList.toggle("stale", stale);
   if (stale) {
     setText(byId("angle-value"), UNKNOWN);

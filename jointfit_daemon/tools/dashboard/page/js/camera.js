@@ -3,24 +3,21 @@
 import { dot, mix, norm, rotate, scale, subtract } from "./geometry.js";
 
 const ELEVATION = 0.16;
-const DEFAULT_TURN = -0.6;
 const FOLLOW_S = 0.9;
 const TURN_S = 3;
 
-/** Return a camera; `turn` is the angle of the view about the vertical, rad. */
+/** Return a camera; `turn` is the angle of the view about the vertical, rad; null until it is set. */
 export function createCamera() {
   const camera = {
-    turn: DEFAULT_TURN,
+    turn: null,
     target: null,
     length: 0,
     facing: null,
     floor: null,
 
     /** Follow a limb: centre, size and facing direction change smoothly, or at once if `still`. */
-    follow(points, firstSegment, seconds, still) {
+    follow(points, length, firstSegment, seconds, still) {
       const center = scale(points.reduce((sum, p) => sum.map((v, i) => v + p[i]), [0, 0, 0]), 1 / points.length);
-      const lengths = points.slice(1).map((p, i) => norm(subtract(p, points[i])));
-      const length = lengths.reduce((sum, value) => sum + value, 0);
       const lowest = Math.min(...points.map((p) => p[2])) - 0.14 * length;
       const first = camera.target === null;
       const share = (time) => (first || still ? 1 : 1 - Math.exp(-seconds / time));

@@ -1,8 +1,11 @@
 // Header of the page: rig, state in words, broker, clock, and the one button that matters now.
 
 import { byId, createElement, setClass, setText } from "./dom.js";
-import { gatewayNow } from "./store.js";
+import { gatewayNow, poseAgeMs } from "./store.js";
 import { calibrationSentence, formatClock, isRunning } from "./words.js";
+
+const SILENT_MS = 5000; // poses come at 10 Hz, with or without sensors
+const RETAINED_MS = 1000; // retained messages arrive within this time after a connection
 
 /** Return the state of link, daemon and calibration: level, words, and the loss for the banner. */
 export function pageState(link, store) {
@@ -10,13 +13,21 @@ export function pageState(link, store) {
   if (link.state === "refused") return { level: "error", words: "Not logged in", loss: link.reason };
   if (link.state === "connecting") return { level: "", words: "Connecting to the broker" };
   if (link.base === null) return { level: "", words: "Looking for rigs on the broker" };
+  if (store.otherVersion !== null) return { level: "error", words: "jointfitd has another version" };
   if (store.bridge === "offline") {
     return {
       level: "error", words: "jointfitd is not running",
       loss: "jointfitd stopped or lost its broker. The page continues when it is back. Check it with: systemctl status jointfitd",
     };
   }
-  if (store.bridge !== "online") return { level: "", words: "Waiting for jointfitd" };
+  if (store.received.has("pose/ui") && poseAgeMs(store) > SILENT_MS) {
+    return {
+      level: "error", words: "jointfitd sends nothing",
+      loss: "jointfitd is connected to the broker, but sends no poses. The page continues when they return. Check it with: systemctl status jointfitd",
+    };
+  }
+  if (store.bridge !== "online" && store.pose === null) return { level: "", words: "Waiting for jointfitd" };
+  if (store.calibration === null) return { level: "", words: "Running; the state of the calibration was not received" };
   const phase = store.calibration?.phase;
   return { level: phase === "aborted" || store.calibration?.kept ? "warning" : "", words: calibrationSentence(store.calibration) };
 }
@@ -81,6 +92,19 @@ export function updateEmptyState(link, store, configuration, rigs, choose) {
 }
 
 function emptyContent(link, store, configuration, rigs, choose) {
+  if (link.state === "lost" && store.pose === null) {
+    return { kind: "lost", children: [
+      createElement("h2", {}, "Not connected"),
+      createElement("p", {}, "The page tries again every two seconds and continues by itself. Check the broker, and start the dashboard with its address:"),
+      createElement("pre", { tabindex: "0" }, createElement("code", {}, "systemctl status mosquitto\njointfit dashboard --broker mqtt://localhost:1883")),
+    ] };
+  }
+  if (link.state === "refused" && store.pose === null) {
+    return { kind: "refused", children: [
+      createElement("h2", {}, "Log in to see the rig"),
+      createElement("p", {}, "The broker has accounts. Ask its administrator for one that may read the topics of the rig."),
+    ] };
+  }
   if (link.state !== "connected") return null;
   if (link.base === null && rigs.size > 1) {
     return { kind: `rigs ${[...rigs.keys()].join()}`, children: [
@@ -89,7 +113,14 @@ function emptyContent(link, store, configuration, rigs, choose) {
         createElement("button", { class: "button", type: "button", dir: "auto", onclick: () => choose(base) }, `${info.rig} (${base})`)),
     ] };
   }
-  if (store.bridge === "unknown") {
+  if (store.otherVersion !== null) {
+    return { kind: "version", children: [
+      createElement("h2", {}, "This page cannot read the messages of jointfitd"),
+      createElement("p", {}, "Page and daemon are of different versions. Install the same version of both, then open the page again."),
+    ] };
+  }
+  if (store.bridge === "unknown" && store.pose === null) {
+    if (performance.now() - link.sinceMs < RETAINED_MS) return null;
     return { kind: "no daemon", children: [
       createElement("h2", {}, `Waiting for jointfitd on ${configuration.broker}`),
       createElement("p", {}, "The broker answers, but no rig publishes on it. Start the daemon with the configuration of the rig:"),

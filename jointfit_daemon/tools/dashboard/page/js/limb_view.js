@@ -2,13 +2,15 @@
 
 import { createCamera } from "./camera.js";
 import { byId, setText } from "./dom.js";
-import { add, conjugate, mix, mixRotations, multiply, rotate, scale } from "./geometry.js";
-import { valueOf } from "./store.js";
-import { formatNumber, titleOf } from "./words.js";
+import { add, conjugate, mix, mixRotations, multiply, norm, rotate, scale, subtract } from "./geometry.js";
+import { poseAgeMs, valueOf } from "./store.js";
+import { formatNumber, isolate, titleOf } from "./words.js";
 
 const FRAME_MS = 1000 / 30;
 const DELAY_MS = 110; // one period of pose/ui: the drawing interpolates between two poses
 const STALE_MS = 1500;
+const SIDE_TURN = -0.6;
+const FRONT_TURN = -1.15; // two legs cover each other from the side
 const OPTICAL_MS = 600;
 const TURN_STEP = 0.15;
 const THICKNESS = [0.15, 0.105];
@@ -99,13 +101,17 @@ function draw(view, store, now, seconds) {
 
   const points = limb.joints.filter((joint) => joint.p !== null).map((joint) => joint.p);
   if (points.length < 2) return;
-  view.camera.follow(points, limb.segments[0]?.q ?? null, seconds, view.still.matches);
+  if (store.info.connections && view.camera.turn === null) view.camera.turn = FRONT_TURN;
+  view.camera.turn ??= SIDE_TURN;
+  const length = lengthOf(limb, store.info);
+  if (length === 0) return;
+  view.camera.follow(points, length, limb.segments[0]?.q ?? null, seconds, view.still.matches);
   const camera = view.camera.projection(width, height);
 
   drawFloor(view, camera, points);
   drawSegments(view, camera, limb);
   if (store.optical && now - store.opticalReceivedMs < OPTICAL_MS) drawOptical(view, camera, limb, store.opticals);
-  drawJoints(view, camera, limb);
+  drawJoints(view, camera, limb, store.info);
   drawSensors(view, camera, limb, store);
 }
 
@@ -131,9 +137,33 @@ function interpolate(view, store, now) {
   const segments = info.segments.map((name, i) => {
     const [a, b] = [before, after].map((sample) => valueOf(sample.pose.segments, name));
     const q = b?.q ? (a?.q ? mixRotations(a.q, b.q, share) : b.q) : null;
-    return { name, q, from: joints[i], to: joints[i + 1], used: b?.used ?? [] };
+    const [from, to] = endsOf(info, i).map((end) => joints[end] ?? NO_JOINT);
+    return { name, q, from, to, used: b?.used ?? [] };
   });
   return { t_us, joints, segments };
+}
+
+const NO_JOINT = { name: "", p: null, sd: null };
+
+/** Return the numbers of the joints at both ends of a segment; the limb may have two branches. */
+function endsOf(info, segment) {
+  if (!info.connections) return [segment, segment + 1];
+  const name = info.segments[segment];
+  const at = (end) => info.joints.flatMap((joint, i) => (valueOf(info.connections, joint)?.[end] === name ? [i] : []));
+  const [proximal, distal] = [at("child"), at("parent")];
+  return proximal.length > 0 ? [proximal[0], distal[0]] : distal;
+}
+
+/** Return the length of the stretched limb: that of its longer branch. */
+function lengthOf(limb, info) {
+  const sums = new Map();
+  for (const { name, from, to } of limb.segments) {
+    if (!from.p || !to.p) continue;
+    const proximal = info.joints.find((joint) => valueOf(info.connections, joint)?.child === name);
+    const side = valueOf(info.connections, proximal)?.side ?? "";
+    sums.set(side, (sums.get(side) ?? 0) + norm(subtract(to.p, from.p)));
+  }
+  return Math.max(...sums.values(), 0);
 }
 
 function drawFloor(view, camera, points) {
@@ -222,7 +252,7 @@ function opticalPosition(frames, t_us, name) {
   return mix(a, b, Math.min(1, (t_us - before.t_us) / (after.t_us - before.t_us)));
 }
 
-function drawJoints(view, camera, limb) {
+function drawJoints(view, camera, limb, info) {
   const { context, colors } = view;
   context.font = "600 13px system-ui, sans-serif";
   context.textBaseline = "middle";
@@ -245,12 +275,23 @@ function drawJoints(view, camera, limb) {
     context.arc(at.x, at.y, 4.5, 0, 7);
     context.fill();
     context.stroke();
-    drawLabel(view, titleOf(joint.name), at.x + view.camera.length * camera.pixels * 0.13, at.y);
+    const side = labelSide(info, joint.name, at.x - view.size[0] / 2);
+    drawLabel(view, titleOf(joint.name), at.x, at.y, side * view.camera.length * camera.pixels * 0.13);
   }
 }
 
-function drawLabel(view, text, x, y) {
+/** Return the side of a joint on which its name stands: 1 right, -1 left, 0 none. */
+function labelSide(info, name, fromMiddle) {
+  if (!info.connections) return 1;
+  if (valueOf(info.connections, name) === undefined) return 0; // the middle of the root segment
+  return fromMiddle < 0 ? -1 : 1;
+}
+
+function drawLabel(view, text, jointX, y, offset) {
   const { context, colors } = view;
+  if (offset === 0) return;
+  const x = jointX + offset;
+  context.textAlign = offset < 0 ? "right" : "left";
   context.lineWidth = 4;
   context.strokeStyle = colors.surface;
   context.strokeText(text, x, y);
@@ -306,15 +347,16 @@ function drawAxis(context, from, to, color, halo) {
 /** Describe the limb in words under the drawing, and mark a drawing that is out of date. */
 export function updateLimbCaption(store) {
   const caption = byId("limb-caption");
-  const ageMs = store.poseReceivedMs === null ? null : performance.now() - store.poseReceivedMs;
-  byId("limb-panel").classList.toggle("stale", ageMs !== null && ageMs > STALE_MS);
+  const ageMs = poseAgeMs(store);
+  byId("limb-panel").classList.toggle("stale", store.pose !== null && ageMs > STALE_MS);
   byId("legend-optical").hidden = !(store.optical && performance.now() - store.opticalReceivedMs < OPTICAL_MS * 3);
-  if (!store.pose || !store.info) return setText(caption, "Waiting for the first pose.");
+  if (!store.pose) return setText(caption, "No pose was received.");
+  if (!store.info) return setText(caption, "The limb cannot be drawn: no message on bridge/info was received.");
   if (ageMs > STALE_MS) return setText(caption, `No pose for ${Math.round(ageMs / 1000)} s: the drawing is the last one.`);
   const parts = store.info.segments.map((name) => {
     const segment = valueOf(store.pose.segments, name);
-    if (!segment?.q) return `${titleOf(name)}: unknown`;
-    return `${titleOf(name)} ± ${formatNumber(segment.sd_deg, 1)}° from ${segment.used.join(", ") || "no sensor"}`;
+    if (!segment?.q) return `${isolate(titleOf(name))}: unknown`;
+    return `${isolate(titleOf(name))} ± ${formatNumber(segment.sd_deg, 1)}° from ${segment.used?.map(isolate).join(", ") || "no sensor"}`;
   });
   const mode = { imu: "First joint fixed (no cameras).", "imu+mocap": "First joint from the cameras." }[store.pose.mode] ?? "";
   return setText(caption, `${parts.join(" · ")}. ${mode}`);

@@ -8,6 +8,8 @@ const TOPICS = [
 ];
 const DISCOVERY = ["+/bridge/info", "+/+/bridge/info", "+/+/+/bridge/info", "+/+/+/+/bridge/info"];
 const RECONNECT_MS = 1500;
+const SERVER_MS = 3000;
+const INTERRUPTED = "The connection is interrupted. The page looks for the cause and connects again by itself.";
 const KEEPALIVE_S = 5;
 // Close codes of the tunnel: the broker could not be reached, or closed the connection.
 const BROKER_UNREACHABLE = 4502;
@@ -19,6 +21,7 @@ const OTHER_VERSION = new Set([1, 132]);
  * Return the link of the page to its broker.
  *
  * `configuration` is that of the server. `handlers` has `changed()` after every change of `state`,
+ * `connected()` after every connection,
  * `found(base)` for every rig, `message(topic, payload)` for every message of the chosen rig, and
  * `login(reason)` when the broker wants an account.
  */
@@ -28,10 +31,14 @@ export function createLink(configuration, handlers) {
     state: "connecting",
     /** Reason in words, for "lost" and "refused". */
     reason: "",
+    /** Browser time of the last change of `state`, ms. */
+    sinceMs: 0,
     base: null,
     version: 5,
     account: {},
     client: null,
+    /** Topics that the broker refused to pass on, from the answer to the subscription. */
+    refused: new Set(),
     closeCode: 0,
     closeReason: "",
     opened: false,
@@ -39,12 +46,14 @@ export function createLink(configuration, handlers) {
 
   const change = (state, reason = "") => {
     if (link.state === state && link.reason === reason) return;
-    Object.assign(link, { state, reason });
+    Object.assign(link, { state, reason, sinceMs: performance.now() });
     handlers.changed();
   };
 
   link.connect = () => {
     link.client?.end(true);
+    const fault = addressFault(configuration.websocket);
+    if (fault !== "") { change("lost", fault); return; }
     link.client = createClient(configuration, link, handlers, change);
   };
   link.logIn = (username, password) => {
@@ -60,7 +69,7 @@ export function createLink(configuration, handlers) {
   link.unsubscribe = (topic) => link.client?.connected && link.client.unsubscribe(`${link.base}/${topic}`);
   link.publish = (topic, text, options) => link.client.publishAsync(`${link.base}/${topic}`, text, options);
 
-  addEventListener("offline", () => change("lost", lossReason(link, configuration)));
+  addEventListener("offline", () => change("lost", lossReason(link, configuration) ?? INTERRUPTED));
   addEventListener("online", () => link.client?.reconnect());
   return link;
 }
@@ -82,13 +91,18 @@ function createClient(configuration, link, handlers, change) {
   });
 
   client.on("connect", () => {
+    handlers.connected();
     change("connected");
     subscribe(link);
   });
-  client.on("close", () => {
-    if (link.client === client && link.state !== "refused") {
-      change("lost", lossReason(link, configuration));
-    }
+  client.on("close", async () => {
+    const present = () => link.client === client && !client.connected && link.state !== "refused";
+    if (!present()) return;
+    const known = lossReason(link, configuration);
+    if (known !== null || link.state !== "lost") change("lost", known ?? INTERRUPTED);
+    if (known !== null) return;
+    const reason = await serverReason(link, configuration);
+    if (present()) change("lost", reason);
   });
   client.on("error", (error) => {
     if (OTHER_VERSION.has(error.code) && link.version === 5) {
@@ -111,7 +125,7 @@ function createClient(configuration, link, handlers, change) {
 // The close code of the tunnel distinguishes a lost broker from a lost server.
 function openWebSocket(url, protocols, link) {
   const socket = new WebSocket(url, protocols);
-  link.opened = false;
+  Object.assign(link, { opened: false, closeCode: 0, closeReason: "" });
   socket.addEventListener("open", () => { link.opened = true; });
   socket.addEventListener("close", (event) => {
     link.closeCode = event.code;
@@ -120,22 +134,45 @@ function openWebSocket(url, protocols, link) {
   return socket;
 }
 
+/** Return the reason of a loss; null if it must be asked for. */
 function lossReason(link, configuration) {
-  const broker = configuration.broker;
+  const { broker, websocket } = configuration;
   if (!navigator.onLine && !/^(localhost|127\.|\[::1\])/.test(location.host)) {
     return "This device has no network connection. The page continues when it is back.";
   }
   if (link.closeCode === BROKER_UNREACHABLE) return `No broker at ${broker}: ${link.closeReason}.`;
-  if (link.closeCode === BROKER_CLOSED || link.opened) {
-    return `The broker at ${broker} does not answer or closed the connection: check that it runs.`;
+  if (link.closeCode === BROKER_CLOSED) return `The broker at ${broker} ended the connection: ${link.closeReason}. Check that it runs.`;
+  if (!websocket) return null;
+  if (link.opened) return `The broker at ${broker} does not answer or closed the connection: check that it runs, and the network.`;
+  return `No WebSocket at ${broker}: check that the broker runs, and that this is the port of its WebSocket listener, not its TCP port (often 1883). Without one, start the dashboard with --broker mqtt://HOST:PORT.`;
+}
+
+/** Ask the server of the page for the cause of a loss: the tunnel alone does not show it. */
+async function serverReason(link, configuration) {
+  const opened = link.opened;
+  const answer = await fetch("config.json", { cache: "no-store", signal: AbortSignal.timeout(SERVER_MS) }).catch(() => null);
+  if (answer === null) {
+    return `The dashboard server at ${location.host} does not answer: check that “jointfit dashboard” runs, and the network.`;
   }
-  if (configuration.websocket) return `No connection to the broker at ${broker}: check that it runs, and the network.`;
-  return `The dashboard server at ${location.host} does not answer: check that “jointfit dashboard” runs, and the network.`;
+  if (!opened) {
+    return `The dashboard server at ${location.host} accepts no WebSocket: too many pages are open, or a proxy on the way does not pass WebSockets on.`;
+  }
+  return `The broker at ${configuration.broker} does not answer: check that it runs.`;
+}
+
+/** Return why a browser cannot connect to an address of a broker; empty if it can. */
+function addressFault(websocket) {
+  if (location.protocol !== "https:" || !websocket?.startsWith("ws:")) return "";
+  return `Pages of https:// cannot connect to ${websocket}. Start the dashboard with --broker wss://HOST/PATH or mqtt://HOST:PORT.`;
 }
 
 function subscribe(link) {
-  if (link.base === null) link.client.subscribe(DISCOVERY, { qos: 0 });
-  else link.client.subscribe(TOPICS.map((topic) => `${link.base}/${topic}`), { qos: 0 });
+  link.refused.clear();
+  const topics = link.base === null ? DISCOVERY : TOPICS.map((topic) => `${link.base}/${topic}`);
+  link.client.subscribe(topics, { qos: 0 }, (error, granted, packet) => {
+    const codes = (packet ?? error?.packet)?.granted ?? [];
+    topics.forEach((topic, i) => { if (codes[i] >= 128 && link.base !== null) link.refused.add(topic); });
+  });
 }
 
 function receive(link, handlers, topic, bytes) {

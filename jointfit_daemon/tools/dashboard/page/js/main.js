@@ -1,5 +1,6 @@
 // Start of the page: connects store, link and views.
 
+import { createAccess } from "./access.js";
 import { chosenTitle, chosenValue, createAngleView, updateAngleAge } from "./angle_view.js";
 import { createAnnouncer } from "./announcer.js";
 import { createCalibrateView } from "./calibrate_view.js";
@@ -10,13 +11,14 @@ import { createHistoryView } from "./history_view.js";
 import { createLimbView, updateLimbCaption } from "./limb_view.js";
 import { createLink } from "./link.js";
 import { createLogView } from "./log_view.js";
+import { createNotices } from "./notices.js";
 import { createRequests } from "./requests.js";
 import { createSensorCards } from "./sensor_cards.js";
 import { createSensorsView } from "./sensors_view.js";
 import { createStore, gatewayNow } from "./store.js";
 import { createTableView } from "./table_view.js";
 import { connectTabs } from "./tabs.js";
-import { formatNumber } from "./words.js";
+import { formatNumber, isolate } from "./words.js";
 
 const REFRESH_MS = 500;
 const SEARCH_MS = 1200; // rigs with retained information answer within this time
@@ -25,8 +27,15 @@ async function readConfiguration() {
   const parameters = new URLSearchParams(location.search);
   const answer = await fetch("config.json", { cache: "no-store" }).catch(() => null);
   const server = answer?.ok ? await answer.json() : { version: "", broker: location.host, websocket: null, base: null };
-  const websocket = parameters.get("broker") ?? server.websocket;
-  return { ...server, websocket, broker: websocket ?? server.broker, base: parameters.get("base") ?? server.base };
+  return { ...server, base: parameters.get("base") ?? server.base, remark: brokerRemark(parameters.get("broker"), server) };
+}
+
+// The server names the one broker to which its security policy permits connections: an address that
+// somebody sends must not lead a password to another broker.
+function brokerRemark(wanted, server) {
+  if (wanted === null || wanted === server.websocket) return "";
+  const start = wanted.startsWith("wss://") || wanted.startsWith("ws://") ? wanted : "wss://HOST/PATH";
+  return `The address of this page asks for the broker ${isolate(wanted)}, but its server is connected to ${server.broker}. To use another broker, start the server with --broker ${isolate(start)}.`;
 }
 
 async function start() {
@@ -36,7 +45,11 @@ async function start() {
   let dialogs = null;
 
   const link = createLink(configuration, {
-    changed: () => refresh(),
+    changed: () => {
+      if (link.state !== "connected") store.disconnected();
+      refresh();
+    },
+    connected: () => store.reconnected(),
     message: (topic, payload) => {
       if (topic.startsWith("bridge/response/")) requests.answer(payload);
       else store.take(topic, payload);
@@ -46,6 +59,8 @@ async function start() {
   });
   const requests = createRequests(link, () => gatewayNow(store) ?? Date.now() * 1000);
   dialogs = createDialogs(link, requests);
+  const access = createAccess(link, store, requests);
+  const updateNotices = createNotices(link, store, access, configuration);
 
   const choose = (base) => {
     store.reset(base);
@@ -74,7 +89,9 @@ async function start() {
 
   const announce = createAnnouncer(byId("announcer"));
   function refresh() {
+    access.update();
     updateHeader();
+    updateNotices();
     updateEmptyState(link, store, configuration, rigs, choose);
     updateLimbCaption(store);
     updateAngleAge(angle);

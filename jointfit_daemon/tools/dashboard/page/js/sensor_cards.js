@@ -10,7 +10,7 @@ const RATE_SHARE = 0.95; // below this share of the usual rate a device is slow
 export function createSensorCards(store) {
   const cards = new Map();
   const update = () => updateCards(store, cards);
-  for (const subject of ["info", "health", "devices", "events"]) store.on(subject, update);
+  for (const subject of ["bridge", "info", "health", "devices", "events"]) store.on(subject, update);
   return update;
 }
 
@@ -32,7 +32,8 @@ function updateCards(store, cards) {
 export function summaryOf(store, name) {
   const device = valueOf(store.info?.devices, name) ?? {};
   const health = valueOf(store.health?.devices, name);
-  const availability = store.devices.get(name)?.availability ?? "unknown";
+  const reachable = store.bridge === "online" || store.bridge === "unknown";
+  const availability = (reachable && store.devices.get(name)?.availability) || "unknown";
   const flags = store.pose?.flags ?? [];
   const [level, state] = stateOf(store, name, availability, health, flags);
   const [clockLevel, clock] = availability === "online" ? clockQuality(health) : ["unknown", UNKNOWN];
@@ -51,9 +52,10 @@ export function summaryOf(store, name) {
 }
 
 function stateOf(store, name, availability, health, flags) {
+  if (store.bridge === "lost") return ["unknown", "Unknown: connection lost"];
   if (store.bridge === "offline") return ["unknown", "jointfitd is not running"];
   if (availability === "offline") return ["error", "No data: check cable and power"];
-  if (availability !== "online") return ["unknown", "Waiting"];
+  if (availability !== "online") return ["unknown", "State not received"];
   if (flags.includes(`stuck:${name}`) || health?.sensor === "stuck") return ["error", "Stuck: repeats its value"];
   if (flags.includes(`slipped:${name}`)) return ["error", "Slipped on the body: fix it"];
   if (health?.sensor === "lost") return ["error", "No data: check cable and power"];

@@ -1,7 +1,10 @@
 // State of the rig, from the messages below its base topic (docs/mqtt.md). Names come from a
 // configuration and can be any text, so they are keys of maps, never of plain objects.
 
+import { PAYLOAD_VERSION, hasForm } from "./payloads.js";
+
 const SHOWN_S = 20;
+const CLOCK_WINDOW_MS = 60_000; // clocks drift apart by less than 10 ms within this time
 const EVENTS = 300;
 
 /** Return an empty state. */
@@ -25,8 +28,14 @@ export function createStore() {
     sensorsReceivedMs: null,
     poses: [],
     opticals: [],
-    clockOffsetMs: null,
+    clock: null,
     messages: 0,
+    /** Topics received since the page connected. */
+    received: new Set(),
+    /** Version and software of a daemon whose payloads the page cannot read; else null. */
+    otherVersion: null,
+    /** Topic of a message that is not one of jointfitd; else null. */
+    faulty: null,
 
     /** Call `listener` after every change of a subject. */
     on(subject, listener) {
@@ -40,15 +49,35 @@ export function createStore() {
     /** Take one message; `topic` is below the base topic. */
     take(topic, payload) {
       store.messages += 1;
+      store.received.add(topic);
+      if ((payload.v ?? PAYLOAD_VERSION) !== PAYLOAD_VERSION) {
+        store.otherVersion = { v: payload.v, software: payload.software ?? store.otherVersion?.software };
+        return;
+      }
+      if (!hasForm(topic, payload)) { store.faulty = topic; return; }
+      if (topic === "bridge/info") store.otherVersion = null;
       takeMessage(store, topic, payload);
+    },
+    /** Mark the state of the daemon as unknown: the page lost its connection. */
+    disconnected() {
+      if (store.bridge === "lost") return;
+      store.bridge = "lost";
+      store.changed("bridge");
+    },
+    /** Wait for the retained messages again: the daemon may have ended while the page was away. */
+    reconnected() {
+      store.received.clear();
+      Object.assign(store, { bridge: "unknown", otherVersion: null, faulty: null });
+      store.changed("bridge");
     },
     /** Forget everything that another rig or another connection might contradict. */
     reset(base) {
       Object.assign(store, {
         base, bridge: "unknown", info: null, health: null, calibration: null, progress: null,
-        pose: null, poseReceivedMs: null, optical: null, sensors: null, clockOffsetMs: null,
-        events: [], poses: [], opticals: [],
+        pose: null, poseReceivedMs: null, optical: null, sensors: null, clock: null,
+        events: [], poses: [], opticals: [], otherVersion: null, faulty: null,
       });
+      store.received.clear();
       store.devices.clear();
       store.lastEvents.clear();
       for (const subject of listeners.keys()) store.changed(subject);
@@ -98,7 +127,7 @@ function takePose(store, pose) {
   if (store.pose && pose.t_us < store.pose.t_us) {
     store.poses.length = 0;
     store.opticals.length = 0;
-    store.clockOffsetMs = null;
+    store.clock = null;
   }
   store.pose = pose;
   store.poseReceivedMs = now;
@@ -108,17 +137,26 @@ function takePose(store, pose) {
   store.changed("pose");
 }
 
-// The clocks of browser and gateway may be hours apart: the smallest difference between receipt
-// and instant converts browser time to gateway time.
+// The clocks of browser and gateway may be hours apart, and drift: the smallest difference between
+// receipt and instant of the last one to two windows converts browser time to gateway time.
 function noteClock(store, t_us, nowMs) {
   const offsetMs = nowMs - t_us / 1000;
-  if (store.clockOffsetMs === null || offsetMs < store.clockOffsetMs) store.clockOffsetMs = offsetMs;
+  if (store.clock === null) store.clock = { before: offsetMs, least: offsetMs, sinceMs: nowMs };
+  const { clock } = store;
+  if (nowMs - clock.sinceMs > CLOCK_WINDOW_MS) {
+    Object.assign(clock, { before: clock.least, least: offsetMs, sinceMs: nowMs });
+  }
+  clock.least = Math.min(clock.least, offsetMs);
 }
 
 /** Return the present UNIX time of the gateway in microseconds; null while it is unknown. */
 export function gatewayNow(store) {
-  return store.clockOffsetMs === null ? null : (performance.now() - store.clockOffsetMs) * 1000;
+  if (store.clock === null) return null;
+  return (performance.now() - Math.min(store.clock.before, store.clock.least)) * 1000;
 }
+
+/** Return the time since the last pose, ms; infinite without one. */
+export const poseAgeMs = (store) => (store.poseReceivedMs === null ? Infinity : performance.now() - store.poseReceivedMs);
 
 function dropOld(entries, newest_us) {
   const oldest_us = newest_us - (SHOWN_S + 1) * 1e6;

@@ -24,10 +24,13 @@ export function formatClock(microseconds) {
   return new Date(microseconds / 1000).toLocaleTimeString([], { hour12: false });
 }
 
+/** Return a name for use inside a sentence: its writing direction does not affect the sentence. */
+export const isolate = (name) => (/^[ -~]*$/.test(name) ? name : `\u2068${name}\u2069`);
+
 /** Return a name for headings: "left_knee" as "Left knee". Names of any script pass unchanged. */
 export function titleOf(name) {
   const words = String(name).replaceAll("_", " ");
-  return words.charAt(0).toLocaleUpperCase() + words.slice(1);
+  return words.charAt(0).toUpperCase() + words.slice(1);
 }
 
 /** Return the words of an angle's key: "flexion_deg" as "flexion". */
@@ -61,7 +64,7 @@ const MINOR = new Set(["extrapolating", "headings_from_static", "origin_fixed", 
 /** Return the sentence of a flag of a pose; an unknown flag is its own text. */
 export function flagSentence(flag) {
   const [kind, name = ""] = flag.split(/:(.*)/s);
-  return (FLAGS[kind] ?? flag).replace("%", name);
+  return (FLAGS[kind] ?? flag).replace("%", () => isolate(name));
 }
 
 /** Return whether a flag is a remark that needs no action. */
