@@ -48,6 +48,7 @@ ON_DEMAND_ERRORS = (
     (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "ProcessExitedError"),
     (EXIT_FAILED, "jointfit_daemon.tools.child_processes", "DemoTimeoutError"),
     (EXIT_MISUSE, "jointfit_daemon.tools.embedded_broker", "BrokerMissingError"),
+    (EXIT_MISUSE, "jointfit_daemon.tools.monitor", "MonitorUnavailableError"),
 )
 """Exit code, module and class of errors whose modules are imported on demand."""
 

@@ -32,6 +32,7 @@ def test_the_version_is_the_packages() -> None:
         "probe",
         "demo",
         "dashboard",
+        "monitor",
         "calibrate",
         "mark",
         "request",

@@ -8,6 +8,7 @@ from jointfit_daemon.outputs.mqtt._connection import (
 )
 from jointfit_daemon.outputs.mqtt._outbox import Outbox
 from jointfit_daemon.outputs.mqtt._publisher import LinkHealth, MqttPublisher
+from jointfit_daemon.outputs.mqtt._rig_search import find_rigs
 from jointfit_daemon.outputs.mqtt._secret_files import (
     RequestKeyError,
     missing_password,
@@ -36,6 +37,7 @@ __all__ = [
     "RequestKeyError",
     "SignatureRejectedError",
     "check_age",
+    "find_rigs",
     "missing_password",
     "request_key_of",
     "signed",

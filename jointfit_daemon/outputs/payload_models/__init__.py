@@ -9,9 +9,41 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.payload_models import _state, _streams
-from jointfit_daemon.outputs.payload_models._answers import ANSWERS
+from jointfit_daemon.outputs.payload_models._answers import (
+    ANSWERS,
+    CalibrationsAnswer,
+    StoredVersion,
+)
+from jointfit_daemon.outputs.payload_models._state import (
+    CalibrationState,
+    DeviceCounts,
+    Event,
+    Health,
+    Info,
+    Progress,
+    State,
+)
+from jointfit_daemon.outputs.payload_models._streams import OpticalPose, Pose, PoseJoint
 
-__all__ = ["ANSWERS", "PAYLOADS", "answer_schema", "payload_schema", "payload_topic"]
+__all__ = [
+    "ANSWERS",
+    "PAYLOADS",
+    "CalibrationState",
+    "CalibrationsAnswer",
+    "DeviceCounts",
+    "Event",
+    "Health",
+    "Info",
+    "OpticalPose",
+    "Pose",
+    "PoseJoint",
+    "Progress",
+    "State",
+    "StoredVersion",
+    "answer_schema",
+    "payload_schema",
+    "payload_topic",
+]
 
 if TYPE_CHECKING:
     from jointfit_daemon.outputs.payload_models._streams import Payload

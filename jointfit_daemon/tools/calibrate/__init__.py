@@ -6,7 +6,7 @@ from jointfit_daemon.tools.calibrate._phase_tracker import (
     PhaseTracker,
     RequestRefusedError,
 )
-from jointfit_daemon.tools.calibrate._report import movement_lines
+from jointfit_daemon.tools.calibrate._report import movement_lines, report
 
 __all__ = [
     "PhaseAbortedError",
@@ -14,4 +14,5 @@ __all__ = [
     "RequestRefusedError",
     "calibrate",
     "movement_lines",
+    "report",
 ]

@@ -75,8 +75,10 @@ def parse_listen(text: str) -> ListenAddress:
     return ListenAddress(host, port)
 
 
-def parse_broker(text: str) -> BrokerAddress:
+def parse_broker(text: str, account: str = "the page asks for them") -> BrokerAddress:
     """Return the address of ``mqtt://HOST:PORT``, ``mqtts://…``, ``wss://…`` or ``HOST:PORT``.
+
+    `account` is the end of the message about a user name in the address: where it belongs.
 
     Raises
     ------
@@ -96,7 +98,7 @@ def parse_broker(text: str) -> BrokerAddress:
     if parts.username is not None:
         raise ValueError(
             f"--broker {parts.scheme}://…@{host or ''}: expected no user name and no password;"
-            " the page asks for them"
+            f" {account}"
         )
     if not host or parts.scheme not in _SCHEMES or port == 0:
         raise ValueError(expected)

@@ -1,0 +1,97 @@
+"""Connection of the monitor to its broker: finds a rig, subscribes, reconnects, sends requests."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.outputs.mqtt import (
+    BrokerLostError,
+    MqttClient,
+    NoAnswerError,
+    find_rigs,
+)
+from jointfit_daemon.tools.monitor._rig_view import TOPICS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from jointfit_daemon.config import MqttSettings
+    from jointfit_daemon.tools.monitor._monitor_state import MonitorState
+    from jointfit_daemon.tools.monitor._rig_view import Moment
+
+RECONNECT_S = 1.0
+"""Pause before the next attempt, s."""
+SEARCH_S = 1.2
+"""Time for the retained information of rigs to arrive, s."""
+
+
+class BrokerLink:
+    """Feeds a state with the messages of its rig until it is cancelled.
+
+    Parameters
+    ----------
+    settings
+        Address and account of the broker; with an empty `base` the rig is searched for.
+    state
+        Changed by messages, connections and losses.
+    now
+        Clocks of this machine.
+    """
+
+    def __init__(
+        self, settings: MqttSettings, state: MonitorState, now: Callable[[], Moment]
+    ) -> None:
+        self._settings, self._state, self._now = settings, state, now
+        self._chosen = asyncio.Event()
+        self._client: MqttClient | None = None
+
+    def choose(self, base: str) -> None:
+        """Show the rig with this base topic."""
+        self._settings = self._settings.model_copy(update={"base": base})
+        self._state.begin_rig(base)
+        self._chosen.set()
+
+    async def run(self) -> None:
+        """Connect, and again after each loss."""
+        if self._settings.base:
+            self.choose(self._settings.base)
+        while True:
+            try:
+                await (self._follow() if self._chosen.is_set() else self._search())
+            except BrokerLostError as lost:
+                self._state.lost(str(lost))
+                await asyncio.sleep(RECONNECT_S)
+
+    async def request(self, command: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """Send a request; return its answer.
+
+        Raises
+        ------
+        NoAnswerError
+            There is no connection, or no answer arrives in time.
+        """
+        if self._client is None:
+            raise NoAnswerError("the monitor is not connected to the broker")
+        try:
+            return await self._client.request(command, arguments)
+        except BrokerLostError as lost:
+            raise NoAnswerError(str(lost)) from lost
+
+    async def _search(self) -> None:
+        """Look for rigs once; the only one is chosen."""
+        only = self._state.found_rigs(await find_rigs(self._settings, SEARCH_S))
+        if only is not None:
+            self.choose(only)
+
+    async def _follow(self) -> None:
+        """Pass on the messages of the rig until the broker is lost."""
+        try:
+            async with MqttClient(self._settings) as client:
+                self._client = client
+                self._state.connected()
+                await client.subscribe(*TOPICS)
+                async for topic, payload in client.messages():
+                    self._state.rig.take(topic, payload, self._now())
+        finally:
+            self._client = None

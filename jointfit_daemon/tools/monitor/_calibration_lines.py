@@ -1,0 +1,224 @@
+"""Calibration in words: phases, progress, predicted errors, missing movement, results, history."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.tools.calibrate import report
+from jointfit_daemon.tools.monitor._text_lines import Column, Line, table, wrap
+from jointfit_daemon.tools.monitor._words import (
+    RUNNING,
+    UNKNOWN,
+    calibration_sentence,
+    format_date,
+    format_number,
+    title_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.outputs.payload_models import (
+        CalibrationState,
+        Info,
+        Progress,
+        StoredVersion,
+    )
+    from jointfit_daemon.tools.monitor._monitor_state import MonitorState
+    from jointfit_daemon.tools.monitor._rig_view import RigView
+    from jointfit_daemon.tools.monitor._text_lines import Style
+
+_BAR = 30
+"""Most cells of the progress bar."""
+_WIDE = 66
+"""Least width of the table of joint centres."""
+_STEPS = (
+    ("align", "a", "Align the sensors", True,
+     "Fix all sensors to the plate. Turn it about all three axes until the time is over."),
+    ("static", "s", "Stand still", False,
+     "Put on all sensors and markers. Stand upright and still, with straight joints."),
+    ("functional", "f", "Move every joint", True,
+     "Move every joint through its range in view of the cameras: walk, squat, sit down and stand"
+     " up, circle the hip."),
+)  # fmt: skip
+"""Phase, key, title, whether it needs cameras, and instruction."""
+_NEXT = {"uncalibrated": "align", "aligned": "static", "posed": "functional"}
+
+
+def calibration_lines(rig: RigView, width: int) -> list[Line]:
+    """Return the calibration view."""
+    calibration = rig.calibration
+    if calibration is None:
+        return wrap("Waiting for the calibration state of the daemon.", width, "muted")
+    lines = _running(calibration, rig.progress, width) if calibration.phase in RUNNING else []
+    if not lines:
+        lines = [*_result(calibration, width), Line(), *_steps(rig.info, calibration, width)]
+    return lines
+
+
+def _steps(info: Info | None, calibration: CalibrationState, width: int) -> list[Line]:
+    """Return the phases with their keys; the next one is marked."""
+    cameras = info is not None and any(each.kind == "mocap" for each in info.devices.values())
+    steps = [step for step in _STEPS if cameras or not step[3]]
+    due = _NEXT.get(str(calibration.phase), "")
+    if due and due not in [step[0] for step in steps]:
+        due = steps[0][0]
+    lines = []
+    for number, (phase, key, title, _, text) in enumerate(steps, 1):
+        style: Style = "strong" if phase == due else ""
+        mark = "▶" if phase == due else " "
+        lines.append(Line.of(f"{mark} {number} {title}", style).add(f"  key {key}", "muted"))
+        lines += [Line.of("    ") + line for line in wrap(text, width - 4, "muted")]
+    return lines
+
+
+def _running(calibration: CalibrationState, progress: Progress | None, width: int) -> list[Line]:
+    """Return progress, instruction, missing movement and predicted errors of the running phase."""
+    share = None if progress is None else progress.progress
+    title = Line.of(calibration_sentence(calibration), "strong")
+    lines = [title.add("  " + format_number(None if share is None else 100 * share, 0, " %"))]
+    if share is not None:
+        cells = max(1, min(_BAR, width))
+        done = round(share * cells)
+        lines.append(Line.of("█" * done, "imu").add("░" * (cells - done), "muted"))
+    instruction = next((text for phase, *_, text in _STEPS if phase == calibration.phase), "")
+    lines += wrap(instruction, width)
+    text = progress.text if progress is not None else calibration.text
+    data: Mapping[str, Any] = {} if progress is None else progress.data
+    missing = [str(each) for each in _list(data.get("missing"))]
+    if text and text not in missing:
+        lines += wrap(text, width, "strong")
+    for each in missing:
+        lines += wrap(f"▲ {each}", width, "warning", indent=2)
+    lines += _joint_lines(_table(data.get("joints")), width)
+    seen = ", ".join(
+        f"{name} {format_number(_number(_table(part).get('seen_pct')), 0, ' %')}"
+        for name, part in _table(data.get("parts")).items()
+    )
+    return lines + (wrap(f"Seen by the cameras: {seen}", width, "muted") if seen else [])
+
+
+def _joint_lines(joints: Mapping[str, Any], width: int) -> list[Line]:
+    """Return the predicted error of every joint centre."""
+    if not joints:
+        return []
+    wide = width >= _WIDE
+    columns = [Column("joint centre"), Column("error", right=True)]
+    if wide:
+        columns += [Column("of it random", right=True), Column("arc", right=True), Column("from")]
+    rows = []
+    for name, joint in joints.items():
+        one = _table(joint)
+        row: list[tuple[str, Style]] = [
+            (title_of(name), "strong"),
+            (_spread(one.get("predicted_error_mm"), 0), ""),
+        ]
+        if wide:
+            row += [
+                (_spread(one.get("noise_error_mm"), 1), ""),
+                (format_number(_number(one.get("arc_deg")), 0, "°"), ""),
+                (str(one.get("source", UNKNOWN)), ""),
+            ]
+        met = bool(one.get("met"))
+        row.append(("✔ enough" if met else "○ more movement", "good" if met else "strong"))
+        rows.append(row)
+    return [Line(), *table([*columns, Column("state")], rows, width)]
+
+
+def _result(calibration: CalibrationState, width: int) -> list[Line]:
+    """Return outcome and quality of the last phase; a rejected result with its remedy."""
+    lines = [Line.of(calibration_sentence(calibration), "strong")]
+    if calibration.phase == "aborted":
+        lines = wrap(f"✖ {calibration_sentence(calibration)}", width, "error", indent=2)
+    if calibration.kept:
+        lines += wrap(f"✖ Rejected: {calibration.kept}", width, "error", indent=2)
+        lines += wrap("Key F repeats the movement and accepts a worse result.", width, "muted")
+    quality = calibration.quality
+    try:
+        texts = report(quality)
+    except (KeyError, TypeError, ValueError, AttributeError):  # quality of another version
+        texts = ["The quality of this calibration cannot be read: it is of another version."]
+    for text in texts:
+        lines += wrap(text, width, indent=2)
+    still_s = _number(_table(quality.get("static")).get("still_s"))
+    if still_s is not None:
+        lines += wrap(f"static pose: still for {format_number(still_s, 1)} s", width)
+    if calibration.phase == "calibrated" and not quality.get("holdout"):
+        lines += wrap("Made without cameras: its error was not measured.", width, "muted")
+    return lines
+
+
+def history_lines(state: MonitorState, width: int) -> list[Line]:
+    """Return the stored calibrations, the newest first; the selected one is marked."""
+    if state.stored_fault:
+        return wrap(f"✖ The list cannot be read: {state.stored_fault}", width, "error", indent=2)
+    stored = state.stored
+    if stored is None:
+        return wrap("Reading the stored calibrations.", width, "muted")
+    if not stored.versions:
+        return wrap("No calibration is stored yet: key 2 shows how to make one.", width, "muted")
+    wide = width >= _WIDE
+    columns = [Column(""), Column("version", right=True), Column("made")]
+    if wide:
+        columns += [Column("method"), Column("held-out error")]
+    chosen = state.chosen_version()
+    rows = [
+        _version_row(state, each, in_force=stored.in_force, chosen=each is chosen, wide=wide)
+        for each in stored.versions
+    ]
+    lines = table([*columns, Column("state")], rows, width)
+    if not wide and chosen is not None:
+        lines += wrap(f"Version {chosen.version}: {_errors(chosen)}", width, "muted")
+    if stored.omitted:
+        lines += wrap(f"{stored.omitted} older: jointfit calibrate --list", width, "muted")
+    return lines
+
+
+def _version_row(
+    state: MonitorState, one: StoredVersion, *, in_force: int | None, chosen: bool, wide: bool
+) -> list[tuple[str, Style]]:
+    style: Style = "chosen" if chosen else ""
+    row: list[tuple[str, Style]] = [
+        ("▶" if chosen else " ", style),
+        (str(one.version), style),
+        (format_date(one.created_utc, state.timezone), style),
+    ]
+    if wide:
+        row += [(one.method or UNKNOWN, style), (_errors(one), style)]
+    text, level = _version_state(one, in_force)
+    return [*row, (text, style or level)]
+
+
+def _version_state(one: StoredVersion, in_force: int | None) -> tuple[str, Style]:
+    if one.fault:
+        return f"✖ {one.fault}", "error"
+    if one.version == in_force:
+        return "✔ in force", "good"
+    if not one.usable:
+        return "○ of another limb", "muted"
+    return ("stored" if one.restored_from is None else f"copy of {one.restored_from}"), ""
+
+
+def _errors(one: StoredVersion) -> str:
+    errors = [
+        f"{title_of(name)} flexion {format_number(error, 1, '°')}"
+        for name, error in one.flexion_deg.items()
+    ]
+    return ", ".join(errors) or "not measured"
+
+
+def _spread(value: Any, decimals: int) -> str:
+    number = _number(value)
+    return UNKNOWN if number is None else f"± {format_number(number, decimals, ' mm')}"
+
+
+def _table(value: Any) -> Mapping[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, int | float) else None

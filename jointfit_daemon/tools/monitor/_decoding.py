@@ -1,0 +1,89 @@
+"""Payloads of the daemon decoded through their published models; the only place that does so."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pydantic import ValidationError
+
+from jointfit_daemon.outputs.log import printable
+from jointfit_daemon.outputs.payload_models import ANSWERS, PAYLOADS, payload_topic
+from jointfit_daemon.outputs.topics import PAYLOAD_VERSION
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+_DEEPEST = 12
+"""Deepest nesting of a payload; the quality of a calibration has 6 levels."""
+
+
+class UnreadablePayloadError(Exception):
+    """A payload does not fit its model; the message gives the key and the remedy."""
+
+
+def decode(topic: str, payload: Any) -> BaseModel | None:
+    """Return the payload of a topic below the base as its model; None of an unknown topic.
+
+    Control characters in texts and names are replaced by escapes, so that no text of a message can
+    control the terminal. Unknown keys are ignored, as docs/mqtt.md asks.
+
+    Raises
+    ------
+    UnreadablePayloadError
+        A key is missing or has another type, or the payload has another version.
+    """
+    found = payload_topic(topic)
+    return None if found is None else _validated(PAYLOADS[found], topic, payload)
+
+
+def decode_answer(command: str, data: Any) -> BaseModel:
+    """Return the ``data`` of an answer as its model; errors as for `decode`."""
+    return _validated(ANSWERS[command], f"bridge/response/{command}", data)
+
+
+def _validated(model: type[BaseModel], topic: str, payload: Any) -> BaseModel:
+    if not isinstance(payload, dict):
+        raise UnreadablePayloadError(f"{topic}: no JSON object; another program publishes here")
+    version = payload.get("v", PAYLOAD_VERSION)
+    if version != PAYLOAD_VERSION:
+        raise UnreadablePayloadError(
+            f"{topic}: payload version {version!r:.20}, this program reads {PAYLOAD_VERSION}:"
+            " install the version of the daemon"
+        )
+    payload = _printable(payload, topic)
+    try:
+        return model.model_validate(payload)
+    except ValidationError as error:
+        faults = error.errors(include_url=False, include_context=False, include_input=False)
+    for fault in faults:
+        if fault["type"] == "extra_forbidden":
+            _remove(payload, fault["loc"])
+    try:
+        return model.model_validate(payload)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False, include_input=False)[0]
+    key = ".".join(str(part) for part in first["loc"])
+    raise UnreadablePayloadError(
+        f"{topic}: {key}: {first['msg'].lower()}; the daemon has another version"
+    )
+
+
+def _printable(value: Any, topic: str, depth: int = 0) -> Any:
+    """Return a copy of a JSON value with `printable` applied to its texts, keys included."""
+    if depth > _DEEPEST:
+        raise UnreadablePayloadError(f"{topic}: nested deeper than {_DEEPEST} levels")
+    if isinstance(value, str):
+        return printable(value)
+    if isinstance(value, dict):
+        return {printable(key): _printable(each, topic, depth + 1) for key, each in value.items()}
+    if isinstance(value, list):
+        return [_printable(each, topic, depth + 1) for each in value]
+    return value
+
+
+def _remove(payload: Any, location: tuple[int | str, ...]) -> None:
+    """Remove the key at a location of a payload."""
+    *path, last = location
+    for key in path:
+        payload = payload[key]
+    del payload[last]

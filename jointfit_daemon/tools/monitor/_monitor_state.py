@@ -1,0 +1,289 @@
+"""State of the monitor beside the rig: connection, views, keys, and answers of the daemon.
+
+Invariants: no clock, no I/O, no terminal. A key changes the state, or returns an action for the
+program.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from jointfit_daemon.outputs.log import printable
+from jointfit_daemon.outputs.payload_models import CalibrationsAnswer
+from jointfit_daemon.tools.monitor._decoding import UnreadablePayloadError, decode_answer
+from jointfit_daemon.tools.monitor._rig_view import RigView
+from jointfit_daemon.tools.monitor._words import RUNNING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from datetime import tzinfo
+
+    from jointfit_daemon.outputs.payload_models import StoredVersion
+    from jointfit_daemon.tools.monitor._rig_view import AngleChoice
+
+ViewName = Literal["live", "calibrate", "history", "health", "log"]
+VIEWS: tuple[ViewName, ...] = ("live", "calibrate", "history", "health", "log")
+_TURN_DEG = 15
+_PAGE = 10
+"""Lines of a page for scrolling."""
+_NOTICE_S = 20.0
+"""Time for which the answer to a request is shown, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class SendRequest:
+    """Action: send a request to the daemon."""
+
+    command: str
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ChooseRig:
+    """Action: show the rig with this base topic."""
+
+    base: str
+
+
+@dataclass(frozen=True, slots=True)
+class AskMark:
+    """Action: ask for the text of a mark."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quit:
+    """Action: end the program."""
+
+
+Action = SendRequest | ChooseRig | AskMark | Quit
+
+
+@dataclass(slots=True)
+class Notice:
+    """Outcome of the last request."""
+
+    text: str
+    refused: bool
+    until_s: float
+
+
+@dataclass(slots=True)
+class MonitorState:
+    """Everything that the screen shows."""
+
+    broker: str
+    """Address of the broker in words."""
+    timezone: tzinfo | None = None
+    unicode: bool = True
+    base: str | None = None
+    link: Literal["connecting", "searching", "connected", "lost"] = "connecting"
+    reason: str = ""
+    """Reason of a lost link."""
+    rigs: dict[str, str] = field(default_factory=dict)
+    """Names of the rigs on the broker by base topic, while none is chosen."""
+    rig: RigView = field(default_factory=RigView)
+    view: ViewName = "live"
+    choice: AngleChoice | None = None
+    turn_deg: int = 0
+    """Direction of view about the vertical, degrees from the side."""
+    cursor: int = 0
+    """Selected entry of the history or of the list of rigs."""
+    scroll: int = 0
+    only_problems: bool = False
+    stored: CalibrationsAnswer | None = None
+    stored_fault: str = ""
+    listed: tuple[object, ...] | None = None
+    """Calibration for which the stored versions were requested."""
+    notice: Notice | None = None
+
+    # --- connection ----------------------------------------------------------------------------
+
+    def begin_rig(self, base: str) -> None:
+        """Show the rig with this base topic; forget another one."""
+        self.base, self.rig, self.stored = base, RigView(), None
+        self.choice, self.cursor, self.scroll = None, 0, 0
+
+    def connected(self) -> None:
+        """Note a new connection: retained messages follow."""
+        self.link, self.reason = ("connected" if self.base is not None else "searching"), ""
+        self.rig.bridge, self.listed = "unknown", None
+
+    def lost(self, reason: str) -> None:
+        """Note that the broker is lost."""
+        self.link, self.reason = "lost", printable(reason)
+
+    def found_rigs(self, rigs: Mapping[str, str]) -> str | None:
+        """Note the result of a search; return the base topic of the only rig."""
+        self.rigs = {base: printable(name) for base, name in sorted(rigs.items())}
+        self.link, self.reason = "searching", ""
+        return next(iter(self.rigs)) if len(self.rigs) == 1 else None
+
+    # --- answers -------------------------------------------------------------------------------
+
+    def take_answer(self, command: str, answer: Mapping[str, Any], now_s: float) -> None:
+        """Take the answer to a request."""
+        if command == "calibrations":
+            self._take_versions(answer)
+        elif answer.get("status") == "error":
+            self.refused(f"jointfitd refuses {command}: {_fault_text(answer)}", now_s)
+        else:
+            done = "started" if answer.get("status") == "accepted" else "done"
+            text = printable(f"{_words_of(command, answer)}: {done}")
+            self.notice = Notice(text, False, now_s + _NOTICE_S)
+            self.listed = None
+
+    def refused(self, reason: str, now_s: float) -> None:
+        """Show why a request has no effect."""
+        self.notice = Notice(printable(reason), True, now_s + _NOTICE_S)
+
+    def versions_unreadable(self, reason: str) -> None:
+        """Show why the stored calibrations cannot be read."""
+        self.stored, self.stored_fault = None, printable(reason)
+
+    def _take_versions(self, answer: Mapping[str, Any]) -> None:
+        if answer.get("status") == "error":
+            self.versions_unreadable(_fault_text(answer))
+            return
+        try:
+            data = decode_answer("calibrations", answer.get("data"))
+        except UnreadablePayloadError as fault:
+            self.versions_unreadable(str(fault))
+            return
+        if isinstance(data, CalibrationsAnswer):
+            self.stored, self.stored_fault = data, ""
+            self.cursor = min(self.cursor, max(0, len(data.versions) - 1))
+
+    # --- keys ----------------------------------------------------------------------------------
+
+    @property
+    def is_running(self) -> bool:
+        """Return whether a calibration phase runs."""
+        calibration = self.rig.calibration
+        return calibration is not None and calibration.phase in RUNNING
+
+    def chosen_version(self) -> StoredVersion | None:
+        """Return the selected entry of the history."""
+        if self.stored is None or not self.stored.versions:
+            return None
+        return self.stored.versions[min(self.cursor, len(self.stored.versions) - 1)]
+
+    def press(self, key: str) -> Action | None:
+        """Change the state by a key; return an action for the program, if the key has one."""
+        if key in {"q", "ctrl+c", "ctrl+q"}:
+            return Quit()
+        if self.base is None:
+            return self._press_in_rigs(key)
+        if key.isdecimal() and 1 <= int(key) <= len(VIEWS):
+            self._show(VIEWS[int(key) - 1])
+        elif key in {"tab", "shift+tab"}:
+            step = 1 if key == "tab" else -1
+            self._show(VIEWS[(VIEWS.index(self.view) + step) % len(VIEWS)])
+        elif self.view == "history" and key in {"up", "down", "enter", "r"}:
+            return self._press_in_history(key)
+        elif self._move(key):
+            pass
+        else:
+            return self._requested_by(key)
+        return None
+
+    def due_request(self) -> SendRequest | None:
+        """Return the request for the stored versions when the view needs them, once."""
+        calibration = self.rig.calibration
+        if self.view != "history" or self.link != "connected" or self.rig.bridge != "online":
+            return None
+        shown = (
+            None if calibration is None else (str(calibration.phase), calibration.version),
+            self.base,
+        )
+        if shown == self.listed:
+            return None
+        self.listed = shown
+        return SendRequest("calibrations")
+
+    def _show(self, view: ViewName) -> None:
+        self.view, self.scroll, self.cursor, self.listed = view, 0, 0, None
+
+    def _press_in_rigs(self, key: str) -> Action | None:
+        bases = [*self.rigs]
+        if key in {"up", "down"} and bases:
+            self.cursor = (self.cursor + (1 if key == "down" else -1)) % len(bases)
+        if key == "enter" and bases:
+            return ChooseRig(bases[min(self.cursor, len(bases) - 1)])
+        return None
+
+    def _press_in_history(self, key: str) -> Action | None:
+        count = 0 if self.stored is None else len(self.stored.versions)
+        if key in {"up", "down"} and count:
+            self.cursor = max(0, min(count - 1, self.cursor + (1 if key == "down" else -1)))
+        version = self.chosen_version()
+        if key == "enter" and version is not None:
+            return SendRequest("use-calibration", {"version": version.version})
+        return SendRequest("use-calibration", {"revert": True}) if key == "r" else None
+
+    def _move(self, key: str) -> bool:
+        """Scroll, turn the limb, or choose an angle; return whether the key does that."""
+        steps = {"down": 1, "up": -1, "pagedown": _PAGE, "pageup": -_PAGE}
+        if key in steps:
+            self.scroll = max(0, self.scroll + steps[key])
+        elif key in {"left", "right"}:
+            self.turn_deg = (self.turn_deg + (_TURN_DEG if key == "right" else -_TURN_DEG)) % 360
+        elif key in {"j", "J"}:
+            self._choose_angle(1 if key == "j" else -1)
+        elif key == "w" and self.view == "log":
+            self.only_problems, self.scroll = not self.only_problems, 0
+        else:
+            return False
+        return True
+
+    def _choose_angle(self, step: int) -> None:
+        choices = self.rig.angle_choices()
+        if choices:
+            at = choices.index(self.choice) if self.choice in choices else 0
+            self.choice = choices[(at + step) % len(choices)]
+
+    def _requested_by(self, key: str) -> Action | None:
+        """Return the request of a key; phases other than the static pose have it in their view."""
+        if key == "m":
+            return AskMark()
+        if key == "s" and not self.is_running:
+            return SendRequest("static")
+        if key == "x" and self.is_running:
+            return SendRequest("calibrate", {"phase": "abort"})
+        if self.view != "calibrate" or self.is_running:
+            return None
+        phases: dict[str, Mapping[str, Any]] = {
+            "a": {"phase": "align"},
+            "f": {"phase": "functional"},
+            "F": {"phase": "functional", "force": True},
+        }
+        return SendRequest("calibrate", phases[key]) if key in phases else None
+
+
+def chosen_angle(state: MonitorState) -> AngleChoice | None:
+    """Return the angle to show: the chosen one, or the first one of the rig."""
+    choices = state.rig.angle_choices()
+    if state.choice in choices:
+        return state.choice
+    return choices[0] if choices else state.choice
+
+
+def _fault_text(answer: Mapping[str, Any]) -> str:
+    error = answer.get("error")
+    error = error if isinstance(error, dict) else {}
+    faults = error.get("faults")
+    first = faults[0] if isinstance(faults, list) and faults else error
+    return str(first.get("message") if isinstance(first, dict) else first)
+
+
+def _words_of(command: str, answer: Mapping[str, Any]) -> str:
+    """Return what a request did, in words."""
+    data = answer.get("data")
+    data = data if isinstance(data, dict) else {}
+    if command == "mark":
+        return f"mark {data.get('number')}"
+    if command == "use-calibration":
+        return f"calibration in force is version {data.get('version')}"
+    if command in {"calibrate", "static"}:
+        return f"{data.get('phase', 'static')} phase"
+    return command

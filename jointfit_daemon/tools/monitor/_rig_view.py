@@ -1,0 +1,221 @@
+"""State of a rig, reduced from the messages below its base topic.
+
+Invariants: no clock, no I/O, no terminal; memory is bounded for any sequence of messages.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
+
+from jointfit_daemon.outputs.payload_models import (
+    CalibrationState,
+    Event,
+    Health,
+    Info,
+    OpticalPose,
+    Pose,
+    Progress,
+    State,
+)
+from jointfit_daemon.tools.monitor._decoding import UnreadablePayloadError, decode
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pydantic import BaseModel
+
+TOPICS = (
+    "bridge/state", "bridge/info", "bridge/health", "bridge/event", "calibration",
+    "calibration/progress", "device/+/availability", "pose/ui", "optical/pose",
+)  # fmt: skip
+"""Topics below the base that the monitor reads."""
+SHOWN_S = 20.0
+"""Longest time range of the curve, s."""
+_MOST_SAMPLES = 1000
+"""Stored points of a curve: 20 s of `pose/ui` at 30 Hz, or of `optical/pose` at 50 Hz."""
+_MOST_EVENTS = 300
+_MOST_DEVICES = 200
+"""Devices and ids of events that are remembered; a rig has fewer than 50 devices."""
+AngleChoice = tuple[str, str]
+"""Joint, and key of its angle such as ``flexion_deg``."""
+
+
+@dataclass(frozen=True, slots=True)
+class AngleSample:
+    """Angles of all joints at one instant."""
+
+    t_us: int
+    angles: Mapping[AngleChoice, float | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """Present time by the clocks of this machine."""
+
+    monotonic_s: float
+    unix_us: float
+
+
+@dataclass(slots=True)
+class RigView:
+    """Newest messages of a rig, and the curves of the last seconds."""
+
+    bridge: Literal["unknown", "online", "offline"] = "unknown"
+    info: Info | None = None
+    health: Health | None = None
+    calibration: CalibrationState | None = None
+    progress: Progress | None = None
+    pose: Pose | None = None
+    pose_s: float | None = None
+    """Receipt of `pose`, s of the monotonic clock."""
+    optical: OpticalPose | None = None
+    optical_s: float | None = None
+    availability: dict[str, str] = field(default_factory=dict)
+    last_events: dict[str, Event] = field(default_factory=dict)
+    """Newest event of each id."""
+    events: deque[Event] = field(default_factory=lambda: deque(maxlen=_MOST_EVENTS))
+    """Newest first."""
+    poses: deque[AngleSample] = field(default_factory=lambda: deque(maxlen=_MOST_SAMPLES))
+    opticals: deque[AngleSample] = field(default_factory=lambda: deque(maxlen=_MOST_SAMPLES))
+    faults: dict[str, str] = field(default_factory=dict)
+    """Reason why the last message of a topic could not be read."""
+    reach_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    """Largest horizontal distance from the first joint, lowest and highest point beside it, m."""
+    clock_offset_us: float | None = None
+    """UNIX time of the gateway minus monotonic time of this machine, µs."""
+    clock_error_us: float = 0.0
+    """UNIX time of the gateway minus that of this machine, µs."""
+
+    def take(self, topic: str, payload: Any, now: Moment) -> None:
+        """Take one message; `topic` is below the base topic."""
+        kind = "device" if topic.startswith("device/") else topic
+        try:
+            message = decode(topic, payload)
+        except UnreadablePayloadError as fault:
+            if kind in (*TOPICS, "device"):
+                self.faults[kind] = str(fault)
+            return
+        self.faults.pop(kind, None)
+        if message is not None:
+            self._reduce(topic, message, now)
+
+    def gateway_us(self, now: Moment) -> float | None:
+        """Return the present UNIX time of the gateway, µs; None while it is unknown."""
+        if self.clock_offset_us is None:
+            return None
+        return self.clock_offset_us + now.monotonic_s * 1e6
+
+    def angle_choices(self) -> list[AngleChoice]:
+        """Return all angles of the rig, in the order of its joints."""
+        if self.pose is None:
+            return []
+        names = self.info.joints if self.info is not None else [*self.pose.joints]
+        return [
+            (name, key)
+            for name in names
+            if name in self.pose.joints
+            for key in type(self.pose.joints[name]).model_fields
+            if key.endswith("_deg")
+            and key != "sd_deg"
+            and key in self.pose.joints[name].model_fields_set
+        ]
+
+    def _reduce(self, topic: str, message: BaseModel, now: Moment) -> None:
+        match message:
+            case Pose():
+                self._take_pose(message, now)
+            case OpticalPose():
+                self.optical, self.optical_s = message, now.monotonic_s
+                _append(self.opticals, _angles(message))
+            case State() if topic == "bridge/state":
+                self.bridge = message.state
+            case State():
+                _bounded_set(self.availability, topic.split("/")[1], message.state)
+            case Info():
+                self.info = message
+            case Health():
+                self.health = message
+            case CalibrationState():
+                self._take_calibration(message)
+            case Progress():
+                self.progress = message
+            case Event():
+                self.events.appendleft(message)
+                _bounded_set(self.last_events, message.id, message)
+            case _:
+                pass
+
+    def _take_pose(self, pose: Pose, now: Moment) -> None:
+        # An older instant is a restart of the daemon or a step of its clock: the curve begins anew.
+        if self.pose is not None and pose.t_us < self.pose.t_us:
+            self.poses.clear()
+            self.opticals.clear()
+            self.clock_offset_us = None
+        self.pose, self.pose_s = pose, now.monotonic_s
+        _append(self.poses, _angles(pose))
+        self._extend_reach(pose)
+
+        # The smallest delay between instant and receipt converts our time to that of the gateway.
+        offset_us = pose.t_us - now.monotonic_s * 1e6
+        if self.clock_offset_us is None or offset_us > self.clock_offset_us:
+            self.clock_offset_us = offset_us
+            self.clock_error_us = pose.t_us - now.unix_us
+
+    def _extend_reach(self, pose: Pose) -> None:
+        points = [known_vector(joint.p_m, 3) for joint in pose.joints.values()]
+        known = [point for point in points if point is not None]
+        if not known:
+            return
+        (x0, y0, z0), reach = known[0], self.reach_m
+        for x, y, z in known[1:]:
+            reach[0] = max(reach[0], math.hypot(x - x0, y - y0))
+            reach[1] = min(reach[1], z - z0)
+            reach[2] = max(reach[2], z - z0)
+
+    def _take_calibration(self, calibration: CalibrationState) -> None:
+        before = self.calibration
+        if before is None or before.version != calibration.version:
+            self.reach_m = [0.0, 0.0, 0.0]
+        self.calibration = calibration
+        if self.progress is not None and self.progress.phase != calibration.phase:
+            self.progress = None
+
+
+def known_vector(vector: list[float | None] | None, length: int) -> list[float] | None:
+    """Return the components of a vector; None if one of them is unknown."""
+    if vector is None or len(vector) != length:
+        return None
+    known = [value for value in vector if value is not None and math.isfinite(value)]
+    return known if len(known) == length else None
+
+
+def _angles(pose: Pose | OpticalPose) -> AngleSample:
+    """Return the angles of a pose."""
+    return AngleSample(
+        pose.t_us,
+        {
+            (name, key): getattr(joint, key)
+            for name, joint in pose.joints.items()
+            for key in joint.model_fields_set
+            if key.endswith("_deg") and key != "sd_deg"
+        },
+    )
+
+
+def _append(samples: deque[AngleSample], sample: AngleSample) -> None:
+    """Append a sample; remove those that the curve no longer shows."""
+    samples.append(sample)
+    oldest_us = sample.t_us - SHOWN_S * 1e6
+    while samples[0].t_us < oldest_us:
+        samples.popleft()
+
+
+def _bounded_set(table: dict[str, Any], key: str, value: Any) -> None:
+    """Set a key as the newest of a table; remove the oldest beyond `_MOST_DEVICES`."""
+    table.pop(key, None)
+    table[key] = value
+    if len(table) > _MOST_DEVICES:
+        del table[next(iter(table))]

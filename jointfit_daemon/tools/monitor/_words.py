@@ -1,0 +1,156 @@
+"""Numbers, ages, states and flags in words. Unknown is ``–``, never 0 and never an old value.
+
+The dashboard's page has the same words (``page/js/words.js``).
+"""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from datetime import tzinfo
+
+    from jointfit_daemon.outputs.payload_models import CalibrationState, DeviceCounts
+
+UNKNOWN = "–"
+Level = Literal["good", "warning", "error", "muted"]
+SYMBOLS: dict[Level, str] = {"good": "✔", "warning": "▲", "error": "✖", "muted": "○"}
+"""Mark of a level, so that no meaning depends on colour."""
+RUNNING = frozenset({"align", "static", "functional", "fitting"})
+"""Phases during which the daemon records or fits."""
+LARGE_SIGMA_US = 2000.0
+"""Standard deviation of a clock, µs, above which it is a warning."""
+_FLAGS = {
+    "uncalibrated": "Not calibrated: angles are unknown.",
+    "other_chain": "The stored calibration belongs to another limb: calibrate again.",
+    "headings_from_static": "Headings come from the static pose: there was no align phase.",
+    "same_pose_assumed": "The static pose was recorded without cameras: the last one is assumed.",
+    "stuck": "% repeats its value and is not used.",
+    "slipped": "% moved on the body and is not used.",
+    "pair_disagrees": "The two sensors of % contradict each other: check their straps.",
+    "heading_disagrees": "Magnetic disturbance at the %: angles are corrected, headings uncertain.",
+    "heading_unseen": "The limb may have turned about the vertical; joint angles are not affected.",
+    "one_sensor": "Only one sensor of % contributes.",
+    "held": "No data from the sensors of %: the last orientation is held.",
+    "lost": "No data from the sensors of %.",
+    "untrained": "% is outside of the movements of the calibration.",
+    "extrapolating": "A sensor is late and was extrapolated.",
+    "origin_fixed": "The cameras do not see the first joint.",
+    "axis_vertical": "% uses the vertical as its axis: the calibration found no joint centre.",
+    "facing_unknown": "The flexion axis of % is unknown; the facing direction is used.",
+    "uncorrected": "Sensors are used without correction (procedure of the patent).",
+    "gimbal": "Gimbal lock: flexion and rotation cannot be separated.",
+}
+_MINOR = {"extrapolating", "headings_from_static", "origin_fixed", "uncorrected"}
+"""Flags that need no action."""
+_PHASES = {
+    "uncalibrated": "Not calibrated",
+    "align": "Align phase runs",
+    "aligned": "Sensors aligned; the static pose is next",
+    "static": "Static phase runs",
+    "posed": "Static pose recorded; the functional phase is next",
+    "functional": "Functional phase runs",
+    "fitting": "Fitting the calibration",
+}
+_CLOCKS: dict[str, tuple[Level, str]] = {
+    "settling": ("muted", "settling"),
+    "direct": ("good", "sync line"),
+    "echo": ("good", "synchronised"),
+    "passive": ("good", "fitted"),
+    "arrival": ("warning", "no device time"),
+    "stale": ("warning", "stale"),
+}
+
+
+def format_number(value: float | None, decimals: int = 1, unit: str = "") -> str:
+    """Return a number with fixed decimals and its unit."""
+    if value is None or not math.isfinite(value):
+        return UNKNOWN
+    text = f"{value:.{decimals}f}"
+    if text.startswith("-"):
+        text = text[1:] if not text.strip("-0.") else f"−{text[1:]}"
+    return f"{text}{unit}"
+
+
+def format_duration(seconds: float) -> str:
+    """Return a duration in the largest fitting unit."""
+    for limit, size, unit in ((90, 1, "s"), (5400, 60, "min"), (129_600, 3600, "h")):
+        if seconds < limit:
+            return f"{max(0, round(seconds / size))} {unit}"
+    return f"{round(seconds / 86_400)} days"
+
+
+def format_clock(microseconds: float | None, timezone: tzinfo | None = None) -> str:
+    """Return the time of day of a UNIX time, µs; `timezone` None: that of this machine."""
+    if microseconds is None:
+        return UNKNOWN
+    try:
+        moment = datetime.fromtimestamp(microseconds / 1e6, tz=UTC).astimezone(timezone)
+    except (ValueError, OverflowError, OSError):
+        return UNKNOWN
+    return moment.strftime("%H:%M:%S")
+
+
+def format_date(text: str | None, timezone: tzinfo | None = None) -> str:
+    """Return date and time of an ISO 8601 text; the text itself if it is none."""
+    if text is None:
+        return UNKNOWN
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        return text
+    if moment.tzinfo is None:
+        moment = moment.replace(tzinfo=UTC)
+    return moment.astimezone(timezone).strftime("%Y-%m-%d %H:%M")
+
+
+def title_of(name: str) -> str:
+    """Return a name for headings: ``left_knee`` as ``Left knee``."""
+    words = name.replace("_", " ")
+    return words[:1].upper() + words[1:]
+
+
+def angle_name(key: str) -> str:
+    """Return the words of an angle's key: ``flexion_deg`` as ``flexion``."""
+    return "inner angle" if key == "inner_deg" else key.removesuffix("_deg").replace("_", " ")
+
+
+def flag_sentence(flag: str) -> str:
+    """Return the sentence of a flag of a pose; an unknown flag is its own text."""
+    kind, _, name = flag.partition(":")
+    return _FLAGS.get(kind, flag).replace("%", name.replace("_", " "))
+
+
+def serious_flags(flags: list[str]) -> list[str]:
+    """Return the flags that may need an action."""
+    return [flag for flag in flags if flag.partition(":")[0] not in _MINOR]
+
+
+def calibration_sentence(calibration: CalibrationState | None) -> str:
+    """Return the state of the calibration in words."""
+    if calibration is None:
+        return "Waiting for the calibration state"
+    phase = str(calibration.phase)
+    if phase == "calibrated":
+        version = calibration.version
+        stored = "not stored yet" if version is None else f"version {version}"
+        rejected = "; the last result was rejected" if calibration.kept else ""
+        return f"Calibrated, {stored}{rejected}"
+    if phase == "aborted":
+        return f"Calibration aborted: {calibration.text}"
+    return _PHASES.get(phase, phase)
+
+
+def clock_quality(device: DeviceCounts | None) -> tuple[Level, str]:
+    """Return level and words of the clock of a device."""
+    if device is None:
+        return "muted", UNKNOWN
+    level, words = _CLOCKS[device.clock]
+    sigma = device.sigma_us
+    if level != "good" or sigma is None:
+        return level, words
+    if sigma > LARGE_SIGMA_US:
+        return "warning", f"{words} ±{format_number(sigma / 1000, 1, ' ms')}"
+    return level, f"{words} ±{format_number(sigma, 0, ' µs')}"
