@@ -46,6 +46,7 @@ NOT_RUN = {
     r"^make ": "minutes of processor time: CI runs the targets",
     r"python -m bench": "minutes of processor time: the options are checked against its --help",
     r"pytest": "the test suite itself",
+    r"examples/subscribers|http.server": "runs until it is stopped: tests/examples",
     r"^curl ": "needs [metrics] on port 9464: tests/outputs/metrics starts it on a free one",
     r"^jointfit dashboard": "needs port 8080: tests/tools/dashboard starts it on a free one",
     r"^jointfit monitor": "needs a terminal: tests/system runs it in a pseudo-terminal",
