@@ -48,6 +48,7 @@ NOT_RUN = {
     r"pytest": "the test suite itself",
     r"examples/subscribers|http.server": "runs until it is stopped: tests/examples",
     r"^curl ": "needs [metrics] on port 9464: tests/outputs/metrics starts it on a free one",
+    r"^jointfit init ": "asks questions: tests/tools/init answers them",
     r"^jointfit dashboard": "needs port 8080: tests/tools/dashboard starts it on a free one",
     r"^jointfit monitor": "needs a terminal: tests/system runs it in a pseudo-terminal",
     r"^jointfit report --cor-study": "12 s of processor time",

@@ -13,6 +13,7 @@ from jointfit_daemon.config._tables import (
     MqttSettings,
     RecordingSettings,
     TlsSettings,
+    is_this_host,
 )
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "drifting_imus",
     "faults_of",
     "heading_warning",
+    "is_this_host",
     "load_rig",
     "missing_files",
     "parse_rig",

@@ -19,6 +19,7 @@ from jointfit_daemon.tools.dashboard import dashboard
 from jointfit_daemon.tools.decode import decode
 from jointfit_daemon.tools.demo import demo
 from jointfit_daemon.tools.ik import ik
+from jointfit_daemon.tools.init import init
 from jointfit_daemon.tools.markers import markers
 from jointfit_daemon.tools.monitor import monitor
 from jointfit_daemon.tools.probe import probe
@@ -36,8 +37,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    check, probe, demo, dashboard, monitor, calibrate, mark, request, center, decode, ik, markers,
-    report, sample, schema,
+    init, check, probe, demo, dashboard, monitor, calibrate, mark, request, center, decode, ik,
+    markers, report, sample, schema,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(fuse.app)

@@ -1,0 +1,74 @@
+"""Answer files: the state of an interrupted dialogue, and the input of scripts.
+
+A question that is asked once is a key. One that is asked for several subjects is a table of them::
+
+    limb = "knee"
+    [sensors]
+    thigh = ["thigh-front", "thigh-side"]
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.tools.init._rig_text import toml, toml_key
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from jointfit_daemon.tools.init._answers import Answers, Key
+
+_HEADER = "# Answers of an unfinished `jointfit init`, which continues with them.\n"
+
+
+def read_answers(path: Path) -> Answers:
+    """Return the answers in a file; their values are not checked.
+
+    Raises
+    ------
+    ValueError
+        The file is not TOML in UTF-8.
+    OSError
+        The file cannot be read.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: no answer file: {error}: expected TOML in UTF-8") from error
+    answers: Answers = {}
+    for key, value in table.items():
+        if isinstance(value, dict):
+            answers |= {(key, subject): answer for subject, answer in value.items()}
+        else:
+            answers[key, ""] = value
+    return answers
+
+
+def write_answers(path: Path, answers: Mapping[Key, Any]) -> None:
+    """Write `answers`; a file is replaced at once, so that an interruption leaves a whole one."""
+    tables: dict[str, list[str]] = {"": []}
+    for (key, subject), value in answers.items():
+        # TOML has no null: an empty text is the empty answer.
+        text = toml("" if value is None else value)
+        if subject:
+            tables.setdefault(key, []).append(f"{toml_key(subject)} = {text}")
+        else:
+            tables[""].append(f"{key} = {text}")
+    parts = [f"[{key}]\n" * bool(key) + "\n".join(lines) + "\n" for key, lines in tables.items()]
+    replace_file(path, _HEADER + "\n".join(parts))
+
+
+def replace_file(path: Path, text: str) -> None:
+    """Write a text file as a whole, or leave the old one."""
+    partial = path.with_name(f"{path.name}.part")
+    try:
+        with partial.open("w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

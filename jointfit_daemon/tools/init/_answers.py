@@ -1,0 +1,107 @@
+"""Answers of the dialogue, and what follows from them for later questions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.tools.init._limbs import LIMBS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.tools.init._found import Found, ImuDriver, MocapDriver
+    from jointfit_daemon.tools.init._limbs import Limb
+
+Key = tuple[str, str]
+"""Key of a question and its subject: a segment, a sensor, a body part, or an empty text."""
+Answers = dict[Key, Any]
+"""Answers in the order in which they were given."""
+
+_LAST_PORT = 65535
+
+
+def limb_of(answers: Mapping[Key, Any]) -> Limb:
+    """Return the limb that was chosen."""
+    return LIMBS[answers["limb", ""]]
+
+
+def sensors_of(answers: Mapping[Key, Any]) -> dict[str, str]:
+    """Return the segment of every sensor, in the order of the rig."""
+    limb = limb_of(answers)
+    return {
+        name: segment for segment in limb.segments for name in answers.get(("sensors", segment), ())
+    }
+
+
+def wiring_of(answers: Mapping[Key, Any], device: str) -> str:
+    """Return ``serial`` for the path of a port that is no CAN adapter, else ``can``."""
+    return "serial" if "/" in device and device not in answers["can_adapters", ""] else "can"
+
+
+def drivers_for(answers: Mapping[Key, Any], found: Found, sensor: str) -> tuple[ImuDriver, ...]:
+    """Return the drivers that can read the device of `sensor`."""
+    wiring = wiring_of(answers, answers["device", sensor])
+    return tuple(driver for driver in found.imu_drivers if driver.wiring == wiring)
+
+
+def driver_of(answers: Mapping[Key, Any], found: Found, sensor: str) -> ImuDriver:
+    """Return the driver of `sensor`."""
+    fitting = drivers_for(answers, found, sensor)
+    name = answers.get(("driver", sensor))
+    return next((driver for driver in fitting if driver.name == name), fitting[0])
+
+
+def mocap_driver_of(answers: Mapping[Key, Any], found: Found) -> MocapDriver:
+    """Return the driver of the cameras."""
+    name = answers.get(("mocap_driver", ""))
+    known = found.mocap_drivers
+    return next((driver for driver in known if driver.name == name), known[0])
+
+
+def has_cameras(answers: Mapping[Key, Any]) -> bool:
+    """Return whether the rig has cameras."""
+    return limb_of(answers).is_planar or bool(answers["cameras", ""])
+
+
+def marked_parts(answers: Mapping[Key, Any]) -> tuple[str, ...]:
+    """Return the body parts that may carry markers, from proximal to distal."""
+    if not has_cameras(answers):
+        return ()
+    limb = limb_of(answers)
+    first = [limb.ends["proximal"]] if "proximal" in limb.ends else []
+    return tuple(dict.fromkeys((*first, *limb.segments, *limb.optional_parts)))
+
+
+def lengths_asked(answers: Mapping[Key, Any]) -> tuple[str, ...]:
+    """Return the segments whose length the cameras cannot estimate."""
+    limb = limb_of(answers)
+    if limb.is_planar:
+        return ()
+    if not has_cameras(answers):
+        return limb.segments
+    return tuple(
+        segment
+        for segment in limb.segments
+        if segment in limb.lengths_m
+        or ((end := limb.end_of(segment)) is not None and not answers["markers", end])
+    )
+
+
+def split_address(text: str) -> tuple[str, int]:
+    """Return host and port of ``HOST``, ``HOST:PORT`` or ``[IPv6]:PORT``; port 0 if missing.
+
+    Raises
+    ------
+    ValueError
+        The port is no number from 1 to 65535.
+    """
+    if text.startswith("["):
+        host, _, rest = text[1:].partition("]")
+        port = rest.removeprefix(":")
+    elif text.count(":") == 1:
+        host, _, port = text.partition(":")
+    else:
+        host, port = text, ""
+    if port and not (port.isascii() and port.isdigit() and 1 <= int(port) <= _LAST_PORT):
+        raise ValueError(f"found the port {port!r}, expected a number from 1 to {_LAST_PORT}")
+    return host, int(port or 0)

@@ -1,0 +1,219 @@
+"""Command `jointfit init`: asks, and writes a checked rig.toml."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import orjson
+import typer
+
+from jointfit_daemon.tools.command_group import EXIT_INTERRUPTED, EXIT_MISUSE
+from jointfit_daemon.tools.output_files import check_output
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.tools.init._answers import Answers
+    from jointfit_daemon.tools.init._dialogue import Dialogue
+
+PASSWORD_VARIABLE = "JOINTFIT_MQTT_PASSWORD"  # noqa: S105 - its name
+"""Environment variable with the password of the broker."""
+
+
+def init(
+    folder: Annotated[
+        Path, typer.Argument(help="Folder of the rig.toml, created if missing.")
+    ] = Path(),
+    *,
+    config: Annotated[
+        Path | None, typer.Option("--config", help="File to write instead of FOLDER/rig.toml.")
+    ] = None,
+    answers: Annotated[
+        Path | None,
+        typer.Option("--answers", help="TOML file with answers; others take their proposal."),
+    ] = None,
+    port: Annotated[
+        list[Path] | None,
+        typer.Option("--port", help="Further serial port for the list; repeatable."),
+    ] = None,
+    network: Annotated[
+        bool, typer.Option(help="Search the network for motion-capture servers.")
+    ] = True,
+    restart: Annotated[
+        bool, typer.Option("--restart", help="Forget the answers of an interrupted dialogue.")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing rig.toml.")] = False,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
+) -> None:
+    """Ask for limb, sensors, cameras and broker, and write a checked rig.toml.
+
+    Found devices are listed; Enter takes the proposal. Without a terminal, the lines of standard
+    input are the answers. An interrupted dialogue continues at the next start. Exit codes: 0 the
+    file is written; 2 it exists, cannot be written, or an answer is missing; 130 interrupted.
+    """
+    path = folder / "rig.toml" if config is None else config
+    if config is None:
+        folder.mkdir(parents=True, exist_ok=True)
+    check_output("rig.toml" if config is None else "--config", path, (".toml",))
+    if path.exists() and not force:
+        raise ValueError(f"{path} exists: replace it with --force, or choose another folder")
+    state = path.with_suffix(".answers.toml")
+    if restart:
+        state.unlink(missing_ok=True)
+
+    def show(text: str) -> None:
+        typer.echo(text, err=json)
+
+    ports = tuple(str(each) for each in port or ())
+    dialogue = _new_dialogue(show, state, answers, ports, network=network)
+    given = _finished(dialogue, state)
+    password = _write_password(path, given, show)
+    rig, warnings = _write_rig(path, given, dialogue)
+    state.unlink(missing_ok=True)
+    if json:
+        result = {
+            "ok": True, "rig": str(path), "password_file": password, "table": rig.table,
+            "warnings": warnings, "next": _next_commands(path, rig),
+        }  # fmt: skip
+        typer.echo(orjson.dumps(result, default=str))
+        return
+    _show_result(path, rig, warnings)
+
+
+def _show_result(path: Path, rig: Rig, warnings: list[str]) -> None:
+    typer.echo(f"\n{path} is written and valid.")
+    for warning in warnings:
+        typer.echo(f"warning: {warning}")
+    typer.echo("Next:")
+    following = _next_commands(path, rig)
+    for command, use in following.items():
+        typer.echo(f"  {command:{max(map(len, following))}}  {use}")
+
+
+def _new_dialogue(
+    show: Callable[[str], None],
+    state: Path,
+    answers: Path | None,
+    ports: tuple[str, ...],
+    *,
+    network: bool,
+) -> Dialogue:
+    """Return the dialogue with the answers of a file, or those of an interrupted dialogue."""
+    from jointfit_daemon.tools.init._answer_file import read_answers, write_answers
+    from jointfit_daemon.tools.init._dialogue import Dialogue
+    from jointfit_daemon.tools.init._search import DeviceSearch
+
+    prepared = {} if answers is None else read_answers(answers)
+    stored = read_answers(state) if state.exists() and answers is None else None
+    search = DeviceSearch(show, ports, network)
+    dialogue = Dialogue(
+        search,
+        show,
+        _reader(show),
+        lambda given: write_answers(state, given),
+        search.start(),
+        prepared,
+        is_script=answers is not None,
+    )
+    _show_found(dialogue, show)
+    if stored is not None:
+        show(f"Continuing with the answers in {state} (--restart begins again)")
+        dialogue.resume(stored)
+    elif answers is None:
+        show("Enter takes the proposal in brackets, '?' explains, '<' returns to the last question")
+    return dialogue
+
+
+def _reader(show: Callable[[str], None]) -> Callable[[str], str]:
+    """Return a function that prints a prompt and reads a line of standard input."""
+    is_terminal = sys.stdin.isatty()
+
+    def read_line(prompt: str) -> str:
+        if is_terminal:
+            typer.echo(prompt, nl=False, err=True)
+        line = sys.stdin.readline()
+        if not line:
+            raise EOFError
+        if not is_terminal:
+            show(f"{prompt}{line.rstrip()}")
+        return line
+
+    return read_line
+
+
+def _show_found(dialogue: Dialogue, show: Callable[[str], None]) -> None:
+    found = dialogue.found
+    devices = (*found.ports, *found.interfaces, *found.servers)
+    if not devices:
+        show("No serial port, CAN interface or motion-capture server was found.")
+        show("You may type their names, or connect them and start again.")
+        return
+    show("Found devices:")
+    width = max(len(each.address) for each in devices)
+    for each in devices:
+        show(f"  {each.address:{width}}  {each.text}")
+
+
+def _finished(dialogue: Dialogue, state: Path) -> Answers:
+    """Run the dialogue; an interruption is reported with the way to continue."""
+    from jointfit_daemon.tools.init._dialogue import UnansweredError
+
+    try:
+        return dialogue.run()
+    except KeyboardInterrupt:
+        code, reason = EXIT_INTERRUPTED, "interrupted"
+    except EOFError:
+        code, reason = EXIT_MISUSE, "the input ended before the last question"
+    except UnansweredError as error:
+        code, reason = EXIT_MISUSE, str(error)
+    kept = f"{len(dialogue.answers)} answers are in {state}; the same command continues with them"
+    typer.echo(f"\njointfit init: {reason}\n{kept}", err=True)
+    raise typer.Exit(code)
+
+
+def _write_password(path: Path, given: Answers, show: Callable[[str], None]) -> str | None:
+    """Write the password of the broker to its file; return the path, None without an account."""
+    name = given.get(("password_file", ""))
+    if name is None:
+        return None
+    file = path.absolute().parent / name
+    if file.exists():
+        show(f"The password in {file} is used.")
+        return str(file)
+    password = os.environ.get(PASSWORD_VARIABLE)
+    if not password and sys.stdin.isatty():
+        password = typer.prompt("Password for the broker", hide_input=True, err=True)
+    if not password:
+        return str(file)  # the check warns of the missing file
+    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
+        stream.write(f"{password}\n")
+    return str(file)
+
+
+def _write_rig(path: Path, given: Answers, dialogue: Dialogue) -> tuple[Rig, list[str]]:
+    """Write the rig, and return it as the daemon reads it, with the warnings of the check."""
+    from jointfit_daemon.config import heading_warning, load_rig, missing_files
+    from jointfit_daemon.tools.init._answer_file import replace_file
+    from jointfit_daemon.tools.init._rig_table import rig_table
+    from jointfit_daemon.tools.init._rig_text import rig_text
+
+    replace_file(path, rig_text(rig_table(given, dialogue.found)))
+    rig = load_rig(path)
+    heading = heading_warning(rig.sources)
+    return rig, [*missing_files(rig.mqtt), *([] if heading is None else [heading])]
+
+
+def _next_commands(path: Path, rig: Rig) -> dict[str, str]:
+    """Return the commands that follow, with their use."""
+    scheme = "mqtt" if rig.mqtt.tls is None else "mqtts"
+    broker = f"{scheme}://{rig.mqtt.host}:{rig.mqtt.tcp_port}"
+    return {
+        f"jointfit check {path}": "check the file after changes",
+        f"jointfitd --config {path}": "run the daemon",
+        f"jointfit dashboard --broker {broker}": "see the limb and calibrate in a browser",
+    }

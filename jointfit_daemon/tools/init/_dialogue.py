@@ -1,0 +1,208 @@
+"""The dialogue on lines of text: shows questions, reads answers, and starts searches.
+
+Invariant: only `Dialogue.read_line` waits for the user, and every accepted answer is stored at
+once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.nearest_name import did_you_mean
+from jointfit_daemon.tools.init._answers import split_address
+from jointfit_daemon.tools.init._engine import accept, complete, next_question
+from jointfit_daemon.tools.init._parsing import AnswerError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.tools.init._answers import Answers, Key
+    from jointfit_daemon.tools.init._engine import Asked
+    from jointfit_daemon.tools.init._found import Found
+    from jointfit_daemon.tools.init._search import DeviceSearch
+
+HELP, BACK, FIND = "?", "<", "find"
+"""Words instead of an answer: explain the question, return to the one before, start a search."""
+
+
+class UnansweredError(ValueError):
+    """The input of a script ended, or an answer file has no answer to a question."""
+
+
+@dataclass
+class Dialogue:
+    """One dialogue, from its answers so far to the complete ones."""
+
+    search: DeviceSearch
+    show: Callable[[str], None]
+    """Prints a line."""
+    read_line: Callable[[str], str]
+    """Prints a prompt and returns a line; raises EOFError at the end of the input."""
+    store: Callable[[Answers], None]
+    """Stores the answers."""
+    found: Found
+    prepared: dict[Key, Any] = field(default_factory=dict)
+    """Values of an answer file."""
+    is_script: bool = False
+    """Whether questions without a prepared answer take their default, or fail."""
+    answers: Answers = field(default_factory=dict)
+
+    def run(self) -> Answers:
+        """Ask until the dialogue is complete; return the answers.
+
+        Raises
+        ------
+        UnansweredError
+            Only in a script: an answer is missing, or not accepted.
+        """
+        while (asked := self._next()) is not None:
+            if asked.key in self.prepared:
+                self._take_prepared(asked)
+            elif self.is_script:
+                self._take_default(asked)
+            else:
+                self._ask(asked)
+        if self.is_script:
+            self._refuse_unused()
+        return self.answers
+
+    def _next(self) -> Asked | None:
+        """Return the next question; the list of devices is the current one."""
+        asked = next_question(self.answers, self.found)
+        if asked is None or asked.question.kind != "device":
+            return asked
+        self.found = self.search.refresh(self.found)
+        return next_question(self.answers, self.found)
+
+    def resume(self, stored: Answers) -> None:
+        """Take over stored answers; report those that are not accepted any more."""
+        while (asked := next_question(self.answers, self.found)) is not None:
+            if asked.key not in stored:
+                break
+            try:
+                self._accept(asked, stored[asked.key])
+            except AnswerError as error:
+                self.show(f"{asked.name} = {stored[asked.key]!r} is asked again: {error}")
+                break
+
+    def _accept(self, asked: Asked, given: Any) -> None:
+        """Accept an answer, store it, and read what it makes available."""
+        self.answers = accept(asked, given, self.answers, self.found)
+        self.store(self.answers)
+        value = self.answers[asked.key]
+        if asked.question.key == "device" and not self.search.is_present(self.found, value):
+            self.show(f"  note: {value} is absent now; connect it before the daemon starts")
+        if asked.question.key == "server":
+            self._read_stream()
+
+    def _read_stream(self) -> None:
+        host, port = split_address(self.answers["server", ""])
+        self.found, text = self.search.stream_names(self.found, host, port)
+        self.show(f"  {text}")
+
+    # --- scripts -----------------------------------------------------------------------------
+
+    def _take_prepared(self, asked: Asked) -> None:
+        value = self.prepared[asked.key]
+        try:
+            if value == FIND and asked.question.finder is not None:
+                self._find(asked)
+                again = next_question(self.answers, self.found)
+                if again is not None and again.key == asked.key:
+                    self._accept(again, None)  # the search changed the proposal
+            else:
+                self._accept(asked, value)
+        except AnswerError as error:
+            raise UnansweredError(f"{asked.name} = {value!r}: {error}") from error
+
+    def _take_default(self, asked: Asked) -> None:
+        try:
+            self._accept(asked, None)
+        except AnswerError as error:
+            raise UnansweredError(
+                f"{asked.name} is missing, and there is no proposal: {asked.text}:"
+                f" {asked.question.help}"
+            ) from error
+
+    def _refuse_unused(self) -> None:
+        """Refuse answers to questions that were not asked: they are probably misspelled."""
+        for key, subject in self.prepared.keys() - self.answers.keys():
+            name = f"{key}.{subject}" if subject else key
+            known = [f"{k}.{s}" if s else k for k, s in self.answers]
+            raise UnansweredError(
+                f"{name}: there is no such question with these answers; {did_you_mean(name, known)}"
+            )
+
+    # --- terminal ----------------------------------------------------------------------------
+
+    def _ask(self, asked: Asked) -> None:
+        """Ask one question until it is answered, or until the user goes back."""
+        total = len(complete(self.answers, self.found))
+        self.show(f"\n({len(self.answers) + 1}/{total}) {asked.text}")
+        width = max((len(choice.address) for choice in asked.choices), default=0)
+        if asked.question.kind != "ids":
+            for number, choice in enumerate(asked.choices, 1):
+                self.show(f"  {number}  {choice.address:{width}}  {choice.text}".rstrip())
+        while True:
+            line = self.read_line(self._prompt(asked)).strip()
+            if line == HELP:
+                self.show(f"  {asked.question.help}")
+                self.show("  Enter takes the proposal in brackets, '<' returns.")
+                continue
+            if line == BACK:
+                self._go_back()
+                return
+            try:
+                if line == FIND and asked.question.finder is not None:
+                    self._find(asked)
+                else:
+                    self._accept(asked, line or (None if asked.default is not None else ""))
+            except AnswerError as error:
+                self.show(f"  {error}")
+                continue
+            return
+
+    def _prompt(self, asked: Asked) -> str:
+        shown = answer_text(asked.default)
+        find = " ('find' searches)" if asked.question.finder else ""
+        if not shown:
+            return f"  empty: none{find} > " if asked.optional else f" {find} > "
+        return f"  [{shown}]{find} > "
+
+    def _go_back(self) -> None:
+        if self.answers:
+            key, _ = self.answers.popitem()
+            self.prepared.pop(key, None)
+            self.store(self.answers)
+
+    def _find(self, asked: Asked) -> None:
+        """Start the search of a question, and accept its result.
+
+        Raises
+        ------
+        AnswerError
+            Nothing was found.
+        """
+        if asked.question.finder == "stream":
+            self._read_stream()
+            if not self.found.markers:
+                raise AnswerError("no names of markers: type them, separated by commas")
+            return
+        self.found, address = self.search.moved_device(
+            self.found, self.answers, asked.subject, asked.choices
+        )
+        self.show(f"  {asked.subject} is at {address}")
+        self._accept(asked, address)
+
+
+def answer_text(value: Any) -> str:
+    """Return an answer as a user types it."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, tuple):
+        is_id = bool(value) and isinstance(value[0], int)
+        return " ".join(map(hex, value)) if is_id else ", ".join(value)
+    return str(value)

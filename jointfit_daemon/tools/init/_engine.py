@@ -1,0 +1,162 @@
+"""The engine of the dialogue: the next question, and the check of an answer.
+
+Invariant: pure. Equal answers and findings yield the same question, and every completed dialogue
+yields a rig that `jointfit check` accepts.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from itertools import groupby
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.config import ConfigError, parse_rig
+from jointfit_daemon.tools.init._answers import drivers_for, limb_of, wiring_of
+from jointfit_daemon.tools.init._parsing import AnswerError, parse_answer
+from jointfit_daemon.tools.init._proposals import is_optional
+from jointfit_daemon.tools.init._questions import QUESTIONS, Question
+from jointfit_daemon.tools.init._rig_table import rig_table
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from jointfit_daemon.tools.init._answers import Answers, Key
+    from jointfit_daemon.tools.init._found import Found, FoundDevice
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A question with its subject, and what is shown beside it."""
+
+    question: Question
+    subject: str
+    text: str
+    default: Any
+    """Answer if nothing is typed; None without a proposal."""
+    choices: tuple[FoundDevice, ...]
+    optional: bool
+
+    @property
+    def key(self) -> Key:
+        """Key of the answer."""
+        return self.question.key, self.subject
+
+    @property
+    def name(self) -> str:
+        """Name of the key in an answer file."""
+        return f"{self.question.key}.{self.subject}" if self.subject else self.question.key
+
+
+def next_question(answers: Mapping[Key, Any], found: Found) -> Asked | None:
+    """Return the first question without an answer; None if the dialogue is complete."""
+    for question, subject in _in_order(answers, found):
+        if (question.key, subject) not in answers:
+            return Asked(
+                question,
+                subject,
+                question.text.format(subject=_spoken(answers, subject)),
+                question.default(answers, found, subject),
+                question.choices(answers, found, subject),
+                _is_optional(question, answers, subject),
+            )
+    return None
+
+
+def _is_optional(question: Question, answers: Mapping[Key, Any], subject: str) -> bool:
+    return question.optional or (question.key == "markers" and is_optional(answers, subject))
+
+
+def _spoken(answers: Mapping[Key, Any], subject: str) -> str:
+    """Return a segment or body part as words; names that a user typed stay as they are."""
+    if not subject:
+        return ""
+    limb = limb_of(answers)
+    is_ours = subject in (*limb.segments, *limb.optional_parts)
+    return subject.replace("_", " ") if is_ours else subject
+
+
+def _in_order(answers: Mapping[Key, Any], found: Found) -> Iterator[tuple[Question, str]]:
+    """Yield the questions that apply; the consumer stops at the first one without an answer."""
+    for group, members in groupby(QUESTIONS, key=lambda question: question.group or question.key):
+        questions = tuple(members)
+        for subject in questions[0].subjects(answers, found):
+            for question in questions:
+                if question.group != group or subject in question.subjects(answers, found):
+                    yield question, subject
+
+
+def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -> Answers:
+    """Return the answers with a further one.
+
+    Parameters
+    ----------
+    asked
+        The question, from `next_question`.
+    given
+        A typed text, a value of an answer file, or None for the default.
+    answers, found
+        As of `next_question`.
+
+    Raises
+    ------
+    AnswerError
+        The answer has another type, or yields a rig that `jointfit check` refuses; the message is
+        that of the check.
+    """
+    if given is None:
+        value = asked.default
+        if value is None and not asked.optional:
+            raise AnswerError(
+                "there is no proposal: an answer is needed, '?' explains the question"
+            )
+    else:
+        values = [choice.address for choice in asked.choices]
+        value = parse_answer(asked.question.kind, given, values, optional=asked.optional)
+    if value is None and asked.question.kind == "names":
+        value = ()
+
+    extended = {**answers, asked.key: value}
+    if asked.question.kind == "device":
+        _check_device(extended, found, asked.subject)
+    if faults := rig_faults(extended, found) - rig_faults(answers, found):
+        raise AnswerError("; ".join(sorted(faults)))
+    return extended
+
+
+def _check_device(answers: Mapping[Key, Any], found: Found, sensor: str) -> None:
+    device = answers["device", sensor]
+    if _PORT_WITHOUT_FOLDER.fullmatch(device):
+        raise AnswerError(
+            f"found {device!r}, expected the path of a serial port, as /dev/{device}, or the name"
+            " of a CAN interface, as can0"
+        )
+    if not drivers_for(answers, found, sensor):
+        wiring = wiring_of(answers, device)
+        raise AnswerError(f"{device}: no installed driver reads sensors on {wiring} connections")
+
+
+_PORT_WITHOUT_FOLDER = re.compile(r"tty\w+|COM\d+", re.IGNORECASE)
+"""Names of serial ports without their folder."""
+
+
+def complete(answers: Mapping[Key, Any], found: Found) -> Answers:
+    """Return an answer to every question: missing ones are defaults or stand-ins."""
+    filled = dict(answers)
+    for question, subject in _in_order(filled, found):  # it reads what this loop adds
+        key = question.key, subject
+        if key not in filled:
+            value = question.default(filled, found, subject)
+            if value is None and not _is_optional(question, filled, subject):
+                value = question.stand_in(filled, found, subject)
+            filled[key] = () if value is None and question.kind == "names" else value
+    return filled
+
+
+def rig_faults(answers: Mapping[Key, Any], found: Found) -> set[str]:
+    """Return the faults of the rig that the answers and defaults for the others yield."""
+    try:
+        parse_rig(rig_table(complete(answers, found), found))
+    except ConfigError as error:
+        return {fault.text() for fault in error.faults}
+    return set()

@@ -1,0 +1,167 @@
+"""Default answers, derived from the answers before them and from found devices."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from itertools import count
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.tools.init._answers import (
+    Key,
+    driver_of,
+    limb_of,
+    marked_parts,
+    sensors_of,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Container
+
+    from jointfit_daemon.tools.init._found import Found, FoundDevice
+
+Given = Mapping[Key, Any]
+
+_USUAL_BAUDS = (115_200, 230_400, 460_800, 921_600, 2_000_000)
+"""Speeds that are proposed, in this order, baud."""
+_BITS_PER_SAMPLE = 600
+"""Generous bit rate of one sensor at 1 Hz, bit/s: a message of orientation and raw readings."""
+_MARKERS = 4
+"""Number of proposed markers: three, and one that may be hidden."""
+_LEAST_MARKERS = 3
+_ID_STEP = 0x100
+"""Distance of the identifiers of two sensors in stand-ins."""
+
+
+def _unused(name: str, used: Container[str]) -> str:
+    """Return `name`, with a number if it is used."""
+    if name not in used:
+        return name
+    return next(f"{name}-{k}" for k in count(2) if f"{name}-{k}" not in used)
+
+
+def sensor_rate(answers: Given, _found: Found, _subject: str) -> Any:
+    """Return the rate of the poses, if a sensor can be set to it."""
+    rate = answers["output_rate_hz", ""]
+    return rate if rate in (50, 100, 200, 400) else 100
+
+
+def sensors(answers: Given, _found: Found, segment: str) -> tuple[str, ...]:
+    """Return a name for each usual place on `segment`."""
+    used = {*sensors_of(answers)}
+    names = []
+    for place in limb_of(answers).places[segment]:
+        names.append(_unused(f"{segment.replace('_', '-')}-{place}", used))
+        used.add(names[-1])
+    return tuple(names)
+
+
+def devices(answers: Given, found: Found, _sensor: str) -> tuple[FoundDevice, ...]:
+    """Return all buses, and the serial ports that no other sensor uses."""
+    used = {value for (key, _), value in answers.items() if key == "device"}
+    adapters = answers["can_adapters", ""]
+    ports = [port for port in found.ports if port.address in adapters or port.address not in used]
+    return (*ports, *found.interfaces)
+
+
+def device(answers: Given, found: Found, sensor: str) -> str | None:
+    """Return the only device that is left; None if there is a choice, or nothing."""
+    listed = devices(answers, found, sensor)
+    waiting = [name for name in sensors_of(answers) if ("device", name) not in answers]
+    return listed[0].address if len(listed) == 1 and len(waiting) == 1 else None
+
+
+def unused_port(answers: Given, found: Found, _sensor: str) -> str:
+    """Return a path that no sensor uses."""
+    used = {value for (key, _), value in answers.items() if key == "device"}
+    used |= {*answers["can_adapters", ""], *found.addresses}
+    return next(f"/dev/sensor{k}" for k in count() if f"/dev/sensor{k}" not in used)
+
+
+def baud(answers: Given, found: Found, sensor: str) -> int:
+    """Return the speed at which the device answered, or the lowest usual one that suffices."""
+    known = found.bauds.get(answers["device", sensor])
+    if known is not None:
+        return known
+    usual = driver_of(answers, found, sensor).baud or _USUAL_BAUDS[0]
+    needed = answers["sensor_rate_hz", ""] * _BITS_PER_SAMPLE
+    fitting = [speed for speed in (usual, *_USUAL_BAUDS) if speed >= max(needed, usual)]
+    return fitting[0] if fitting else _USUAL_BAUDS[-1]
+
+
+def _ids_in_use(answers: Given, bus: str) -> list[tuple[int, ...]]:
+    return [
+        ids
+        for (key, sensor), ids in answers.items()
+        if key == "ids" and answers.get(("device", sensor)) == bus
+    ]
+
+
+def ids(answers: Given, found: Found, sensor: str) -> tuple[int, ...] | None:
+    """Return the first identifiers on the bus of `sensor` that no other sensor has."""
+    bus = answers["device", sensor]
+    used = _ids_in_use(answers, bus)
+    return next((each for each in found.ids.get(bus, ()) if each not in used), None)
+
+
+def unused_ids(answers: Given, found: Found, sensor: str) -> tuple[int, ...]:
+    """Return identifiers that no other sensor on the bus has."""
+    used = {number for each in _ids_in_use(answers, answers["device", sensor]) for number in each}
+    first = tuple(driver_of(answers, found, sensor).ids.values())
+    for step in count():
+        numbers = tuple(number + step * _ID_STEP for number in first)
+        block = {number & ~0xFF for number in numbers}
+        if not any(number & ~0xFF in block for number in used):
+            return numbers
+    raise AssertionError
+
+
+def _markers_in_use(answers: Given) -> set[str]:
+    return {name for (key, _), names in answers.items() if key == "markers" for name in names}
+
+
+def markers(answers: Given, found: Found, part: str) -> tuple[str, ...] | None:
+    """Return the markers of the stream whose names fit `part`, or usual names without a stream.
+
+    A group of names that differ in their last digits belongs to a part if the group is named like
+    the part, or begins with its usual letters.
+    """
+    if not found.markers:
+        return unused_markers(answers, found, part)
+    used = _markers_in_use(answers)
+    groups: dict[str, list[str]] = {}
+    for name in found.markers:
+        if name not in used:
+            groups.setdefault(_stem(name), []).append(name)
+
+    for prefix in (part, *limb_of(answers).prefixes[part]):
+        names = groups.get(_stem(prefix), ())
+        if len(names) >= _LEAST_MARKERS or (names and limb_of(answers).is_planar):
+            return tuple(names)
+    return () if is_optional(answers, part) else None
+
+
+def _stem(name: str) -> str:
+    return re.sub(r"[\s_.:-]*\d*$", "", name).casefold().replace("_", "").replace(" ", "")
+
+
+def unused_markers(answers: Given, _found: Found, part: str) -> tuple[str, ...]:
+    """Return the usual names of markers on `part`, with other numbers where they are used."""
+    used = _markers_in_use(answers)
+    prefix = limb_of(answers).prefixes[part][0]
+    numbered = (f"{prefix}{k}" for k in count(1))
+    free = (name for name in numbered if name not in used)
+    return tuple(next(free) for _ in range(_MARKERS))
+
+
+def is_optional(answers: Given, part: str) -> bool:
+    """Return whether `part` may be without markers."""
+    limb = limb_of(answers)
+    return not limb.is_planar and part in limb.optional_parts and part in marked_parts(answers)
+
+
+def plate(_answers: Given, found: Found, _subject: str) -> str | None:
+    """Return the rigid body that is named like a plate; without a stream the usual name."""
+    if not found.bodies and not found.markers:
+        return "Plate"
+    return next((body for body in found.bodies if "plate" in body.casefold()), None)

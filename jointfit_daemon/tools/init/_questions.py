@@ -1,0 +1,361 @@
+"""The questions of the dialogue, in their order.
+
+Invariant: questions are frozen data. Every default and every stand-in is a valid answer, whatever
+the answers before it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from jointfit_daemon.config import is_this_host
+from jointfit_daemon.tools.init import _proposals
+from jointfit_daemon.tools.init._answers import (
+    Key,
+    driver_of,
+    drivers_for,
+    has_cameras,
+    lengths_asked,
+    limb_of,
+    marked_parts,
+    mocap_driver_of,
+    sensors_of,
+    split_address,
+)
+from jointfit_daemon.tools.init._found import Found, FoundDevice
+from jointfit_daemon.tools.init._limbs import LIMBS
+
+if TYPE_CHECKING:
+    from jointfit_daemon.tools.init._parsing import Kind
+
+Finder = Literal["movement", "stream"]
+"""Search that the word ``find`` starts: a sensor by its movement, names in the stream of the
+cameras."""
+
+Given = Mapping[Key, Any]
+Propose = Callable[[Given, Found, str], Any]
+ONCE = ("",)
+
+
+def _once(_answers: Given, _found: Found) -> tuple[str, ...]:
+    return ONCE
+
+
+def _nothing(_answers: Given, _found: Found, _subject: str) -> Any:
+    return None
+
+
+def _no_choices(_answers: Given, _found: Found, _subject: str) -> tuple[FoundDevice, ...]:
+    return ()
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """One question; it is asked once, or for each of its subjects."""
+
+    key: str
+    """Key in answer files."""
+    kind: Kind
+    text: str
+    """Text with a place for the subject."""
+    help: str
+    group: str = ""
+    """Adjacent questions of a group are asked subject by subject."""
+    subjects: Callable[[Given, Found], tuple[str, ...]] = _once
+    """Subjects; none if the question does not apply to the answers before it."""
+    default: Propose = _nothing
+    """Proposal; None without one."""
+    stand_in: Propose = _nothing
+    """Valid answer in place of a missing default, for the check of the answers before it."""
+    choices: Callable[[Given, Found, str], tuple[FoundDevice, ...]] = _no_choices
+    """Entries of the list that is shown."""
+    optional: bool = False
+    """Whether the answer may be empty."""
+    finder: Finder | None = None
+
+
+def _if(condition: Callable[[Given], bool]) -> Callable[[Given, Found], tuple[str, ...]]:
+    return lambda answers, _found: ONCE if condition(answers) else ()
+
+
+def _sensors(answers: Given, _found: Found) -> tuple[str, ...]:
+    return tuple(sensors_of(answers))
+
+
+def _has_sensors(answers: Given) -> bool:
+    return not limb_of(answers).is_planar
+
+
+def _is_remote(answers: Given) -> bool:
+    return not is_this_host(split_address(answers["broker", ""])[0])
+
+
+def _has_account(answers: Given) -> bool:
+    return answers["username", ""] is not None
+
+
+def _always(value: Any) -> Propose:
+    return lambda _answers, _found, _subject: value
+
+
+def _limbs(_answers: Given, _found: Found, _subject: str) -> tuple[FoundDevice, ...]:
+    return tuple(FoundDevice(name, limb.text) for name, limb in LIMBS.items())
+
+
+def _list(*entries: tuple[str, str]) -> Callable[..., tuple[FoundDevice, ...]]:
+    listed = tuple(FoundDevice(*entry) for entry in entries)
+    return lambda _answers, _found, _subject: listed
+
+
+QUESTIONS: tuple[Question, ...] = (
+    Question(
+        "name",
+        "text",
+        "Name of the rig",
+        "It becomes part of every MQTT topic. Letters of any script are allowed, / + # are not.",
+        default=_always("bench-1"),
+    ),
+    Question(
+        "limb",
+        "choice",
+        "Limb",
+        "Segments and joints of the rig. Other limbs: see the documentation of rig.toml.",
+        default=_always("knee"),
+        choices=_limbs,
+    ),
+    Question(
+        "side",
+        "choice",
+        "Side of the body",
+        "It determines the sign of adduction and rotation.",
+        subjects=_if(lambda answers: limb_of(answers).has_side),
+        default=_always("right"),
+        choices=_list(("right", ""), ("left", "")),
+    ),
+    Question(
+        "subject",
+        "text",
+        "Name of the subject's calibrations",
+        "Folder of the stored calibrations: letters, digits, . _ and -.",
+        default=_always("subject-1"),
+    ),
+    Question(
+        "output_rate_hz",
+        "number",
+        "Poses per second (Hz)",
+        "Rate at which joint angles are published.",
+        default=_always(100),
+    ),
+    Question(
+        "sensor_rate_hz",
+        "number",
+        "Samples per second of each sensor (Hz)",
+        "Rate to which the sensors are set. At least the rate of the poses is best.",
+        subjects=_if(_has_sensors),
+        default=_proposals.sensor_rate,
+    ),
+    Question(
+        "sensors",
+        "names",
+        "Sensors on the {subject}",
+        "Names of the sensors, separated by commas. Two sensors per segment reduce the error of"
+        " soft tissue; one is enough. The names become MQTT topics.",
+        subjects=lambda answers, _: limb_of(answers).segments if _has_sensors(answers) else (),
+        default=_proposals.sensors,
+    ),
+    Question(
+        "can_adapters",
+        "names",
+        "Serial ports that are CAN adapters (SLCAN)",
+        "Paths, separated by commas; empty if there are none. A CAN interface of the kernel, such"
+        " as can0, needs no entry here.",
+        subjects=_if(_has_sensors),
+        optional=True,
+    ),
+    Question(
+        "bitrate",
+        "number",
+        "Bit rate of the CAN bus at {subject} (bit/s)",
+        "It is the same for all devices on the bus; Xsens sensors leave the factory with 250000.",
+        subjects=lambda answers, _: answers["can_adapters", ""] if _has_sensors(answers) else (),
+        default=_always(1_000_000),
+    ),
+    Question(
+        "device",
+        "device",
+        "Connection of the sensor {subject}",
+        "A number of the list, the path of a serial port, or a CAN interface. 'find' detects the"
+        " sensor by its movement: it opens the free ports and buses of the list.",
+        group="sensor",
+        subjects=_sensors,
+        default=_proposals.device,
+        stand_in=_proposals.unused_port,
+        choices=_proposals.devices,
+        finder="movement",
+    ),
+    Question(
+        "driver",
+        "choice",
+        "Driver of the sensor {subject}",
+        "Several installed drivers read this connection.",
+        group="sensor",
+        subjects=lambda answers, found: tuple(
+            name
+            for name in sensors_of(answers)
+            if ("device", name) in answers and len(drivers_for(answers, found, name)) > 1
+        ),
+        default=lambda answers, found, sensor: driver_of(answers, found, sensor).name,
+        choices=lambda answers, found, sensor: tuple(
+            FoundDevice(driver.name) for driver in drivers_for(answers, found, sensor)
+        ),
+    ),
+    Question(
+        "baud",
+        "number",
+        "Speed of the sensor {subject} (baud)",
+        "Speed to which the device is set; Xsens sensors leave the factory with 115200.",
+        group="sensor",
+        subjects=lambda answers, found: tuple(
+            name
+            for name in sensors_of(answers)
+            if ("device", name) in answers and driver_of(answers, found, name).baud is not None
+        ),
+        default=_proposals.baud,
+    ),
+    Question(
+        "ids",
+        "ids",
+        "CAN identifiers of the sensor {subject}",
+        "Identifiers of the messages of this sensor, as 0x105 0x106 0x121. The documentation of"
+        " rig.toml describes how a recording of the bus shows them.",
+        group="sensor",
+        subjects=lambda answers, found: tuple(
+            name
+            for name in sensors_of(answers)
+            if ("device", name) in answers and driver_of(answers, found, name).ids
+        ),
+        default=_proposals.ids,
+        stand_in=_proposals.unused_ids,
+        choices=lambda answers, found, sensor: tuple(
+            FoundDevice(name) for name in driver_of(answers, found, sensor).ids
+        ),
+    ),
+    Question(
+        "cameras",
+        "yes_no",
+        "Is there an optical motion-capture system?",
+        "It measures joint centres and soft-tissue artefact in the calibration. Without it, a"
+        " static pose calibrates the sensors.",
+        subjects=_if(_has_sensors),
+        default=lambda _answers, found, _subject: bool(found.servers),
+    ),
+    Question(
+        "mocap_driver",
+        "choice",
+        "Motion-capture system",
+        "Driver of the system.",
+        subjects=lambda answers, found: (
+            ONCE if has_cameras(answers) and len(found.mocap_drivers) > 1 else ()
+        ),
+        default=lambda answers, found, _: mocap_driver_of(answers, found).name,
+        choices=lambda _answers, found, _subject: tuple(
+            FoundDevice(driver.name) for driver in found.mocap_drivers
+        ),
+    ),
+    Question(
+        "server",
+        "address",
+        "Computer of the motion-capture system",
+        "Name or address of the computer that runs Motive, with :PORT if its command port is not"
+        " 1510. 'find' connects to it and reads the names of markers.",
+        subjects=_if(has_cameras),
+        default=lambda _answers, found, _: next((s.address for s in found.servers), None),
+        stand_in=_always("192.168.1.10"),
+        choices=lambda _answers, found, _subject: found.servers,
+    ),
+    Question(
+        "markers",
+        "names",
+        "Markers on the {subject}",
+        "Names in the stream, separated by commas: at least three that are not on one line."
+        " 'find' reads the names from the stream. Body parts beside the segments may have none.",
+        subjects=lambda answers, _: marked_parts(answers),
+        default=_proposals.markers,
+        stand_in=_proposals.unused_markers,
+        finder="stream",
+    ),
+    Question(
+        "plate",
+        "text",
+        "Rigid body of the plate for the align phase",
+        "Name in the stream of the plate that carries all sensors once per laboratory.",
+        subjects=_if(lambda answers: _has_sensors(answers) and has_cameras(answers)),
+        default=_proposals.plate,
+        optional=True,
+    ),
+    Question(
+        "up_axis",
+        "choice",
+        "Vertical axis of the stream",
+        "Motive's default is y.",
+        subjects=_if(has_cameras),
+        default=_always("y"),
+        choices=_list(("x", ""), ("y", ""), ("z", "")),
+    ),
+    Question(
+        "length_m",
+        "number",
+        "Length of the {subject} (m)",
+        "From joint to joint. Without a length, positions below the segment are unknown; angles"
+        " do not need it.",
+        subjects=lambda answers, _: lengths_asked(answers),
+        default=lambda answers, _, segment: limb_of(answers).lengths_m.get(segment),
+        optional=True,
+    ),
+    Question(
+        "broker",
+        "address",
+        "MQTT broker",
+        "Name or address, with :PORT if it is not the usual one.",
+        default=_always("127.0.0.1"),
+    ),
+    Question(
+        "encryption",
+        "choice",
+        "Encryption of the connection to the broker",
+        "Without encryption, any computer on the network path can read and send all messages.",
+        subjects=_if(_is_remote),
+        default=_always("tls"),
+        choices=_list(
+            ("tls", "TLS, certificate of a public authority"),
+            ("own-ca", "TLS, certificate of an authority of your own"),
+            ("none", "no encryption"),
+        ),
+    ),
+    Question(
+        "ca",
+        "text",
+        "File with the certificate of the authority",
+        "PEM file, relative to the folder of the rig.",
+        subjects=_if(lambda answers: _is_remote(answers) and answers["encryption", ""] == "own-ca"),
+        default=_always("ca.pem"),
+    ),
+    Question(
+        "username",
+        "text",
+        "User name for the broker",
+        "Empty if the broker requires none.",
+        optional=True,
+    ),
+    Question(
+        "password_file",
+        "text",
+        "File for the password",
+        "The password is in a file of its own, readable by its owner only, never in the rig.",
+        subjects=_if(_has_account),
+        default=_always("mqtt-password"),
+    ),
+)
+"""All questions, in their order."""

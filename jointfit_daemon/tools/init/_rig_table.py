@@ -1,0 +1,146 @@
+"""Conversion of answers to the tables of rig.toml."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.tools.init._answers import (
+    Key,
+    driver_of,
+    has_cameras,
+    lengths_asked,
+    limb_of,
+    marked_parts,
+    mocap_driver_of,
+    sensors_of,
+    split_address,
+    wiring_of,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.tools.init._found import Found
+
+Given = Mapping[Key, Any]
+
+AXES_CHECK_HZ = 10
+"""Rate of the topic that the check of axes in the dashboard needs, Hz."""
+
+
+def rig_table(answers: Given, found: Found) -> dict[str, Any]:
+    """Return the table of a rig.toml, in the order of its text.
+
+    Parameters
+    ----------
+    answers
+        An answer to every question that applies.
+    found
+        Drivers of the devices.
+    """
+    table: dict[str, Any] = {
+        "rig": {"name": answers["name", ""], "output_rate_hz": answers["output_rate_hz", ""]},
+        "chain": _chain(answers),
+    }
+    if not limb_of(answers).is_planar:
+        buses = _buses(answers)
+        table["imu"] = [_imu(answers, found, buses, name) for name in sensors_of(answers)]
+        if buses:
+            table["can"] = {name: _bus(answers, device) for device, name in buses.items()}
+    if has_cameras(answers):
+        table["mocap"] = _mocap(answers, found)
+    table["calibration"] = {"store": answers["subject", ""]}
+    table["mqtt"] = _mqtt(answers)
+    return table
+
+
+def _chain(answers: Given) -> dict[str, Any]:
+    limb = limb_of(answers)
+    table: dict[str, Any] = {}
+    if limb.joints:
+        table["joints"] = list(limb.joints)
+    table["segments"] = list(limb.segments)
+    if limb.has_side:
+        table["side"] = answers["side", ""]
+    table |= {end: part for end, part in limb.ends.items() if answers.get(("markers", part))}
+    if limb.is_planar:
+        table["motion"] = "planar"
+    lengths = {name: answers["length_m", name] for name in lengths_asked(answers)}
+    if known := {name: length for name, length in lengths.items() if length is not None}:
+        table["lengths_m"] = known
+    if limb.branches:
+        table["joint"] = [_joint(answers, dict(joint)) for joint in limb.branches]
+    return table
+
+
+def _joint(answers: Given, joint: dict[str, Any]) -> dict[str, Any]:
+    """Return the table of a joint; a distal body part without markers is omitted."""
+    child = joint["child"]
+    if child not in limb_of(answers).segments and not answers.get(("markers", child)):
+        del joint["child"]
+    return joint
+
+
+def _buses(answers: Given) -> dict[str, str]:
+    """Return the name of the table of every CAN bus by its device."""
+    devices = dict.fromkeys(answers["device", name] for name in sensors_of(answers))
+    buses = [device for device in devices if wiring_of(answers, device) == "can"]
+    return {device: f"can{at}" for at, device in enumerate(buses)}
+
+
+def _bus(answers: Given, device: str) -> dict[str, Any]:
+    if device in answers["can_adapters", ""]:
+        bitrate = answers["bitrate", device]
+        return {"interface": "slcan", "channel": device, "bitrate": bitrate}
+    return {"interface": "socketcan", "channel": device}
+
+
+def _imu(answers: Given, found: Found, buses: Mapping[str, str], name: str) -> dict[str, Any]:
+    driver, device = driver_of(answers, found, name), answers["device", name]
+    table: dict[str, Any] = {
+        "id": name,
+        "segment": sensors_of(answers)[name],
+        "driver": driver.name,
+    }
+    table |= {"port": device} if driver.wiring == "serial" else {"can": buses[device]}
+    if driver.baud is not None:
+        table["baud"] = answers["baud", name]
+    if driver.ids:
+        table["ids"] = dict(zip(driver.ids, answers["ids", name], strict=True))
+        if any(number > _STANDARD_MAX for number in answers["ids", name]):
+            table["extended_ids"] = True
+    return table | {"rate_hz": answers["sensor_rate_hz", ""]}
+
+
+_STANDARD_MAX = 0x7FF
+"""Largest 11-bit CAN identifier."""
+
+
+def _mocap(answers: Given, found: Found) -> dict[str, Any]:
+    driver = mocap_driver_of(answers, found)
+    host, port = split_address(answers["server", ""])
+    table: dict[str, Any] = {"driver": driver.name, "server": host}
+    if port and driver.port is not None:
+        table["command_port"] = port
+    table["up_axis"] = answers["up_axis", ""]
+    if answers.get(("plate", "")) is not None:
+        table["plate"] = answers["plate", ""]
+    named = {part: answers["markers", part] for part in marked_parts(answers)}
+    return table | {"markers": {part: list(names) for part, names in named.items() if names}}
+
+
+def _mqtt(answers: Given) -> dict[str, Any]:
+    host, port = split_address(answers["broker", ""])
+    table: dict[str, Any] = {"host": host} | ({"port": port} if port else {})
+    if answers["username", ""] is not None:
+        table["username"] = answers["username", ""]
+        table["password_file"] = answers["password_file", ""]
+    if not limb_of(answers).is_planar:
+        table["sensors_hz"] = AXES_CHECK_HZ
+
+    # Absent for a broker on this machine.
+    encryption = answers.get(("encryption", ""))
+    if encryption == "none":
+        table["insecure"] = True
+    elif encryption is not None:
+        table["tls"] = {"ca": answers["ca", ""]} if encryption == "own-ca" else {}
+    return table

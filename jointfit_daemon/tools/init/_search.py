@@ -1,0 +1,159 @@
+"""Searches of the dialogue: installed drivers, ports, servers, and sensors that move.
+
+Invariant: a device is opened only by a search that the user starts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.driver import ImuSettings, MocapSettings
+from jointfit_daemon.tools.discovery import (
+    find_can_interfaces,
+    find_mocap_servers,
+    find_serial_ports,
+    installed_drivers,
+)
+from jointfit_daemon.tools.init._answers import wiring_of
+from jointfit_daemon.tools.init._found import Found, FoundDevice, ImuDriver, MocapDriver
+from jointfit_daemon.tools.init._movement import find_moved
+from jointfit_daemon.tools.init._parsing import AnswerError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from pydantic.fields import FieldInfo
+
+    from jointfit_daemon.tools.init._answers import Answers
+
+_DIALOGUE_KEYS = {"id", "segment", "driver", "port", "can", "ids", "server"}
+"""Keys without default that the dialogue can answer; drivers with others are not offered."""
+SERVER_WAIT_S = 1.0
+"""Time to wait for motion-capture servers, s."""
+
+
+def drivers_found() -> Found:
+    """Return the installed drivers whose required keys the dialogue knows."""
+    imu, mocap = [], []
+    for name, driver in installed_drivers():
+        fields: Mapping[str, FieldInfo] = driver.Settings.model_fields
+        required = {key for key, field in fields.items() if field.is_required()}
+        if not required <= _DIALOGUE_KEYS:
+            continue
+        if issubclass(driver.Settings, ImuSettings) and required & {"port", "can"}:
+            imu.append(_imu_driver(name, fields))
+        elif issubclass(driver.Settings, MocapSettings) and "server" in fields:
+            port = fields["command_port"].default if "command_port" in fields else None
+            mocap.append(MocapDriver(name, port))
+    return Found(imu_drivers=tuple(imu), mocap_drivers=tuple(mocap))
+
+
+def _imu_driver(name: str, fields: Mapping[str, FieldInfo]) -> ImuDriver:
+    baud = fields["baud"].default if "baud" in fields and "port" in fields else None
+    ids: dict[str, int] = {}
+    table = getattr(fields.get("ids"), "annotation", None)
+    for key, field in getattr(table, "model_fields", {}).items():
+        if isinstance(field.default, int):
+            ids[key] = field.default
+    return ImuDriver(name, "serial" if "port" in fields else "can", baud, ids)
+
+
+@dataclass
+class DeviceSearch:
+    """Searches on this machine and its networks."""
+
+    show: Callable[[str], None]
+    """Prints a line."""
+    ports: tuple[str, ...] = ()
+    """Serial ports that are not found by themselves, such as pseudo-terminals."""
+    network: bool = True
+    """Whether to search for motion-capture servers in the networks of this machine."""
+
+    def start(self, servers: Sequence[FoundDevice] | None = None) -> Found:
+        """Return drivers and devices; `servers` are those of an earlier search."""
+        known = {info.path: info.description for info in find_serial_ports()}
+        known |= {os.path.abspath(port): "named by --port" for port in self.ports}  # noqa: PTH100 - keeps links
+        interfaces = [
+            FoundDevice(each.name, f"CAN interface, {'up' if each.up else 'down'}")
+            for each in find_can_interfaces()
+        ]
+        return replace(
+            drivers_found(),
+            ports=tuple(FoundDevice(path, text) for path, text in known.items()),
+            interfaces=tuple(interfaces),
+            servers=tuple(self._servers() if servers is None else servers),
+        )
+
+    def refresh(self, found: Found) -> Found:
+        """Return `found` with the ports and interfaces that are there now."""
+        fresh = self.start(found.servers)
+        return replace(found, ports=fresh.ports, interfaces=fresh.interfaces)
+
+    def is_present(self, found: Found, address: str) -> bool:
+        """Return whether a device file or a CAN interface exists."""
+        return address in found.addresses or ("/" in address and os.path.exists(address))  # noqa: PTH110 - NUL returns False
+
+    def _servers(self) -> list[FoundDevice]:
+        if not self.network:
+            return []
+        try:
+            servers = asyncio.run(find_mocap_servers(broadcast=True, wait_s=SERVER_WAIT_S))
+        except OSError:
+            return []  # no network: nothing is found
+        usual = {driver.name: driver.port for driver in drivers_found().mocap_drivers}
+        return [
+            FoundDevice(
+                server.server
+                if server.port == usual.get(server.driver)
+                else f"{server.server}:{server.port}",
+                f"{server.application} {server.version}, {server.protocol}",
+            )
+            for server in servers
+        ]
+
+    def stream_names(self, found: Found, host: str, port: int) -> tuple[Found, str]:
+        """Return the names in the stream of a server, and a description of the result."""
+        if not self.network:
+            return found, f"{host} was not asked for its markers (--no-network)"
+        try:
+            servers = asyncio.run(
+                find_mocap_servers([host], port=port or None, wait_s=SERVER_WAIT_S)
+            )
+        except OSError as error:
+            return found, f"{host}: {error.strerror or error}: the names of markers are unknown"
+        named = [server for server in servers if server.markers or server.bodies]
+        if not named:
+            text = f"{host} {'sent no names' if servers else 'does not answer'}"
+            return found, f"{text}: check the address, or type the names of the markers"
+        markers, bodies = named[0].markers, named[0].bodies
+        text = f"{host}: {len(markers)} markers, {len(bodies)} rigid bodies"
+        return replace(found, markers=markers, bodies=bodies), text
+
+    def moved_device(
+        self, found: Found, answers: Answers, sensor: str, choices: Sequence[FoundDevice]
+    ) -> tuple[Found, str]:
+        """Return the address of the device that the user turns, and its speed in `found`.
+
+        Raises
+        ------
+        AnswerError
+            No device, several devices, or none that moved.
+        """
+        drivers = [driver.name for driver in found.imu_drivers if driver.wiring == "serial"]
+        tables = {
+            choice.address: {"driver": drivers[0], "port": choice.address}
+            for choice in choices
+            if drivers and wiring_of(answers, choice.address) == "serial"
+        }
+        if not tables:
+            raise AnswerError(
+                "no free serial port was found: connect the sensor, or name its port with --port"
+            )
+        self.show(f"  Opening {', '.join(tables)}; hold all sensors still …")
+        rate_hz = answers["sensor_rate_hz", ""]
+        address, table = asyncio.run(find_moved(sensor, tables, rate_hz, self.show))
+        bauds = {**found.bauds} | ({address: table["baud"]} if "baud" in table else {})
+        return replace(found, bauds=bauds), address
