@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
+.PHONY: help install demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -18,6 +18,8 @@ $(STAMP): pyproject.toml requirements.lock
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --upgrade 'pip>=25.1'
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable '.[all]' --group dev
 	@touch $@
+
+install: $(STAMP)  ## the programs in .venv; then: . .venv/bin/activate
 
 demo: $(STAMP)  ## the main job on simulated hardware, with an embedded broker
 	@$(BIN)/jointfit demo $(ARGS)

@@ -42,6 +42,7 @@ OPTIONAL_PROGRAMS = ("mosquitto_sub", "mosquitto_pub", "openssl")
 NOT_RUN = {
     r"^(sudo|sudoedit|systemctl|journalctl) |apt ": "needs root and systemd: tests/vm_service",
     r"/etc/|^chown |^mosquitto_passwd ": "needs root: changes an installed broker or service",
+    r"^\. \.venv/": "the environment of the tests has the programs already",
     r"^git clone |pip install |^pipx ": "needs the network",
     r"^make ": "minutes of processor time: CI runs the targets",
     r"python -m bench": "minutes of processor time: the options are checked against its --help",

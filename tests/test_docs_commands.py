@@ -79,10 +79,10 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "sample"
 
 
-def shorten_simulations(broker: Broker, home: Path) -> None:
+def shorten_simulations(broker: Broker, home: Path, phases: str = SHORT_PHASES) -> None:
     """Put a `jointfit-sim` before the real one that names the broker and shortens the phases."""
     real = shutil.which("jointfit-sim", path=environment(ROOT)["PATH"])
-    options = f"--mqtt-host {broker.host} --mqtt-port {broker.port} {SHORT_PHASES}"
+    options = f"--mqtt-host {broker.host} --mqtt-port {broker.port} {phases}"
     (home / "bin").mkdir()
     program = home / "bin" / "jointfit-sim"
     program.write_text(
@@ -118,6 +118,8 @@ def test_every_command_of_a_page_runs_as_printed(
         folder.mkdir()
     if IN_SAMPLE in " ".join(text_of(page).split()):
         shutil.copytree(request.getfixturevalue("sample"), reader, dirs_exist_ok=True)
+    if "git clone" in text_of(page):
+        (reader / "examples").symlink_to(ROOT / "examples")
     point_clients_at(broker, home)
     shorten_simulations(broker, home)
 
