@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.natnet._decoder import NatNetDecoder
+from jointfit_drivers.natnet._diagnosis import diagnose
 from jointfit_drivers.natnet._server_search import find_servers
 from jointfit_drivers.natnet._session import NatNetSession
 from jointfit_drivers.natnet._settings import NatNetSettings
@@ -21,7 +22,7 @@ from jointfit_drivers.ports.udp_socket import local_address
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.device_search import FoundServer
+    from jointfit_daemon.device_search import Finding, FoundServer
     from jointfit_daemon.driver import Emit, Wire
 
 
@@ -44,6 +45,11 @@ class NatNetMocap:
     ) -> list[FoundServer]:
         """Return the NatNet servers that answer; see `jointfit_daemon.device_search`."""
         return await find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
+
+    @classmethod
+    async def diagnose(cls, settings: NatNetSettings, wait_s: float) -> list[Finding]:
+        """Return the causes of missing frames; see `jointfit_daemon.device_search`."""
+        return await diagnose(settings, wait_s)
 
     async def run(self, emit: Emit) -> None:
         """Connect to the server and read until cancelled.

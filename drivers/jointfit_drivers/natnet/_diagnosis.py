@@ -1,0 +1,270 @@
+"""Diagnosis of "connected, but no data": the cause of missing frames, each with its remedy.
+
+The connection is that of the driver: it connects, receives for a while, and disconnects.
+
+| cause | evidence |
+|---|---|
+| wrong interface or subnet | the route leaves by another card; no card has the server's network |
+| multicast on two interfaces | the frames arrive at another card than the one in use |
+| firewall | the server answers, and its multicast frames arrive at no card |
+| streaming off | the port is closed, or the server answers without sending frames |
+| no rigid body or marker set | the model of the stream is empty, or lacks names of rig.toml |
+| unknown bitstream | the announced version is newer than all known ones |
+| playback paused | frames are flagged as a recording, and their number stands still |
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointfit_daemon.device_search import Finding
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.model import DeviceEvent, MocapFrame
+from jointfit_drivers.natnet._bitstream import FRAME_START
+from jointfit_drivers.natnet._decoder import NatNetDecoder
+from jointfit_drivers.natnet._network_findings import CHECK, card_findings, multicast_arrivals
+from jointfit_drivers.natnet._server_checks import NEWEST_MAJOR
+from jointfit_drivers.natnet._session import CONNECT_S, MODEL_S, NatNetSession
+from jointfit_drivers.ports.network_cards import network_cards
+from jointfit_drivers.ports.udp_socket import local_address
+from jointfit_protocols.natnet import OLDEST
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Chunk
+    from jointfit_drivers.natnet._settings import NatNetSettings
+
+_FRAMES_S = 1.0
+"""Time to receive after the first frame, s."""
+_NEWEST = "4.2"
+"""Newest bitstream with a description; sections of later ones are skipped by their size."""
+_STILL = 3
+"""Repeated frames from which the frame number stands still."""
+_STREAMING = (
+    "in Motive's Streaming pane enable streaming and select the local interface of this network "
+    "(not loopback); in playback, press play"
+)
+
+
+class _Reception:
+    """Everything that the server sent, decoded."""
+
+    def __init__(self, settings: NatNetSettings) -> None:
+        self.decoder = NatNetDecoder(settings)
+        self.events: list[DeviceEvent] = []
+        self.frames: list[MocapFrame] = []
+        self.arrived = asyncio.Event()
+        """Set by the first decoded frame."""
+        self.datagrams = 0
+        """Datagrams with a frame, decoded or not."""
+
+    def emit(self, chunk: Chunk) -> None:
+        self.datagrams += chunk.data.startswith(FRAME_START)
+        for item in self.decoder.feed(chunk):
+            if isinstance(item, MocapFrame):
+                self.frames.append(item)
+                self.arrived.set()
+            elif isinstance(item, DeviceEvent):
+                self.events.append(item)
+
+    @property
+    def server(self) -> dict[str, Any] | None:
+        """Description of the server; None before its answer."""
+        found = [dict(event.data) for event in self.events if "natnet" in event.data]
+        return found[-1] if found else None
+
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings about the model, each once."""
+        texts = [event.text for event in self.events if event.kind in ("warning", "error")]
+        return list(dict.fromkeys(texts))
+
+
+async def diagnose(settings: NatNetSettings, wait_s: float) -> list[Finding]:
+    """Return the findings for a ``[mocap]`` table; see `Diagnosis.diagnose`."""
+    name = settings.server
+    loop = asyncio.get_running_loop()
+    try:
+        addresses = await loop.getaddrinfo(name, None, family=socket.AF_INET)
+    except (OSError, UnicodeError):
+        text = f"no such host: {name!r} has no IPv4 address"
+        remedy = "set server in [mocap] to the address that Motive's PC has: ipconfig"
+        return [Finding(CHECK, name, "error", text, remedy)]
+    host = str(addresses[0][4][0])
+
+    cards = network_cards()
+    try:
+        local = local_address(host, settings.interface)
+    except OSError as error:
+        listed = ", ".join(f"{card.name} ({card.address})" for card in cards)
+        if settings.interface is None:
+            text = f"no route to {host}: {error.strerror}; this host has {listed}"
+            return [Finding(CHECK, name, "error", text, f"ip route get {host}")]
+        text = f"no network card {settings.interface!r}; this host has {listed}"
+        remedy = "set interface in [mocap] to one of them, or remove the key"
+        return [Finding(CHECK, name, "error", text, remedy)]
+    routed = None
+    with contextlib.suppress(OSError):
+        routed = local_address(host, None)
+    findings = card_findings(name, host, local, routed, cards)
+
+    reception = _Reception(settings)
+    failure = await _receive(settings, host, local, reception, wait_s)
+    if reception.frames:
+        return [*findings, *_stream_findings(settings, reception)]
+    if reception.server is None:
+        return [*findings, _unanswered(settings, failure)]
+    missing = await _missing_frames(settings, host, local, reception, failure)
+    return [*findings, *missing]
+
+
+async def _receive(
+    settings: NatNetSettings, host: str, local: str, reception: _Reception, wait_s: float
+) -> Exception | None:
+    """Receive as the driver does; return the error that ended the connection."""
+    patient = settings.model_copy(update={"silence_s": wait_s})
+    session = NatNetSession(patient, host, local, reception.emit)
+    task = asyncio.create_task(session.run(), name="natnet diagnosis")
+    first_frame = asyncio.create_task(reception.arrived.wait(), name="natnet first frame")
+    tasks = {task, first_frame}
+    limit_s = CONNECT_S + MODEL_S + wait_s
+    try:
+        await asyncio.wait(tasks, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
+        if reception.frames:
+            await asyncio.sleep(_FRAMES_S)
+    finally:
+        for each in tasks:
+            each.cancel()
+        await asyncio.wait(tasks)
+    if task.cancelled():
+        return None
+    failure = task.exception()
+    if failure is not None and not isinstance(failure, DeviceLostError | DeviceMisconfiguredError):
+        raise failure
+    return failure if isinstance(failure, Exception) else None
+
+
+def _unanswered(settings: NatNetSettings, failure: Exception | None) -> Finding:
+    """Return the finding for a server without an answer to CONNECT."""
+    name, port = settings.server, settings.command_port
+    if isinstance(failure, DeviceMisconfiguredError):
+        remedy = "set server and command_port in [mocap] to those in Motive's Streaming pane"
+        return Finding(CHECK, name, "error", str(failure), remedy)
+    refused = failure is not None and isinstance(failure.__cause__, ConnectionRefusedError)
+    if refused:
+        text = f"streaming off: {name} refuses UDP port {port}, no program listens"
+        return Finding(CHECK, name, "error", text, f"start Motive; {_STREAMING}")
+    text = (
+        f"no answer from {name}, UDP port {port}: the address is wrong, a firewall drops the "
+        "datagrams, or streaming is off"
+    )
+    remedy = f"ping {name}; allow Motive in the firewall of its PC; {_STREAMING}"
+    return Finding(CHECK, name, "error", text, remedy)
+
+
+async def _missing_frames(
+    settings: NatNetSettings,
+    host: str,
+    local: str,
+    reception: _Reception,
+    failure: Exception | None,
+) -> list[Finding]:
+    """Return the findings for a server that answers, but sends no usable frame."""
+    name, server = settings.server, reception.server or {}
+    natnet = ".".join(str(server["natnet"]).split(".")[:2])
+    major = int(natnet.partition(".")[0])
+    oldest = ".".join(map(str, OLDEST))
+
+    if major > NEWEST_MAJOR or (reception.datagrams and major >= NEWEST_MAJOR):
+        text = f"the server streams bitstream {natnet}, the newest known one is {_NEWEST}"
+        remedy = 'switch Motive to unicast, and set bitstream = "4.1" in [mocap]'
+        return [Finding(CHECK, name, "error", text, remedy)]
+    if major < OLDEST[0]:
+        text = f"the server streams bitstream {natnet}, expected {oldest} or newer"
+        return [Finding(CHECK, name, "error", text, "update Motive to 2.0 or later")]
+    if reception.datagrams or isinstance(failure, DeviceMisconfiguredError):
+        remedy = "restart streaming in Motive; `jointfit decode natnet` shows a capture of it"
+        text = str(failure) if failure is not None else "frames arrive before the model"
+        return [Finding(CHECK, name, "error", text, remedy)]
+
+    multicast = server["transport"] == "multicast"
+    if settings.transport not in ("auto", server["transport"]):
+        text = f"the server sends {server['transport']}, transport = {settings.transport!r}"
+        return [Finding(CHECK, name, "error", text, 'set transport = "auto" in [mocap]')]
+    if multicast:
+        return [await _missing_multicast(settings, host, local, server)]
+    text = "streaming off: the server answers, but sends no frame"
+    return [Finding(CHECK, name, "error", text, _STREAMING)]
+
+
+async def _missing_multicast(
+    settings: NatNetSettings, host: str, local: str, server: dict[str, Any]
+) -> Finding:
+    """Return whether the frames arrive at another card, or at none."""
+    name, group = settings.server, str(server["group"])
+    port = settings.data_port or int(server["data_port"])
+    cards = network_cards()
+    arrivals = await multicast_arrivals(group, port, host, cards, _FRAMES_S)
+    other = next((c for c in cards if arrivals[c.address] and c.address != local), None)
+    if other is not None:
+        text = (
+            f"multicast on two interfaces: the frames arrive at {other.name} ({other.address}), "
+            f"not at {local}"
+        )
+        return Finding(CHECK, name, "error", text, f'set interface = "{other.address}" in [mocap]')
+    text = (
+        f"the server answers, but its multicast frames ({group}, UDP port {port}) arrive at no "
+        "network card: a firewall or a switch drops them, or streaming is off"
+    )
+    remedy = (
+        f"sudo ufw allow proto udp from {host} to any port {port} (or the same rule of your "
+        f"firewall); or select unicast in Motive; {_STREAMING}"
+    )
+    return Finding(CHECK, name, "error", text, remedy)
+
+
+def _stream_findings(settings: NatNetSettings, reception: _Reception) -> list[Finding]:
+    """Return the findings about the content of the stream."""
+    name, frames = settings.server, reception.frames
+    layout = frames[-1].layout
+    findings = []
+
+    if not layout.bodies and not layout.markers:
+        findings.append(
+            Finding(
+                CHECK, name, "error", "the stream has no rigid body and no marker set",
+                "in Motive create the assets, tick them in the Assets pane, and enable Rigid "
+                "Bodies and Labeled Markers in the Streaming pane",
+            )
+        )  # fmt: skip
+    for text in reception.warnings:
+        remedy = "correct the names in [mocap], or those of the assets in Motive"
+        findings.append(Finding(CHECK, name, "error", text, remedy))
+
+    still = reception.decoder.duplicates >= _STILL
+    if not frames[-1].live:
+        text = "playback paused: the frames repeat one instant of a recording"
+        if not still:
+            text = "the frames are those of a recording (edit mode), not of the cameras"
+        level: Any = "error" if still else "warning"
+        findings.append(Finding(CHECK, name, level, text, "switch Motive to live mode"))
+    elif still:
+        text = "the frame number stands still: the cameras are paused"
+        findings.append(Finding(CHECK, name, "error", text, "resume the cameras in Motive"))
+
+    for segment, body in settings.rigid_body.items():
+        if body in layout.bodies:
+            column = layout.bodies.index(body)
+            if all(np.isnan(frame.body_positions[column]).any() for frame in frames):
+                text = f"rigid body {body!r} of {segment} was not tracked in {len(frames)} frames"
+                remedy = "put it in view of the cameras, and check its marker positions in Motive"
+                findings.append(Finding(CHECK, name, "warning", text, remedy))
+
+    span_s = (frames[-1].arrival_ns - frames[0].arrival_ns) / 1e9
+    rate = f"{(len(frames) - 1) / span_s:.0f} frames a second, " if span_s > 0 else ""
+    content = f"{rate}{len(layout.bodies)} rigid bodies, {len(layout.markers)} markers"
+    return findings or [Finding(CHECK, name, "ok", content)]
