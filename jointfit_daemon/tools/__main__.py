@@ -18,6 +18,7 @@ from jointfit_daemon.tools.command_group import EXIT_CODES, CommandGroup
 from jointfit_daemon.tools.dashboard import dashboard
 from jointfit_daemon.tools.decode import decode
 from jointfit_daemon.tools.demo import demo
+from jointfit_daemon.tools.doctor import doctor
 from jointfit_daemon.tools.ik import ik
 from jointfit_daemon.tools.init import init
 from jointfit_daemon.tools.markers import markers
@@ -37,8 +38,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    init, check, probe, demo, dashboard, monitor, calibrate, mark, request, center, decode, ik,
-    markers, report, sample, schema,
+    init, check, probe, doctor, demo, dashboard, monitor, calibrate, mark, request, center, decode,
+    ik, markers, report, sample, schema,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(fuse.app)

@@ -30,6 +30,7 @@ def test_the_version_is_the_packages() -> None:
     [
         "check",
         "probe",
+        "doctor",
         "demo",
         "dashboard",
         "monitor",

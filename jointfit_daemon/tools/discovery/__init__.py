@@ -7,8 +7,10 @@ the named device only, and write nothing to it.
 from jointfit_daemon.tools.discovery._can_interfaces import (
     CanChannel,
     CanInterface,
+    RunCommand,
     configured_can_channels,
     find_can_interfaces,
+    run_command,
 )
 from jointfit_daemon.tools.discovery._can_listening import CanIdentifier, CanTraffic, listen_can
 from jointfit_daemon.tools.discovery._mocap_servers import (
@@ -22,6 +24,7 @@ from jointfit_daemon.tools.discovery._serial_listening import (
     usual_bauds,
 )
 from jointfit_daemon.tools.discovery._serial_ports import SerialPortInfo, find_serial_ports
+from jointfit_daemon.tools.discovery._sysfs import read_attribute
 from jointfit_daemon.tools.discovery._traffic import DecodedDevice, decode_traffic
 
 __all__ = [
@@ -31,6 +34,7 @@ __all__ = [
     "CanTraffic",
     "DecodedDevice",
     "FoundServer",
+    "RunCommand",
     "SerialPortInfo",
     "SerialTraffic",
     "configured_can_channels",
@@ -41,5 +45,7 @@ __all__ = [
     "installed_drivers",
     "listen_can",
     "listen_serial",
+    "read_attribute",
+    "run_command",
     "usual_bauds",
 ]

@@ -9,19 +9,17 @@ import configparser
 import os
 import shutil
 import subprocess
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import orjson
 
 from jointfit_daemon.tools.discovery._sysfs import read_attribute, read_number
 
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    RunCommand = Callable[[Sequence[str]], str | None]
-
+RunCommand = Callable[[Sequence[str]], str | None]
+"""Returns the output of a command; None if it is absent or fails."""
 _ARPHRD_CAN = 280
 """Hardware type of CAN interfaces in the kernel."""
 _IFF_UP = 1

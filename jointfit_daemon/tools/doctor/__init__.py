@@ -1,0 +1,5 @@
+"""`jointfit doctor`: faults of host, network and devices that keep data from the daemon."""
+
+from jointfit_daemon.tools.doctor._command import doctor
+
+__all__ = ["doctor"]

@@ -1,0 +1,151 @@
+"""Command `jointfit doctor`: checks of host, devices, broker and cameras."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+
+from jointfit_daemon.tools.command_group import EXIT_FAILED
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.config import Rig, Source
+    from jointfit_daemon.device_search import Diagnosis, Finding
+    from jointfit_daemon.tools.doctor._host import Host
+
+_DEFAULT = Path("rig.toml")
+
+
+def doctor(
+    *,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Configuration to check. Default: rig.toml, if it is in this folder."),
+    ] = None,
+    wait_s: Annotated[
+        float,
+        typer.Option("--wait", help="Longest wait for frames of the cameras, s.", min=0.5, max=60),
+    ] = 3.0,
+    json: Annotated[bool, typer.Option("--json", help="Print the findings as JSON.")] = False,
+) -> None:
+    """Find the faults that keep data from the daemon, each with its remedy.
+
+    Checks permissions, other programs and latency of serial ports, CAN interfaces, clock, disk,
+    memory and processor; with a rig.toml also the broker, and the cameras by a connection as the
+    daemon makes it. Changes nothing, and needs no root access. Exit codes: 0 no fault; 1 a warning
+    or an error; 2 invalid options or rig.toml.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from jointfit_daemon.config import load_rig
+    from jointfit_daemon.tools.doctor._doctor_report import finding_lines, report_of
+    from jointfit_daemon.tools.doctor._host import Host
+    from jointfit_daemon.tools.text_output import echo_json
+
+    chosen = config or (_DEFAULT if _DEFAULT.exists() else None)
+    rig = None if chosen is None else load_rig(chosen)
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("checking", total=1.0)
+        findings = examine(Host(), rig, wait_s, lambda share: bar.update(task, completed=share))
+
+    report = report_of(findings)
+    if json:
+        echo_json(report)
+    else:
+        for finding in findings:
+            for line in finding_lines(finding):
+                typer.echo(line)
+    if report.level != "ok":
+        raise typer.Exit(EXIT_FAILED)
+
+
+def examine(
+    host: Host, rig: Rig | None, wait_s: float, progress: Callable[[float], None] = lambda _: None
+) -> list[Finding]:
+    """Return all findings about a host, and about a rig if there is one.
+
+    Parameters
+    ----------
+    host
+        The host.
+    rig
+        Contents of rig.toml; None checks all devices of the host, no broker and no cameras.
+    wait_s
+        Longest wait for frames of the cameras, s.
+    progress
+        Called with the share of the work that is done, 0 to 1.
+    """
+    from jointfit_daemon.tools.doctor import _host_checks as of_host
+    from jointfit_daemon.tools.doctor._can_checks import check_can
+    from jointfit_daemon.tools.doctor._serial_checks import check_serial
+
+    cameras = None if rig is None else next((s for s in rig.sources if s.kind == "mocap"), None)
+    by_ptp = cameras is not None and getattr(cameras.settings, "time", "server") != "server"
+    findings = [
+        *check_serial(host, None if rig is None else _serial_paths(rig)),
+        *check_can(host, None if rig is None else _can_bitrates(rig)),
+        *of_host.check_clock(host, needed=by_ptp),
+        *of_host.check_disk(host),
+        *of_host.check_memory(host),
+        *of_host.check_processor(host),
+    ]
+    progress(0.2)
+    if rig is None:
+        return [*findings, _without_rig()]
+
+    from jointfit_daemon.tools.doctor._broker_checks import check_broker
+
+    findings += asyncio.run(check_broker(rig.mqtt))
+    progress(0.4)
+    if cameras is not None:
+        found = asyncio.run(_diagnose(cameras, wait_s))
+        findings += found
+        server = getattr(cameras.settings, "server", None)
+        if server is not None and any(each.level == "error" for each in found):
+            findings += of_host.check_firewall(host, server)
+    progress(1.0)
+    return findings
+
+
+def _without_rig() -> Finding:
+    from jointfit_daemon.device_search import Finding
+
+    text = "no rig.toml: broker and cameras were not checked"
+    return Finding("rig", "", "unknown", text, "jointfit doctor --config rig.toml")
+
+
+async def _diagnose(cameras: Source, wait_s: float) -> list[Finding]:
+    """Return the findings of the driver of the cameras."""
+    from jointfit_daemon.device_search import Finding
+
+    if not hasattr(cameras.driver_class, "diagnose"):
+        text = f"driver {cameras.driver} has no diagnosis: the stream was not checked"
+        return [Finding("mocap", cameras.driver, "unknown", text, "start jointfitd, read its log")]
+    driver = cast("Diagnosis", cast("Any", cameras.driver_class))
+    return await driver.diagnose(cameras.settings, wait_s)
+
+
+def _serial_paths(rig: Rig) -> list[str]:
+    """Return the serial ports of a rig: of sensors, and of CAN adapters on a serial port."""
+    from jointfit_daemon.driver import SERIAL_ADAPTERS
+
+    paths = []
+    for source in rig.sources:
+        can = getattr(source.settings, "can", None)
+        if can is not None and can.interface in SERIAL_ADAPTERS:
+            paths.append(can.channel)
+        elif isinstance(port := getattr(source.settings, "port", None), str):
+            paths.append(port)
+    return list(dict.fromkeys(paths))
+
+
+def _can_bitrates(rig: Rig) -> dict[str, int]:
+    """Return the SocketCAN interfaces of a rig with their bit rates, bit/s."""
+    buses = (getattr(source.settings, "can", None) for source in rig.sources)
+    return {bus.channel: bus.bitrate for bus in buses if bus and bus.interface == "socketcan"}

@@ -1,0 +1,44 @@
+"""The result of `jointfit doctor`, its JSON Schema, and its text."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pydantic.dataclasses import dataclass
+
+from jointfit_daemon.device_search import Finding, Level
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+_WORST_FIRST: tuple[Level, ...] = ("error", "warning")
+
+
+@dataclass(frozen=True, slots=True)
+class DoctorReport:
+    """All findings, and the worst level among them."""
+
+    level: Level
+    """``error``, ``warning``, or ``ok`` if there is neither."""
+    findings: list[Finding]
+
+
+def report_of(findings: list[Finding]) -> DoctorReport:
+    """Return the report with the worst level of `findings`."""
+    levels = {finding.level for finding in findings}
+    return DoctorReport(next((each for each in _WORST_FIRST if each in levels), "ok"), findings)
+
+
+def doctor_schema() -> dict[str, Any]:
+    """Return the JSON Schema of `jointfit doctor --json`."""
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(DoctorReport).json_schema(mode="serialization")
+
+
+def finding_lines(finding: Finding) -> Iterator[str]:
+    """Yield a finding as text, its remedy in a line of its own."""
+    subject = f"{finding.check} {finding.id}".strip()
+    yield f"{finding.level:8} {subject}: {finding.text}"
+    if finding.remedy:
+        yield f"{'':8} → {finding.remedy}"

@@ -1,0 +1,130 @@
+"""Facts about this host, below a root folder and from a few calls of the system.
+
+Invariant: everything is read without root access, and nothing is changed.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import getpass
+import grp
+import os
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.tools.discovery import RunCommand, read_attribute, run_command
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+_TIMEX_BYTES = 256
+"""At least the size of ``struct timex``; modes = 0 reads only."""
+_STATUS_OFFSET = 40
+"""Place of the field ``status`` on 64-bit systems: after modes and four more."""
+_STA_UNSYNC = 0x40
+
+
+def clock_is_synchronized() -> bool | None:
+    """Return whether a service disciplines the system clock (adjtimex); None if unknown."""
+    if ctypes.sizeof(ctypes.c_long) != ctypes.sizeof(ctypes.c_int64):
+        return None  # another layout
+    buffer = ctypes.create_string_buffer(_TIMEX_BYTES)
+    try:
+        if ctypes.CDLL(None, use_errno=True).adjtimex(buffer) < 0:
+            return None
+    except AttributeError:  # no adjtimex in this C library
+        return None
+    status = ctypes.c_int.from_buffer(buffer, _STATUS_OFFSET).value
+    return not status & _STA_UNSYNC
+
+
+def can_read_and_write(path: Path) -> bool:
+    """Return whether this user may open `path`."""
+    return os.access(path, os.R_OK | os.W_OK)
+
+
+def own_groups() -> frozenset[str]:
+    """Return the groups of this process."""
+    found = set()
+    for number in {os.getgid(), *os.getgroups()}:
+        try:
+            found.add(grp.getgrgid(number).gr_name)
+        except KeyError:
+            found.add(str(number))
+    return frozenset(found)
+
+
+def members_of(group: str) -> frozenset[str]:
+    """Return the users that the system's database lists in `group`."""
+    try:
+        return frozenset(grp.getgrnam(group).gr_mem)
+    except KeyError:
+        return frozenset()
+
+
+def group_of(path: Path) -> str:
+    """Return the group of a file."""
+    number = path.stat().st_gid
+    try:
+        return grp.getgrgid(number).gr_name
+    except KeyError:
+        return str(number)
+
+
+def free_bytes(folder: Path) -> int:
+    """Return the free space of the file system of `folder`, bytes."""
+    return shutil.disk_usage(folder).free
+
+
+@dataclass(frozen=True, slots=True)
+class Host:
+    """The host to check; tests replace single facts.
+
+    Parameters
+    ----------
+    root
+        Folder that contains ``sys``, ``proc``, ``dev``, ``etc`` and ``run``.
+    """
+
+    root: Path = Path("/")
+    run: RunCommand = run_command
+    user: str = field(default_factory=getpass.getuser)
+    groups: frozenset[str] = field(default_factory=own_groups)
+    may_open: Callable[[Path], bool] = can_read_and_write
+    members: Callable[[str], frozenset[str]] = members_of
+    group_of: Callable[[Path], str] = group_of
+    free_bytes: Callable[[Path], int] = free_bytes
+    clock_is_synchronized: Callable[[], bool | None] = clock_is_synchronized
+
+    def at(self, path: str) -> Path:
+        """Return an absolute path of the host below the root folder."""
+        return self.root / path.lstrip("/") if path.startswith("/") else Path(path)
+
+    def processes(self) -> Iterator[tuple[int, str, Path]]:
+        """Yield number, name and folder of the running processes."""
+        for folder in (self.root / "proc").glob("[0-9]*"):
+            name = read_attribute(folder / "comm")
+            if name is not None and folder.name.isdigit():
+                yield int(folder.name), name, folder
+
+    def is_running(self, name: str) -> bool:
+        """Return whether a process has this name; the kernel keeps 15 characters."""
+        return any(found == name[:15] for _, found, _ in self.processes())
+
+    def holders(self, device: Path) -> list[tuple[int, str]]:
+        """Return the processes, of those that this user may inspect, that have `device` open."""
+        wanted = device.resolve()
+        found = []
+        for number, name, folder in self.processes():
+            try:
+                links = list((folder / "fd").iterdir())
+                if any(self._target(link) == wanted for link in links):
+                    found.append((number, name))
+            except OSError:  # of another user, or ended
+                continue
+        return found
+
+    def _target(self, link: Path) -> Path:
+        return self.at(str(link.readlink()))
