@@ -49,6 +49,7 @@ NOT_RUN = {
     r"pytest": "the test suite itself",
     r"examples/subscribers|http.server": "runs until it is stopped: tests/examples",
     r"^telegraf ": "is not in Debian: tests/examples evaluates its configuration",
+    r"^colcon |^ros2 ": "needs ROS 2: tests/examples runs the bridge with a stand-in",
     r"^curl ": "needs [metrics] on port 9464: tests/outputs/metrics starts it on a free one",
     r"^jointfit init ": "asks questions: tests/tools/init answers them",
     r"^jointfit dashboard": "needs port 8080: tests/tools/dashboard starts it on a free one",

@@ -1,0 +1,1 @@
+"""Bridge from the MQTT topics of jointfitd to ROS 2."""
