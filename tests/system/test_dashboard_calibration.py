@@ -23,6 +23,7 @@ from tests.tools.dashboard.browser import PICTURES, SIZES, VIEWS, OpenedPage, ch
 if TYPE_CHECKING:
     from playwright.async_api import Browser
 
+    from jointfit_daemon.tools.child_processes import Simulator
     from tests.broker_fixture import Broker
 
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(400)]
@@ -51,6 +52,14 @@ OPTICAL_PIXELS = """() => {
   return count;
 }"""
 """Number of pixels of the limb in the colour of the cameras."""
+TURNED_BY = """([name, degrees]) => {
+  const cards = [...document.querySelectorAll('#view-sensors .card')];
+  const card = cards.find((card) => card.querySelector('h3')?.textContent === name);
+  const text = card?.querySelector('.turn').textContent ?? '';
+  const angle = text === 'not turned' ? 0 : Number(/turned (\\d+)°/.exec(text)?.[1] ?? NaN);
+  return Math.abs(angle - degrees) <= 5;
+}"""
+"""Whether the check of axes shows this rotation of a sensor, within the limit of "not turned"."""
 KNEES = "jointfit.store.poses.map((pose) => pose.joints.knee.flexion_deg).filter((x) => x !== null)"
 READY = {
     "live": "difference from the cameras", "calibrate": "Held-out error", "history": "in force",
@@ -117,8 +126,9 @@ async def calibrate(page: OpenedPage) -> None:
 
 async def revert(page: OpenedPage) -> None:
     """Record another static pose, then use the first calibration again, in the history."""
-    await page.page.click(".rail >> text=Stand still")
-    await page.page.click("text=Start standing")
+    await page.page.click("#menu-button")
+    await page.page.click("#menu >> text=Record the static pose again")
+    await page.page.click("#action .primary")
     await page.until_text("#rig-state", "Calibrated, version 2", FIT_PATIENCE_S)
     await page.show("history")
     await page.page.click("text=Use version 1")
@@ -136,6 +146,40 @@ async def see_the_limb_move(page: OpenedPage) -> None:
     await page.page.wait_for_function(
         f"() => {{ const x = {KNEES}; return Math.max(...x) - Math.min(...x) > 30; }}"
     )
+
+
+async def turn_a_sensor(page: OpenedPage, simulator: Simulator) -> None:
+    """Turn a simulated sensor while the subject stands: its axes follow."""
+    await page.show("sensors")
+    await page.until_text("#view-sensors .turn", "not turned")
+    await simulator.say("slip S1 90")
+    await page.page.wait_for_function(TURNED_BY, arg=["S1", 90], timeout=30_000)
+    await simulator.say("slip S1 -90")
+    await page.page.wait_for_function(TURNED_BY, arg=["S1", 0], timeout=30_000)
+
+
+async def use_the_requests(page: OpenedPage) -> None:
+    """Use the requests of the Sensors view; the daemon answers."""
+    await page.page.click("#view-sensors >> text=Self-test")
+    await page.until_text("#action .answer", "checks passed")
+    await page.page.click("#action .buttons .button:not(.primary)")
+    await page.page.click("#view-sensors >> text=Output rate")
+    await page.page.fill("#action input", "999")
+    await page.page.click("#action .primary")
+    await page.until_text("#action .answer", "the sample rate of the fastest sensor")
+    await page.page.fill("#action input", "25")
+    await page.page.click("#action .primary")
+    await page.until_text("#action .answer", "The output rate is 25 Hz; before: 50 Hz.")
+    await page.page.click("#action .buttons .button:not(.primary)")
+    await page.page.click("#view-sensors >> text=Reload rig.toml")
+    await page.page.click("#action .primary")
+    await page.until_text("#action .answer", "S1, S2, S3, S4, mocap")
+    await page.page.click("#action .buttons .button:not(.primary)")
+    await page.page.click('[aria-label="Restart S3"]')
+    await page.page.click("#action .primary")
+    await page.until_text("#action .answer", "S3 restarts")
+    await page.page.click("#action .buttons .button:not(.primary)")
+    await page.page.wait_for_function(ALL_ONLINE, timeout=60_000)
 
 
 async def photograph(browser: Browser, url: str) -> None:
@@ -192,7 +236,7 @@ async def test_a_rig_is_calibrated_in_the_page_and_survives_daemon_and_broker(
     tmp_path: Path, broker: Broker
 ) -> None:
     station = Station(tmp_path, broker.port, OPTIONS)
-    async with chromium() as browser, station.simulator():
+    async with chromium() as browser, station.simulator() as simulator:
         server, url = await start_server(broker)
         try:
             async with opened(browser, url) as page:
@@ -203,8 +247,11 @@ async def test_a_rig_is_calibrated_in_the_page_and_survives_daemon_and_broker(
                     await calibrate(page)
                     await see_the_limb_move(page)
                     cost = await measured(browser, page, server)
-                    await page.show("calibrate")
                     await revert(page)
+                    await simulator.say("play stand")
+                    await turn_a_sensor(page, simulator)
+                    await use_the_requests(page)
+                    await simulator.say("play walk")
                     await photograph(browser, url)
                     assert daemon.process is not None
                     daemon.process.send_signal(signal.SIGKILL)

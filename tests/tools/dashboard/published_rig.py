@@ -30,6 +30,22 @@ def about_x(angle: float) -> list[float]:
     return [math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0]
 
 
+def about_z(angle: float) -> list[float]:
+    """Return the quaternion of a rotation about the z axis, rad."""
+    return [math.cos(angle / 2), 0.0, 0.0, math.sin(angle / 2)]
+
+
+def product(a: list[float], b: list[float]) -> list[float]:
+    """Return the product of two quaternions."""
+    (w, x, y, z), (p, q, r, s) = a, b
+    return [
+        w * p - x * q - y * r - z * s,
+        w * q + x * p + y * s - z * r,
+        w * r - x * s + y * p + z * q,
+        w * s + x * r - y * q + z * p,
+    ]
+
+
 STORED = {
     "in_force": 3,
     "omitted": 0,
@@ -66,6 +82,10 @@ class PublishedRig:
     """Whether the rig hangs: it sends no poses, but keeps its connection."""
     requests: list[dict[str, Any]] = field(default_factory=list)
     """Requests received, without the check of rights that a page sends once."""
+    commands: list[str] = field(default_factory=list)
+    """Their commands."""
+    turned: dict[str, tuple[str, float]] = field(default_factory=dict)
+    """Axis and angle, deg, by which a sensor was turned about its own axis."""
     answer: dict[str, Any] = field(
         default_factory=lambda: {"status": "accepted", "data": {}, "error": None}
     )
@@ -169,6 +189,16 @@ class PublishedRig:
         pose |= {"v": 1, "seq": seq, "t_us": t_us, "mode": "imu+mocap", "sync": "locked"}
         return pose | {"flags": []}, optical | {"v": 1, "t_us": t_us, "frame": seq}
 
+    def orientations(self) -> dict[str, Any]:
+        """Return `sensors/pose`: sensors with different headings, each turned by `turned`."""
+        sensors = {}
+        for i, name in enumerate(name for group in self.sensors.values() for name in group):
+            axis, degrees = self.turned.get(name, ("x", 0.0))
+            half = math.radians(degrees) / 2
+            turn = [math.cos(half), *(math.sin(half) if key == axis else 0.0 for key in "xyz")]
+            sensors[name] = {"q": product(about_z(0.5 * i), turn), "q_segment": None}
+        return {"v": 1, "t_us": self.now_us(), "sensors": sensors, "joints": {}}
+
     def _limb(self, hip: float, knee: float) -> dict[str, Any]:
         (thigh, shank), p = [*self.sensors], [0.06, 0.02, 0.86]
         shank_angle = hip - knee
@@ -252,6 +282,8 @@ async def _publish_poses(rig: PublishedRig, client: aiomqtt.Client) -> None:
         if not rig.silent:
             await client.publish(f"{rig.base}/pose/ui", orjson.dumps(pose))
             await client.publish(f"{rig.base}/optical/pose", orjson.dumps(optical))
+            orientations = orjson.dumps(rig.orientations())
+            await client.publish(f"{rig.base}/sensors/pose", orientations)
         seq += 1
         await asyncio.sleep(PERIOD_S)
 
@@ -260,9 +292,10 @@ async def _answer(rig: PublishedRig, client: aiomqtt.Client) -> None:
     with contextlib.suppress(aiomqtt.MqttError):
         async for message in client.messages:
             request = orjson.loads(bytes(message.payload))
+            command = message.topic.value.rpartition("/")[2]
             if request.get("count") != 1:
                 rig.requests.append(request)
-            command = message.topic.value.rpartition("/")[2]
+                rig.commands.append(command)
             found = rig.answers.get(command, rig.answer)
             answer = {"v": 1, "transaction": request.get("transaction"), **found}
             topic = message.topic.value.replace("/request/", "/response/")

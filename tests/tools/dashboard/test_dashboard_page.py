@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -12,12 +11,11 @@ from jointfit_daemon.outputs.mqtt import verify
 from jointfit_daemon.tools.dashboard.addresses import BrokerAddress, ListenAddress
 from jointfit_daemon.tools.dashboard.server import DashboardServer
 from tests.broker_fixture import HOST
-from tests.tools.dashboard.browser import SIZES, VIEWS, OpenedPage, chromium, opened
+from tests.tools.dashboard.browser import SIZES, VIEWS, chromium, opened
 from tests.tools.dashboard.published_rig import PublishedRig, publishing
+from tests.tools.dashboard.shown_page import shown
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
-
     from tests.broker_fixture import Broker
 
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(150)]
@@ -26,20 +24,6 @@ LIMB_PIXELS = """() => {
   const canvas = document.querySelector('#limb');
   return canvas.width + ':' + canvas.toDataURL().slice(0, 60000);
 }"""
-
-
-@asynccontextmanager
-async def shown(broker: Broker, rig: PublishedRig, **window: Any) -> AsyncIterator[OpenedPage]:
-    """Yield the page of a rig once it shows an angle."""
-    server = DashboardServer(BrokerAddress(HOST, broker.port))
-    async with (
-        chromium() as browser,
-        publishing(rig, broker.port),
-        server.listening(ListenAddress(HOST, 0)) as url,
-        opened(browser, url, **window) as page,
-    ):
-        await page.until_text("#angle-value", "°")
-        yield page
 
 
 async def test_the_limb_moves_and_the_angle_has_a_standard_deviation(broker: Broker) -> None:

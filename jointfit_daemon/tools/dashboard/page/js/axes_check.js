@@ -1,56 +1,97 @@
 // Check of axes: the live axes of every sensor, to be compared with the housing in the hand.
 
 import { createElement, setText } from "./dom.js";
-import { multiply, rotate } from "./geometry.js";
+import { conjugate, multiply, rotate } from "./geometry.js";
 import { valueOf } from "./store.js";
+import { formatNumber } from "./words.js";
 
 const AXES = [["x", [1, 0, 0]], ["y", [0, 1, 0]], ["z", [0, 0, 1]]];
 const SIZE = 150;
 const STALE_MS = 2000;
+const STILL_DEG = 5; // below this angle a sensor counts as not turned
 
 /** Return the panel of the check; it subscribes to `sensors/pose` only while it is shown. */
 export function createAxesCheck(store, link) {
   const note = createElement("p", { class: "lead" });
   const drawings = createElement("div", { class: "cards" });
-  const root = createElement("div", { class: "panel stack" }, createElement("h2", {}, "Check of axes"), note, drawings);
-  const canvases = new Map();
+  const cards = new Map();
+  const zero = createElement("button", { class: "button", type: "button", onclick: () => { for (const card of cards.values()) card.start = null; update(); } }, "Set all to zero");
+  const root = createElement(
+    "div", { class: "panel stack" },
+    createElement("div", { class: "panel-head" }, createElement("h2", {}, "Check of axes"), zero), note, drawings,
+  );
   let visible = false;
 
-  const update = () => { if (visible) updateDrawings(store, drawings, canvases); };
+  const update = () => { if (visible && isFresh(store)) updateDrawings(store, drawings, cards); };
   store.on("sensors", update);
-  setInterval(() => { if (visible) setText(note, noteOf(store)); }, 500);
+  setInterval(() => { if (visible) updateNote(); }, 500);
+  const updateNote = () => {
+    setText(note, noteOf(store));
+    zero.hidden = !isFresh(store);
+  };
   return {
     root,
     show(shown) {
       visible = shown;
       if (shown) link.subscribe("sensors/pose");
       else link.unsubscribe("sensors/pose");
-      setText(note, noteOf(store));
+      for (const card of cards.values()) card.start = null;
+      updateNote();
       update();
     },
   };
 }
 
+function isFresh(store) {
+  return store.sensorsReceivedMs !== null && performance.now() - store.sensorsReceivedMs < STALE_MS;
+}
+
 function noteOf(store) {
-  const fresh = store.sensorsReceivedMs !== null && performance.now() - store.sensorsReceivedMs < STALE_MS;
-  if (fresh) {
-    return "Turn one sensor by hand. Its axes must turn the same way here as on its housing: x, y and z as printed there, z of the world up.";
+  if (isFresh(store)) {
+    return "Turn one sensor by hand about one of the axes printed on its housing, for example by 90° about x. The drawing must turn the same way, and the line below it must name the same axis, sign and angle. Up in the drawing is up in the room.";
   }
   return "Orientations of single sensors are not published. To see their axes, set sensors_hz = 10 under [mqtt] in rig.toml and reload the daemon.";
 }
 
-function updateDrawings(store, drawings, canvases) {
+function updateDrawings(store, drawings, cards) {
   const style = getComputedStyle(document.documentElement);
   const color = (name) => style.getPropertyValue(`--${name}`).trim();
   for (const [name, sensor] of Object.entries(store.sensors?.sensors ?? {})) {
-    if (!canvases.has(name)) {
-      const canvas = createElement("canvas", { width: SIZE * 2, height: SIZE * 2, role: "img", "aria-label": `Axes of ${name}`, class: "axes" });
-      canvases.set(name, canvas);
-      drawings.append(createElement("article", { class: "card" }, createElement("h3", { dir: "auto" }, name), canvas));
+    if (!cards.has(name)) {
+      cards.set(name, createCard(name));
+      drawings.append(cards.get(name).root);
     }
+    const card = cards.get(name);
     const world = valueOf(store.calibration?.quality?.sensors, name)?.q_optical_world;
-    drawAxes(canvases.get(name), sensor.q && world ? multiply(world, sensor.q) : sensor.q, color);
+    drawAxes(card.canvas, sensor.q && world ? multiply(world, sensor.q) : sensor.q, color);
+    if (sensor.q) card.start ??= sensor.q;
+    const turn = sensor.q ? turnSince(card.start, sensor.q) : null;
+    setText(card.turn, turn === null ? "no data" : turnText(turn));
+    card.root.classList.toggle("turned", turn !== null && turn.angle >= STILL_DEG);
   }
+}
+
+function createCard(name) {
+  const canvas = createElement("canvas", { width: SIZE * 2, height: SIZE * 2, role: "img", "aria-label": `Axes of ${name}`, class: "axes" });
+  const turn = createElement("p", { class: "digits turn" });
+  return { canvas, turn, start: null, root: createElement("article", { class: "card" }, createElement("h3", { dir: "auto" }, name), canvas, turn) };
+}
+
+/** Return the rotation between two orientations: its angle, degrees, and its nearest sensor axis. */
+export function turnSince(start, q) {
+  const [w, ...v] = multiply(conjugate(start), q); // in the axes of the sensor
+  const length = Math.hypot(...v);
+  const sign = w < 0 ? -1 : 1;
+  const angle = (2 * Math.atan2(length, Math.abs(w)) * 180) / Math.PI;
+  const largest = v.reduce((best, value, i) => (Math.abs(value) > Math.abs(v[best]) ? i : best), 0);
+  const tilt = length === 0 ? 0 : (Math.acos(Math.min(1, Math.abs(v[largest]) / length)) * 180) / Math.PI;
+  return { angle, axis: `${sign * v[largest] < 0 ? "−" : "+"}${"xyz"[largest]}`, tilt };
+}
+
+function turnText({ angle, axis, tilt }) {
+  if (angle < STILL_DEG) return "not turned";
+  const degrees = formatNumber(angle, 0, "°");
+  return tilt > 30 ? `turned ${degrees}, between the axes` : `turned ${degrees} about ${axis}`;
 }
 
 function drawAxes(canvas, q, color) {

@@ -1,6 +1,7 @@
 // Start of the page: connects store, link and views.
 
 import { createAccess } from "./access.js";
+import { createActions } from "./actions.js";
 import { chosenTitle, chosenValue, createAngleView, updateAngleAge } from "./angle_view.js";
 import { createAnnouncer } from "./announcer.js";
 import { createCalibrateView } from "./calibrate_view.js";
@@ -75,7 +76,8 @@ async function start() {
   const updateCards = createSensorCards(store);
   const request = (command, content) => requests.ask(command, content, dialogs.askForKey);
   const calibrate = createCalibrateView(store, request);
-  const views = { history: createHistoryView(store, request), sensors: createSensorsView(store, link), log: createLogView(store, request), table: createTableView(store) };
+  const openAction = createActions(store, request, (name) => showView(name));
+  const views = { history: createHistoryView(store, request), sensors: createSensorsView(store, link, openAction), log: createLogView(store, request), table: createTableView(store) };
   const updateHeader = createHeader(link, store, configuration, {
     reconnect: () => link.connect(),
     logIn: () => dialogs.askForAccount(link.reason),

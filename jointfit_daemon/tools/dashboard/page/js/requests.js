@@ -17,13 +17,15 @@ export function createRequests(link, now) {
 
     /**
      * Send a request; return the data of the answer. `askForKey` is called if the rig accepts signed
-     * requests only. Throws an Error with a sentence if the request has no effect.
+     * requests only. Throws an Error with a sentence, and with the `faults` of the answer, if the request
+     * has no effect.
      */
     async ask(command, content, askForKey) {
       const answer = await requests.send(command, content);
       if (answer.status !== "error") return answer.data ?? {};
       if (!needsSignature(answer.error)) {
-        throw new Error(`jointfitd refuses: ${answer.error?.message ?? "no reason given"}`);
+        const refusal = new Error(`jointfitd refuses: ${answer.error?.message ?? "no reason given"}`);
+        throw Object.assign(refusal, { faults: answer.error?.faults ?? [] });
       }
       await askForKey();
       return requests.ask(command, content, askForKey);

@@ -1,21 +1,29 @@
 // The Sensors view: counters and clocks of every device, the daemon, and the check of axes by hand.
 
-import { byId, createElement, createTable } from "./dom.js";
+import { byId, createElement, createTable, patchTable } from "./dom.js";
 import { createAxesCheck } from "./axes_check.js";
 import { summaryOf } from "./sensor_cards.js";
 import { UNKNOWN, formatNumber } from "./words.js";
 
-/** Show the health of a store's devices in a view. */
-export function createSensorsView(store, link) {
+/** Show the health of a store's devices in a view; `openAction(name, device)` starts a request. */
+export function createSensorsView(store, link, openAction) {
   const view = { visible: false };
   const tables = createElement("div", { class: "stack" });
   const check = createAxesCheck(store, link);
+  const action = (name, text) => createElement("button", { class: "button", type: "button", onclick: () => openAction(name) }, text);
   byId("view-sensors").append(
-    createElement("div", { class: "panel stack" }, tables),
+    createElement(
+      "div", { class: "panel stack" },
+      createElement(
+        "div", { class: "panel-head" }, createElement("h2", {}, "Health"),
+        createElement("div", { class: "actions" }, action("selftest", "Self-test"), action("rate", "Output rate…"), action("reload", "Reload rig.toml…")),
+      ),
+      tables,
+    ),
     check.root,
   );
   const update = () => {
-    if (view.visible && !tables.contains(document.activeElement)) tables.replaceChildren(...tablesOf(store));
+    if (view.visible) patchTable(tables, createElement("div", { class: "stack" }, ...tablesOf(store, openAction)));
   };
   for (const subject of ["info", "health", "devices"]) store.on(subject, update);
   view.show = (visible) => {
@@ -26,11 +34,11 @@ export function createSensorsView(store, link) {
   return view;
 }
 
-function tablesOf(store) {
+function tablesOf(store, openAction) {
   if (!store.info) return [createElement("p", {}, "No rig was found yet.")];
   const number = { name: "" };
-  const columns = ["device", "state", "model", "received", "used", "late", "lost", "corrupt", "rate", "delay, median", "delay, 99 %", "clock"]
-    .map((name) => ({ ...number, name, text: ["state", "model", "clock"].includes(name) }));
+  const columns = ["device", "state", "", "model", "received", "used", "late", "lost", "corrupt", "rate", "delay, median", "delay, 99 %", "clock"]
+    .map((name) => ({ ...number, name, text: ["state", "", "model", "clock"].includes(name) }));
   const rows = Object.keys(store.info.devices).map((name) => {
     const summary = summaryOf(store, name);
     const health = summary.health ?? {};
@@ -38,7 +46,8 @@ function tablesOf(store) {
     return [
       summary.place ? `${name} · ${summary.place}` : name,
       createElement("span", { class: `status ${summary.level}` }, summary.state),
-      [info.model, info.firmware].filter(Boolean).join(" ") || UNKNOWN,
+      createElement("button", { class: "button small", type: "button", "aria-label": `Restart ${name}`, onclick: () => openAction("restart", name) }, "Restart…"),
+      createElement("span", { class: "model" }, [info.model, info.firmware].filter(Boolean).join(" ") || UNKNOWN),
       ...["received", "used", "late", "lost", "corrupt"].map((key) => formatNumber(health[key], 0)),
       summary.rate,
       formatNumber(health.delay_us?.p50 == null ? null : health.delay_us.p50 / 1000, 1, " ms"),

@@ -93,7 +93,7 @@ export function calibrationSentence(calibration) {
     const stored = version == null ? "not stored yet" : `version ${version}`;
     return kept ? `Calibrated, ${stored}; the last result was rejected` : `Calibrated, ${stored}`;
   }
-  if (phase === "aborted" && version != null) return `Calibrated, version ${version}; the last step was stopped`;
+  if (phase === "aborted" && version != null) return `Calibrated, version ${version}; last step stopped`;
   if (phase === "posed" && version != null) return `Calibrated, version ${version}; static pose recorded`;
   if (phase === "aborted" && text && !text.startsWith("abort requested")) return `Calibration stopped: ${text}`;
   return PHASES[phase] ?? String(phase);
