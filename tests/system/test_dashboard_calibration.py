@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.child_processes import Simulator
     from tests.broker_fixture import Broker
 
-pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(600)]
 
 OPTIONS = (
     *("--follow", "--sensors-hz", "10", "--rate", "50", "--output-rate-hz", "50"),
@@ -63,9 +63,10 @@ TURNED_BY = """([name, degrees]) => {
 KNEES = "jointfit.store.poses.map((pose) => pose.joints.knee.flexion_deg).filter((x) => x !== null)"
 READY = {
     "live": "difference from the cameras", "calibrate": "Held-out error", "history": "in force",
-    "sensors": "z of the world up", "table": "Knee flexion",
+    "sensors": "Up in the drawing", "table": "Knee flexion",
 }  # fmt: skip
 """A text of each view when it is complete."""
+FIRST_STEPS = ["Align", "Stand still"]
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -109,7 +110,11 @@ async def calibrate(page: OpenedPage) -> None:
     await page.until_text(".percent", "%")
     await page.page.reload()
     await page.until_text(".step.running .percent", "%")
+    await page.until_text(".percent", "6")
+    await page.picture("wizard-align")
     await page.until_text("#rig-state", "Sensors aligned", FIT_PATIENCE_S)
+    await page.page.wait_for_selector(".step:not(.running) >> text=Start standing")
+    await page.picture("wizard-static")
     await page.page.click("text=Start standing")
     await page.until_text("#rig-state", "the movement is next", FIT_PATIENCE_S)
 
@@ -118,10 +123,13 @@ async def calibrate(page: OpenedPage) -> None:
     await page.until_text(".joints", "± ")
     assert "Predicted errors of the joint centres" in await page.text(".joints")
     assert await page.page.locator(".pose.wanted").count() >= 1
+    assert await page.page.locator(".rail .done .rail-title").all_inner_texts() == FIRST_STEPS
+    await page.picture("wizard-move")
     assert await page.accessibility_faults() == []
     await page.until_text("#rig-state", "Calibrated, version 1", 60 + FIT_PATIENCE_S)
     await page.until_text("#view-calibrate", "Held-out error against the cameras")
     assert "Knee flexion" in await page.text(".good")
+    await page.picture("wizard-result")
 
 
 async def revert(page: OpenedPage) -> None:
@@ -151,9 +159,17 @@ async def see_the_limb_move(page: OpenedPage) -> None:
 async def turn_a_sensor(page: OpenedPage, simulator: Simulator) -> None:
     """Turn a simulated sensor while the subject stands: its axes follow."""
     await page.show("sensors")
-    await page.until_text("#view-sensors .turn", "not turned")
+    await page.until_text("#view-sensors .turn", "turned")
+    async with asyncio.timeout(60):
+        while True:  # the subject comes to rest
+            await page.page.click("text=Set all to zero")
+            await asyncio.sleep(1.0)
+            turns = await page.page.locator(".turn").all_inner_texts()
+            if set(turns) == {"not turned"}:
+                break
     await simulator.say("slip S1 90")
     await page.page.wait_for_function(TURNED_BY, arg=["S1", 90], timeout=30_000)
+    await page.picture("axes-turned")
     await simulator.say("slip S1 -90")
     await page.page.wait_for_function(TURNED_BY, arg=["S1", 0], timeout=30_000)
 
@@ -162,6 +178,7 @@ async def use_the_requests(page: OpenedPage) -> None:
     """Use the requests of the Sensors view; the daemon answers."""
     await page.page.click("#view-sensors >> text=Self-test")
     await page.until_text("#action .answer", "checks passed")
+    await page.picture("self-test")
     await page.page.click("#action .buttons .button:not(.primary)")
     await page.page.click("#view-sensors >> text=Output rate")
     await page.page.fill("#action input", "999")

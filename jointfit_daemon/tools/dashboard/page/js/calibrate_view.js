@@ -11,7 +11,7 @@ const RESULT = "result";
 
 /** Show the calibration of a store; `request(command, content)` sends a request. */
 export function createCalibrateView(store, request) {
-  const view = { store, request, steps: [], builtFor: null, chosen: null, recorded: null, phase: null };
+  const view = { store, request, steps: [], builtFor: null, chosen: null, recorded: null, phase: null, done: new Set() };
   view.rail = createElement("ol", { class: "rail", "aria-label": "Steps of the calibration" });
   view.message = createElement("p", { class: "banner", role: "alert", dir: "auto", hidden: true });
   view.stage = createElement("div", { class: "stage" });
@@ -103,7 +103,7 @@ function createRailEntry(view, { phase, short }, number) {
 }
 
 function updateRail(view, shown) {
-  const done = finishedSteps(view.store.calibration);
+  const done = finishedSteps(view);
   const running = isRunning(view.store.calibration?.phase);
   for (const { phase, number, mark, note, button } of view.entries) {
     button.classList.toggle("done", done.has(phase));
@@ -115,15 +115,19 @@ function updateRail(view, shown) {
   }
 }
 
-/** Return the steps that the calibration in force, or the one in progress, contains. */
-function finishedSteps(calibration) {
-  const { phase, quality, version } = calibration ?? {};
-  const done = new Set();
-  if (quality?.alignment) done.add("align");
-  if (quality?.static) done.add("static");
-  if (quality?.holdout || quality?.anatomy) done.add("functional");
-  if (phase === "calibrated" || version != null) done.add(RESULT);
-  return done;
+/** Return the steps that are done: in this calibration as far as it was seen, or in that in force. */
+function finishedSteps({ store, done }) {
+  const { phase, quality, version } = store.calibration ?? {};
+  if (phase === "align" || phase === "uncalibrated") done.clear();
+  if (phase === "aligned") done.add("align");
+  if (phase === "posed" || phase === "functional") done.add("static");
+  if (phase === "static") done.delete("static");
+  if (version == null && phase !== "calibrated") return done;
+  const inForce = new Set([RESULT]);
+  if (quality?.alignment) inForce.add("align");
+  if (quality?.static) inForce.add("static");
+  if (quality?.holdout || quality?.anatomy) inForce.add("functional");
+  return inForce;
 }
 
 function createStep(view, step, number, count) {
