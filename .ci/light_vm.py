@@ -33,6 +33,7 @@ CAN_MODULES = (
     "net/can/can-raw",
     "drivers/net/can/dev/can-dev",
     "drivers/net/can/vcan",
+    "drivers/net/veth",
 )
 HIDDEN = ("/tmp", "/run", "/var/tmp", "/mnt")
 """Folders that are empty in the guest; needed parts of them are mounted back."""

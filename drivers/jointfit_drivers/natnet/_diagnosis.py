@@ -110,10 +110,12 @@ async def diagnose(settings: NatNetSettings, wait_s: float) -> list[Finding]:
     routed = None
     with contextlib.suppress(OSError):
         routed = local_address(host, None)
-    findings = card_findings(name, host, local, routed, cards)
-
     reception = _Reception(settings)
     failure = await _receive(settings, host, local, reception, wait_s)
+    findings = card_findings(
+        name, host, local, routed, cards,
+        chosen=settings.interface is not None, arrived=bool(reception.frames),
+    )  # fmt: skip
     if reception.frames:
         return [*findings, *_stream_findings(settings, reception)]
     if reception.server is None:

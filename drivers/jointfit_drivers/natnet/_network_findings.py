@@ -19,7 +19,14 @@ CHECK = "mocap"
 
 
 def card_findings(
-    name: str, host: str, local: str, routed: str | None, cards: Sequence[NetworkCard]
+    name: str,
+    host: str,
+    local: str,
+    routed: str | None,
+    cards: Sequence[NetworkCard],
+    *,
+    chosen: bool = False,
+    arrived: bool = False,
 ) -> list[Finding]:
     """Return the faults of the choice of the network card; pure.
 
@@ -33,6 +40,10 @@ def card_findings(
         Address of the card that routes to the server; None without a route.
     cards
         Network cards of this host.
+    chosen
+        Whether rig.toml names the card, so that several cards are no fault.
+    arrived
+        Whether frames arrive, so that several cards are only a risk.
     """
     names = {card.address: card.name for card in cards}
     used = next((card for card in cards if card.address == local), None)
@@ -56,11 +67,11 @@ def card_findings(
                 f"give the server an address in {used.network}, or switch Motive to unicast",
             )
         ]  # fmt: skip
-    if len(reaching) > 1:
+    if len(reaching) > 1 and not chosen:
         listed = " and ".join(f"{card.name} ({card.address})" for card in reaching)
         return [
             Finding(
-                CHECK, name, "warning",
+                CHECK, name, "note" if arrived else "warning",
                 f"two interfaces reach {host}: {listed}; multicast frames may arrive at the other",
                 f'set interface = "{local}" in [mocap], or disconnect one: '
                 f"sudo ip link set {reaching[-1].name} down",

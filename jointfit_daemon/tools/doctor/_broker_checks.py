@@ -32,7 +32,8 @@ async def check_broker(settings: MqttSettings) -> list[Finding]:
             await client.subscribe("bridge/state")
             state = await _state(client)
     except BrokerLostError as error:
-        return [*findings, Finding(CHECK, address, "error", str(error), _remedy(error, settings))]
+        text = str(error).removeprefix(f"broker {address}: ")
+        return [*findings, Finding(CHECK, address, "error", text, _remedy(error, settings))]
 
     identifier = topics.client_identifier(settings.base)
     if state == "online":

@@ -59,7 +59,9 @@ def _check_port(host: Host, path: str, ports: Sequence[SerialPortInfo]) -> Itera
     if not host.may_open(node):
         yield _permission(host, path, node)
 
-    holders = host.holders(node)
+    # The simulator, or a terminal program, holds both ends of a pseudo-terminal.
+    is_pseudo = node.resolve().is_relative_to(host.at("/dev/pts"))
+    holders = [] if is_pseudo else host.holders(node)
     yield from _foreign_holders(path, holders)
     if name.startswith(_MODEM_PORTS) and _is_probed(host, name):
         yield Finding(
@@ -100,7 +102,7 @@ def _foreign_holders(path: str, holders: Sequence[tuple[int, str]]) -> Iterator[
             text = f"in use by {name} (process {number}), as while the daemon runs"
             yield Finding(CHECK, path, "note", text)
         else:
-            text = f"in use by {name} (process {number}): the daemon cannot open it"
+            text = f"in use by {name} (process {number}), which takes bytes or blocks it"
             yield Finding(CHECK, path, "error", text, f"close it: kill {number}")
 
 

@@ -175,6 +175,14 @@ def test_the_choice_of_the_network_card_is_checked(
     assert [each.text.startswith(text or "") for each in found] == ([] if text is None else [True])
 
 
+def test_two_cards_are_a_note_with_frames_and_nothing_once_one_is_chosen() -> None:
+    cards = [ETH, WLAN]
+    where = ("motive", "192.168.1.20", ETH.address, ETH.address, cards)
+    (risk,) = card_findings(*where, arrived=True)
+    assert (risk.level, risk.remedy.split(" in ")[0]) == ("note", 'set interface = "192.168.1.5"')
+    assert card_findings(*where, chosen=True) == []
+
+
 async def test_multicast_frames_are_counted_at_each_card() -> None:
     server = made(transport="multicast")
     (loopback,) = (card for card in network_cards() if card.loopback)

@@ -116,7 +116,8 @@ def test_broker_and_cameras_that_work_are_ok(tmp_path: Path, mosquitto: Broker) 
 def test_a_missing_broker_and_silent_cameras_are_errors(tmp_path: Path) -> None:
     path = rig_file(tmp_path, free_port(), free_port())
     (broker,) = examined(tmp_path, path, "broker")
-    assert (broker.level, "connection refused" in broker.text) == ("error", True)
+    assert broker.level == "error"
+    assert broker.text.startswith("connection refused")
     assert broker.remedy.startswith("sudo systemctl start mosquitto")
     (mocap,) = examined(tmp_path, path, "mocap")
     assert mocap.text.startswith("streaming off")

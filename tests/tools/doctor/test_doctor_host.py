@@ -284,9 +284,12 @@ def test_the_facts_of_this_host_are_read_without_root() -> None:
     assert host.is_running(Path("/proc/self/comm").read_text().strip())
 
 
-def test_a_real_pseudo_terminal_is_held_by_this_process() -> None:
+def test_a_real_pseudo_terminal_is_held_by_this_process_which_is_no_fault(tmp_path: Path) -> None:
     controller, line = os.openpty()
+    (tmp_path / "imu").symlink_to(os.ttyname(line))  # as jointfit-sim does
     holders = Host().holders(Path(os.ttyname(line)))
+    (found,) = check_serial(Host(), [str(tmp_path / "imu")])
     os.close(controller)
     os.close(line)
     assert os.getpid() in [number for number, _ in holders]
+    assert found.level == "ok"
