@@ -7,6 +7,7 @@ Invariant: a client that sends nothing, or reads nothing, delays other scrapes b
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 import threading
 from typing import TYPE_CHECKING, Any
@@ -128,9 +129,7 @@ class _Snapshot:
 
 
 class _Handler(WSGIRequestHandler):
-    """Handler without a log line per scrape, and with a time limit."""
-
-    timeout = _CLIENT_S
+    """Handler without a log line per scrape."""
 
     @override
     def log_message(self, format: str, *args: Any) -> None:
@@ -142,10 +141,26 @@ def _server_of(host: str) -> type[WSGIServer]:
         address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
 
         @override
+        def finish_request(self, request: Any, client_address: Any) -> None:
+            """Serve one client, and end its connection at the time limit."""
+            limit = threading.Timer(_CLIENT_S, _end, (request,))  # also for one that sends slowly
+            limit.daemon = True
+            limit.start()
+            try:
+                super().finish_request(request, client_address)
+            finally:
+                limit.cancel()
+
+        @override
         def handle_error(self, request: Any, client_address: Any) -> None:
             """Ignore a client that went away or was too slow."""
 
     return Server
+
+
+def _end(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 def _only_metrics(app: Any) -> Any:

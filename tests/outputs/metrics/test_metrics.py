@@ -201,14 +201,30 @@ async def test_the_date_of_the_calibration_is_that_of_its_file_or_now(
     assert key not in await scrape(frames)
 
 
-async def test_a_silent_client_delays_the_next_scrape_by_at_most_its_time_limit() -> None:
+@pytest.mark.parametrize("sends", [b"", b"G"])
+async def test_a_slow_client_delays_the_next_scrape_by_at_most_its_time_limit(
+    sends: bytes,
+) -> None:
     async with serving(FrameStatistics()) as address:
         host, _, port = address.rpartition(":")
-        with socket.create_connection((host, int(port))):
+        with socket.create_connection((host, int(port))) as slow:
+
+            async def trickle() -> None:
+                with contextlib.suppress(OSError):
+                    while True:
+                        slow.sendall(sends)
+                        await asyncio.sleep(0.2)
+
+            task = asyncio.create_task(trickle(), name="slow client")
             began = time.monotonic()
             status, _ = await asyncio.to_thread(fetch, address)
+            task.cancel()
         assert status == 200
         assert time.monotonic() - began < 4
+
+
+async def test_another_path_is_refused() -> None:
+    async with serving(FrameStatistics()) as address:
         assert (await asyncio.to_thread(fetch, address, "/"))[0] == 404
 
 
