@@ -30,6 +30,10 @@ def main() -> None:
         names=tuple(settings["names"]),
         page_context=page_context(certificate, key),
     )
+    if settings["set_up"] is not None:
+        from jointfit_daemon.tools.dashboard.set_up import set_up_server
+
+        server = set_up_server(server, Path(settings["set_up"]))
     listener = socket.socket(fileno=settings["descriptor"])
     asyncio.run(_serve(server, ListenAddress(**settings["listen"]), listener))
 
@@ -40,6 +44,8 @@ async def _serve(server: DashboardServer, listen: ListenAddress, listener: socke
         try:
             async with server.listening(listen, listener) as url:
                 print(f"dashboard: {url}  (broker {server.broker.text}; Ctrl-C stops)", flush=True)
+                if type(server) is not DashboardServer:
+                    print(f"set-up: {url}set-up.html", flush=True)
                 if not listen.is_local:
                     print(exposure(encrypted=server.page_context is not None), file=sys.stderr)
                 if server.broker.websocket is None:

@@ -11,7 +11,12 @@ from typing import Annotated
 
 import typer
 
-from jointfit_daemon.tools.dashboard.addresses import LISTEN, parse_broker, parse_listen
+from jointfit_daemon.tools.dashboard.addresses import (
+    LISTEN,
+    ListenAddress,
+    parse_broker,
+    parse_listen,
+)
 
 
 def dashboard(
@@ -39,6 +44,10 @@ def dashboard(
         list[str] | None,
         typer.Option(help="Host name under which browsers open the page; repeatable."),
     ] = None,
+    set_up: Annotated[
+        Path | None,
+        typer.Option("--set-up", help="Folder for a new rig.toml: asks its questions in the page."),
+    ] = None,
 ) -> None:
     """Serve the dashboard: a web page with limb, joint angles, sensors and calibration.
 
@@ -51,6 +60,7 @@ def dashboard(
     from jointfit_daemon.tools.dashboard.server import open_listener
 
     broker_context(target, ca), page_context(certificate, key)  # report faulty files
+    rig = None if set_up is None else _new_rig(set_up, address)
     listener = open_listener(address)
     listener.set_inheritable(True)
     settings = {
@@ -62,7 +72,20 @@ def dashboard(
         "key": None if key is None else str(key),
         "base": base.strip("/") if base else None,
         "names": [each.lower() for each in name or ()],
+        "set_up": None if rig is None else str(rig),
     }
     # The libraries of the command line take a third of the memory of a server that runs for days.
     module = "jointfit_daemon.tools.dashboard"
     os.execv(sys.executable, [sys.executable, "-m", module, json.dumps(settings)])  # noqa: S606 - itself
+
+
+def _new_rig(folder: Path, address: ListenAddress) -> Path:
+    """Return the path of the rig that the page writes; it is offered to this machine only."""
+    from jointfit_daemon.tools.init import rig_path
+
+    if not address.is_local:
+        raise ValueError(
+            "--set-up writes files and opens devices: use it with --listen 127.0.0.1:8080, on a"
+            " gateway without screen through ssh -L 8080:127.0.0.1:8080"
+        )
+    return rig_path(folder).absolute()

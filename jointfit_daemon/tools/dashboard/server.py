@@ -83,7 +83,7 @@ class DashboardServer:
             sock=open_listener(listen) if listener is None else listener,
             ssl=self.page_context,
             process_request=self.respond,
-            subprotocols=[Subprotocol("mqtt")],
+            subprotocols=[Subprotocol("mqtt"), Subprotocol("jointfit-set-up")],
             server_header=None,
             compression=None,  # costs more CPU time and memory than it saves on a local network
             max_size=_PACKET_BYTES,

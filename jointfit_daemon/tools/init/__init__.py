@@ -3,6 +3,6 @@
 Questions are data, and the engine that selects them is pure: it has no terminal, clock or device.
 """
 
-from jointfit_daemon.tools.init._command import init
+from jointfit_daemon.tools.init._command import init, rig_path
 
-__all__ = ["init"]
+__all__ = ["init", "rig_path"]

@@ -55,13 +55,10 @@ def init(
     input are the answers. An interrupted dialogue continues at the next start. Exit codes: 0 the
     file is written; 2 it exists, cannot be written, or an answer is missing; 130 interrupted.
     """
-    path = folder / "rig.toml" if config is None else config
-    if config is None:
-        folder.mkdir(parents=True, exist_ok=True)
-    check_output("rig.toml" if config is None else "--config", path, (".toml",))
-    if path.exists() and not force:
-        raise ValueError(f"{path} exists: replace it with --force, or choose another folder")
-    state = path.with_suffix(".answers.toml")
+    from jointfit_daemon.tools.init._writing import next_commands, state_of, write_rig
+
+    path = rig_path(folder, config, force=force)
+    state = state_of(path)
     if restart:
         state.unlink(missing_ok=True)
 
@@ -72,12 +69,12 @@ def init(
     dialogue = _new_dialogue(show, state, answers, ports, network=network)
     given = _finished(dialogue, state)
     password = _write_password(path, given, show)
-    rig, warnings = _write_rig(path, given, dialogue)
+    rig, warnings = write_rig(path, given, dialogue.found)
     state.unlink(missing_ok=True)
     if json:
         result = {
             "ok": True, "rig": str(path), "password_file": password, "table": rig.table,
-            "warnings": warnings, "next": _next_commands(path, rig),
+            "warnings": warnings, "next": next_commands(path, rig),
         }  # fmt: skip
         typer.echo(orjson.dumps(result, default=str))
         return
@@ -85,11 +82,13 @@ def init(
 
 
 def _show_result(path: Path, rig: Rig, warnings: list[str]) -> None:
+    from jointfit_daemon.tools.init._writing import next_commands
+
     typer.echo(f"\n{path} is written and valid.")
     for warning in warnings:
         typer.echo(f"warning: {warning}")
     typer.echo("Next:")
-    following = _next_commands(path, rig)
+    following = next_commands(path, rig)
     for command, use in following.items():
         typer.echo(f"  {command:{max(map(len, following))}}  {use}")
 
@@ -126,6 +125,23 @@ def _new_dialogue(
     elif answers is None:
         show("Enter takes the proposal in brackets, '?' explains, '<' returns to the last question")
     return dialogue
+
+
+def rig_path(folder: Path, config: Path | None = None, *, force: bool = False) -> Path:
+    """Return the path of the rig.toml, whose folder is created if missing.
+
+    Raises
+    ------
+    ValueError
+        The file exists and is not to be replaced, or it cannot be written.
+    """
+    path = folder / "rig.toml" if config is None else config
+    if config is None:
+        folder.mkdir(parents=True, exist_ok=True)
+    check_output("rig.toml" if config is None else "--config", path, (".toml",))
+    if path.exists() and not force:
+        raise ValueError(f"{path} exists: replace it with --force, or choose another folder")
+    return path
 
 
 def _reader(show: Callable[[str], None]) -> Callable[[str], str]:
@@ -177,6 +193,8 @@ def _finished(dialogue: Dialogue, state: Path) -> Answers:
 
 def _write_password(path: Path, given: Answers, show: Callable[[str], None]) -> str | None:
     """Write the password of the broker to its file; return the path, None without an account."""
+    from jointfit_daemon.tools.init._writing import write_password
+
     name = given.get(("password_file", ""))
     if name is None:
         return None
@@ -189,31 +207,5 @@ def _write_password(path: Path, given: Answers, show: Callable[[str], None]) -> 
         password = typer.prompt("Password for the broker", hide_input=True, err=True)
     if not password:
         return str(file)  # the check warns of the missing file
-    descriptor = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
-        stream.write(f"{password}\n")
+    write_password(file, password)
     return str(file)
-
-
-def _write_rig(path: Path, given: Answers, dialogue: Dialogue) -> tuple[Rig, list[str]]:
-    """Write the rig, and return it as the daemon reads it, with the warnings of the check."""
-    from jointfit_daemon.config import heading_warning, load_rig, missing_files
-    from jointfit_daemon.tools.init._answer_file import replace_file
-    from jointfit_daemon.tools.init._rig_table import rig_table
-    from jointfit_daemon.tools.init._rig_text import rig_text
-
-    replace_file(path, rig_text(rig_table(given, dialogue.found)))
-    rig = load_rig(path)
-    heading = heading_warning(rig.sources)
-    return rig, [*missing_files(rig.mqtt), *([] if heading is None else [heading])]
-
-
-def _next_commands(path: Path, rig: Rig) -> dict[str, str]:
-    """Return the commands that follow, with their use."""
-    scheme = "mqtt" if rig.mqtt.tls is None else "mqtts"
-    broker = f"{scheme}://{rig.mqtt.host}:{rig.mqtt.tcp_port}"
-    return {
-        f"jointfit check {path}": "check the file after changes",
-        f"jointfitd --config {path}": "run the daemon",
-        f"jointfit dashboard --broker {broker}": "see the limb and calibrate in a browser",
-    }

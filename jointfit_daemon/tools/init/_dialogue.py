@@ -56,7 +56,7 @@ class Dialogue:
         UnansweredError
             Only in a script: an answer is missing, or not accepted.
         """
-        while (asked := self._next()) is not None:
+        while (asked := self.next()) is not None:
             if asked.key in self.prepared:
                 self._take_prepared(asked)
             elif self.is_script:
@@ -67,7 +67,7 @@ class Dialogue:
             self._refuse_unused()
         return self.answers
 
-    def _next(self) -> Asked | None:
+    def next(self) -> Asked | None:
         """Return the next question; the list of devices is the current one."""
         asked = next_question(self.answers, self.found)
         if asked is None or asked.question.kind != "device":
@@ -81,12 +81,12 @@ class Dialogue:
             if asked.key not in stored:
                 break
             try:
-                self._accept(asked, stored[asked.key])
+                self.accept_answer(asked, stored[asked.key])
             except AnswerError as error:
                 self.show(f"{asked.name} = {stored[asked.key]!r} is asked again: {error}")
                 break
 
-    def _accept(self, asked: Asked, given: Any) -> None:
+    def accept_answer(self, asked: Asked, given: Any) -> None:
         """Accept an answer, store it, and read what it makes available."""
         self.answers = accept(asked, given, self.answers, self.found)
         self.store(self.answers)
@@ -107,18 +107,18 @@ class Dialogue:
         value = self.prepared[asked.key]
         try:
             if value == FIND and asked.question.finder is not None:
-                self._find(asked)
+                self.find(asked)
                 again = next_question(self.answers, self.found)
                 if again is not None and again.key == asked.key:
-                    self._accept(again, None)  # the search changed the proposal
+                    self.accept_answer(again, None)  # the search changed the proposal
             else:
-                self._accept(asked, value)
+                self.accept_answer(asked, value)
         except AnswerError as error:
             raise UnansweredError(f"{asked.name} = {value!r}: {error}") from error
 
     def _take_default(self, asked: Asked) -> None:
         try:
-            self._accept(asked, None)
+            self.accept_answer(asked, None)
         except AnswerError as error:
             raise UnansweredError(
                 f"{asked.name} is missing, and there is no proposal: {asked.text}:"
@@ -151,13 +151,13 @@ class Dialogue:
                 self.show("  Enter takes the proposal in brackets, '<' returns.")
                 continue
             if line == BACK:
-                self._go_back()
+                self.go_back()
                 return
             try:
                 if line == FIND and asked.question.finder is not None:
-                    self._find(asked)
+                    self.find(asked)
                 else:
-                    self._accept(asked, line or (None if asked.default is not None else ""))
+                    self.accept_answer(asked, line or (None if asked.default is not None else ""))
             except AnswerError as error:
                 self.show(f"  {error}")
                 continue
@@ -170,13 +170,13 @@ class Dialogue:
             return f"  empty: none{find} > " if asked.optional else f" {find} > "
         return f"  [{shown}]{find} > "
 
-    def _go_back(self) -> None:
+    def go_back(self) -> None:
         if self.answers:
             key, _ = self.answers.popitem()
             self.prepared.pop(key, None)
             self.store(self.answers)
 
-    def _find(self, asked: Asked) -> None:
+    def find(self, asked: Asked) -> None:
         """Start the search of a question, and accept its result.
 
         Raises
@@ -189,11 +189,16 @@ class Dialogue:
             if not self.found.markers:
                 raise AnswerError("no names of markers: type them, separated by commas")
             return
+        if asked.question.finder == "identifiers":
+            bus = self.answers["device", asked.subject]
+            self.found = self.search.identifiers(self.found, bus)
+            self.show(f"  {bus}: {len(self.found.ids[bus])} sensors were received")
+            return
         self.found, address = self.search.moved_device(
             self.found, self.answers, asked.subject, asked.choices
         )
         self.show(f"  {asked.subject} is at {address}")
-        self._accept(asked, address)
+        self.accept_answer(asked, address)
 
 
 def answer_text(value: Any) -> str:

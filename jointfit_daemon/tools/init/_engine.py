@@ -86,6 +86,17 @@ def _in_order(answers: Mapping[Key, Any], found: Found) -> Iterator[tuple[Questi
                     yield question, subject
 
 
+def answered(answers: Mapping[Key, Any], found: Found) -> list[tuple[str, Any]]:
+    """Return text and answer of every question that was answered, in their order."""
+    given = []
+    for question, subject in _in_order(answers, found):
+        if (question.key, subject) not in answers:
+            break
+        text = question.text.format(subject=_spoken(answers, subject))
+        given.append((text, answers[question.key, subject]))
+    return given
+
+
 def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -> Answers:
     """Return the answers with a further one.
 

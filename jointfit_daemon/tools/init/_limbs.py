@@ -69,7 +69,7 @@ _TWO = ("front", "side")
 
 LIMBS: Mapping[str, Limb] = {
     "knee": Limb(
-        "knee: thigh and shank of one leg",
+        "thigh and shank of one leg",
         places={"thigh": _TWO, "shank": _TWO},
         prefixes={
             "pelvis": ("PL", "P"),
@@ -102,7 +102,7 @@ LIMBS: Mapping[str, Limb] = {
         has_side=False,
     ),
     "arm": Limb(
-        "arm: thorax, upper arm, forearm and hand",
+        "thorax, upper arm, forearm and hand",
         places={
             "thorax": ("sternum",),
             "upper_arm": _TWO,
@@ -119,7 +119,7 @@ LIMBS: Mapping[str, Limb] = {
         lengths_m={"thorax": 0.05, "hand": 0.09},
     ),
     "trunk": Limb(
-        "trunk: thorax and pelvis",
+        "thorax and pelvis",
         places={"thorax": ("sternum", "back"), "pelvis": ("sacrum", "side")},
         prefixes={"head": ("E",), "thorax": ("X",), "pelvis": ("P",)},
         joints=("neck", "lumbar", "hips"),

@@ -30,9 +30,9 @@ from jointfit_daemon.tools.init._limbs import LIMBS
 if TYPE_CHECKING:
     from jointfit_daemon.tools.init._parsing import Kind
 
-Finder = Literal["movement", "stream"]
-"""Search that the word ``find`` starts: a sensor by its movement, names in the stream of the
-cameras."""
+Finder = Literal["movement", "identifiers", "stream"]
+"""Search that the word ``find`` starts: a sensor by its movement, identifiers on a CAN bus, names
+in the stream of the cameras."""
 
 Given = Mapping[Key, Any]
 Propose = Callable[[Given, Found, str], Any]
@@ -228,8 +228,8 @@ QUESTIONS: tuple[Question, ...] = (
         "ids",
         "ids",
         "CAN identifiers of the sensor {subject}",
-        "Identifiers of the messages of this sensor, as 0x105 0x106 0x121. The documentation of"
-        " rig.toml describes how a recording of the bus shows them.",
+        "Identifiers of the messages of this sensor, as 0x105 0x106 0x121. 'find' receives on a"
+        " CAN interface and proposes the identifiers of its sensors.",
         group="sensor",
         subjects=lambda answers, found: tuple(
             name
@@ -241,6 +241,7 @@ QUESTIONS: tuple[Question, ...] = (
         choices=lambda answers, found, sensor: tuple(
             FoundDevice(name) for name in driver_of(answers, found, sensor).ids
         ),
+        finder="identifiers",
     ),
     Question(
         "cameras",

@@ -6,9 +6,10 @@ Invariant: a device is opened only by a search that the user starts.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.driver import ImuSettings, MocapSettings
 from jointfit_daemon.tools.discovery import (
@@ -16,6 +17,7 @@ from jointfit_daemon.tools.discovery import (
     find_mocap_servers,
     find_serial_ports,
     installed_drivers,
+    listen_can,
 )
 from jointfit_daemon.tools.init._answers import wiring_of
 from jointfit_daemon.tools.init._found import Found, FoundDevice, ImuDriver, MocapDriver
@@ -132,28 +134,82 @@ class DeviceSearch:
         text = f"{host}: {len(markers)} markers, {len(bodies)} rigid bodies"
         return replace(found, markers=markers, bodies=bodies), text
 
+    def identifiers(self, found: Found, bus: str) -> Found:
+        """Return `found` with the identifiers of the sensors that send on a CAN interface.
+
+        Raises
+        ------
+        AnswerError
+            `bus` is a serial adapter, cannot be opened, or carries no sensor.
+        """
+        if "/" in bus:
+            raise AnswerError(
+                f"{bus} is a serial adapter, which is not searched: type the identifiers, as MT"
+                " Manager shows them"
+            )
+        sensors = tuple(ids for _, ids in self._sensors_on(found, bus))
+        if not sensors:
+            raise AnswerError(f"{bus}: no sensor was received: check its power and the bit rate")
+        return replace(found, ids={**found.ids, bus: sensors})
+
+    def _sensors_on(self, found: Found, bus: str) -> list[tuple[ImuDriver, tuple[int, ...]]]:
+        """Return driver and identifiers of every sensor that sends on `bus`."""
+        traffic = listen_can(bus)
+        if traffic.fault is not None:
+            raise AnswerError(traffic.fault)
+        drivers = {driver.name: driver for driver in found.imu_drivers}
+        sensors = []
+        for device in traffic.devices:
+            driver, ids = drivers.get(device.driver), device.settings.get("ids") or {}
+            if driver is not None and driver.ids.keys() <= ids.keys():
+                sensors.append((driver, tuple(ids[name] for name in driver.ids)))
+        return sensors
+
     def moved_device(
         self, found: Found, answers: Answers, sensor: str, choices: Sequence[FoundDevice]
     ) -> tuple[Found, str]:
-        """Return the address of the device that the user turns, and its speed in `found`.
+        """Return the address of the device that the user turns, and its speed or identifiers.
 
         Raises
         ------
         AnswerError
             No device, several devices, or none that moved.
         """
-        drivers = [driver.name for driver in found.imu_drivers if driver.wiring == "serial"]
-        tables = {
-            choice.address: {"driver": drivers[0], "port": choice.address}
-            for choice in choices
-            if drivers and wiring_of(answers, choice.address) == "serial"
-        }
+        tables = self._tables(found, answers, choices)
         if not tables:
             raise AnswerError(
-                "no free serial port was found: connect the sensor, or name its port with --port"
+                "nothing was found to listen to: connect the sensor, or name its port with --port"
             )
         self.show(f"  Opening {', '.join(tables)}; hold all sensors still …")
         rate_hz = answers["sensor_rate_hz", ""]
-        address, table = asyncio.run(find_moved(sensor, tables, rate_hz, self.show))
-        bauds = {**found.bauds} | ({address: table["baud"]} if "baud" in table else {})
-        return replace(found, bauds=bauds), address
+        _, table = asyncio.run(find_moved(sensor, tables, rate_hz, self.show))
+        if "port" in table:
+            port = str(table["port"])
+            speed = {port: table["baud"]} if "baud" in table else {}
+            return replace(found, bauds={**found.bauds, **speed}), port
+        bus, ids = str(table["can"]["channel"]), tuple(table["ids"].values())
+        others = (each for each in found.ids.get(bus, ()) if each != ids)
+        return replace(found, ids={**found.ids, bus: (ids, *others)}), bus
+
+    def _tables(
+        self, found: Found, answers: Answers, choices: Sequence[FoundDevice]
+    ) -> dict[str, dict[str, Any]]:
+        """Return keys of ``[[imu]]`` of every free port, and of every free sensor on a bus."""
+        used = {value for (key, _), value in answers.items() if key == "ids"}
+        serial = [driver.name for driver in found.imu_drivers if driver.wiring == "serial"]
+        tables: dict[str, dict[str, Any]] = {}
+        for address in (choice.address for choice in choices):
+            if wiring_of(answers, address) == "serial":
+                if serial:
+                    tables[address] = {"driver": serial[0], "port": address}
+            elif "/" not in address:
+                with contextlib.suppress(AnswerError):  # a bus that is down has no sensor
+                    for driver, ids in self._sensors_on(found, address):
+                        if ids not in used:
+                            name = f"{address} {' '.join(map(hex, ids))}"
+                            tables[name] = {
+                                "driver": driver.name,
+                                "can": {"interface": "socketcan", "channel": address},
+                                "ids": dict(zip(driver.ids, ids, strict=True)),
+                            }
+        return tables
