@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.config import heading_warning, load_rig, missing_files
@@ -42,8 +43,9 @@ def next_commands(path: Path, rig: Rig) -> dict[str, str]:
     """Return the commands that follow, with their use."""
     scheme = "mqtt" if rig.mqtt.tls is None else "mqtts"
     broker = f"{scheme}://{rig.mqtt.host}:{rig.mqtt.tcp_port}"
+    name = shlex.quote(str(path))
     return {
-        f"jointfit check {path}": "check the file after changes",
-        f"jointfitd --config {path}": "run the daemon",
+        f"jointfit check {name}": "check the file after changes",
+        f"jointfitd --config {name}": "run the daemon",
         f"jointfit dashboard --broker {broker}": "see the limb and calibrate in a browser",
     }

@@ -218,6 +218,12 @@ def test_a_password_is_in_a_file_for_its_owner_and_never_in_the_rig(
     assert load_rig(tmp_path / "rig.toml").mqtt.password_file == str(password)
 
 
+def test_the_next_commands_quote_a_path_with_spaces(tmp_path: Path, machine: Machine) -> None:
+    assert machine.ports == []
+    done = init(tmp_path / "my lab", "--answers", answer_file(tmp_path / "a.toml", PORTS))
+    assert f"jointfit check '{tmp_path / 'my lab' / 'rig.toml'}'" in done.output
+
+
 def test_an_existing_rig_is_replaced_only_with_force(tmp_path: Path, machine: Machine) -> None:
     assert machine.ports == []
     rig = answer_file(tmp_path / "rig.toml", "mine")
