@@ -44,8 +44,11 @@ def curve_lines(
     span = _angle_range(values)
     front, back = (DotCanvas(columns, rows, unicode) for _ in range(2))
     column_us = shown_s * 1e6 / front.width
+    # The curve moves by whole cells: with each dot, every cell of it would be sent again.
+    cell_us = column_us * front.width / columns
+    newest = (math.floor(newest_us / cell_us) + 1) * (front.width // columns) - 1
     for canvas, points, every in ((front, imu, 1), (back, optical, 2)):
-        _draw(canvas, points, math.floor(newest_us / column_us), column_us, span=span, every=every)
+        _draw(canvas, points, newest, column_us, span=span, every=every)
 
     labels = {0: span[1], rows - 1: span[0]}
     lines = []
@@ -83,7 +86,7 @@ def _draw(
     span: tuple[float, float],
     every: int,
 ) -> None:
-    """Draw points; columns belong to instants, so that the curve moves by whole dots."""
+    """Draw points; `newest` is the number of the last column since 1970."""
     low, high = span
 
     def dot(point: _Point) -> tuple[int, int]:

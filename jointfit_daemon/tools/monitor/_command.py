@@ -68,7 +68,7 @@ def monitor(
     user: _User = None,
     password_file: _PasswordFile = None,
     request_key_file: _KeyFile = None,
-    rate: _Rate = 10.0,
+    rate: _Rate = 5.0,
     ascii_only: _Ascii = False,
 ) -> None:
     """Show limb, joint angles, sensors and calibration in a terminal, also over ssh.
