@@ -132,11 +132,13 @@ class FloodFigures:
 
 
 @dataclass(frozen=True, slots=True)
-class _Gateway:
+class Gateway:
     """Running devices and daemon, and their subscriber."""
 
     hardware: Simulator
     pid: int
+    base: str
+    """Base topic of the rig."""
     heard: ReceivedMessages
     began_s: float
     """Monotonic start time of the daemon."""
@@ -144,7 +146,7 @@ class _Gateway:
 
 async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
     """Start everything, settle, measure for `seconds`, stop the devices, count all samples."""
-    async with _gateway(folder, port, load) as gateway:
+    async with running_gateway(folder, port, load) as gateway:
         heard = gateway.heard
         measured = await _measure(gateway.pid, heard, seconds)
         sent = (await gateway.hardware.quit())["sent"]
@@ -160,7 +162,7 @@ async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
 
 async def run_flooded(folder: Path, port: int, load: Load) -> FloodFigures:
     """Start everything, settle, measure without requests and then under a flood of requests."""
-    async with _gateway(folder, port, load) as gateway:
+    async with running_gateway(folder, port, load) as gateway:
         heard, pid = gateway.heard, gateway.pid
         quiet_ms, _, quiet_cpu, *_ = await _measure(pid, heard, SECONDS)
 
@@ -201,7 +203,7 @@ async def flooder(port: int, base: str, seconds: float) -> AsyncIterator[asyncio
 
 
 @asynccontextmanager
-async def _gateway(folder: Path, port: int, load: Load) -> AsyncIterator[_Gateway]:
+async def running_gateway(folder: Path, port: int, load: Load) -> AsyncIterator[Gateway]:
     """Start devices, subscriber and daemon; ready when all sources are online and settled."""
     base = f"jointfit/{folder.name}"
     CalibrationStore(folder / "state" / "calibrations", "demo").save(calibration())
@@ -219,7 +221,7 @@ async def _gateway(folder: Path, port: int, load: Load) -> AsyncIterator[_Gatewa
                         process.check()
                         await asyncio.sleep(0.05)
                 await asyncio.sleep(SETTLE_S)
-                yield _Gateway(hardware, process.process.pid, heard, began)
+                yield Gateway(hardware, process.process.pid, base, heard, began)
 
 
 @asynccontextmanager
