@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import os
+import signal
 from typing import TYPE_CHECKING, Any
 
 import jinja2
@@ -24,9 +26,11 @@ from jointfit_daemon.outputs.payload_models import PAYLOADS, payload_topic
 from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.supervisor.requests import REQUESTS
+from tests.supervisor.test_daemon import daemon, small, toml
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
+    from pathlib import Path
 
     from jointfit_daemon.config import Rig
     from tests.broker_fixture import Broker
@@ -266,4 +270,20 @@ async def test_home_assistant_that_was_started_receives_the_rig_again_and_once_o
 
         off = rig_of(table, host=broker.host, port=broker.port, home_assistant={"enabled": False})
         async with publisher(off):
+            assert (await anext(arriving)).payload == b""
+
+
+async def test_a_reload_without_the_table_removes_the_rig(
+    broker: Broker, table: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    off = small(table, broker.port)
+    on = off | {"mqtt": off["mqtt"] | {"home_assistant": {}}}
+    async with asyncio.timeout(20), MqttConnection(parse_rig(on).mqtt) as home:
+        await home.subscribe(["homeassistant/device/+/config"])
+        arriving = home.messages()
+        async with daemon(on, tmp_path):
+            assert (await anext(arriving)).topic == TOPIC
+            (tmp_path / "rig.toml").write_text(toml(off), encoding="utf-8")
+            os.kill(os.getpid(), signal.SIGHUP)
             assert (await anext(arriving)).payload == b""
