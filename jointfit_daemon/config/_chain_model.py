@@ -102,7 +102,10 @@ def load_chain_model(
 def load_refinement(
     model: ChainModel, table: ChainRefinementTable
 ) -> tuple[ChainRefinement | None, dict[str, float], list[Fault]]:
-    """Return the refinement of a chain model, the weights of markers, and faults."""
+    """Return the refinement of a chain model, the weights of markers, and faults.
+
+    Keys of `table` that had faults are None; there is no refinement then.
+    """
     faults: list[Fault] = []
 
     def fail(key: str, text: str, value: object) -> None:
@@ -110,7 +113,7 @@ def load_refinement(
 
     weights: dict[str, float] = {}
     try:
-        given = table.weights
+        given = table.weights or {}
         weights = read_marker_weights(Path(given)) if isinstance(given, str) else given
         model = with_weights(model, weights, "marker")
     except OSError as error:
@@ -119,17 +122,10 @@ def load_refinement(
         fail("weights", str(error), table.weights)
     for key, locked in (("unlock", False), ("lock", True)):
         try:
-            model = with_locks(model, getattr(table, key), "marker", locked=locked)
+            model = with_locks(model, getattr(table, key) or (), "marker", locked=locked)
         except ValueError as error:
             fail(key, str(error), list(getattr(table, key)))
-
-    # Options that exclude each other.
-    if table.threshold_mm > table.first_step_mm:
-        text = f"expected first_step_mm = {table.first_step_mm:g} or less"
-        fail("threshold_mm", text, table.threshold_mm)
-    if table.cost == "l1" and table.method == "search":
-        fail("cost", "method search has no loss function: use joint or block, or l2", "l1")
-    if faults:
+    if faults or None in dict(table).values():
         return None, weights, faults
     settings = RefinementSettings(
         table.method,

@@ -154,6 +154,8 @@ def _model_at(model: type[BaseModel], loc: Sequence[int | str]) -> type[BaseMode
     """Return the model whose fields are the keys at `loc`; None if it is not a model."""
     here: type[BaseModel] | None = model
     for part in loc:
+        if isinstance(part, int):
+            continue  # an element of an array has the model of the array
         field = here.model_fields.get(str(part)) if here is not None else None
         here = _model_in(field.annotation) if field is not None else None
     return here

@@ -230,19 +230,21 @@ class _RigReader:
         self, calibration: CalibrationTable | None, model: LoadedModel | None
     ) -> ChainRefinement | None:
         """Return the refinement of the chain model; weights replace the name of their file."""
-        if calibration is None:
-            return None
+        table = calibration or self.partial.get("calibration")
         key, name = "calibration.chain_refinement", "chain_refinement"
-        given = self.table.get("calibration", {}).get(name)
+        section = self.table.get("calibration")
+        given = section.get(name) if isinstance(section, dict) else None
         if model is None:
             has_model = isinstance(chain := self.table.get("chain"), dict) and "model" in chain
             if given is not None and not has_model:
                 text = "needs a chain model: add [chain] model, or remove this table"
                 self.faults.append(Fault(key, text))
             return None
+        if table is None or table.chain_refinement is None:
+            return None
         from jointfit_daemon.config._chain_model import load_refinement  # noqa: PLC0415 - as above
 
-        refinement, weights, faults = load_refinement(model.chain, calibration.chain_refinement)
+        refinement, weights, faults = load_refinement(model.chain, table.chain_refinement)
         self.faults += faults
         if given and not faults:
             given["weights"] = weights

@@ -73,8 +73,8 @@ def _readable(value: Any, annotation: Any, wrong: _Locations) -> Any:
                 key: _readable(inner, arguments[1], parts.get(key, []))
                 for key, inner in value.items()
             }
-        if get_origin(choice) is tuple and arguments == (str, ...) and isinstance(value, list):
-            return _texts(value)
+        if get_origin(choice) is tuple and arguments[1:] == (...,) and isinstance(value, list):
+            return _elements(value, arguments[0], wrong)
     return None
 
 
@@ -98,7 +98,11 @@ def _below(wrong: _Locations) -> dict[int | str, _Locations]:
     return below
 
 
-def _texts(values: Sequence[Any]) -> tuple[str, ...] | None:
+def _elements(values: Sequence[Any], kind: Any, wrong: _Locations) -> tuple[Any, ...] | None:
+    """Return the readable elements of an array; None for texts that contain tables or arrays."""
+    if kind is not str:
+        parts = _below(wrong)
+        return tuple(_readable(value, kind, parts.get(at, [])) for at, value in enumerate(values))
     if any(isinstance(value, (list, dict)) for value in values):
         return None
     return tuple(map(str, values))
@@ -117,6 +121,10 @@ def contradictions(settings: BaseModel, key: str) -> Iterator[Fault]:
     for name, value in settings:
         if isinstance(value, BaseModel):
             yield from contradictions(value, join(key, (name,)))
+        if isinstance(value, tuple):
+            for at, inner in enumerate(value):
+                if isinstance(inner, BaseModel):
+                    yield from contradictions(inner, join(key, (name, at)))
     if isinstance(settings, Settings):
         for name, text in settings.contradictions():
             value = getattr(settings, name, None)

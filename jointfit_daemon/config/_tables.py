@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import ipaddress
 import math
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
+from typing_extensions import override  # typing has it from Python 3.12
 
 from jointfit_daemon.calibration import (  # noqa: TC001 - pydantic reads them
     CenterMethod,
@@ -20,6 +21,9 @@ from jointfit_daemon.calibration import (  # noqa: TC001 - pydantic reads them
 from jointfit_daemon.driver import Settings, host_fault
 from jointfit_daemon.limb_model import Method, Procedure  # noqa: TC001 - pydantic reads them
 from jointfit_daemon.model import AngleConvention  # noqa: TC001 - as above
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 JOINTS_HELP = "joints from proximal to distal, one more than segments"
 """Description of the key ``chain.joints``; it is needed unless the limb has branches."""
@@ -144,6 +148,16 @@ class ChainRefinementTable(Settings):
         2.0, ge=0.001, le=100, description="step at which `search` ends, mm"
     )
     limit_s: float = Field(60.0, gt=0, le=200, description="longest duration of the iteration, s")
+
+    @override
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """Refuse options that exclude each other."""
+        first_mm: float | None = self.first_step_mm  # None: cannot be read
+        last_mm: float | None = self.threshold_mm
+        if first_mm is not None and last_mm is not None and last_mm > first_mm:
+            yield "threshold_mm", f"expected first_step_mm = {first_mm:g} or less"
+        if self.cost == "l1" and self.method == "search":
+            yield "cost", "method search has no loss function: use joint or block, or l2"
 
     @field_validator("weights", mode="before")
     @classmethod

@@ -70,7 +70,15 @@ markers.thigh = ["T1", "T2", "T3"]
 markers.shank = ["C1", "C2", "C3"]
 rigid_body = { pelvis = "Pelvis" }
 """
+SECOND_USER_OF_THE_PORT = """
+[[imu]]
+id='S5'
+segment='shank'
+driver='xbus'
+port="/dev/ttyUSB0"
+"""
 MISTAKES = (
+    ("[can.can1]\n", f"{SECOND_USER_OF_THE_PORT}[can.can1]\n", "is the port of imu["),
     ('"bench"\noutput', '"ben+ch"\noutput', "rig.name = 'ben+ch'"),
     ("rate_hz = 100", 'rate_hz = "fast"', "rig.output_rate_hz"),
     ("align_mode", "aling_mode", "did you mean 'align_mode'?"),
@@ -88,6 +96,10 @@ MISTAKES = (
     ('orientation = "device"', 'orientation = "devise"', "did you mean 'device'?"),
     ("orientation =", "orientaton =", "did you mean 'orientation'?"),
     ("silence_s = 1.0", "silence_s = inf", "silence_s = inf"),
+    ('"thigh"\ndriver', "\"thigh\"\nsync = [{ functoin = 'send_latest' }]\ndriver",
+     "did you mean 'function'?"),
+    ('"thigh"\ndriver', "\"thigh\"\nsync = [{ function = 'send_latest', line = 'out1' }]\ndriver",
+     "sync[0].line = 'out1'"),
     ('"shank"\ndriver = "xcdi"\ncan = "can1"\nb', '"shnak"\ndriver = "xcdi"\ncan = "can1"\nb',
      "imu[S3].segment = 'shnak'"),
     ('= "big"', "= big", "a text needs quotation marks"),
@@ -103,6 +115,10 @@ MISTAKES = (
     ('"anchored"', '"patent21"', "calibration.method"),
     ("functional_s = 60", "functional_s = 10", "is shorter than functional_min_s"),
     ("static_s = 5", "static_s = 500", "calibration.static_s"),
+    ("[calibration]\n", "[calibration]\nchain_refinement = { threshold_mm = 20 }\n",
+     "calibration.chain_refinement.threshold_mm = 20"),
+    ("[calibration]\n", "[calibration]\nchain_refinement = { method = 'search', cost = 'l1' }\n",
+     "method search has no loss function"),
     ('{ knee = "sara" }', '{ kene = "sara" }', "calibration.joint_center_methods.kene"),
     ('{ knee = "sara" }', '{ knee = "sarah" }', "calibration.joint_center_methods.knee"),
     ('"jointfit/bench"', '"jointfit//bench"', "mqtt.base"),

@@ -226,6 +226,18 @@ def test_faulty_options_of_the_refinement_are_named(
     assert message in text
 
 
+@pytest.mark.parametrize("other", [{"static_s": 500}, {"chain_refinement": {"frames": 5}}])
+def test_another_fault_of_the_calibration_hides_none_of_its_refinement(
+    rig: Table, other: Table
+) -> None:
+    options = {"lock": ["T9"], "weights": {"C9": 1.0}, **other.get("chain_refinement", {})}
+    rig["calibration"] = other | {"chain_refinement": options}
+    found = "\n".join(refusals(rig))
+    assert "marker T9: unknown marker" in found
+    assert "marker C9: unknown marker" in found
+    assert ("static_s = 500" if "static_s" in other else "frames = 5") in found
+
+
 def test_refinement_without_a_chain_model_is_refused(rig: Table) -> None:
     del rig["chain"]["model"]
     rig["calibration"] = {"chain_refinement": {"frames": 80}}

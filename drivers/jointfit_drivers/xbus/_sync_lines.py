@@ -5,9 +5,10 @@ The order of entries is irrelevant to the device, and therefore to the compariso
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field
+from typing_extensions import override  # typing has it from Python 3.12
 
 from jointfit_daemon.driver import Settings
 from jointfit_protocols.xbus.configuration import SyncSetting
@@ -22,7 +23,7 @@ from jointfit_protocols.xbus.sync_lines import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
 _MOST = 0xFFFF
 """Largest value of a 16-bit field."""
@@ -69,19 +70,23 @@ class XbusSyncSettings(Settings):
         description="number of the wire in the rig: devices on one wire have the same number",
     )
 
-    @model_validator(mode="after")
-    def _fits_together(self) -> Self:
+    @override
+    def contradictions(self) -> Iterator[tuple[str, str]]:
         """Refuse combinations that no device supports."""
-        out = self.function == "interval_transition_measurement"
-        if out != (self.line == "out1"):
+        function: str | None = self.function  # None: cannot be read
+        if function is None:
+            return
+        line: str | None = self.line
+        out = function == "interval_transition_measurement"
+        if line is not None and out != (line == "out1"):
             kind = "an output (out1)" if out else "an input (clock_in, in1, in2)"
-            raise ValueError(f"{self.function} is a function of {kind}, found {self.line}")
+            yield "line", f"{function} is a function of {kind}"
+        elif function == "trigger_indication" and line not in {None, *TRIGGERS}:
+            yield "line", "expected in1 or in2 with trigger_indication"
 
-        if (self.function == "clock_bias_estimation") != (self.period_ms > 0):
-            raise ValueError("period_ms belongs to clock_bias_estimation, which needs it")
-        if self.function == "trigger_indication" and self.line not in TRIGGERS:
-            raise ValueError(f"trigger_indication: in1 or in2, found {self.line}")
-        return self
+        period_ms: int | None = self.period_ms
+        if period_ms is not None and (function == "clock_bias_estimation") != (period_ms > 0):
+            yield "period_ms", "belongs to clock_bias_estimation, which needs it"
 
 
 def sync_entries(

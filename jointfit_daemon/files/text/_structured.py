@@ -74,10 +74,13 @@ def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        found = "UTF-16" if data.startswith(_UTF_16) else f"byte {data[error.start]:#04x}"
+        found, encoding = f"byte {data[error.start]:#04x}", "WINDOWS-1252"
+        if data.startswith(_UTF_16):
+            found = encoding = "UTF-16"
         line = data.count(b"\n", 0, error.start) + 1
         raise MalformedFileError(
-            f"{path}: is not UTF-8: found {found} (line {line}): save the file as UTF-8"
+            f"{path}: is not UTF-8: found {found} (line {line}): save the file as UTF-8, or "
+            f"convert it: iconv -f {encoding} -t UTF-8 {path.name} > converted-{path.name}"
         ) from error
 
 
