@@ -245,7 +245,8 @@ class _RigReader:
         from jointfit_daemon.config._chain_model import load_refinement  # noqa: PLC0415 - as above
 
         refinement, weights, faults = load_refinement(model.chain, table.chain_refinement)
-        self.faults += faults
+        reported = {fault.key for fault in self.faults}
+        self.faults += [fault for fault in faults if fault.key not in reported]
         if given and not faults:
             given["weights"] = weights
         return refinement
