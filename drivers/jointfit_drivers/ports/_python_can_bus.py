@@ -231,6 +231,8 @@ class PythonCanBus:
     def _error_by_number(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
         """Choose the error by the kernel's error number."""
         channel = self._settings.channel
+        if isinstance(error.__cause__, OSError):  # python-can puts its traceback into the message
+            error = error.__cause__
         number = getattr(error, "error_code", None) or getattr(error, "errno", None)
         if number == errno.EAFNOSUPPORT:
             return DeviceMisconfiguredError(
@@ -255,6 +257,23 @@ class PythonCanBus:
 def _socket(bus: can.BusABC) -> socket.socket:
     sock: socket.socket = bus.socket  # type: ignore[attr-defined]  # SocketCAN's own
     return sock
+
+
+def _require_server(bus: can.BusABC) -> None:
+    """Raise `DeviceLostError` if a socketcand server has closed the connection.
+
+    python-can then returns no message at once, without an error, and has no public socket.
+    """
+    sock: socket.socket | None = getattr(bus, "_SocketCanDaemonBus__socket", None)
+    try:
+        closed = sock is not None and not sock.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+    except OSError:  # nothing to read; other errors are those of the next message
+        return
+    if closed:
+        raise DeviceLostError(
+            f"{bus.channel_info}: the server closed the connection: start it again, and check the "
+            "network"
+        )
 
 
 def _require_interface(name: str) -> None:
@@ -294,6 +313,7 @@ class _Pump:
             while not self._stopped.is_set():
                 message = self._bus.recv(_PUMP_S)
                 if message is None:
+                    _require_server(self._bus)
                     continue
 
                 frames: list[CanFrame] = []

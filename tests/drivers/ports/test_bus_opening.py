@@ -117,6 +117,16 @@ async def test_a_server_that_works_is_read() -> None:
     assert (frame.can_id, frame.data) == (0x21, bytes(range(1, 9)))
 
 
+async def test_a_server_that_ends_is_reported_at_once_and_costs_no_processor_time() -> None:
+    with listening() as (server, port), answering(server, [b"< hi >", *2 * [b"< ok >"]]):
+        used = time.process_time()
+        async with shared_bus(socketcand(port)) as bus, asyncio.timeout(3.0):
+            key = (0x21, False)
+            with pytest.raises(DeviceLostError, match="the server closed the connection: start it"):
+                await bus.pump("S3", {key: "quaternion"}, lambda _: None, 5.0, needed=key)
+    assert time.process_time() - used < 0.5
+
+
 async def test_a_library_that_hangs_is_called_by_one_thread_only_and_its_late_bus_is_closed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
