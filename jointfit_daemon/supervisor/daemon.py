@@ -58,6 +58,7 @@ from jointfit_daemon.supervisor._calibration_store import (
 from jointfit_daemon.supervisor._core_runner import CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_daemon.supervisor._optional_sinks import start_metrics, start_recording
+from jointfit_daemon.supervisor._outage_lines import OutageLines
 from jointfit_daemon.supervisor._overload_monitor import OverloadMonitor
 from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
@@ -95,6 +96,8 @@ CHECK_S = 0.1
 """Interval between checks of the event loop's delay and of due health messages, s."""
 HEALTH_SOON_S = 0.5
 """Delay of the health message after a device was lost or found, s."""
+CLOSED_S = 1.0
+"""Longest time from the silence that a source permits to the message that it is closed, s."""
 KNOWN_S = 2.0
 """Time after the start for which a silent source is awaited, s."""
 FAREWELL_S = 0.5
@@ -135,6 +138,7 @@ class Daemon:
         self._overload = OverloadMonitor()
         self._recorder: EventLogWriter | None = None
         self._online: set[str] = set()
+        self._outages = OutageLines()
         self._version: int | None = None
         self._state_fault: str | None = None
         self._state_lock: int | None = None  # set if the directory was not writable at the start
@@ -292,8 +296,10 @@ class Daemon:
             case Reply():
                 self._requests.note_reply(output)
             case Notice():
-                fields = journal_fields(output.kind, output.id)
-                log.log(_LEVELS[output.level], "%s: %s", output.id, output.text, extra=fields)
+                if not self._outages.holds(
+                    output, time.monotonic(), self._closes_within(output.id)
+                ):
+                    self._log(output)
             case CalibrationStatus():
                 # A change of the calibration, with the file in which it is stored.
                 self._calibration, phase, text = output, output.phase, output.text
@@ -303,8 +309,20 @@ class Daemon:
                 self._version, fields = output.version, journal_fields("calibration", phase)
                 log.log(_LEVELS[output.level], "calibration %s: %s", phase, text, extra=fields)
             case DeviceStatus(name, online):
+                self._outages.close(name)
                 (self._online.add if online else self._online.discard)(name)
                 self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
+
+    def _log(self, notice: Notice) -> None:
+        fields = journal_fields(notice.kind, notice.id)
+        log.log(_LEVELS[notice.level], "%s: %s", notice.id, notice.text, extra=fields)
+
+    def _closes_within(self, name: str) -> float | None:
+        """Return the time after which a silent source is closed, s; None if it is closed."""
+        if name not in self._online:
+            return None
+        settings = [source.settings for source in self._rig.sources if source.id == name]
+        return max((getattr(one, "silence_s", 0.0) for one in settings), default=0.0) + CLOSED_S
 
     # --- requests ----------------------------------------------------------------------------
 
@@ -359,6 +377,8 @@ class Daemon:
             await asyncio.sleep(CHECK_S)
             now_s = loop.time()
             self._process.add_delay(now_s - due)
+            for notice in self._outages.due(time.monotonic()):
+                self._log(notice)
 
             if now_s - fed_s > watchdog_s / 3:
                 health = self._core.core.health(time.monotonic_ns())

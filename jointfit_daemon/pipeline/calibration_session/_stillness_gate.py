@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 _NS = 1_000_000_000
 SILENT_NS = 500_000_000
 """Time without data after which a sensor is silent, ns."""
+REPORTED_NS = 500_000_000
+"""Shortest stillness whose end is reported, ns: a slow movement ends several in a row."""
 
 
 class StillnessGate:
@@ -37,7 +39,7 @@ class StillnessGate:
         """Instant from which all sensors are still; None while they are not."""
 
     def feed(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> bool:
-        """Add one orientation; return whether it ended a stillness."""
+        """Add one orientation; return whether it ended a stillness of `REPORTED_NS` or more."""
         monitor = self._monitors.get(sensor)
         if monitor is None:
             return False
@@ -49,7 +51,8 @@ class StillnessGate:
             self.still_since_ns = None
         elif before is None:
             self.still_since_ns = t_ns
-        return before is not None and self.still_since_ns is None
+        ended = before is not None and self.still_since_ns is None
+        return ended and t_ns - (before or 0) >= REPORTED_NS
 
     def still_s(self, now_ns: int) -> float:
         """Return the time for which all sensors have been still, s; silence ends it."""

@@ -1,0 +1,42 @@
+"""One log line for each sensor and outage."""
+
+from __future__ import annotations
+
+from jointfit_daemon.pipeline.events import Notice, NoticeKind
+from jointfit_daemon.supervisor._outage_lines import OutageLines
+
+
+def sensor(state: str) -> Notice:
+    return Notice(0, NoticeKind.SENSOR, "S1", state, data={"state": state})
+
+
+def test_lost_sensor_has_no_line_beside_that_of_its_closed_source() -> None:
+    lines = OutageLines()
+    assert lines.holds(sensor("lost"), 10.0, 2.0)
+    lines.close("S1")
+    assert lines.due(100.0) == []
+    assert not lines.holds(sensor("ok"), 20.0, 2.0)
+    assert lines.holds(sensor("lost"), 30.0, None), "the source was closed first"
+    assert lines.due(1000.0) == []
+
+
+def test_lost_sensor_whose_source_is_not_closed_has_a_line() -> None:
+    lines = OutageLines()
+    assert lines.holds(sensor("lost"), 10.0, 2.0)
+    assert lines.due(11.9) == []
+    assert [notice.text for notice in lines.due(12.0)] == ["lost"]
+    assert lines.due(13.0) == []
+    assert not lines.holds(sensor("ok"), 14.0, 2.0)
+
+
+def test_recovery_from_a_short_pause_has_no_line() -> None:
+    lines = OutageLines()
+    assert lines.holds(sensor("lost"), 10.0, 2.0)
+    assert lines.holds(sensor("ok"), 11.0, 2.0)
+    assert lines.due(100.0) == []
+
+
+def test_other_notices_have_lines_at_once() -> None:
+    lines = OutageLines()
+    assert not lines.holds(sensor("stuck"), 10.0, 2.0)
+    assert not lines.holds(Notice(0, NoticeKind.DEVICE, "S1", "closed"), 10.0, 2.0)
