@@ -5,6 +5,7 @@ from jointfit_daemon.calibration.marker_refinement._coordinate_search import Sea
 from jointfit_daemon.calibration.marker_refinement._evaluation import judge_trial
 from jointfit_daemon.calibration.marker_refinement._input_checks import (
     MOST_RMS_M,
+    exchange_text,
     exchanged_markers,
     find_trial_faults,
 )
@@ -38,6 +39,7 @@ __all__ = [
     "SearchSettings",
     "TrackingStatistics",
     "TrialOutcome",
+    "exchange_text",
     "exchanged_markers",
     "find_trial_faults",
     "judge_trial",

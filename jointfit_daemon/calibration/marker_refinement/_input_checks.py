@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration.marker_refinement._motion_trial import MotionTrial, RefinementError
+from jointfit_daemon.kinematics.exchanged_labels import find_exchanged_labels
 from jointfit_daemon.kinematics.inverse_kinematics import IkOptions, solve_frames, tracking_error
 
 if TYPE_CHECKING:
@@ -35,10 +36,10 @@ _APART_M = 0.04
 """Smallest distance between markers of one segment that is compared, m."""
 MOST_RMS_M = 0.08
 """Tracking error above which labels, scaling or axes must be wrong, m."""
-_SWAP_GAIN = 0.2
-"""Ratio of the squared error after and before an exchange of two labels, below which the labels
-were exchanged in the trial."""
+_FAR_M = 0.025
+"""Distance from its place above which a marker may have another label, m."""
 _SWAP_LEAST_M = 0.05
+"""Smallest root of the summed squared distances of exchanged markers, m."""
 _SWAPPED_TRIAL = 0.5
 """Share of the frames above which a whole trial counts as labelled wrongly."""
 _ROBUST = IkOptions(huber_m=0.02, reweightings=4)
@@ -194,13 +195,13 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
     if not (trial.targets.shape[0] and np.isfinite(found.residuals).any()):
         return trial, [], [f"{trial.name}: the model follows none of its frames"]
     faults, notes, targets = [], [], trial.targets.copy()
-    for i, j, frames in exchanged_markers(found.residuals, trial.targets):
-        pair = f"{model.markers[i].name} and {model.markers[j].name}"
+    for group, frames in exchanged_markers(found.residuals, trial.targets).items():
+        text = f"{trial.name}: {exchange_text(model, group)}"
         if frames.mean() >= _SWAPPED_TRIAL:
-            faults.append(f"{trial.name}: {pair} look exchanged: exchange their labels back")
+            faults.append(f"{text}: correct their labels")
         else:
-            notes.append(f"{trial.name}: {pair} look exchanged in {frames.sum()} frames: left out")
-            targets[frames, i] = targets[frames, j] = np.nan
+            notes.append(f"{text} in {frames.sum()} frames: left out")
+            targets[np.ix_(frames, group)] = np.nan
 
     rms = tracking_error(found.residuals)
     if rms > MOST_RMS_M and not faults:
@@ -212,18 +213,30 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
     return replace(trial, targets=targets), notes, faults
 
 
-def exchanged_markers(residuals: Array, targets: Array) -> list[tuple[int, int, NDArray[np.bool_]]]:
-    """Return pairs of markers that fit far better with each other's label, and when."""
+def exchanged_markers(residuals: Array, targets: Array) -> dict[tuple[int, ...], NDArray[np.bool_]]:
+    """Return groups of markers that fit far better with each other's labels, and when.
+
+    Each marker of a group is at the place of the next one, and the last at that of the first.
+    """
     places = targets + residuals  # positions in the model
     own = np.einsum("tmi,tmi->tm", residuals, residuals)
-    found = []
-
-    for i, j in combinations(range(targets.shape[1]), 2):
-        kept = own[:, i] + own[:, j]
-        crossed = ((places[:, i] - targets[:, j]) ** 2).sum(axis=-1)
-        crossed += ((places[:, j] - targets[:, i]) ** 2).sum(axis=-1)
-        frames = (crossed < _SWAP_GAIN * kept) & (kept > _SWAP_LEAST_M**2)
-        if frames.any():
-            found.append((i, j, frames))
-
+    far = own > _FAR_M**2  # False where a marker is missing
+    found: dict[tuple[int, ...], NDArray[np.bool_]] = {}
+    for frame in np.flatnonzero(far.sum(axis=1) > 1):
+        for group in find_exchanged_labels(places[frame], targets[frame], far[frame]):
+            if own[frame, list(group)].sum() > _SWAP_LEAST_M**2:
+                frames = found.setdefault(group, np.zeros(len(targets), dtype=bool))
+                frames[frame] = True
     return found
+
+
+def exchange_text(model: ChainModel, group: tuple[int, ...]) -> str:
+    """Return the names of exchanged markers, and the place of each if there are more than two."""
+    names = [model.markers[i].name for i in group]
+    if len(names) == 2:
+        return f"{names[0]} and {names[1]} look exchanged"
+    order = ", ".join(
+        f"{name} is at the place of {other}"
+        for name, other in zip(names, names[1:] + names[:1], strict=True)
+    )
+    return f"{', '.join(names[:-1])} and {names[-1]} look exchanged ({order})"

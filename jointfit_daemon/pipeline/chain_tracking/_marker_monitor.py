@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
+from jointfit_daemon.kinematics.exchanged_labels import find_exchanged_labels
 from jointfit_daemon.model import MarkerFlag
 
 if TYPE_CHECKING:
@@ -30,9 +30,6 @@ FAR_M = 0.06
 """Distance of a misplaced marker, m: soft-tissue artefact is smaller, and 0.04 m is accepted."""
 NEAR_M = 0.03
 """Distance below which a faulty marker recovers, m."""
-EXCHANGE_GAIN = 0.2
-"""Ratio of the squared distances after and before an exchange of labels, below which they are
-exchanged."""
 FAULT_NS = 1_000_000_000
 """Time for which a marker is misplaced, exchanged or hidden before it is flagged, ns."""
 RECOVERY_NS = 2_000_000_000
@@ -166,7 +163,7 @@ class MarkerMonitor:
         distances = np.sqrt(((places - measured) ** 2).sum(axis=1))
 
         far = distances > FAR_M  # False where NaN
-        exchanged = _exchanged_labels(places, measured, far) if far.any() else []
+        exchanged = find_exchanged_labels(places, measured, far) if far.any() else []
         grouped = {m for group in exchanged for m in group}
         suspects = {self._flag(MarkerFlag.EXCHANGED, *group): group for group in exchanged}
         for m in np.flatnonzero(far).tolist():
@@ -296,38 +293,3 @@ class MarkerMonitor:
 def _joined(words: Iterable[str]) -> str:
     *first, last = words
     return f"{', '.join(first)} and {last}" if first else last
-
-
-def _exchanged_labels(
-    places: Array, measured: Array, far: NDArray[np.bool_]
-) -> list[tuple[int, ...]]:
-    """Return groups of far markers that fit much better with each other's labels.
-
-    Each marker of a group is at the place of the next one, and the last at that of the first.
-    """
-    rows = np.flatnonzero(far)
-    square = ((places[rows, None] - measured[None, rows]) ** 2).sum(axis=-1)
-    # the marker at each place if all labels are assigned anew
-    nearest = linear_sum_assignment(square)[1]
-    place_of = np.argsort(nearest)
-
-    groups: list[tuple[int, ...]] = []
-    left = set(range(len(rows)))
-    for first in range(len(rows)):
-        group = [first]
-        while (following := int(place_of[group[-1]])) != first:
-            group.append(following)
-        if first != min(group) or len(group) == 1:
-            continue
-        if square[place_of[group], group].sum() < EXCHANGE_GAIN * square[group, group].sum():
-            groups.append(tuple(rows[group].tolist()))
-            left -= set(group)
-
-    # A misplaced marker may have spoiled the assignment of two others.
-    own = square.diagonal()
-    better = square + square.T < EXCHANGE_GAIN * (own[:, None] + own[None])
-    for i, j in np.argwhere(np.triu(better, 1)).tolist():
-        if {i, j} <= left:
-            groups.append((int(rows[i]), int(rows[j])))
-            left -= {i, j}
-    return groups

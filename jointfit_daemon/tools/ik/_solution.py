@@ -15,6 +15,7 @@ from jointfit_daemon.calibration.marker_refinement import (
     MOST_RMS_M,
     MotionTrial,
     RefinementError,
+    exchange_text,
     exchanged_markers,
     find_trial_faults,
     require_marker,
@@ -193,9 +194,9 @@ def _check(
 def _check_fit(motion: MotionTrial, found: IkResult, model: ChainModel) -> list[str]:
     """Return notes on exchanged labels; `RefinementError` if the model does not fit."""
     notes = []
-    for i, j, frames in exchanged_markers(found.residuals, motion.targets):
-        pair = f"{model.marker_names[i]} and {model.marker_names[j]}"
-        notes.append(f"{pair} look exchanged in {int(frames.sum())} frames: check their labels")
+    for group, frames in exchanged_markers(found.residuals, motion.targets).items():
+        text = exchange_text(model, group)
+        notes.append(f"{text} in {int(frames.sum())} frames: correct their labels")
 
     square = np.einsum("tmi,tmi->tm", found.residuals, found.residuals)
     rms = float(np.sqrt(np.nanmean(square)))

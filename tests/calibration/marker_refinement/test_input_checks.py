@@ -92,6 +92,20 @@ def test_labels_exchanged_throughout_are_named() -> None:
     assert "T0 and T2 look exchanged" in refused(exchanged("T0", "T2", slice(None)))
 
 
+def three_exchanged(frames: slice) -> MotionTrial:
+    given, names = trial(), list(two_segments().marker_names)
+    rows = [names.index(name) for name in ("P1", "T3", "T0")]
+    given.targets[frames, rows] = given.targets[frames, rows[-1:] + rows[:-1]]
+    return given
+
+
+def test_three_exchanged_labels_are_named_together_each_with_its_place() -> None:
+    why = refused(three_exchanged(slice(None)))
+    assert "P1, T0 and T3 look exchanged" in why
+    assert "P1 is at the place of T0, T0 is at the place of T3, T3 is at the place of P1" in why
+    assert why.count("look exchanged") == 1
+
+
 def test_labels_exchanged_between_segments_are_refused() -> None:
     assert "labels" in refused(exchanged("P1", "T3", slice(None)))
 

@@ -1,0 +1,64 @@
+"""Detection of exchanged marker labels from measured positions and places in a model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+
+EXCHANGE_GAIN = 0.2
+"""Ratio of the squared distances after and before an exchange of labels, below which they are
+exchanged."""
+
+
+def find_exchanged_labels(
+    places: Array, measured: Array, far: NDArray[np.bool_]
+) -> list[tuple[int, ...]]:
+    """Return groups of far markers that fit much better with each other's labels.
+
+    Parameters
+    ----------
+    places
+        Positions of the markers in the model, m, shape (M, 3).
+    measured
+        Measured positions, m, shape (M, 3).
+    far
+        Markers that are measured far from their places, shape (M,).
+
+    Returns
+    -------
+    list of tuple of int
+        Each marker of a group is at the place of the next one, and the last at that of the first.
+    """
+    rows = np.flatnonzero(far)
+    square = ((places[rows, None] - measured[None, rows]) ** 2).sum(axis=-1)
+    # the marker at each place if all labels are assigned anew
+    nearest = linear_sum_assignment(square)[1]
+    place_of = np.argsort(nearest)
+
+    groups: list[tuple[int, ...]] = []
+    left = set(range(len(rows)))
+    for first in range(len(rows)):
+        group = [first]
+        while (following := int(place_of[group[-1]])) != first:
+            group.append(following)
+        if first != min(group) or len(group) == 1:
+            continue
+        if square[place_of[group], group].sum() < EXCHANGE_GAIN * square[group, group].sum():
+            groups.append(tuple(rows[group].tolist()))
+            left -= set(group)
+
+    # A misplaced marker may have spoiled the assignment of two others.
+    own = square.diagonal()
+    better = square + square.T < EXCHANGE_GAIN * (own[:, None] + own[None])
+    for i, j in np.argwhere(np.triu(better, 1)).tolist():
+        if {i, j} <= left:
+            groups.append((int(rows[i]), int(rows[j])))
+            left -= {i, j}
+    return groups
