@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.child_processes import ChildProcess
     from tests.broker_fixture import Broker
 
-pytestmark = [pytest.mark.system, pytest.mark.alone]
+pytestmark = pytest.mark.system
 
 REQUEST = f"{BASE}/bridge/request/calibrate"
 RSS_GROWTH_BYTES = 20_000_000

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.child_processes import Simulator
     from tests.broker_fixture import Broker
 
-pytestmark = [pytest.mark.system, pytest.mark.alone]
+pytestmark = pytest.mark.system
 
 SECOND_US = 1_000_000
 BLOCK_S = 0.2

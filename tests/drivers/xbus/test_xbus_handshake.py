@@ -210,14 +210,21 @@ class Queueing(XbusDevice):
 
 
 @pytest.mark.alone
-@pytest.mark.parametrize("streams", [True, False])
 async def test_a_device_that_acknowledges_after_a_second_and_a_half_comes_up(
-    tmp_path: Path, streams: bool
+    tmp_path: Path,
 ) -> None:
-    device = Queueing(tmp_path / "imu", options=XbusDeviceOptions(measures_at_once=streams))
-    async with serving(device, feeding=True):
-        assert len(await chunks_of(make(tmp_path))) >= 5
-        assert device.asked == 1 or not streams, "one request at a time"
+    async def comes_up(folder: Path, *, streams: bool) -> None:
+        folder.mkdir()
+        device = Queueing(folder / "imu", options=XbusDeviceOptions(measures_at_once=streams))
+        async with serving(device, feeding=True):
+            assert len(await chunks_of(make(folder))) >= 5
+            assert device.asked == 1 or not streams, "one request at a time"
+
+    # Both wait for seconds, so they run at the same time.
+    await asyncio.gather(
+        comes_up(tmp_path / "streaming", streams=True),
+        comes_up(tmp_path / "silent", streams=False),
+    )
 
 
 async def test_device_that_restarts_at_every_request_is_configured(tmp_path: Path) -> None:
