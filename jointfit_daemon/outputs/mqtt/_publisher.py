@@ -12,7 +12,7 @@ import logging
 import random
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.mqtt._competing_daemon import (
@@ -69,7 +69,12 @@ _HEALTHY_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class LinkHealth:
-    """State of the connection to the broker; docs/mqtt.md explains the fields."""
+    """State of the connection to the broker; docs/mqtt.md explains the fields.
+
+    The payload of ``bridge/health`` contains these fields, and no others.
+    """
+
+    __pydantic_config__: ClassVar = {"extra": "forbid"}
 
     connected: bool
     connects: int

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, Field
 
+from jointfit_daemon.outputs.mqtt import LinkHealth  # noqa: TC001 - pydantic reads it
 from jointfit_daemon.outputs.payload_models._streams import Number, Payload, Table, Time
 from jointfit_daemon.pipeline.events import (  # noqa: TC001 - pydantic reads them
     CalibrationPhase,
@@ -144,20 +145,6 @@ class Process(Table):
     loop_delay_p99_ms: Number
 
 
-class Link(Table):
-    """Connection to the broker."""
-
-    connected: bool
-    connects: int
-    confirmed: bool
-    denied: list[str]
-    sent: int
-    queued: int
-    dropped: int
-    ignored_requests: int
-    noise: int
-
-
 class StateFaults(Table):
     """Reasons why data cannot be stored."""
 
@@ -185,7 +172,7 @@ class Health(Payload):
     frames: Frames
     learning: Learning
     process: Process
-    link: Link
+    link: LinkHealth
     state: StateFaults
     recording: Recording | None = None
 
