@@ -140,6 +140,12 @@ ALL = "JOINTFIT_ALL_PAIRS" in os.environ
 """Whether to try all pairs, which takes 4 s, and not every third one."""
 
 
+@pytest.fixture(autouse=True)
+def installed_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read the metadata of all packages once, and not at every search for a driver, 20 ms each."""
+    monkeypatch.setattr("jointfit_daemon.driver.entry_points", cache(entry_points))
+
+
 def messages(folder: Path, text: str) -> str:
     path = folder / "rig.toml"
     path.write_text(text, encoding="utf-8")
@@ -171,10 +177,7 @@ NEED_SEGMENTS = (
 )  # fmt: skip
 
 
-def test_no_mistake_hides_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Every search for a driver reads the metadata of all packages, 20 ms.
-    monkeypatch.setattr("jointfit_daemon.driver.entry_points", cache(entry_points))
-
+def test_no_mistake_hides_another(tmp_path: Path) -> None:
     hidden = []
     for first, second in [*combinations(MISTAKES, 2)][:: 1 if ALL else 3]:
         changed = RIG.replace(first[0], first[1])

@@ -211,10 +211,9 @@ class Queueing(XbusDevice):
 
 @pytest.mark.alone
 async def test_a_device_that_acknowledges_after_a_second_and_a_half_comes_up(
-    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> None:
     async def comes_up(folder: Path, *, streams: bool) -> None:
-        folder.mkdir()
         device = Queueing(folder / "imu", options=XbusDeviceOptions(measures_at_once=streams))
         async with serving(device, feeding=True):
             assert len(await chunks_of(make(folder))) >= 5
@@ -222,8 +221,8 @@ async def test_a_device_that_acknowledges_after_a_second_and_a_half_comes_up(
 
     # Both wait for seconds, so they run at the same time.
     await asyncio.gather(
-        comes_up(tmp_path / "streaming", streams=True),
-        comes_up(tmp_path / "silent", streams=False),
+        comes_up(tmp_path_factory.mktemp("streaming"), streams=True),
+        comes_up(tmp_path_factory.mktemp("silent"), streams=False),
     )
 
 
