@@ -201,7 +201,7 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
             faults.append(f"{text}: correct their labels")
         else:
             notes.append(f"{text} in {frames.sum()} frames: left out")
-            targets[np.ix_(frames, group)] = np.nan
+            targets[frames[:, None] & np.isin(np.arange(targets.shape[1]), group)] = np.nan
 
     rms = tracking_error(found.residuals)
     if rms > MOST_RMS_M and not faults:
