@@ -90,6 +90,21 @@ def test_poses_keep_their_latency_during_a_flood_of_invalid_requests(tmp_path: P
     assert flooded_ms <= max(20.0, 3.0 * quiet_ms)
 
 
+@pytest.mark.alone
+@pytest.mark.experiment
+@pytest.mark.system
+@pytest.mark.timeout(120)
+def test_the_dashboard_is_small_and_ten_viewers_change_nothing_for_the_daemon(
+    tmp_path: Path,
+) -> None:
+    rows = measured(tmp_path, "dashboard-viewers", "dashboard-page", timeout_s=115.0)
+    if not rows:
+        pytest.skip(MOSQUITTO_MISSING)
+    assert rows["dashboard server, ten viewers: memory"]["value"] < 40
+    if "page: transferred" in rows:
+        assert rows["page: transferred"]["value"] < 300
+
+
 def test_missed_threshold_ends_with_1_and_missed_target_does_not(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
