@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from rich.cells import cell_len
+
 from jointfit_daemon.tools.monitor._dot_canvas import DotCanvas, render
 from jointfit_daemon.tools.monitor._rig_view import known_vector
 from jointfit_daemon.tools.monitor._text_lines import Line, fit_text
@@ -21,8 +23,8 @@ _BRANCHED_TURN_DEG = 35.0
 """Direction of view on a limb of two sides, degrees from the side: both are visible."""
 _LEAST_HORIZONTAL = 0.1
 """Least horizontal part of the direction ahead."""
-_LABEL = 9
-"""Cells for the name of a joint beside the figure."""
+_LONGEST_LABEL = 12
+"""Most cells for the name of a joint beside the figure."""
 
 
 def limb_lines(
@@ -51,7 +53,8 @@ def limb_lines(
     if origin is None or len(points) == 1:
         return None
     front, back = (DotCanvas(columns, rows, unicode) for _ in range(2))
-    scale = _Scale(rig.reach_m, front, max(1, columns - _LABEL))
+    label = min(_LONGEST_LABEL, 1 + max(cell_len(title_of(name)) for name in points))
+    scale = _Scale(rig.reach_m, front, max(1, columns - label - 1))
 
     def dots(places: dict[str, list[float]]) -> dict[str, _Dot]:
         return {name: scale.dot(place, origin, across) for name, place in places.items()}
@@ -67,7 +70,7 @@ def limb_lines(
         for first, last in _bones(info):
             if first in seen and last in seen:
                 back.line(seen[first], seen[last], every=3 if unicode else 1)
-    return _labelled(render(front, "imu", back, "optical"), front, joints)
+    return _labelled(render(front, "imu", back, "optical"), front, joints, label)
 
 
 class _Scale:
@@ -144,19 +147,21 @@ def _blob(canvas: DotCanvas, x: int, y: int) -> None:
             canvas.plot(x + dx, y + dy)
 
 
-def _labelled(lines: list[Line], canvas: DotCanvas, joints: dict[str, _Dot]) -> list[Line]:
+def _labelled(
+    lines: list[Line], canvas: DotCanvas, joints: dict[str, _Dot], width: int
+) -> list[Line]:
     """Write the name of each joint at the right end of its row, where the row is free."""
     taken: set[int] = set()
     rows = canvas.height // canvas.rows
     for name, (_, y) in joints.items():
         row = min(canvas.rows - 1, max(0, y // rows))
         line = lines[row]
-        free = canvas.columns - _LABEL
+        free = canvas.columns - width
         if row in taken or len(line.text.rstrip("⠀ ")) > free:
             continue
         taken.add(row)
         lines[row] = line.fit(free) if line.width <= free else _cut(line, free)
-        lines[row] = lines[row].add(" " + fit_text(title_of(name), _LABEL - 1), "muted")
+        lines[row] = lines[row].add(" " + fit_text(title_of(name), width - 1), "muted")
     return lines
 
 

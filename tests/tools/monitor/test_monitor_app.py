@@ -137,6 +137,12 @@ STATES: dict[str, tuple[Callable[[], MonitorState], tuple[int, int]]] = {
 }
 
 
+@pytest.fixture(autouse=True)
+def colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the pictures independent of the environment of the tests."""
+    monkeypatch.delenv("NO_COLOR", raising=False)
+
+
 @pytest.mark.parametrize("name", STATES)
 async def test_picture(name: str) -> None:
     make, size = STATES[name]

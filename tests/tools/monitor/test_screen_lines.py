@@ -8,6 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jointfit_daemon.outputs.payload_models import Info
+from jointfit_daemon.tools.monitor._limb_figure import _bones
 from jointfit_daemon.tools.monitor._monitor_state import VIEWS, MonitorState
 from jointfit_daemon.tools.monitor._screen_lines import screen_lines
 from jointfit_daemon.tools.monitor._text_lines import Line, fit_text, wrap
@@ -233,3 +235,22 @@ def test_several_rigs_are_offered() -> None:
     state.found_rigs({"jointfit/a": "left leg", "jointfit/b": "right leg"})
     assert "▶ left leg (jointfit/a)" in words(state)
     assert "Enter show" in words(state)
+
+
+def test_the_segments_of_two_legs_connect_the_joints_of_each_side() -> None:
+    joints = {
+        f"{side}_{name}": {"parent": parent if parent == "pelvis" else f"{side}_{parent}",
+                           "child": child and f"{side}_{child}", "side": side}
+        for side in ("left", "right")
+        for name, parent, child in (
+            ("hip", "pelvis", "thigh"), ("knee", "thigh", "shank"), ("ankle", "shank", None)
+        )
+    }  # fmt: skip
+    segments = ["pelvis", "left_thigh", "right_thigh", "left_shank", "right_shank"]
+    more = {"side": "both", "joints": [*joints], "segments": segments, "connections": joints}
+    info = Info.model_validate(SampleRig().info() | more)
+    assert {frozenset(bone) for bone in _bones(info)} == {
+        frozenset({"left_hip", "right_hip"}),
+        *(frozenset({f"{side}_hip", f"{side}_knee"}) for side in ("left", "right")),
+        *(frozenset({f"{side}_knee", f"{side}_ankle"}) for side in ("left", "right")),
+    }
