@@ -34,6 +34,8 @@ WALK_S = 20.0
 """Time after the calibration before the last pictures, s: the length of the curve."""
 CLOCKS_S = 8.0
 """Time for the clocks of the sensors to settle, s."""
+START_S = 6.0
+"""Time until the subject walks after the calibration, s."""
 MOST_LINES = 16
 SHOW_BROKER = """(address) => {
   const shown = document.querySelector("#broker-text");
@@ -144,6 +146,7 @@ class TutorialRun:
     async def _walk(self) -> None:
         """Collect the poses of the walking subject, and draw the limb."""
         poses: dict[str, list[dict[str, Any]]] = {"pose": [], "optical/pose": []}
+        await asyncio.sleep(START_S)
         settings = MqttSettings(host=HOST, port=self._broker.port, base=BASE)
         async with MqttClient(settings) as client:
             await client.subscribe(*poses)
