@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
@@ -22,9 +22,14 @@ SHOWN = "knee flexion 28.31° ± 1.4°"
 
 
 @contextlib.asynccontextmanager
-async def live_rig(port: int) -> AsyncIterator[MqttConnection]:
-    """Publish `STATE` on ``pose/ui`` and ``joint/knee`` during the block; yield the connection."""
-    settings = MqttSettings(host="127.0.0.1", port=port, base=BASE)
+async def live_rig(
+    port: int, version: Literal["5", "3.1.1"] = "5"
+) -> AsyncIterator[MqttConnection]:
+    """Publish `STATE` on ``pose/ui`` and ``joint/knee`` during the block; yield the connection.
+
+    The embedded broker connects publishers and subscribers of the same MQTT version only.
+    """
+    settings = MqttSettings(host="127.0.0.1", port=port, base=BASE, version=version)
     async with MqttConnection(settings) as connection:
 
         async def publish() -> None:

@@ -181,7 +181,7 @@ async def test_the_bridge_publishes_the_messages_of_a_real_broker(
     port = broker.port_of("3.1.1")
     node = StandInNode(port=port, base=BASE, topic="pose/ui")
     client = module.mqtt_client(module.Bridge(node, KINDS))
-    async with asyncio.timeout(20), live_rig(broker.port) as rig:
+    async with asyncio.timeout(20), live_rig(port, "3.1.1") as rig:
         await rig.publish(Outgoing(f"{BASE}/bridge/info", info_of(table), 1, retain=True))
         client.loop_start()
         try:

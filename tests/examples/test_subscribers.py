@@ -39,7 +39,7 @@ def test_a_subscriber_is_short(file: Path) -> None:
 @pytest.mark.system
 async def test_the_python_subscriber_prints_the_flexion(broker: Broker) -> None:
     port = broker.port_of("3.1.1")  # version of the library's default
-    async with live_rig(broker.port):
+    async with live_rig(port, "3.1.1"):
         shown = await first_line(sys.executable, SUBSCRIBERS / "knee.py", "127.0.0.1", str(port))
     assert shown == SHOWN
 
@@ -68,7 +68,7 @@ async def test_the_cpp_subscriber_prints_the_flexion(broker: Broker, tmp_path: P
     compiled = _run(command)
     assert compiled.returncode == 0, compiled.stderr
     port = broker.port_of("3.1.1")
-    async with live_rig(broker.port):
+    async with live_rig(port, "3.1.1"):
         shown = await first_line(tmp_path / "knee", "127.0.0.1", str(port), BASE)
     assert shown.replace("0°", "°") == SHOWN
 

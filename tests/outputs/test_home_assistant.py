@@ -266,7 +266,9 @@ async def test_home_assistant_that_was_started_receives_the_rig_again_and_once_o
             await home.publish(Outgoing("homeassistant/status", b"online", 1))
             assert await anext(arriving) == first
         assert first.topic == TOPIC
-        assert first.retained
+        async with MqttConnection(on.mqtt) as later:  # the message is retained
+            await later.subscribe([TOPIC])
+            assert (await anext(later.messages())).payload == first.payload
 
         off = rig_of(table, host=broker.host, port=broker.port, home_assistant={"enabled": False})
         async with publisher(off):
