@@ -62,11 +62,12 @@ TURNED_BY = """([name, degrees]) => {
 """Whether the check of axes shows this rotation of a sensor, within the limit of "not turned"."""
 KNEES = "jointfit.store.poses.map((pose) => pose.joints.knee.flexion_deg).filter((x) => x !== null)"
 READY = {
-    "live": "difference from the cameras", "calibrate": "Held-out error", "history": "in force",
-    "sensors": "Up in the drawing", "table": "Knee flexion",
+    "live": "difference from the cameras", "calibrate": "Held-out error",
+    "history": "Use version 2", "sensors": "Up in the drawing", "table": "Knee flexion",
 }  # fmt: skip
 """A text of each view when it is complete."""
 FIRST_STEPS = ["Align", "Stand still"]
+FULL_CURVE = "() => jointfit.store.poses.length > 195"
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -264,6 +265,8 @@ async def test_a_rig_is_calibrated_in_the_page_and_survives_daemon_and_broker(
                     await calibrate(page)
                     await see_the_limb_move(page)
                     cost = await measured(browser, page, server)
+                    await page.page.wait_for_function(FULL_CURVE, timeout=60_000)
+                    await page.picture("run-dashboard")
                     await revert(page)
                     await simulator.say("play stand")
                     await turn_a_sensor(page, simulator)

@@ -5,6 +5,7 @@ import { dot, mix, norm, rotate, scale, subtract } from "./geometry.js";
 const ELEVATION = 0.16;
 const FOLLOW_S = 0.9;
 const TURN_S = 3;
+const JUMP = 0.5; // distance, in lengths of the limb, that the view does not follow smoothly
 
 /** Return a camera; `turn` is the angle of the view about the vertical, rad; null until it is set. */
 export function createCamera() {
@@ -19,7 +20,9 @@ export function createCamera() {
     follow(points, length, firstSegment, seconds, still) {
       const center = scale(points.reduce((sum, p) => sum.map((v, i) => v + p[i]), [0, 0, 0]), 1 / points.length);
       const lowest = Math.min(...points.map((p) => p[2])) - 0.14 * length;
-      const first = camera.target === null;
+      // The first joint changes its place at once when cameras begin or cease to locate it.
+      const first = camera.target === null || norm(subtract(center, camera.target)) > JUMP * length;
+      if (first) camera.floor = null;
       const share = (time) => (first || still ? 1 : 1 - Math.exp(-seconds / time));
 
       camera.target = first ? center : mix(camera.target, center, share(FOLLOW_S));
