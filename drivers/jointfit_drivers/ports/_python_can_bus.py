@@ -224,6 +224,9 @@ class PythonCanBus:
 
     def _receive_error(self, error: Exception) -> Exception:
         """Return the error for a bus that stopped; programming errors are returned unchanged."""
+        cause = error.__cause__
+        if getattr(error, "error_code", None) is None and isinstance(cause, OSError):
+            error = cause  # python-can puts its traceback into some messages
         if isinstance(error, (can.CanError, OSError, ValueError)):  # ValueError: a backend's parser
             return self._error_by_number(error)
         return error
@@ -231,8 +234,6 @@ class PythonCanBus:
     def _error_by_number(self, error: Exception) -> DeviceLostError | DeviceMisconfiguredError:
         """Choose the error by the kernel's error number."""
         channel = self._settings.channel
-        if isinstance(error.__cause__, OSError):  # python-can puts its traceback into the message
-            error = error.__cause__
         number = getattr(error, "error_code", None) or getattr(error, "errno", None)
         if number == errno.EAFNOSUPPORT:
             return DeviceMisconfiguredError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import socket
+import struct
 import threading
 import time
 from typing import TYPE_CHECKING, Any
@@ -125,6 +126,30 @@ async def test_a_server_that_ends_is_reported_at_once_and_costs_no_processor_tim
             with pytest.raises(DeviceLostError, match="the server closed the connection: start it"):
                 await bus.pump("S3", {key: "quaternion"}, lambda _: None, 5.0, needed=key)
     assert time.process_time() - used < 0.5
+
+
+async def test_a_connection_that_is_reset_is_reported_without_a_traceback() -> None:
+    with listening() as (server, port):
+
+        def serve() -> None:
+            for _ in range(2):  # the check of the server, and the bus
+                connection, _ = server.accept()
+                connection.sendall(b"< hi >")
+                for _ in range(2):
+                    connection.recv(256)
+                    connection.sendall(b"< ok >")
+                linger = struct.pack("ii", 1, 0)
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+                connection.close()
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        async with shared_bus(socketcand(port)) as bus, asyncio.timeout(3.0):
+            key = (0x21, False)
+            with pytest.raises(DeviceLostError) as lost:
+                await bus.pump("S3", {key: "quaternion"}, lambda _: None, 5.0, needed=key)
+        thread.join()
+    assert str(lost.value) == "can0 (socketcand): Connection reset by peer"
 
 
 async def test_a_library_that_hangs_is_called_by_one_thread_only_and_its_late_bus_is_closed(
