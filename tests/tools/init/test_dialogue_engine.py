@@ -6,10 +6,11 @@ import tomllib
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.config import Rig, parse_rig
+from jointfit_daemon.tools.init import _engine
 from jointfit_daemon.tools.init._answer_file import read_answers, write_answers
 from jointfit_daemon.tools.init._answers import sensors_of, split_address
 from jointfit_daemon.tools.init._engine import accept, complete, next_question, rig_faults
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 FOUND = st.sampled_from([NOTHING, DEVICES, STREAM])
 RANDOM = settings(
     max_examples=5,
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # to shrink a dialogue takes minutes
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
@@ -86,6 +88,11 @@ def assert_means(rig: Rig, answers: Answers) -> None:
         marked = {part: names for (key, part), names in answers.items() if key == "markers"}
         assert source.settings.markers == {part: names for part, names in marked.items() if names}
 
+        assert source.settings.up_axis == answers["up_axis", ""]
+        assert source.settings.plate == answers.get(("plate", ""))
+    lengths = {part: length for (key, part), length in answers.items() if key == "length_m"}
+    assert rig.chain.lengths == tuple(lengths.get(segment) for segment in limb.segments)
+
     host, port = split_address(answers["broker", ""])
     assert rig.mqtt.host == host
     assert rig.mqtt.port == port
@@ -94,6 +101,8 @@ def assert_means(rig: Rig, answers: Answers) -> None:
     encryption = answers.get(("encryption", ""))
     assert rig.mqtt.insecure == (encryption == "none")
     assert (rig.mqtt.tls is not None) == (encryption in ("tls", "own-ca"))
+    if rig.mqtt.tls is not None:
+        assert rig.mqtt.tls.ca == answers.get(("ca", ""))
 
 
 @RANDOM
@@ -103,6 +112,51 @@ def test_every_completed_dialogue_yields_a_valid_rig_with_its_meaning(
 ) -> None:
     answers = random_answers(data, found)
     assert_means(rig_of(answers, found), answers)
+
+
+UNUSUAL = {
+    "name": "rig 7", "side": "left", "subject": "p-2", "output_rate_hz": "50",
+    "sensor_rate_hz": "200", "can_adapters": "/dev/ttyACM0", "bitrate": "500000",
+    "baud": "460800", "cameras": "yes", "server": "10.0.0.5:1600", "up_axis": "z",
+    "plate": "Board", "length_m": "0.37", "broker": "lab-pc:1884", "ca": "lab.pem",
+    "username": "gw", "password_file": "pw",
+}  # fmt: skip
+"""An answer to every question that differs from its proposal."""
+
+
+@pytest.mark.parametrize("cameras", ["yes", "no"])
+@pytest.mark.parametrize(
+    ("limb", "encryption"),
+    [
+        ("knee", "none"),
+        ("legs", "tls"),
+        ("arm", "own-ca"),
+        ("trunk", "none"),
+        ("planar", "tls"),
+    ],
+)
+def test_every_answer_that_differs_from_its_proposal_is_in_the_rig(
+    monkeypatch: pytest.MonkeyPatch, limb: str, encryption: str, cameras: str
+) -> None:
+    monkeypatch.setattr(_engine, "rig_faults", lambda *_: set())  # the complete rig is checked
+    chosen = UNUSUAL | {"limb": limb, "encryption": encryption, "cameras": cameras}
+    answers: Answers = {}
+    while (asked := next_question(answers, NOTHING)) is not None:
+        number = len(answers)
+        own = {
+            "device": (f"/dev/ttyUSB{number}", "/dev/ttyACM0", "can3")[number % 3],
+            "ids": [number << 4, number << 4 | 1, number << 4 | 2],
+            "sensors": f"{asked.subject}.a, {asked.subject}.b, {asked.subject}.c",
+            "markers": ", ".join(f"{asked.subject}:{k}" for k in range(3)),
+        }
+        answers = accept(asked, (chosen | own)[asked.question.key], answers, NOTHING)
+    rig = rig_of(answers, NOTHING)
+    assert_means(rig, answers)
+    assert rig.chain.left_side == (limb in ("knee", "arm", "planar"))
+    assert (rig.mqtt.port, rig.mqtt.insecure) == (1884, encryption == "none")
+    for source in rig.sources:
+        if source.kind == "mocap":
+            assert (source.settings.command_port, source.settings.up_axis) == (1600, "z")
 
 
 @RANDOM
