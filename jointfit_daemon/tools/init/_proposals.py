@@ -98,10 +98,10 @@ def _ids_in_use(answers: Given, bus: str) -> list[tuple[int, ...]]:
 
 
 def ids(answers: Given, found: Found, sensor: str) -> tuple[int, ...] | None:
-    """Return the first identifiers on the bus of `sensor` that no other sensor has."""
+    """Return the first identifiers received on the bus of `sensor` that no other sensor has."""
     bus = answers["device", sensor]
-    used = _ids_in_use(answers, bus)
-    return next((each for each in found.ids.get(bus, ()) if each not in used), None)
+    used = {number for each in _ids_in_use(answers, bus) for number in each}
+    return next((each for each in found.ids.get(bus, ()) if used.isdisjoint(each)), None)
 
 
 def unused_ids(answers: Given, found: Found, sensor: str) -> tuple[int, ...]:

@@ -36,6 +36,7 @@ STREAM = replace(
     DEVICES,
     markers=tuple(f"{stem}{k}" for stem in ("P", "T", "C", "Foot_") for k in range(1, 5)),
     bodies=("Thigh", "calibration plate"),
+    ids={"can0": ((0x105, 0x106, 0x121), (0x205, 0x206, 0x221))},
 )
 NAMES = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)
 
