@@ -51,7 +51,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.check:
         print(rig_summary(rig))
         return 0
-    _start_logging(options.log_level, rig.name)
+
+    from jointfit_daemon.outputs.log import PrintableRecord
+
+    logging.setLogRecordFactory(PrintableRecord)
+    faulthandler.enable()  # log a traceback on the watchdog's SIGABRT
+    logging.basicConfig(
+        level=options.log_level.upper(),
+        handlers=[_log_handler(rig.name, limited=options.log_level != "debug")],
+    )
+    # aiomqtt's logger: the daemon reports connection faults itself
+    logging.getLogger("mqtt").setLevel(logging.ERROR)
+
     if not _lock_state_directory():
         return EXIT_IN_USE
     return _run(options.config, rig)
@@ -96,16 +107,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="store_true", help="print the version and exit")
     return parser
-
-
-def _start_logging(level: str, rig: str) -> None:
-    from jointfit_daemon.outputs.log import PrintableRecord
-
-    logging.setLogRecordFactory(PrintableRecord)
-    faulthandler.enable()  # log a traceback on the watchdog's SIGABRT
-    logging.basicConfig(level=level.upper(), handlers=[_log_handler(rig, limited=level != "debug")])
-    # aiomqtt's logger: the daemon reports connection faults itself
-    logging.getLogger("mqtt").setLevel(logging.ERROR)
 
 
 def _log_handler(rig: str, *, limited: bool) -> logging.Handler:

@@ -95,7 +95,11 @@ class OpticalLimb:
             if fitted is None:
                 continue
             orientations[k] = fitted.q
-            for joint, position in zip(self._carried(k), fitted.points, strict=True):
+
+            found = self._parts[k]
+            for joint, position in zip(
+                [] if found is None else found[1], fitted.points, strict=True
+            ):
                 carried[joint].append(position)
 
         segments = [
@@ -117,10 +121,6 @@ class OpticalLimb:
         cluster, joints = part
         centers = np.array([self._centers[i] for i in joints], dtype=np.float64).reshape(-1, 3)
         return ClusterPose(cluster, centers, layout)
-
-    def _carried(self, part: int) -> list[int]:
-        found = self._parts[part]
-        return [] if found is None else found[1]
 
     def _angles(self, joint: int, segments: list[Quaternion | None]) -> JointReading | None:
         if (inner := self._inner.get(joint)) is None:  # the ends of the chain have no angles

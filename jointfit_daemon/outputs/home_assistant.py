@@ -52,7 +52,17 @@ def discovery_payload(rig: Rig) -> dict[str, Any]:
     base, device = rig.mqtt.base, topics.client_identifier(rig.mqtt.base)
     components = dict([*_angles(rig), *_calibration(base), *_problems(rig)])
     if rig.mqtt.request_key_file is None and not rig.chain.planar:
-        components |= _buttons(base)
+        components |= {
+            f"{key}_button": {
+                "platform": "button",
+                "name": name,
+                "command_topic": topics.REQUEST.name(base, request),
+                "payload_press": json.dumps(arguments),
+                "qos": 1,
+                "icon": icon,
+            }
+            for key, (name, request, arguments, icon) in _BUTTONS.items()
+        }
     for key, component in components.items():
         component["unique_id"] = f"{device}_{key}"
     return {
@@ -143,17 +153,3 @@ def _problems(rig: Rig) -> Iterator[tuple[str, dict[str, Any]]]:
                 ),
             },
         )
-
-
-def _buttons(base: str) -> dict[str, dict[str, Any]]:
-    return {
-        f"{key}_button": {
-            "platform": "button",
-            "name": name,
-            "command_topic": topics.REQUEST.name(base, request),
-            "payload_press": json.dumps(arguments),
-            "qos": 1,
-            "icon": icon,
-        }
-        for key, (name, request, arguments, icon) in _BUTTONS.items()
-    }

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.guidance import LiveJointCenter
     from jointfit_daemon.center_of_rotation import CenterEstimate
     from jointfit_daemon.limb_model import CalibratedCenter, Calibration
-    from jointfit_daemon.model import Chain, MocapFrame, Vector
+    from jointfit_daemon.model import Chain, MocapFrame
 
 RATE_HZ = 20.0
 """Camera frames used per second: joints turn by a few degrees between two of them."""
@@ -148,9 +148,11 @@ class MovingCenters:
         parts = centers.parts
         item = self._calibration.segment.get(segment)
         turn = np.eye(3) if item is None else rotation.to_matrix(np.array(item.q_static)).T
+
+        a, b, c = turn @ fit.covariance @ turn.T
         found = found._replace(
             center=vector(turn @ (fit.center - parts.origins[parts.names.index(segment)])),
-            covariance=_rows(turn @ fit.covariance @ turn.T),
+            covariance=(vector(a), vector(b), vector(c)),
             unseen=tuple(vector(turn @ direction) for direction in fit.unseen),
             axis=None if fit.axis is None else vector(turn @ fit.axis),
             effective_frames=fit.effective_frames,
@@ -162,11 +164,6 @@ class MovingCenters:
         if shift is None:
             return found
         return found._replace(shift=vector(turn @ shift), p_value=chance, moved=chance < MOVED_P)
-
-
-def _rows(matrix: Array) -> tuple[Vector, Vector, Vector]:
-    a, b, c = matrix
-    return vector(a), vector(b), vector(c)
 
 
 def _shift_test(fit: CenterEstimate, reference: CalibratedCenter) -> tuple[Array | None, float]:

@@ -42,7 +42,18 @@ def request(
     The request is signed if rig.toml names a key. Exit codes: 0 done or accepted; 1 no broker, no
     answer, or the daemon refused the request; 2 invalid JSON, options or rig.toml.
     """
-    answer = send_request(rig, name, _table(arguments), timeout_s)
+    try:
+        table = orjson.loads(arguments)
+    except orjson.JSONDecodeError as error:
+        raise ValueError(
+            f"the arguments are no JSON ({error}): expected an object in quotes, such as "
+            '\'{"device":"S1"}\''
+        ) from error
+    if not isinstance(table, dict):
+        raise ValueError(  # noqa: TRY004 - the text of a user
+            f'the arguments are {arguments}, expected a JSON object, such as {{"hz":50}}'
+        )
+    answer = send_request(rig, name, table, timeout_s)
     if json:
         typer.echo(orjson.dumps(answer))
     elif answer.get("status") != "error":
@@ -106,21 +117,6 @@ def exit_if_refused(answer: Mapping[str, Any]) -> None:
     if error.get("more"):
         typer.echo(f"and {error['more']} more faults", err=True)
     raise typer.Exit(EXIT_FAILED)
-
-
-def _table(text: str) -> dict[str, Any]:
-    try:
-        table = orjson.loads(text)
-    except orjson.JSONDecodeError as error:
-        raise ValueError(
-            f"the arguments are no JSON ({error}): expected an object in quotes, such as "
-            '\'{"device":"S1"}\''
-        ) from error
-    if not isinstance(table, dict):
-        raise ValueError(  # noqa: TRY004 - the text of a user
-            f'the arguments are {text}, expected a JSON object, such as {{"hz":50}}'
-        )
-    return table
 
 
 def _lines(answer: Mapping[str, Any]) -> list[str]:

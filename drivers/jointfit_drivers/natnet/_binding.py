@@ -100,7 +100,20 @@ def bind_model(
         Names in rig.toml, and the key of each.
     """
     shared, shared_bodies = _shared_ids(model, _MODELS), _shared_ids(model, natnet.BodyDescription)
-    all_bodies, all_markers = _body_entries(model), _marker_entries(model)
+
+    # All bodies, with those inside skeletons and assets.
+    all_bodies: list[ModelEntry] = []
+    for item in model.descriptions:
+        if isinstance(item, natnet.BodyDescription):
+            all_bodies.append(ModelEntry(item.id, "", item.name, 1))
+        elif isinstance(item, natnet.SkeletonDescription | natnet.AssetDescription):
+            inner = item.bones if isinstance(item, natnet.SkeletonDescription) else item.bodies
+            all_bodies += [
+                ModelEntry(body_key(item.id, body.id), item.name, body.name, number)
+                for number, body in enumerate(inner, 1)
+            ]
+
+    all_markers = _marker_entries(model)
     bodies_found = [e for e in all_bodies if e.owner or e.key not in shared_bodies]
     markers_found = [
         e for e in all_markers if not isinstance(e.key, int) or e.key >> _MEMBER_BITS not in shared
@@ -132,20 +145,6 @@ def body_key(owner: int, member: int) -> int:
 
 
 # --- entries of the model ---------------------------------------------------------------------
-
-
-def _body_entries(model: natnet.ModelDefinition) -> list[ModelEntry]:
-    found: list[ModelEntry] = []
-    for item in model.descriptions:
-        if isinstance(item, natnet.BodyDescription):
-            found.append(ModelEntry(item.id, "", item.name, 1))
-        elif isinstance(item, natnet.SkeletonDescription | natnet.AssetDescription):
-            inner = item.bones if isinstance(item, natnet.SkeletonDescription) else item.bodies
-            found += [
-                ModelEntry(body_key(item.id, body.id), item.name, body.name, number)
-                for number, body in enumerate(inner, 1)
-            ]
-    return found
 
 
 def _marker_entries(model: natnet.ModelDefinition) -> list[ModelEntry]:

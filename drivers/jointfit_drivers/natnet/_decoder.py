@@ -243,7 +243,14 @@ class NatNetDecoder:
         found = self._poses.columns(frame, binding)
         self.suspicious += found.suspicious
         if found.unknown:
-            self._warn_of_unknown(found.unknown, out)
+            # Warn of each unknown id once.
+            self.unknown_ids += len(found.unknown)
+            new = [i for i in found.unknown if i not in self._named_unknown]
+            if new and len(self._named_unknown) < _NAMED_UNKNOWN:
+                self._named_unknown.update(new)
+                names = ", ".join(f"{i >> 16}:{i & 0xFFFF}" for i in new[:_NAMED_UNKNOWN])
+                text = f"ids that are not in the model list are dropped: {names}"
+                out.append(DeviceEvent("warning", text, {"ids": new[:_NAMED_UNKNOWN]}))
         ticks = self._exposure_ticks(frame, out)
         out.append(
             MocapFrame(
@@ -288,13 +295,3 @@ class NatNetDecoder:
             self._live = live
             text = "live again" if live else "edit mode: the frames are a recording"
             out.append(DeviceEvent("setting", text, {"live": live}))
-
-    def _warn_of_unknown(self, unknown: tuple[int, ...], out: list[Decoded]) -> None:
-        """Append a warning that lists ids for the first time."""
-        self.unknown_ids += len(unknown)
-        new = [i for i in unknown if i not in self._named_unknown]
-        if new and len(self._named_unknown) < _NAMED_UNKNOWN:
-            self._named_unknown.update(new)
-            names = ", ".join(f"{i >> 16}:{i & 0xFFFF}" for i in new[:_NAMED_UNKNOWN])
-            text = f"ids that are not in the model list are dropped: {names}"
-            out.append(DeviceEvent("warning", text, {"ids": new[:_NAMED_UNKNOWN]}))

@@ -66,22 +66,7 @@ class PoseConverter:
     def columns(self, frame: FrameOfData, binding: Binding) -> FrameColumns:
         """Return `frame` in the columns of `binding`."""
         unknown: list[int] = []
-        markers = self._markers(frame, binding, unknown)
 
-        bodies, suspicious = self._bodies(frame, binding, unknown)
-        places = [bodies.get(key, _ABSENT) for key in binding.bodies]
-
-        return FrameColumns(
-            _array([markers.get(key, _NO_POSITION) for key in binding.markers], 3),
-            _array([place for place, _ in places], 3),
-            _array([turn for _, turn in places], 4),
-            suspicious,
-            tuple(unknown),
-        )
-
-    def _markers(
-        self, frame: FrameOfData, binding: Binding, unknown: list[int]
-    ) -> dict[Key, Vector]:
         place = self._place
         seen = self._labeled(frame, binding.known, unknown)
         for asset in frame.assets:
@@ -94,7 +79,17 @@ class PoseConverter:
                 for i, (x, y, z) in enumerate(marker_set.positions):
                     if (x or y or z) and _near(x, y, z):
                         seen[marker_set.name, i] = place(x, y, z)
-        return seen
+
+        bodies, suspicious = self._bodies(frame, binding, unknown)
+        places = [bodies.get(key, _ABSENT) for key in binding.bodies]
+
+        return FrameColumns(
+            _array([seen.get(key, _NO_POSITION) for key in binding.markers], 3),
+            _array([place for place, _ in places], 3),
+            _array([turn for _, turn in places], 4),
+            suspicious,
+            tuple(unknown),
+        )
 
     def _labeled(
         self, frame: FrameOfData, known: frozenset[Key], unknown: list[int]

@@ -96,14 +96,7 @@ class XbusHandshake:
         if not entered:
             await self._explain_silence()
 
-        await self._read_identity()
-        await self._ensure_outputs()
-        await self._ensure_sync()
-        reply = await self._answer(XbusMessageId.GOTO_MEASUREMENT)
-        self._refuse_error(reply, "refuses to start measuring")
-
-    async def _read_identity(self) -> None:
-        """Request the properties that the decoder reports; only the device id is required."""
+        # Properties that the decoder reports; only the device id is required.
         await self._answer(XbusMessageId.REQ_DEVICE_ID)
         for mid in (
             XbusMessageId.REQ_PRODUCT_CODE,
@@ -116,6 +109,11 @@ class XbusHandshake:
                 self._product_code = setup.decode_text(reply.data)
         for frame in _FRAMES:
             await self._conversation.request(XbusMessageId.ALIGNMENT_ROTATION, bytes((frame,)))
+
+        await self._ensure_outputs()
+        await self._ensure_sync()
+        reply = await self._answer(XbusMessageId.GOTO_MEASUREMENT)
+        self._refuse_error(reply, "refuses to start measuring")
 
     async def _answer(self, mid: int, data: bytes = b"") -> XbusMessage:
         """Return the reply to a request that the device must answer; it may be an error."""

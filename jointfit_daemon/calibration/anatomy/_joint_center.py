@@ -174,7 +174,14 @@ def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> Cen
     )
     if not np.isfinite(both.center).all():
         return found
-    return _replace_observed(found, both)
+
+    # Take center and covariance of `both` in the directions that both fits observed.
+    kept = both.unseen.T @ both.unseen
+    C = both.covariance + kept @ found.covariance @ kept
+    unseen = found.unseen.T @ found.unseen
+    across = np.eye(3) - unseen
+    center = across @ both.center + unseen @ found.center
+    return replace(found, center=center, covariance=across @ C @ across)
 
 
 def _markers(track: ClusterTrack) -> Array:
@@ -189,19 +196,6 @@ def _poses(track: ClusterTrack) -> BodyPoses:
     step = max(1, -(-len(track.q) // MAX_FRAMES))
     q, p = track.q[::step], track.p[::step]
     return BodyPoses(q, p - rotation.rotate(q, track.origin))
-
-
-def _replace_observed(found: CenterEstimate, both: CenterEstimate) -> CenterEstimate:
-    """Return `found` with the center and covariance of `both` in the directions that both observed.
-
-    `both` was placed at the center of `found` along its own unobserved direction.
-    """
-    kept = both.unseen.T @ both.unseen
-    C = both.covariance + kept @ found.covariance @ kept
-    unseen = found.unseen.T @ found.unseen
-    across = np.eye(3) - unseen
-    center = across @ both.center + unseen @ found.center
-    return replace(found, center=center, covariance=across @ C @ across)
 
 
 def carried_center_gap(parent: ClusterTrack, child: ClusterTrack, center: Array) -> float:

@@ -192,7 +192,15 @@ class LiveJointCenters:
         center = np.asarray(fit.center, dtype=np.float64)
         shown, axes, clear = np.zeros((3, 3)), np.eye(3), np.zeros(3, dtype=np.bool_)
         if len(fit.unseen) < 2 and np.isfinite(center).all():
-            shown = self._direction_spread(k, center)
+            # The mean square change of the marker directions, rad², shape (3, 3).
+            sums = centered(self._spheres[k].sums())
+            n = sums.weights
+            turned = (
+                np.einsum("jajb->jab", sums.M[:, 1:-1, :, 1:-1]) / np.maximum(n, 1.0)[:, None, None]
+            )
+            radius2 = ((sums.origin - center) ** 2).sum(axis=1) + np.einsum("jaa->j", turned)
+            weight = n / np.maximum(radius2, _ROUNDED_M2)
+            shown = np.asarray(np.einsum("j,jab->ab", weight, turned) / max(float(n.sum()), 1.0))
             spread, axes = np.linalg.eigh(shown)
             clear = np.asarray(spread >= MIN_DIRECTION_RAD**2)
             for axis in fit.unseen:
@@ -214,17 +222,6 @@ class LiveJointCenters:
         )  # fmt: skip
         observed = basis @ own @ basis.T
         return one, replace(fit, center=center, covariance=observed, unseen=rest, leverage=lever)
-
-    def _direction_spread(self, k: int, center: Array) -> Array:
-        """Return the mean square change of the marker directions, rad², shape (3, 3)."""
-        sums = centered(self._spheres[k].sums())
-        n = sums.weights
-        spread = (
-            np.einsum("jajb->jab", sums.M[:, 1:-1, :, 1:-1]) / np.maximum(n, 1.0)[:, None, None]
-        )
-        radius2 = ((sums.origin - center) ** 2).sum(axis=1) + np.einsum("jaa->j", spread)
-        weight = n / np.maximum(radius2, _ROUNDED_M2)
-        return np.asarray(np.einsum("j,jab->ab", weight, spread) / max(float(n.sum()), 1.0))
 
 
 def _finite(value: float) -> float:

@@ -130,23 +130,18 @@ def fit_sensor_alignment(
         return _judged(kind, (q_s, q_ref), rotation.IDENTITY, q_mount, 0.0)
 
     T = np.swapaxes(rotation.left_matrix(q_s), -1, -2) @ rotation.right_matrix(q_ref)
-    starts = _starts(q_s, q_ref, T)
-    return min(
-        (_solve(kind, q_s, q_ref, T[:, :, _columns(kind)], signs) for signs in starts),
-        key=lambda found: found.residual_scale,
-    )
 
-
-def _starts(q_s: Array, q_ref: Array, T: Array) -> tuple[Array, Array]:
-    """Return two initial guesses of the signs: from continuity in time, and independent of time.
-
-    Outliers break continuity; the second guess maximizes the similarity of the T_i.
-    """
+    # Two initial guesses of the signs: from continuity in time, which outliers break, and from
+    # the similarity of the T_i.
     steady = np.where(np.sum(rotation.continuous(q_s) * q_s, axis=1) < 0.0, -1.0, 1.0)
     steady *= np.where(np.sum(rotation.continuous(q_ref) * q_ref, axis=1) < 0.0, -1.0, 1.0)
     flat = T.reshape(len(T), 16)
     alike = np.linalg.eigh(flat.T @ flat)[1][:, -1]
-    return steady, np.where(flat @ alike < 0.0, -1.0, 1.0)
+    starts = (steady, np.where(flat @ alike < 0.0, -1.0, 1.0))
+    return min(
+        (_solve(kind, q_s, q_ref, T[:, :, _columns(kind)], signs) for signs in starts),
+        key=lambda found: found.residual_scale,
+    )
 
 
 def _solve(

@@ -98,7 +98,15 @@ class RunningCircle:
         A NaN (missing), or a weight not above zero, leaves a gap in time.
         """
         if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and 0.0 < weight < inf):
-            self._pass()
+            # Advance one frame without a measurement.
+            mu = self._forgetting
+            if mu < 1.0:
+                self._sums = _scaled(self._sums, mu)
+                self._lagged = _scaled(self._lagged, mu * mu)
+                self._squares *= mu * mu
+            self._before = (0.0, 0.0, 0.0)
+            if self._window is not None and self._kept and self._kept[-1][2] > 0.0:
+                self._kept.append((0.0, 0.0, 0.0))  # separates the frames before and after
             return
 
         if self._origin is None:
@@ -136,17 +144,6 @@ class RunningCircle:
         self._squares = mu * mu * self._squares + w * w
         self._lagged = _paired(self._lagged, mu * mu, (x, y, w), self._before)
         self._before = (x, y, w)
-
-    def _pass(self) -> None:
-        """Advance one frame without a measurement."""
-        mu = self._forgetting
-        if mu < 1.0:
-            self._sums = _scaled(self._sums, mu)
-            self._lagged = _scaled(self._lagged, mu * mu)
-            self._squares *= mu * mu
-        self._before = (0.0, 0.0, 0.0)
-        if self._window is not None and self._kept and self._kept[-1][2] > 0.0:
-            self._kept.append((0.0, 0.0, 0.0))  # separates the frames before and after
 
     def _slide(self, frame: Kept) -> None:
         """Remove the oldest frame; recompute sums every `_RESUM_FRAMES` to limit rounding."""

@@ -150,7 +150,12 @@ def two_sided_estimate(
     found = _answer(name, fit, Vt, _arc(*poses), near, posture=posture)
     if markers is None or not np.isfinite(found.center).all():
         return found
-    return replace(found, radii=_radii(markers[1] - fit.point[3:], Vt[len(fit.score) :, 3:]))
+
+    # The distances of markers from the center, m; across the axis (rows) of a hinge.
+    away = markers[1] - fit.point[3:]
+    axis = Vt[len(fit.score) :, 3:]
+    along = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)
+    return replace(found, radii=np.asarray(np.linalg.norm(away - away @ along.T @ along, axis=1)))
 
 
 def _answer(
@@ -195,12 +200,6 @@ def _answer(
         within95=within95(rank - 3, 3.0 * n * (1 - rho) / (1 + rho) - 6.0),
         refused=objection(arc, LEVER_M, conditioning, SphereLimits()),
     )
-
-
-def _radii(away: Array, axis: Array) -> Array:
-    """Return the distances of markers from the center, m; across the axis (rows) of a hinge."""
-    along = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)
-    return np.asarray(np.linalg.norm(away - away @ along.T @ along, axis=1))
 
 
 def _covariances(

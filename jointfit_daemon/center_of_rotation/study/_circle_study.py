@@ -127,7 +127,19 @@ def run_study(
         lines = []
         for row in rows:
             radius, noise, step = np.broadcast_arrays(*cells(float(row)))
-            lines.append(_line(setup, rng, radius, noise, step))
+
+            # All results of one row of cells, each of shape (cells,).
+            three = _noisy(rng, radius, noise, step[:, None] * np.arange(3.0), setup.repeats)
+            few = three[:, : setup.grid_repeats]
+            results = {
+                "predicted": equal_step_error(step, noise),
+                "three frames": _rms(three_frame_center(three)),
+            }
+
+            for word, offset in (("grid", 0.0), ("shifted grid", 0.5 * setup.node)):
+                nodes = Grid((offset, offset), setup.box, setup.node)
+                results[word] = _rms(grid_center(few, nodes))
+            lines.append(results | _all_frames(setup, rng, radius, noise, step))
             done += 1
             if on_progress is not None:
                 on_progress(done / total)
@@ -166,24 +178,6 @@ def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool
     if c >= 1.0 or along <= 0.0 or frames <= 0:  # no arc, or an arc within rounding
         return float("inf")
     return float(noise * np.sqrt((2.0 / (1.0 - c) + 2.0 / along) / frames))
-
-
-def _line(
-    setup: StudySetup, rng: np.random.Generator, radius: Array, noise: Array, step: Array
-) -> dict[str, Array]:
-    """Return all results of one row of cells, each of shape (cells,)."""
-    three = _noisy(rng, radius, noise, step[:, None] * np.arange(3.0), setup.repeats)
-    few = three[:, : setup.grid_repeats]
-    line = {
-        "predicted": equal_step_error(step, noise),
-        "three frames": _rms(three_frame_center(three)),
-    }
-
-    for key, offset in (("grid", 0.0), ("shifted grid", 0.5 * setup.node)):
-        nodes = Grid((offset, offset), setup.box, setup.node)
-        line[key] = _rms(grid_center(few, nodes))
-
-    return line | _all_frames(setup, rng, radius, noise, step)
 
 
 def _all_frames(

@@ -204,21 +204,16 @@ def _wrong_values(what: str, label: str, row: dict[str, Any]) -> list[str]:
     ]
 
     if what == "marker":
-        wrong += _wrong_marker(label, row)
+        wrong += [] if "position" in row else [f"{label}: needs a position"]
+        locked = row.get("locked", "")
+        if isinstance(locked, str) and not set(locked) <= set(_AXES):
+            wrong.append(f'{label}: locked names axes such as "x" or "xyz", is {locked!r}')
+        if not _are_numbers([row.get("weight", 1.0)], 1):
+            wrong.append(f"{label}: weight must be a number, is {row['weight']!r}")
     elif isinstance(row.get("joint", "free"), str) and row.get("joint", "free") not in get_args(
         JointKind
     ):
         wrong.append(f"{label}: joint {row['joint']!r}, expected {', '.join(get_args(JointKind))}")
-    return wrong
-
-
-def _wrong_marker(label: str, row: dict[str, Any]) -> list[str]:
-    wrong = [] if "position" in row else [f"{label}: needs a position"]
-    locked = row.get("locked", "")
-    if isinstance(locked, str) and not set(locked) <= set(_AXES):
-        wrong.append(f'{label}: locked names axes such as "x" or "xyz", is {locked!r}')
-    if not _are_numbers([row.get("weight", 1.0)], 1):
-        wrong.append(f"{label}: weight must be a number, is {row['weight']!r}")
     return wrong
 
 

@@ -187,14 +187,8 @@ class SlipDetector:
         uncorrected = (rx + correction * ux, ry + correction * uy, rz + correction * uz)
 
         self._smooth_differences(t_ns, uncorrected, residual, tilt, usual=usual)
-        self._update_excess(residual, usual)
-        self.changed = self._debouncer.update(t_ns, self.distance, self.limit)
 
-    def _update_excess(self, residual: Vector, usual: float) -> None:
-        """Compute the excess of the current frame, of the mean, and of the recent change.
-
-        A soft-tissue artefact may cancel a slip in one frame, but rarely in its change as well.
-        """
+        # The excess of the current frame, of the mean, and of the recent change.
         length = hypot(*residual)
         beyond = max(0.0, length - USUAL_FACTOR * usual)
         self.exceeded = beyond > 0.0
@@ -207,6 +201,8 @@ class SlipDetector:
         change = hypot(residual[0] - x, residual[1] - y, residual[2] - z) - USUAL_FACTOR * usual
         mean = hypot(*self._mean) - USUAL_MEAN_FACTOR * usual
         self.excess = max(beyond, change, mean)
+
+        self.changed = self._debouncer.update(t_ns, self.distance, self.limit)
 
     def _smooth_differences(
         self, t_ns: int, uncorrected: Vector, residual: Vector, tilt: Vector, *, usual: float

@@ -106,7 +106,14 @@ class ChainModel:
     name: str = "chain"
 
     def __post_init__(self) -> None:
-        wrong = [*_wrong_segments(self.segments), *_wrong_markers(self.segments, self.markers)]
+        names = [s.name for s in self.segments]
+        wrong = _doubled("segment", names) if names else ["no segments"]
+        for i, s in enumerate(self.segments):
+            if s.parent is not None and s.parent not in names[:i]:
+                known = "after it" if s.parent in names else "unknown"
+                wrong.append(f"segment {s.name!r}: its parent {s.parent!r} is {known}")
+            wrong += [f"segment {s.name!r}: {reason}" for reason in _wrong_joint(s)]
+        wrong = [*wrong, *_wrong_markers(self.segments, self.markers)]
         if wrong:
             raise InvalidChainModelError(f"{self.name}: {'; '.join(wrong)}")
 
@@ -208,17 +215,6 @@ class ChainModel:
 
 def _doubled(what: str, names: Sequence[str]) -> list[str]:
     return [f"{what} {name!r} twice" for name, n in Counter(names).items() if n > 1]
-
-
-def _wrong_segments(segments: tuple[Segment, ...]) -> list[str]:
-    names = [s.name for s in segments]
-    wrong = _doubled("segment", names) if names else ["no segments"]
-    for i, s in enumerate(segments):
-        if s.parent is not None and s.parent not in names[:i]:
-            known = "after it" if s.parent in names else "unknown"
-            wrong.append(f"segment {s.name!r}: its parent {s.parent!r} is {known}")
-        wrong += [f"segment {s.name!r}: {reason}" for reason in _wrong_joint(s)]
-    return wrong
 
 
 def _wrong_joint(s: Segment) -> list[str]:

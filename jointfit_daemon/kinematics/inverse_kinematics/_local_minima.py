@@ -81,12 +81,22 @@ def restart_local_minima(
     trial = _Trial(model, measured, checked_weights(model, weights, seen), options or IkOptions())
     best = _Best(trial, deepcopy(found))
 
+    # The instants with an error well above that of their surroundings.
+    rms = np.sqrt(best.cost / np.maximum(trial.weights.sum(axis=1), 1e-12))
+    usual = median_filter(rms, size=min(_SURROUNDINGS, max(len(rms), 1)), mode="nearest")
     probes = np.union1d(
-        np.flatnonzero(_jumps(best.cost, trial.weights)),
+        np.flatnonzero((rms > _JUMP * usual) & (rms > usual + _JUMP_M)),
         np.linspace(0, len(measured) - 1, min(_PROBES, len(measured))).astype(np.intp),
     )
     for k in range(_POSES if len(measured) else 0):
-        start = apply_step(model, best.result.state.take(probes), _perturbation(model, k, probes))
+        # The k-th perturbation of the rotations, rad, shape (len(probes), nq).
+        layout = layout_of(model)
+        numbers = np.arange(1, model.nq + 1) * (k + 1) * _GOLDEN
+        step = _PERTURBATION * (2.0 * (numbers % 1.0) - 1.0)
+        step[layout.shifts] = 0.0
+        start = apply_step(
+            model, best.result.state.take(probes), np.broadcast_to(step, (len(probes), model.nq))
+        )
         best.try_from(probes, start)
 
     # the wave ends where the start from the neighbor is no improvement
@@ -145,19 +155,3 @@ class _Best:
             if f.name != "state":
                 getattr(self.result, f.name)[to] = getattr(new, f.name)[better]
         return better
-
-
-def _jumps(cost: Array, weights: Array) -> NDArray[np.bool_]:
-    """Return the instants with an error well above that of their surroundings."""
-    rms = np.sqrt(cost / np.maximum(weights.sum(axis=1), 1e-12))
-    usual = median_filter(rms, size=min(_SURROUNDINGS, max(len(rms), 1)), mode="nearest")
-    return np.asarray((rms > _JUMP * usual) & (rms > usual + _JUMP_M))
-
-
-def _perturbation(model: ChainModel, k: int, at: NDArray[np.intp]) -> Array:
-    """Return the k-th perturbation of the rotations, rad, shape (len(at), nq)."""
-    layout = layout_of(model)
-    numbers = np.arange(1, model.nq + 1) * (k + 1) * _GOLDEN
-    step = _PERTURBATION * (2.0 * (numbers % 1.0) - 1.0)
-    step[layout.shifts] = 0.0
-    return np.broadcast_to(step, (len(at), model.nq))

@@ -220,16 +220,6 @@ class MqttPublisher:
         await self._pause()
         return True
 
-    async def _await_other_daemon(self) -> None:
-        """Wait, before the first connection, until no other daemon publishes below this base.
-
-        A connection takes over the client id, and the broker then publishes the will of the other
-        daemon. A fault of the broker is reported by the attempt that follows.
-        """
-        with contextlib.suppress(BrokerLostError):
-            if await is_in_use(self._settings, OFFLINE):
-                await self._pause()
-
     async def _pause(self) -> None:
         log.error("mqtt: %s. Publishing is paused until the other client is gone", self._contested)
         await await_departure(self._settings, OFFLINE)
@@ -262,7 +252,11 @@ class MqttPublisher:
         TaskGroup appears cancelled from then on.
         """
         if self.connects == 0:
-            await self._await_other_daemon()
+            # A connection takes over the client id, and the broker then publishes the will of
+            # another daemon. A fault of the broker is reported by the attempt that follows.
+            with contextlib.suppress(BrokerLostError):
+                if await is_in_use(self._settings, OFFLINE):
+                    await self._pause()
 
         will = Outgoing(self._outbox.state_topic, OFFLINE, 1, retain=True)
         name = topics.client_identifier(self._base)
@@ -311,24 +305,22 @@ class MqttPublisher:
         sent()
         self.sent += 1
         if message.qos and self._modern:
-            self._note_acknowledgement(message.topic, refusal)
+            # Log a change of whether the broker accepts messages on this topic.
+            topic = message.topic
+            if topic.startswith(responses := topics.RESPONSE.name(self._base)):
+                topic = responses + "#"  # clients choose the last levels: one entry for all
+
+            if refusal is None:
+                self.denied.discard(topic)
+            elif topic not in self.denied:
+                self.denied.add(topic)
+                log.warning(
+                    "mqtt: the broker refuses messages on %s (%s): allow them in its ACL",
+                    topic,
+                    refusal,
+                )
         if (echo := self._echoes.get(message.topic)) is not None:
             echo.sent.set()
-
-    def _note_acknowledgement(self, topic: str, refusal: str | None) -> None:
-        """Note whether the broker accepted a message on `topic`; log a change."""
-        if topic.startswith(responses := topics.RESPONSE.name(self._base)):
-            topic = responses + "#"  # clients choose the last levels, so all of them have one entry
-
-        if refusal is None:
-            self.denied.discard(topic)
-        elif topic not in self.denied:
-            self.denied.add(topic)
-            log.warning(
-                "mqtt: the broker refuses messages on %s (%s): allow them in its ACL",
-                topic,
-                refusal,
-            )
 
     async def _subscribe(self, connection: MqttConnection) -> None:
         wanted = [f"{self._requests}+", *self._echoes, *filter(None, [self._birth])]

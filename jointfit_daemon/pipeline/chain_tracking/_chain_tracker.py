@@ -92,7 +92,17 @@ class ChainTracker:
         """Return the state of the model in a live frame, if one is due, and notices."""
         if not self._rate.is_due(t_ns):
             return []
-        measured = self._markers(frame)
+
+        # The markers of the model in a frame, m, shape (M, 3); NaN where missing.
+        if frame.layout is not self._layout:
+            self._layout = frame.layout
+            column = {name: k for k, name in enumerate(frame.layout.markers)}
+            self._columns = [column.get(name) for name in self._model.marker_names]
+        padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
+        found = padded[[-1 if column is None else column for column in self._columns]]
+        possible = (np.abs(found) < FARTHEST_M).all(axis=1, keepdims=True)
+        measured = np.where(possible, found, np.nan)
+
         seen: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=1))
         reports = self._monitor.see(t_ns, seen)
         used: NDArray[np.bool_] = seen & ~self._monitor.excluded & (self._model.weights > 0.0)
@@ -111,17 +121,6 @@ class ChainTracker:
         fit = self._errors(t_ns, distances[used])
         state = self._state(t_ns, frame, self._values(pose), shown, fit)
         return [state, *_notices(t_ns, [*reports, *faults])]
-
-    def _markers(self, frame: MocapFrame) -> Array:
-        """Return the markers of the model in a frame, m, shape (M, 3); NaN where missing."""
-        if frame.layout is not self._layout:
-            self._layout = frame.layout
-            column = {name: k for k, name in enumerate(frame.layout.markers)}
-            self._columns = [column.get(name) for name in self._model.marker_names]
-        padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
-        found = padded[[-1 if column is None else column for column in self._columns]]
-        possible = (np.abs(found) < FARTHEST_M).all(axis=1, keepdims=True)
-        return np.where(possible, found, np.nan)
 
     def _values(self, pose: LivePose) -> tuple[ModelCoordinate, ...]:
         values, sd = self._coordinates.read(pose.state, pose.covariance)

@@ -116,7 +116,19 @@ class OnlineFrameCollector:
             return
         if frame.layout is not self._layout:
             self._layout = frame.layout
-            self._find_columns(frame.layout)
+
+            # The markers or the rigid body of every cluster in the new layout.
+            columns, missing = [], []
+            for markers, body in self._clusters:
+                known, names = (
+                    (frame.layout.markers, markers)
+                    if body is None
+                    else (frame.layout.bodies, (body,))
+                )
+                missing += [name for name in names if name not in known]
+                columns.append([known.index(name) for name in names if name in known])
+            self._missing = list(dict.fromkeys(missing))
+            self._columns = None if missing else columns
         if epoch != self._epoch:
             self._clear()
             self._epoch = epoch
@@ -130,7 +142,18 @@ class OnlineFrameCollector:
             frame.markers[columns] if body is None else frame.body_orientations[columns[0]]
             for columns, (_, body) in zip(self._columns, self._clusters, strict=True)
         ]
-        invisible = self._invisible_names(mocap)
+
+        # Markers and bodies that are not visible; mostly none.
+        invisible = []
+        for x, (markers, body) in zip(mocap, self._clusters, strict=True):
+            if np.isfinite(x).all():
+                continue
+            if body is not None:
+                invisible.append(body)
+            else:
+                visible = np.isfinite(x.sum(axis=1)).tolist()
+                invisible += [n for n, seen in zip(markers, visible, strict=True) if not seen]
+        invisible = list(dict.fromkeys(invisible))  # clusters may share markers
         if not invisible:
             self._waiting.append((t_ns, mocap))
             return
@@ -179,29 +202,6 @@ class OnlineFrameCollector:
         )
 
     # --- mocap names -------------------------------------------------------------------------
-
-    def _find_columns(self, layout: MocapLayout) -> None:
-        """Find the markers or the rigid body of every cluster in a new layout of the stream."""
-        columns, missing = [], []
-        for markers, body in self._clusters:
-            known, names = (layout.markers, markers) if body is None else (layout.bodies, (body,))
-            missing += [name for name in names if name not in known]
-            columns.append([known.index(name) for name in names if name in known])
-        self._missing = list(dict.fromkeys(missing))
-        self._columns = None if missing else columns
-
-    def _invisible_names(self, mocap: list[Array]) -> list[str]:
-        """Return markers and bodies that are not visible; mostly none."""
-        invisible = []
-        for x, (markers, body) in zip(mocap, self._clusters, strict=True):
-            if np.isfinite(x).all():
-                continue
-            if body is not None:
-                invisible.append(body)
-            else:
-                visible = np.isfinite(x.sum(axis=1)).tolist()
-                invisible += [n for n, seen in zip(markers, visible, strict=True) if not seen]
-        return list(dict.fromkeys(invisible))  # clusters may share markers
 
     # --- pairs -------------------------------------------------------------------------------
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.pipeline.health import LearningHealth, LearningState
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.pipeline.events import JobFinished
     from jointfit_daemon.pipeline.online_learning._frame_collector import OnlineFrameCollector
@@ -44,7 +42,15 @@ class OnlineRefits:
             text = f"models unchanged: {event.failure}"
             return RefitOutcome(None, Notice(event.t_ns, kind, "online", text, NoticeLevel.WARNING))
 
-        info, data = NoticeLevel.INFO, _notice_data(result.quality.get("online", {}))
+        # The data of the notice: errors in degrees, to four digits.
+        quality = result.quality.get("online", {})
+        data: dict[str, object] = {
+            key: quality[key] for key in ("frames", "judged") if key in quality
+        }
+        for when in ("before", "after"):
+            errors = quality.get(f"{when}_rad", {})
+            data[f"{when}_deg"] = {n: float(f"{math.degrees(x):.4g}") for n, x in errors.items()}
+        info = NoticeLevel.INFO
         if (found := result.calibration) is None:
             text = f"models unchanged: {result.kept}"
             return RefitOutcome(None, Notice(event.t_ns, kind, "online", text, info, data))
@@ -84,15 +90,6 @@ class OnlineRefits:
             memory=old.memory,
             quality=quality,
         )
-
-
-def _notice_data(quality: Mapping[str, Any]) -> dict[str, object]:
-    """Return the data of the notice: errors in degrees, to four digits."""
-    data: dict[str, object] = {key: quality[key] for key in ("frames", "judged") if key in quality}
-    for when in ("before", "after"):
-        errors = quality.get(f"{when}_rad", {})
-        data[f"{when}_deg"] = {n: float(f"{math.degrees(x):.4g}") for n, x in errors.items()}
-    return data
 
 
 def only_models_differ(before: Calibration, after: Calibration) -> bool:

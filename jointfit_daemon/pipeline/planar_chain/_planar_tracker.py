@@ -142,7 +142,19 @@ class PlanarTracker:
         learned, shown = self._learned.is_due(t_ns), self._shown.is_due(t_ns)
         if not (learned or shown):
             return []
-        measured = self._markers(frame)
+
+        # The markers of every part, m, shape (m, 3); NaN where missing.
+        if frame.layout is not self._layout:
+            self._layout = frame.layout
+            column = {name: k for k, name in enumerate(frame.layout.markers)}
+            self._columns = [column.get(name, -1) for name in self._names]
+        padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
+        found = padded[self._columns]
+        possible = (np.abs(found) < FARTHEST_M).all(axis=1, keepdims=True)
+        found = np.where(possible, found, np.nan)
+        ends = np.cumsum([len(part.markers) for part in self._parts.values()])[:-1]
+        measured = dict(zip(self._parts, np.split(found, ends), strict=True))
+
         notices: list[Output] = []
         fitted = learned and self._fitted.is_due(t_ns)
         if learned:
@@ -154,19 +166,6 @@ class PlanarTracker:
         if learned and self._basis is not None:
             self._learn(measured, poses, fit=fitted)
         return [*notices, self._figure(t_ns, frame, measured, poses)] if shown else notices
-
-    def _markers(self, frame: MocapFrame) -> dict[str, Array]:
-        """Return the markers of every part, m, shape (m, 3); NaN where missing."""
-        if frame.layout is not self._layout:
-            self._layout = frame.layout
-            column = {name: k for k, name in enumerate(frame.layout.markers)}
-            self._columns = [column.get(name, -1) for name in self._names]
-        padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
-        found = padded[self._columns]
-        possible = (np.abs(found) < FARTHEST_M).all(axis=1, keepdims=True)
-        found = np.where(possible, found, np.nan)
-        ends = np.cumsum([len(part.markers) for part in self._parts.values()])[:-1]
-        return dict(zip(self._parts, np.split(found, ends), strict=True))
 
     def _update_plane(self, t_ns: int) -> list[Output]:
         """Use the first plane, and another one if the movement has changed its plane."""

@@ -194,7 +194,10 @@ class SourceState:
             if isinstance(item, ClockEcho):
                 clock.feed_echo(item, tick_clock)
             elif isinstance(item, SyncPulse):
-                self._add_pulse(item, tick_clock)
+                own_ns = clock.edge_ns(item.ticks, tick_clock)
+                if own_ns is not None and clock.settled:
+                    edge = Edge(clock.host_ns(own_ns), own_ns)
+                    self.lines.add_edge(item.line, self.source.id, clock, edge)
             else:
                 self._count(item)
                 items.append(item)
@@ -221,13 +224,6 @@ class SourceState:
             edge = Edge(clock.host_ns(clock.last_u), clock.last_u)
             self.lines.add_exposure(number, self.source.id, clock, edge)
         return StampedMeasurement(item, stamp)
-
-    def _add_pulse(self, pulse: SyncPulse, tick_clock: TickClock | None) -> None:
-        clock = self.clock
-        own_ns = clock.edge_ns(pulse.ticks, tick_clock)
-        if own_ns is not None and clock.settled:
-            edge = Edge(clock.host_ns(own_ns), own_ns)
-            self.lines.add_edge(pulse.line, self.source.id, clock, edge)
 
     def _clock_events(self) -> list[DeviceEvent]:
         """Return the events of the clock, and count its restarts."""

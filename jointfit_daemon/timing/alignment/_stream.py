@@ -238,7 +238,14 @@ class Stream:
         if after < len(samples):
             b = samples[after]
             if b.t_ns - a.t_ns <= self._gap_ns:
-                return self._between(self._before(last), a, b, t_ns)
+                before = self._before(last)
+                a.used = b.used = True
+                self.synced = a.synced and b.synced
+                if before is not None and before.synced is a.synced:
+                    before.used = True
+                else:
+                    before = None
+                return _interpolation.interpolate_orientation(before, a, b, t_ns)
         if t_ns - a.t_ns > self._reach_ns:
             return None
         return self._beyond(last, t_ns)
@@ -250,15 +257,6 @@ class Stream:
         before = self._samples[at - 1]
         apart_ns = self._samples[at].t_ns - before.t_ns
         return before if self._crowded_ns <= apart_ns <= self._gap_ns else None
-
-    def _between(self, before: _Sample | None, a: _Sample, b: _Sample, t_ns: int) -> Quaternion:
-        a.used = b.used = True
-        self.synced = a.synced and b.synced
-        if before is not None and before.synced is a.synced:
-            before.used = True
-        else:
-            before = None
-        return _interpolation.interpolate_orientation(before, a, b, t_ns)
 
     def _beyond(self, last: int, t_ns: int) -> Quaternion | None:
         before = self._before(last)

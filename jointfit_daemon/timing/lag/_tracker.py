@@ -82,7 +82,16 @@ class LagTracker:
         innovation = tau - self._tau
         if abs(innovation) <= GATE_SIGMAS * sqrt(self._tt + variance):
             self._refused.clear()
-            self._update(innovation, variance)
+
+            # Kalman update of lag and drift.
+            total = self._tt + variance
+            gain, drift_gain = self._tt / total, self._pt / total
+            self._tau += gain * innovation
+            self._drift += drift_gain * innovation
+            self._pp -= drift_gain * self._pt
+            self._pt -= gain * self._pt
+            self._tt -= gain * self._tt
+
             return self._now()
 
         self._refused = [*self._refused[-(STEP_WINDOWS - 1) :], tau]
@@ -104,15 +113,6 @@ class LagTracker:
         self._t_ns, self._tau, self._drift = t_ns, tau, 0.0
         self._tt, self._pt, self._pp = variance, 0.0, DRIFT_SD**2
         self._refused = []
-
-    def _update(self, innovation: float, variance: float) -> None:
-        total = self._tt + variance
-        gain, drift_gain = self._tt / total, self._pt / total
-        self._tau += gain * innovation
-        self._drift += drift_gain * innovation
-        self._pp -= drift_gain * self._pt
-        self._pt -= gain * self._pt
-        self._tt -= gain * self._tt
 
     def _now(self, step_ns: float | None = None) -> TrackedLag | None:
         if self._t_ns is None:

@@ -31,10 +31,13 @@ def list_versions(config: Path, *, json: bool) -> None:
     for version in data["versions"]:
         in_force = "*" if version["version"] == data["in_force"] else ""
         date = (version["created_utc"] or "unknown")[:19]
+
+        found = {**version["segments_deg"], **version["flexion_deg"]}
+        shown = [f"{name} {error:.1f}°" for name, error in found.items() if error is not None]
         rows.append(
             (
                 in_force, str(version["version"]), date, version["method"] or "–",
-                _errors(version), _note(version),
+                ", ".join(shown) or "–", _note(version),
             )
         )  # fmt: skip
     typer.echo(align_columns(rows, right=(1,)))
@@ -49,12 +52,6 @@ def use_version(config: Path, version: int | None, *, json: bool) -> None:
     exit_if_refused(answer)
     data: Mapping[str, Any] = answer["data"]
     typer.echo(orjson.dumps(data) if json else f"version {data['version']} is in force")
-
-
-def _errors(version: Mapping[str, Any]) -> str:
-    found = {**version["segments_deg"], **version["flexion_deg"]}
-    shown = [f"{name} {error:.1f}°" for name, error in found.items() if error is not None]
-    return ", ".join(shown) or "–"
 
 
 def _note(version: Mapping[str, Any]) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -130,8 +130,6 @@ async def _listen(client: MqttClient, tracker: PhaseTracker, online: set[str]) -
         if topic == "calibration":
             tracker.on_status(payload)
         elif topic.endswith("/availability"):
-            _note_device(online, topic.split("/")[1], payload)
-
-
-def _note_device(online: set[str], device: str, payload: dict[str, Any]) -> None:
-    (online.add if payload.get("state") == "online" else online.discard)(device)
+            (online.add if payload.get("state") == "online" else online.discard)(
+                topic.split("/")[1]
+            )

@@ -62,7 +62,8 @@ def find_serial_ports(root: Path = Path("/")) -> list[SerialPortInfo]:
         if not (tty / "device").exists() or _is_empty_socket(tty):
             continue  # consoles and pseudo-terminals have no device
         hardware = (tty / "device").resolve()
-        usb = _usb_device(hardware)
+        # The USB device that contains the port; None for other buses.
+        usb = next((up for up in (hardware, *hardware.parents) if (up / "idVendor").exists()), None)
         driver = hardware / "driver"
         found.append(
             SerialPortInfo(
@@ -84,11 +85,6 @@ def find_serial_ports(root: Path = Path("/")) -> list[SerialPortInfo]:
 def _is_empty_socket(tty: Path) -> bool:
     """Return whether the kernel reserves the name without hardware: type 0, PORT_UNKNOWN."""
     return read_number(tty / "type") == 0
-
-
-def _usb_device(hardware: Path) -> Path | None:
-    """Return the USB device that contains the port; None for other buses."""
-    return next((up for up in (hardware, *hardware.parents) if (up / "idVendor").exists()), None)
 
 
 def _links(root: Path, kind: str) -> dict[str, str]:

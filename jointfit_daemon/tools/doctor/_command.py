@@ -97,7 +97,10 @@ def examine(
     ]
     progress(0.2)
     if rig is None:
-        return [*findings, _without_rig()]
+        from jointfit_daemon.device_search import Finding
+
+        text = "no rig.toml: broker and cameras were not checked"
+        return [*findings, Finding("rig", "", "unknown", text, "jointfit doctor --config rig.toml")]
 
     from jointfit_daemon.tools.doctor._broker_checks import check_broker
 
@@ -111,13 +114,6 @@ def examine(
             findings += of_host.check_firewall(host, server)
     progress(1.0)
     return findings
-
-
-def _without_rig() -> Finding:
-    from jointfit_daemon.device_search import Finding
-
-    text = "no rig.toml: broker and cameras were not checked"
-    return Finding("rig", "", "unknown", text, "jointfit doctor --config rig.toml")
 
 
 async def _diagnose(cameras: Source, wait_s: float) -> list[Finding]:

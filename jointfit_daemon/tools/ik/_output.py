@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from jointfit_daemon.arrays import Array
     from jointfit_daemon.tools.ik._solution import TrialSolution
 
 ENDINGS = (".mot", ".sto", ".csv")
@@ -71,11 +70,10 @@ def write_errors(path: Path, found: TrialSolution) -> WrittenTable:
 
 def _write(path: Path, table: TimeTable) -> WrittenTable:
     if path.suffix.lower() == ".csv":
-        _write_csv(path, table.columns, np.column_stack((table.t_s, table.values)))
+        lines = [
+            ",".join(("time", *table.columns)),
+            *(",".join(map(written, row)) for row in np.column_stack((table.t_s, table.values))),
+        ]
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return WrittenTable(path, len(table.t_s))
     return write_known_values(path, table)
-
-
-def _write_csv(path: Path, columns: tuple[str, ...], rows: Array) -> None:
-    lines = [",".join(("time", *columns)), *(",".join(map(written, row)) for row in rows)]
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

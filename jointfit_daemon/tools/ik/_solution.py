@@ -112,7 +112,19 @@ def solve_trial(asked: IkRequest) -> TrialSolution:
     weights, notes = _weights(asked, setup, model)
     notes = [*loaded.remarks, *trial.trajectories.warnings, *notes]
 
-    part = _time_range(asked, setup, trial)
+    # The frames in the time range; options take precedence over the set-up file.
+    t_s = trial.trajectories.t_s
+    given = setup.time_range or (-np.inf, np.inf)
+    low, high = (g if a is None else a for g, a in zip(given, asked.span, strict=True))
+    half = 0.5 / trial.trajectories.rate_hz
+    inside = (t_s >= low - 1e-3 * half) & (t_s <= high + 1e-3 * half)
+    if not inside.any():
+        raise ValueError(
+            f"{asked.trial}: no frame between {low:g} and {high:g} s: the trial lasts from"
+            f" {t_s.min():g} to {t_s.max():g} s: change --start, --end or the set-up file"
+        )
+    part = np.asarray(inside)
+
     targets = motion_trial(asked.trial.stem, trial, model).targets[part]
     targets[:, weights == 0.0] = np.nan
     motion = MotionTrial(asked.trial.stem, targets, trial.trajectories.rate_hz)
@@ -121,7 +133,22 @@ def solve_trial(asked: IkRequest) -> TrialSolution:
     options = IkOptions(limit_m2=_LIMIT_M2 if asked.use_limits else 0.0)
     found = solve_frames(model, targets, weights, options=options)
     found, improved = restart_local_minima(model, targets, weights, found, options)
-    notes += _check_fit(motion, found, model)
+
+    # Remarks on exchanged labels; `RefinementError` if the model does not fit.
+    remarks = []
+    for group, frames in exchanged_markers(found.residuals, motion.targets).items():
+        text = exchange_text(model, group)
+        remarks.append(f"{text} in {int(frames.sum())} frames: correct their labels")
+
+    square = np.einsum("tmi,tmi->tm", found.residuals, found.residuals)
+    rms = float(np.sqrt(np.nanmean(square)))
+    if rms > MOST_RMS_M:
+        raise RefinementError(
+            f"{motion.name}: the model is {1000 * rms:.0f} mm RMS off its markers, expected less"
+            f" than {1000 * MOST_RMS_M:.0f} mm: check labels, scaling and axes (--up)"
+            + "".join(f"; {note}" for note in remarks)
+        )
+    notes += remarks
     return _described(loaded, motion, trial.trajectories.t_s[part], (found, improved, notes))
 
 
@@ -157,21 +184,6 @@ def _weights(asked: IkRequest, setup: IkSetup, model: ChainModel) -> tuple[Array
     return weights, notes
 
 
-def _time_range(asked: IkRequest, setup: IkSetup, trial: MarkerTrial) -> NDArray[np.bool_]:
-    """Return the frames in the time range; options take precedence over the set-up file."""
-    t_s = trial.trajectories.t_s
-    given = setup.time_range or (-np.inf, np.inf)
-    low, high = (g if a is None else a for g, a in zip(given, asked.span, strict=True))
-    half = 0.5 / trial.trajectories.rate_hz
-    inside = (t_s >= low - 1e-3 * half) & (t_s <= high + 1e-3 * half)
-    if not inside.any():
-        raise ValueError(
-            f"{asked.trial}: no frame between {low:g} and {high:g} s: the trial lasts from"
-            f" {t_s.min():g} to {t_s.max():g} s: change --start, --end or the set-up file"
-        )
-    return np.asarray(inside)
-
-
 def _check(
     asked: IkRequest, model: ChainModel, motion: MotionTrial, trial: MarkerTrial, weights: Array
 ) -> list[str]:
@@ -189,24 +201,6 @@ def _check(
         raise RefinementError("; ".join(faults))
     absent = [m.name for m, s, w in zip(model.markers, seen, weights, strict=True) if not s and w]
     return [f"not in the trial: {list_names(absent)}"] if absent else []
-
-
-def _check_fit(motion: MotionTrial, found: IkResult, model: ChainModel) -> list[str]:
-    """Return notes on exchanged labels; `RefinementError` if the model does not fit."""
-    notes = []
-    for group, frames in exchanged_markers(found.residuals, motion.targets).items():
-        text = exchange_text(model, group)
-        notes.append(f"{text} in {int(frames.sum())} frames: correct their labels")
-
-    square = np.einsum("tmi,tmi->tm", found.residuals, found.residuals)
-    rms = float(np.sqrt(np.nanmean(square)))
-    if rms > MOST_RMS_M:
-        raise RefinementError(
-            f"{motion.name}: the model is {1000 * rms:.0f} mm RMS off its markers, expected less"
-            f" than {1000 * MOST_RMS_M:.0f} mm: check labels, scaling and axes (--up)"
-            + "".join(f"; {note}" for note in notes)
-        )
-    return notes
 
 
 def _described(

@@ -29,7 +29,18 @@ def write_markers(path: Path, before: ChainModel, after: ChainModel) -> None:
     """Write the markers; the file extension selects the format."""
     kind = path.suffix.lower()
     if kind == ".xml":
-        _write_marker_set(path, after)
+        root = ET.Element("OpenSimDocument", Version=_OPENSIM_VERSION)
+        whole = ET.SubElement(root, "MarkerSet", name="markerset")
+        objects = ET.SubElement(whole, "objects")
+        for marker, at in zip(after.markers, from_z_up(after.positions), strict=True):
+            found = ET.SubElement(objects, "Marker", name=marker.name)
+            ET.SubElement(found, "socket_parent_frame").text = f"/bodyset/{marker.segment}"
+            ET.SubElement(found, "location").text = " ".join(f"{float(v):.9g}" for v in at)
+            ET.SubElement(found, "fixed").text = str(all(marker.locked)).lower()
+
+        ET.SubElement(whole, "groups")
+        ET.indent(root)
+        ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
     elif kind == ".trc":
         # One frame with the displacement of each marker, m, in segment axes.
         moved = (after.positions - before.positions)[None]
@@ -37,18 +48,3 @@ def write_markers(path: Path, before: ChainModel, after: ChainModel) -> None:
         write_trc(path, MarkerTrajectories(after.marker_names, np.zeros(1), one, moved, 1.0))
     else:
         write_model(path, after)
-
-
-def _write_marker_set(path: Path, model: ChainModel) -> None:
-    root = ET.Element("OpenSimDocument", Version=_OPENSIM_VERSION)
-    whole = ET.SubElement(root, "MarkerSet", name="markerset")
-    objects = ET.SubElement(whole, "objects")
-    for marker, at in zip(model.markers, from_z_up(model.positions), strict=True):
-        one = ET.SubElement(objects, "Marker", name=marker.name)
-        ET.SubElement(one, "socket_parent_frame").text = f"/bodyset/{marker.segment}"
-        ET.SubElement(one, "location").text = " ".join(f"{float(v):.9g}" for v in at)
-        ET.SubElement(one, "fixed").text = str(all(marker.locked)).lower()
-
-    ET.SubElement(whole, "groups")
-    ET.indent(root)
-    ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)

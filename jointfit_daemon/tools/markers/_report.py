@@ -83,7 +83,13 @@ def _summary(found: Refinement) -> list[str]:
             )
 
     for trained, word in ((True, "training"), (False, "validation")):
-        rms_after, largest = _errors_after(found, trained=trained)
+        # The RMS of the trial with the largest RMS, and the largest marker error, m.
+        errors = [t.after for t in found.trials if t.trained is trained]
+        unknown = float("nan")
+        rms_after, largest = (
+            max((e.rms for e in errors), default=unknown),
+            max((e.maximum for e in errors), default=unknown),
+        )
         if isfinite(rms_after):
             lines.append(
                 f"errors    {word}: {comparison('RMS', rms_after, ACCEPTED_RMS_M)};"
@@ -106,16 +112,6 @@ def _summary(found: Refinement) -> list[str]:
         lines.append(f"weak      {gauge.weak} more hardly change it")
 
     return lines
-
-
-def _errors_after(found: Refinement, *, trained: bool) -> tuple[float, float]:
-    """Return the RMS of the trial with the largest RMS, and the largest marker error, m."""
-    errors = [t.after for t in found.trials if t.trained is trained]
-    unknown = float("nan")
-    return (
-        max((e.rms for e in errors), default=unknown),
-        max((e.maximum for e in errors), default=unknown),
-    )
 
 
 def _mm(metres: float) -> str:

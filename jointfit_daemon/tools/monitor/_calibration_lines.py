@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.outputs.payload_models import (
         CalibrationState,
-        Info,
         Progress,
         StoredVersion,
     )
@@ -52,23 +51,21 @@ def calibration_lines(rig: RigView, width: int) -> list[Line]:
         return wrap("Waiting for the calibration state of the daemon.", width, "muted")
     lines = _running(calibration, rig.progress, width) if calibration.phase in RUNNING else []
     if not lines:
-        lines = [*_result(calibration, width), Line(), *_steps(rig.info, calibration, width)]
-    return lines
-
-
-def _steps(info: Info | None, calibration: CalibrationState, width: int) -> list[Line]:
-    """Return the phases with their keys; the next one is marked."""
-    cameras = info is not None and any(each.kind == "mocap" for each in info.devices.values())
-    steps = [step for step in _STEPS if cameras or not step[3]]
-    due = _NEXT.get(str(calibration.phase), "")
-    if due and due not in [step[0] for step in steps]:
-        due = steps[0][0]
-    lines = []
-    for number, (phase, key, title, _, text) in enumerate(steps, 1):
-        style: Style = "strong" if phase == due else ""
-        mark = "▶" if phase == due else " "
-        lines.append(Line.of(f"{mark} {number} {title}", style).add(f"  key {key}", "muted"))
-        lines += [Line.of("    ") + line for line in wrap(text, width - 4, "muted")]
+        # The phases with their keys; the next one is marked.
+        cameras = rig.info is not None and any(
+            each.kind == "mocap" for each in rig.info.devices.values()
+        )
+        steps = [step for step in _STEPS if cameras or not step[3]]
+        due = _NEXT.get(str(calibration.phase), "")
+        if due and due not in [step[0] for step in steps]:
+            due = steps[0][0]
+        shown = []
+        for number, (phase, key, title, _, text) in enumerate(steps, 1):
+            style: Style = "strong" if phase == due else ""
+            mark = "▶" if phase == due else " "
+            shown.append(Line.of(f"{mark} {number} {title}", style).add(f"  key {key}", "muted"))
+            shown += [Line.of("    ") + line for line in wrap(text, width - 4, "muted")]
+        lines = [*_result(calibration, width), Line(), *shown]
     return lines
 
 

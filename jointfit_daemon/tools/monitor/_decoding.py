@@ -57,7 +57,12 @@ def _validated(model: type[BaseModel], topic: str, payload: Any) -> BaseModel:
         faults = error.errors(include_url=False, include_context=False, include_input=False)
     for fault in faults:
         if fault["type"] == "extra_forbidden":
-            _remove(payload, fault["loc"])
+            # Remove the key, of a newer daemon perhaps.
+            table = payload
+            *path, last = fault["loc"]
+            for part in path:
+                table = table[part]
+            del table[last]
     try:
         return model.model_validate(payload)
     except ValidationError as error:
@@ -79,11 +84,3 @@ def _printable(value: Any, topic: str, depth: int = 0) -> Any:
     if isinstance(value, list):
         return [_printable(each, topic, depth + 1) for each in value]
     return value
-
-
-def _remove(payload: Any, location: tuple[int | str, ...]) -> None:
-    """Remove the key at a location of a payload."""
-    *path, last = location
-    for key in path:
-        payload = payload[key]
-    del payload[last]

@@ -57,7 +57,25 @@ def _summary(rig: RigView, name: str, now: Moment) -> DeviceSummary:
     device = None if rig.info is None else rig.info.devices.get(name)
     counts = None if rig.health is None else rig.health.devices.get(name)
     online = rig.availability.get(name) == "online" and rig.bridge == "online"
-    level, state = _state(rig, name, counts)
+
+    # Level and state; an error needs a person.
+    availability = rig.availability.get(name, "unknown")
+    flags = [] if rig.pose is None else rig.pose.flags
+    sensor = None if counts is None else counts.sensor
+    silent = availability == "offline" or (availability == "online" and sensor == "lost")
+    stuck = f"stuck:{name}" in flags or sensor == "stuck"
+    cases: tuple[tuple[bool, Level, str], ...] = (
+        (rig.bridge == "offline", "muted", "jointfitd is not running"),
+        (silent, "error", "No data: check cable, power"),
+        (availability != "online", "muted", "Waiting"),
+        (stuck, "error", "Stuck, repeats its value: restart it"),
+        (f"slipped:{name}" in flags, "error", "Slipped on the body: fix it"),
+        (_is_slow(rig, name, counts), "warning", "Slower than the output rate"),
+    )
+    level, state = next(
+        ((level, words) for applies, level, words in cases if applies), ("good", "Works")
+    )
+
     clock_level, clock = clock_quality(counts) if online else ("muted", UNKNOWN)
     is_camera = device is not None and device.kind == "mocap"
     place = "cameras" if is_camera else (device.segment if device is not None else None)
@@ -75,24 +93,6 @@ def _summary(rig: RigView, name: str, now: Moment) -> DeviceSummary:
         clock,
         _event(rig, name, now),
     )
-
-
-def _state(rig: RigView, name: str, counts: DeviceCounts | None) -> tuple[Level, str]:
-    """Return level and state of a device; an error needs a person."""
-    availability = rig.availability.get(name, "unknown")
-    flags = [] if rig.pose is None else rig.pose.flags
-    sensor = None if counts is None else counts.sensor
-    silent = availability == "offline" or (availability == "online" and sensor == "lost")
-    stuck = f"stuck:{name}" in flags or sensor == "stuck"
-    cases: tuple[tuple[bool, Level, str], ...] = (
-        (rig.bridge == "offline", "muted", "jointfitd is not running"),
-        (silent, "error", "No data: check cable, power"),
-        (availability != "online", "muted", "Waiting"),
-        (stuck, "error", "Stuck, repeats its value: restart it"),
-        (f"slipped:{name}" in flags, "error", "Slipped on the body: fix it"),
-        (_is_slow(rig, name, counts), "warning", "Slower than the output rate"),
-    )
-    return next(((level, words) for applies, level, words in cases if applies), ("good", "Works"))
 
 
 def _is_slow(rig: RigView, name: str, counts: DeviceCounts | None) -> bool:

@@ -21,7 +21,7 @@ from jointfit_daemon.tools.monitor._words import (
 if TYPE_CHECKING:
     from jointfit_daemon.outputs.payload_models import PoseJoint
     from jointfit_daemon.tools.monitor._monitor_state import MonitorState
-    from jointfit_daemon.tools.monitor._rig_view import AngleChoice, Moment, RigView
+    from jointfit_daemon.tools.monitor._rig_view import Moment, RigView
 
 STALE_S = 1.5
 """Age of a pose, s, from which its values are no longer shown."""
@@ -53,7 +53,20 @@ def live_lines(state: MonitorState, width: int, height: int, now: Moment) -> lis
         block = wrap("This rig has no joint between two segments, so it has no angle.", angle_width)
         block += [Line()] * max(0, height - len(devices) - 1 - len(block))
     else:
-        number = _number_lines(state, choice, angle_width, now)
+        # Title, value with standard deviation, and the reason of a limitation.
+        rig = state.rig
+        joint = None if rig.pose is None else rig.pose.joints.get(choice[0])
+        age_s = pose_age_s(rig, now) or 0.0
+        value, sd = (None, None) if age_s > STALE_S else angle_of(joint, choice[1])
+        title = Line.of(f"{title_of(choice[0])} {angle_name(choice[1])}", "strong")
+        shown = format_number(value, 1, "°")
+        spread = "" if value is None or sd is None else f" ± {format_number(sd, 1, '°')}"
+        digits = big_digits(shown, unicode=state.unicode)
+        big = [Line.of(row, "value") for row in digits]
+        big[1] = big[1].add(f" {spread}", "strong")
+        reason, warns = _reason(rig, value, sd, age_s)
+        note = wrap(reason, angle_width, "warning" if warns else "muted")[:2]
+        number = [title, *big, *note]
         free = height - len(number) - 1 - len(devices) - 1
         rows = max(_LEAST_CURVE, min(_MOST_CURVE, free))
         curve = curve_lines(rig, choice, angle_width, rows, unicode=state.unicode)
@@ -99,23 +112,6 @@ def _no_pose(rig: RigView, width: int) -> list[Line]:
             " pose_ui_hz is low."
         )
     return wrap(text, width, "muted")
-
-
-def _number_lines(state: MonitorState, choice: AngleChoice, width: int, now: Moment) -> list[Line]:
-    """Return title, value with standard deviation, and the reason of a limitation."""
-    rig = state.rig
-    joint = None if rig.pose is None else rig.pose.joints.get(choice[0])
-    age_s = pose_age_s(rig, now) or 0.0
-    value, sd = (None, None) if age_s > STALE_S else angle_of(joint, choice[1])
-    title = Line.of(f"{title_of(choice[0])} {angle_name(choice[1])}", "strong")
-    shown = format_number(value, 1, "°")
-    spread = "" if value is None or sd is None else f" ± {format_number(sd, 1, '°')}"
-    digits = big_digits(shown, unicode=state.unicode)
-    big = [Line.of(row, "value") for row in digits]
-    big[1] = big[1].add(f" {spread}", "strong")
-    reason, warns = _reason(rig, value, sd, age_s)
-    note = wrap(reason, width, "warning" if warns else "muted")[:2]
-    return [title, *big, *note]
 
 
 def angle_of(joint: PoseJoint | None, key: str) -> tuple[float | None, float | None]:

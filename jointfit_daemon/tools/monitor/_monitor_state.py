@@ -173,7 +173,12 @@ class MonitorState:
         if key in {"q", "ctrl+c", "ctrl+q"}:
             return Quit()
         if self.base is None:
-            return self._press_in_rigs(key)
+            bases = [*self.rigs]
+            if key in {"up", "down"} and bases:
+                self.cursor = (self.cursor + (1 if key == "down" else -1)) % len(bases)
+            if key == "enter" and bases:
+                return ChooseRig(bases[min(self.cursor, len(bases) - 1)])
+            return None
         if key.isdecimal() and 1 <= int(key) <= len(VIEWS):
             self._show(VIEWS[int(key) - 1])
         elif key in {"tab", "shift+tab"}:
@@ -204,14 +209,6 @@ class MonitorState:
     def _show(self, view: ViewName) -> None:
         self.view, self.scroll, self.cursor, self.listed = view, 0, 0, None
 
-    def _press_in_rigs(self, key: str) -> Action | None:
-        bases = [*self.rigs]
-        if key in {"up", "down"} and bases:
-            self.cursor = (self.cursor + (1 if key == "down" else -1)) % len(bases)
-        if key == "enter" and bases:
-            return ChooseRig(bases[min(self.cursor, len(bases) - 1)])
-        return None
-
     def _press_in_history(self, key: str) -> Action | None:
         count = 0 if self.stored is None else len(self.stored.versions)
         if key in {"up", "down"} and count:
@@ -229,18 +226,15 @@ class MonitorState:
         elif key in {"left", "right"}:
             self.turn_deg = (self.turn_deg + (_TURN_DEG if key == "right" else -_TURN_DEG)) % 360
         elif key in {"j", "J"}:
-            self._choose_angle(1 if key == "j" else -1)
+            choices = self.rig.angle_choices()
+            if choices:
+                at = choices.index(self.choice) if self.choice in choices else 0
+                self.choice = choices[(at + (1 if key == "j" else -1)) % len(choices)]
         elif key == "w" and self.view == "log":
             self.only_problems, self.scroll = not self.only_problems, 0
         else:
             return False
         return True
-
-    def _choose_angle(self, step: int) -> None:
-        choices = self.rig.angle_choices()
-        if choices:
-            at = choices.index(self.choice) if self.choice in choices else 0
-            self.choice = choices[(at + step) % len(choices)]
 
     def _requested_by(self, key: str) -> Action | None:
         """Return the request of a key; phases other than the static pose have it in their view."""

@@ -56,9 +56,26 @@ def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> l
     level, words, loss = page_state(state, now)
     top = _header(state, level, words, width, now)
     if state.base is not None:
-        top.append(_tabs(state, width))
+        titles = _TITLES if width >= _WIDE else _SHORT
+        gap = "   " if width >= _WIDE else ""
+        line = Line()
+        for number, name in enumerate(VIEWS, 1):
+            chosen = name == state.view
+            text = f"[{number} {titles[name]}]" if chosen else f" {number} {titles[name]} "
+            style: Style = "chosen" if chosen else "muted"
+            line = line.add(text, style).add(gap)
+        top.append(line)
     top += wrap(f"✖ {loss}" if loss else "", width, "error")[:_LOSS_LINES]
-    bottom = [*_notice(state, width, now), *_footer(state, width)]
+
+    # The keys of the view, in one line or two.
+    rows, row = [], Line()
+    for key, words in _keys(state):
+        item = Line.of(key, "strong").add(f" {words}", "muted")
+        if row.spans and row.width + 2 + item.width > width:
+            rows.append(row)
+            row = Line()
+        row = row.add("  ") + item if row.spans else item
+    bottom = [*_notice(state, width, now), *rows, row]
 
     free = max(0, height - len(top) - len(bottom))
     body = _body(state, width, free, now)
@@ -128,21 +145,18 @@ def _spread(left: Line, right: Line, width: int) -> Line:
     return left.fit(free).add(" ") + right if free > 0 else left.fit(width)
 
 
-def _tabs(state: MonitorState, width: int) -> Line:
-    titles = _TITLES if width >= _WIDE else _SHORT
-    gap = "   " if width >= _WIDE else ""
-    line = Line()
-    for number, name in enumerate(VIEWS, 1):
-        chosen = name == state.view
-        text = f"[{number} {titles[name]}]" if chosen else f" {number} {titles[name]} "
-        style: Style = "chosen" if chosen else "muted"
-        line = line.add(text, style).add(gap)
-    return line
-
-
 def _body(state: MonitorState, width: int, height: int, now: Moment) -> list[Line]:
     if state.base is None:
-        return _rig_lines(state, width)
+        if state.link != "searching":
+            return []
+        if not state.rigs:
+            return _waiting_lines(state, width)
+        lines = [Line.of("Several rigs use this broker:", "strong")]
+        for at, (base, name) in enumerate(state.rigs.items()):
+            chosen = at == min(state.cursor, len(state.rigs) - 1)
+            style: Style = "chosen" if chosen else ""
+            lines.append(Line.of(f"{'▶' if chosen else ' '} {name}  ({base})", style))
+        return lines
     rig = state.rig
     if rig.bridge == "unknown" and rig.pose is None:
         return _waiting_lines(state, width)
@@ -154,20 +168,6 @@ def _body(state: MonitorState, width: int, height: int, now: Moment) -> list[Lin
         "log": lambda: _log_lines(state, width),
     }
     return views[state.view]()
-
-
-def _rig_lines(state: MonitorState, width: int) -> list[Line]:
-    """Return the rigs of the broker to choose from, or how to start one."""
-    if state.link != "searching":
-        return []
-    if not state.rigs:
-        return _waiting_lines(state, width)
-    lines = [Line.of("Several rigs use this broker:", "strong")]
-    for at, (base, name) in enumerate(state.rigs.items()):
-        chosen = at == min(state.cursor, len(state.rigs) - 1)
-        style: Style = "chosen" if chosen else ""
-        lines.append(Line.of(f"{'▶' if chosen else ' '} {name}  ({base})", style))
-    return lines
 
 
 def _waiting_lines(state: MonitorState, width: int) -> list[Line]:
@@ -218,18 +218,6 @@ def _notice(state: MonitorState, width: int, now: Moment) -> list[Line]:
     mark = "✖ " if notice.refused else "✔ "
     style: Style = "error" if notice.refused else "good"
     return wrap(mark + notice.text, width, style, indent=2)[:_LOSS_LINES]
-
-
-def _footer(state: MonitorState, width: int) -> list[Line]:
-    """Return the keys of the view, in one line or two."""
-    lines, line = [], Line()
-    for key, words in _keys(state):
-        item = Line.of(key, "strong").add(f" {words}", "muted")
-        if line.spans and line.width + 2 + item.width > width:
-            lines.append(line)
-            line = Line()
-        line = line.add("  ") + item if line.spans else item
-    return [*lines, line]
 
 
 def _keys(state: MonitorState) -> list[tuple[str, str]]:

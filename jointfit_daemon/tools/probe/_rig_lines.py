@@ -37,15 +37,12 @@ def rig_lines(
 def _buses(can: Sequence[CanTraffic]) -> Iterator[str]:
     for traffic in can:
         if traffic.devices:
-            name = _bus_name(traffic.interface)
+            # A bare key of TOML, otherwise one in quotes.
+            interface = traffic.interface
+            bare = interface.isascii() and interface.replace("_", "").replace("-", "").isalnum()
+            name = interface if bare else _value(interface)
             keys = {"interface": "socketcan", "channel": traffic.interface}
             yield _table(f"[can.{name}]", keys)
-
-
-def _bus_name(interface: str) -> str:
-    """Return the interface as a key of TOML."""
-    bare = interface.isascii() and interface.replace("_", "").replace("-", "").isalnum()
-    return interface if bare else _value(interface)
 
 
 def _sensors(
@@ -55,7 +52,9 @@ def _sensors(
     for traffic in serial:
         for device in traffic.devices[:1]:
             number += 1
-            info = _port_info(ports, traffic.port)
+
+            name = Path(traffic.port).resolve().name
+            info = next((port for port in ports if Path(port.device).name == name), None)
             keys: dict[str, Any] = {"port": traffic.port if info is None else info.path}
             keys |= device.settings
             if info is not None and info.driver == _USB_SERIAL and _has_transport(device.driver):
@@ -65,11 +64,6 @@ def _sensors(
         for device in bus.devices:
             number += 1
             yield _imu(number, device, {"can": bus.interface, **device.settings})
-
-
-def _port_info(ports: Sequence[SerialPortInfo], path: str) -> SerialPortInfo | None:
-    name = Path(path).resolve().name
-    return next((port for port in ports if Path(port.device).name == name), None)
 
 
 def _has_transport(driver: str) -> bool:
@@ -91,20 +85,19 @@ def _imu(number: int, device: DecodedDevice, connection: dict[str, Any]) -> str:
 
 
 def _cameras(servers: Sequence[FoundServer]) -> Iterator[str]:
+    from jointfit_daemon.driver import find_driver
+
     for server in servers[:1]:  # a rig has one
         keys: dict[str, Any] = {"driver": server.driver, "server": server.server}
-        keys |= _other_port(server)
+
+        # The command port, if it is not the default of the driver.
+        field = find_driver(server.driver).Settings.model_fields.get("command_port")
+        if field is not None and field.default != server.port:
+            keys["command_port"] = server.port
+
         yield _table("[mocap]", keys) + "".join(
             f"# rigid_body.SEGMENT = {_value(name)}\n" for name in server.bodies
         )
-
-
-def _other_port(server: FoundServer) -> dict[str, Any]:
-    """Return the command port if it is not the default of the driver."""
-    from jointfit_daemon.driver import find_driver
-
-    field = find_driver(server.driver).Settings.model_fields.get("command_port")
-    return {} if field is None or field.default == server.port else {"command_port": server.port}
 
 
 def _table(header: str, keys: dict[str, Any]) -> str:

@@ -50,6 +50,18 @@ _METHODS = ("predicted", "three frames", "grid", "shifted grid", "bound", "hyper
 
 def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -> str:
     """Return setup, correlations, errors over the arc, other methods and limits."""
+    degrees = np.rint(np.rad2deg(setup.steps)).astype(int).tolist()
+    medians: list[tuple[str, ...]] = [("α", *more.median_errors)]
+    for angle in (a for a in _SHOWN_DEG if a in degrees):
+        at = degrees.index(angle)
+        medians.append(
+            (f"{angle}°", *(f"{_MM * errors[at]:.3g}" for errors in more.median_errors.values()))
+        )
+
+    repetition: list[tuple[str, ...]] = [("α", "mean of centers", "center of mean positions")]
+    for step, *errors_m in zip(STEPS_RAD, *more.repetition, strict=True):
+        repetition.append((f"{np.rad2deg(step):.0f}°", *(f"{_MM * m:.2g}" for m in errors_m)))
+
     parts = [
         "Center of rotation from a marker on a circle: the numerical experiment of Akbarifar et al."
         " (2021), repeated",
@@ -65,14 +77,19 @@ def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -
         f" r = {setup.radius:g} m and σ = {_MM * setup.noise:g} mm; bisectors: both markers, three"
         " frames; Reuleaux and helical axis: both markers, first and last frame; the others: one"
         f" marker, hyper with {setup.frames} frames",
-        _indented(_comparison(setup, more)),
+        _indented(medians),
         f"Repetition of small angles: median error, mm, after averaging {setup.repeats} repetitions"
         f" at r = {setup.radius:g} m and σ = {_MM * setup.noise:g} mm",
-        _indented(_repetition(more)),
+        _indented(repetition),
         "Effect of the radius: 95th percentile of the error over that at"
         f" r = {100 * setup.radii[-1]:g} cm, α = {np.rad2deg(setup.step):.0f}°,"
         f" σ = {_MM * LARGE_NOISE_M:g} mm",
-        _indented(_radius(more)),
+        _indented(
+            [
+                ("r, cm", *(f"{100 * r:g}" for r in RADII_M)),
+                ("ratio", *(f"{ratio:.2f}" for ratio in more.radius_effect)),
+            ]
+        ),
         "Limits",
         "\n".join(f"- {text}" for text in CAVEATS),
     ]
@@ -136,31 +153,6 @@ def _errors(study: Sequence[PairMaps]) -> list[tuple[str, ...]]:
         )
         rows.append((f"{angle}°", *cells, f"{100 * pair.refused[-1, at]:.0f} %"))
     return rows
-
-
-def _comparison(setup: StudySetup, more: StudyExtension) -> list[tuple[str, ...]]:
-    degrees = np.rint(np.rad2deg(setup.steps)).astype(int).tolist()
-    rows: list[tuple[str, ...]] = [("α", *more.median_errors)]
-    for angle in (a for a in _SHOWN_DEG if a in degrees):
-        at = degrees.index(angle)
-        rows.append(
-            (f"{angle}°", *(f"{_MM * errors[at]:.3g}" for errors in more.median_errors.values()))
-        )
-    return rows
-
-
-def _repetition(more: StudyExtension) -> list[tuple[str, ...]]:
-    rows: list[tuple[str, ...]] = [("α", "mean of centers", "center of mean positions")]
-    for step, *errors_m in zip(STEPS_RAD, *more.repetition, strict=True):
-        rows.append((f"{np.rad2deg(step):.0f}°", *(f"{_MM * m:.2g}" for m in errors_m)))
-    return rows
-
-
-def _radius(more: StudyExtension) -> list[tuple[str, ...]]:
-    return [
-        ("r, cm", *(f"{100 * r:g}" for r in RADII_M)),
-        ("ratio", *(f"{ratio:.2f}" for ratio in more.radius_effect)),
-    ]
 
 
 def _indented(rows: Sequence[Sequence[str]]) -> str:

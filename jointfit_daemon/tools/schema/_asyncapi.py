@@ -41,7 +41,10 @@ def asyncapi_document() -> dict[str, Any]:
     def add(topic: Topic, pattern: str, schema: dict[str, Any]) -> str:
         title = schema["title"]
         schemas[title] = _moved(schema, f"#/components/schemas/{title}")
-        channels[key := _key(pattern)] = _channel(topic, pattern, title)
+
+        # A topic as a key of the document.
+
+        channels[key := re.sub(r"[^A-Za-z0-9]", "_", pattern)] = _channel(topic, pattern, title)
         return key
 
     for topic in TOPICS:
@@ -122,8 +125,3 @@ def _moved(schema: Any, place: str) -> Any:
     if isinstance(reference, str):
         moved["$ref"] = reference.replace("#/$defs/", f"{place}/definitions/")
     return moved
-
-
-def _key(pattern: str) -> str:
-    """Return a topic as a key of the document."""
-    return re.sub(r"[^A-Za-z0-9]", "_", pattern)
