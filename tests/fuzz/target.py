@@ -6,10 +6,11 @@ entrance and no other. Its processor time is bounded per byte, and so is the mem
 
 from __future__ import annotations
 
-import resource
+import contextlib
 import time
 import traceback
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -20,7 +21,7 @@ LEAST_S = 0.15
 PER_BYTE_S = 100e-6
 """Processor time beyond it for each byte, s: under coverage all code runs several times slower."""
 MOST_GROWTH = 20_000_000
-"""Memory that one case may add to the largest the process ever had, bytes."""
+"""Resident memory that one case may add to that before it, bytes."""
 _REPEATS = 3
 
 
@@ -77,11 +78,14 @@ def run_case(target: Target, data: bytes) -> Outcome:
         if seconds > allowed_s:
             finding = f"slow: {seconds:.2f} s for {len(data)} bytes, allowed {allowed_s:.2f} s"
     if not finding and growth > MOST_GROWTH:
+        growth = min(_measured(target, data)[1] for _ in range(_REPEATS))  # without imports
+    if not finding and growth > MOST_GROWTH:
         finding = f"memory: grew by {growth / 1e6:.0f} MB for {len(data)} bytes"
     return Outcome(seconds, growth, finding)
 
 
 def _measured(target: Target, data: bytes) -> tuple[float, int, str]:
+    _forget_largest()
     before, began, finding = _largest_bytes(), time.process_time(), ""
     try:
         target.run(data)
@@ -92,8 +96,15 @@ def _measured(target: Target, data: bytes) -> tuple[float, int, str]:
     return time.process_time() - began, _largest_bytes() - before, finding
 
 
+def _forget_largest() -> None:
+    """Restart the record of the largest resident memory, which earlier tests may have raised."""
+    with contextlib.suppress(OSError):  # kernels without page monitoring
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
 def _largest_bytes() -> int:
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    status = Path("/proc/self/status").read_text(encoding="ascii", errors="replace")
+    return 1024 * int(status.partition("VmHWM:")[2].split()[0])
 
 
 def _described(error: Exception) -> str:
