@@ -151,6 +151,7 @@ class SharedBus:
         silence_s: float,
         *,
         needed: CanKey,
+        first_s: float | None = None,
         resembles: Callable[[bytes], bool] = lambda _: False,
         worked: bool = False,
     ) -> None:
@@ -173,6 +174,8 @@ class SharedBus:
             as lost.
         needed : CanKey
             Identifier in `ids` of the frames with measurements.
+        first_s : float, optional
+            Longest wait for the first of these frames, s; default: `silence_s`.
         resembles : callable
             Whether the data of a frame look like those of `needed`, for a hint in the error
             message.
@@ -196,7 +199,7 @@ class SharedBus:
                 )
 
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        limit = asyncio.timeout(silence_s)
+        limit = asyncio.timeout(silence_s if first_s is None else first_s)
         subscriber = _Subscriber(name, ids, emit, ended, limit, silence_s, needed, self._others)
 
         if self._failed is not None:

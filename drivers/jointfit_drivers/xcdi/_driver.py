@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _LONGEST_SILENCE_S = 30.0
-"""Longest silence, s, before the sensor counts as lost; the time doubles with every attempt. The
-sensor stays subscribed meanwhile, so its first frame is received at once."""
+"""Longest wait, s, for the first frame of a sensor that is lost; the wait doubles with every
+attempt. The sensor stays subscribed meanwhile, so its first frame is received at once. From then
+on `silence_s` applies."""
 _SAMPLE_BYTES = {DataId.SAMPLE_TIME: 4, DataId.GROUP_COUNTER: 2, DataId.QUATERNION: 8}
 _ID_NAMES = XcdiIds._fields[:5]
 _RAW_FRAMES = 20
@@ -190,7 +191,7 @@ class XcdiImu:
         self._settings = settings
         self._ids = settings.ids.resolved(extended=settings.extended_ids)
         self._worked = False
-        self._silent_s = settings.silence_s  # waiting is cheap; opening the bus again is not
+        self._first_s = settings.silence_s  # waiting is cheap; opening the bus again is not
 
     def decoder(self) -> XcdiDecoder:
         """Return the decoder from chunks to samples, for live data and replay."""
@@ -222,7 +223,7 @@ class XcdiImu:
                 for frame in unpack_frames(chunk.data)[:left]:
                     left -= 1
                     log.debug("%s: %s", settings.id, frame)
-            self._silent_s = settings.silence_s
+            self._first_s = settings.silence_s
             self._worked = True
             emit(chunk)
 
@@ -234,15 +235,16 @@ class XcdiImu:
             w, x, y, z = (count * QUATERNION_SCALE for count in counts)
             return OrientationGate().admit((w, x, y, z)) is not None
 
-        silence_s = self._silent_s
-        self._silent_s = min(2 * silence_s, max(settings.silence_s, _LONGEST_SILENCE_S))
+        first_s = self._first_s
+        self._first_s = min(2 * first_s, max(settings.silence_s, _LONGEST_SILENCE_S))
         async with shared_bus(settings.can) as bus:
             await bus.pump(
                 settings.id,
                 ids,
                 emit_sample,
-                silence_s,
+                settings.silence_s,
                 needed=needed,
+                first_s=first_s,
                 resembles=resembles,
                 worked=self._worked,
             )

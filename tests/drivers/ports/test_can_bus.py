@@ -192,6 +192,23 @@ async def test_a_sensor_that_worked_and_falls_silent_has_one_text_at_all_attempt
     assert told == 3 * [f"{bus.channel}: silent: check its power and wiring"]
 
 
+async def test_a_sensor_that_came_late_is_reported_as_soon_as_one_that_was_there(
+    tmp_path: Path,
+) -> None:
+    """The longer waits of the attempts on a silent bus end with its first frame."""
+    adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
+    device = XcdiDevice(adapter, XcdiDeviceOptions(ids=id_block(0x100)))
+    driver = xcdi_driver("S3", bus, 0x100, silence_s=0.2)
+    async with serving(device):
+        for _ in range(3):  # waits of 0.2, 0.4 and 0.8 s
+            await lost(DriverRun(driver), 2.0)
+        run = DriverRun(driver)  # waits 1.6 s
+        await opened(adapter)
+        device.push(0, IDENTITY)
+        await run.wait_for(1)
+        assert "silent: check its power" in await lost(run, 0.7)
+
+
 async def test_a_sensor_with_other_identifiers_is_hinted_at(tmp_path: Path) -> None:
     adapter, bus = SlcanAdapter(tmp_path / "adapter"), bus_at(tmp_path)
     device = XcdiDevice(adapter)
