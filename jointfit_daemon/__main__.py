@@ -123,6 +123,8 @@ def _log_handler(rig: str, *, limited: bool) -> logging.Handler:
     handler = (RateLimitedHandler if limited else logging.StreamHandler)(sys.stderr)
     if "JOURNAL_STREAM" in os.environ or "INVOCATION_ID" in os.environ:
         handler.setFormatter(LevelFormatter())
+    elif sys.stderr.isatty() and limited:
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s", "%H:%M:%S"))
     else:
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     return handler

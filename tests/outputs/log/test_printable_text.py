@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import io
 import logging
+import os
+import pty
+import re
+import sys
 from typing import TYPE_CHECKING, Any
 
 import orjson
@@ -11,6 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from jointfit_daemon.__main__ import _log_handler
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.outputs.log import (
     LevelFormatter,
@@ -97,3 +102,29 @@ def test_events_and_device_info_contain_no_control_characters(table: dict[str, A
         text.isprintable() for text in (event["text"], *event["data"]["name"], info["model"])
     )
     assert "the leg fell off" in event["text"]
+
+
+@pytest.mark.parametrize(
+    ("on_terminal", "limited", "pattern"),
+    [
+        (True, True, r"\d\d:\d\d:\d\d INFO S1: streaming"),
+        (True, False, r"\d{4}-\d\d-\d\d [\d:,]+ INFO jointfit_daemon: S1: streaming"),
+        (False, True, r"\d{4}-\d\d-\d\d [\d:,]+ INFO jointfit_daemon: S1: streaming"),
+    ],
+)
+def test_lines_on_a_terminal_are_short_unless_all_are_wanted(
+    monkeypatch: pytest.MonkeyPatch, on_terminal: bool, limited: bool, pattern: str
+) -> None:
+    parent, child = pty.openpty() if on_terminal else os.pipe()
+    for name in ("JOURNAL_STREAM", "INVOCATION_ID"):
+        monkeypatch.delenv(name, raising=False)
+    with os.fdopen(child, "w") as stream, os.fdopen(parent, "rb") as reader:
+        monkeypatch.setattr(sys, "stderr", stream)
+        handler = _log_handler("bench", limited=limited)
+        record = logging.LogRecord(
+            "jointfit_daemon", logging.INFO, "", 0, "S1: streaming", (), None
+        )
+        handler.handle(record)
+        handler.flush()
+        shown = os.read(reader.fileno(), 200).decode().strip()
+    assert re.fullmatch(pattern, shown)

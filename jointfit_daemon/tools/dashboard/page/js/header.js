@@ -12,7 +12,7 @@ export function pageState(link, store) {
   if (link.state === "lost") return { level: "error", words: "Connection lost", loss: link.reason };
   if (link.state === "refused") return { level: "error", words: "Not logged in", loss: link.reason };
   if (link.state === "connecting") return { level: "", words: "Connecting to the broker" };
-  if (link.base === null) return { level: "", words: "Looking for rigs on the broker" };
+  if (link.base === null) return { level: "", words: link.rigs > 1 ? "Choose a rig" : "Looking for rigs on the broker" };
   if (store.otherVersion !== null) return { level: "error", words: "jointfitd has another version" };
   if (store.bridge === "offline") {
     return {
@@ -109,6 +109,7 @@ function emptyContent(link, store, configuration, rigs, choose) {
   if (link.base === null && rigs.size > 1) {
     return { kind: `rigs ${[...rigs.keys()].join()}`, children: [
       createElement("h2", {}, "Several rigs use this broker"),
+      createElement("p", {}, "Choose the one to show. The list also has rigs whose daemon is stopped."),
       ...[...rigs].map(([base, info]) =>
         createElement("button", { class: "button", type: "button", dir: "auto", onclick: () => choose(base) }, `${info.rig} (${base})`)),
     ] };

@@ -34,6 +34,7 @@ export function createLink(configuration, handlers) {
     /** Browser time of the last change of `state`, ms. */
     sinceMs: 0,
     base: null,
+    rigs: 0, // known on the broker
     version: 5,
     account: {},
     client: null,

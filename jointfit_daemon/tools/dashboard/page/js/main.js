@@ -55,7 +55,7 @@ async function start() {
       if (topic.startsWith("bridge/response/")) requests.answer(payload);
       else store.take(topic, payload);
     },
-    found: (base, info) => { rigs.set(base, info); refresh(); },
+    found: (base, info) => { rigs.set(base, info); link.rigs = rigs.size; refresh(); },
     login: (reason) => dialogs.askForAccount(reason),
   });
   const requests = createRequests(link, () => gatewayNow(store) ?? Date.now() * 1000);
