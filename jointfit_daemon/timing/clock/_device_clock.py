@@ -273,7 +273,7 @@ class DeviceClock:
         if reader is None:
             return self._by_arrival(arrival_ns)
 
-        u = reader.feed(ticks, counter, arrival_ns, self._envelope)
+        u = reader.feed(ticks, counter, arrival_ns, self._envelope, self._echo)
         news = (
             reader.explain(ticks, counter, arrival_ns - before_ns)
             if u is None
@@ -288,7 +288,7 @@ class DeviceClock:
             self._begin(news)
             reader = self._reader_for(ticks, counter, tick_clock)
             if reader is not None:
-                u = reader.feed(ticks, counter, arrival_ns, self._envelope)
+                u = reader.feed(ticks, counter, arrival_ns, self._envelope, self._echo)
             u = arrival_ns if reader is None or u is None else u
         elif self._doubts.early:
             return self._by_arrival(arrival_ns)

@@ -16,6 +16,7 @@ from jointfit_daemon.timing.clock._counter_wrap import unwrap
 if TYPE_CHECKING:
     from jointfit_daemon.model import TickClock
     from jointfit_daemon.timing.clock._clock_events import ClockEvent
+    from jointfit_daemon.timing.clock._echo_fit import EchoFit
     from jointfit_daemon.timing.clock._minimum_delay import MinimumDelayFilter
 
 NS = 1_000_000_000
@@ -36,7 +37,7 @@ _SILENCE_LEAST_NS = 500_000_000
 _SILENCE_SHARE = 0.1
 """Largest difference of device time and host time over a silence, share of the silence."""
 _BACKLOG_NS = 100_000_000
-"""Least delay of a backlog, ns, and largest delay of the first sample after it."""
+"""Least delay of a backlog, ns, and tolerance of the first sample after it."""
 _WRAP_SLACK = 8
 """Counts by which a wrap may differ from the elapsed time while the counter width is unknown."""
 _LATE = 0.65
@@ -67,11 +68,20 @@ def _ran_on(step_ns: int, elapsed_ns: int) -> bool:
     return near and elapsed_ns >= _SILENCE_LEAST_NS
 
 
-def _backlog_ended(ahead_ns: int, u: int, arrival_ns: int, envelope: MinimumDelayFilter) -> bool:
-    """Return whether a sample is punctual after late ones: device time is ahead by their delay."""
-    if ahead_ns <= _BACKLOG_NS or not envelope.settled:
+def _backlog_ended(
+    ahead_ns: int, u: int, arrival_ns: int, envelope: MinimumDelayFilter, echo: EchoFit | None
+) -> bool:
+    """Return whether device time is ahead of the arrivals because the sample before was late.
+
+    A settled clock then still explains the sample: it does not arrive before its sampling instant.
+    After a jump of the device clock outside of a backlog, it would.
+    """
+    if ahead_ns <= _BACKLOG_NS:
         return False
-    return abs(envelope.residual(u, arrival_ns - u)) <= _BACKLOG_NS
+
+    if echo is not None and echo.settled:  # the minimum-delay filter is then not fed
+        return arrival_ns - echo.host_ns(u) >= -_BACKLOG_NS
+    return envelope.settled and envelope.residual(u, arrival_ns - u) >= -_BACKLOG_NS
 
 
 class TickTime:
@@ -112,7 +122,8 @@ class TickTime:
         return self.to_ns(unwrap(ticks, last, self._clock.modulus, 0, self._turn_ns))
 
     def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: MinimumDelayFilter
+        self, ticks: int | None, counter: int | None, arrival_ns: int,
+        envelope: MinimumDelayFilter, echo: EchoFit | None = None,
     ) -> int | None:  # fmt: skip
         """Return the device time, ns, or None for a restart."""
         if ticks is None:
@@ -127,7 +138,7 @@ class TickTime:
                 return None if fell else self.to_ns(ticks)
             step_ns, u = self.to_ns(ticks - last), self.to_ns(ticks)
             ran_on = _ran_on(step_ns, elapsed) or _backlog_ended(
-                step_ns - elapsed, u, arrival_ns, envelope
+                step_ns - elapsed, u, arrival_ns, envelope, echo
             )
             if not ran_on and self._contradicted(ticks - last, counter):
                 return None
@@ -183,7 +194,8 @@ class CounterTime:
         return self._period_ns * (self._width or min(w for w in COUNTER_WIDTHS if w > self._raw))
 
     def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: MinimumDelayFilter  # noqa: ARG002 - the readers' common shape
+        self, ticks: int | None, counter: int | None, arrival_ns: int,  # noqa: ARG002 - the readers' common shape
+        envelope: MinimumDelayFilter, echo: EchoFit | None = None,  # noqa: ARG002 - the readers' common shape
     ) -> int | None:  # fmt: skip
         """Return sample number times nominal period, ns, or None for a restart."""
         if counter is None:
@@ -246,7 +258,8 @@ class ArrivalTime:
         return None
 
     def feed(
-        self, ticks: int | None, counter: int | None, arrival_ns: int, envelope: MinimumDelayFilter  # noqa: ARG002 - the readers' common shape
+        self, ticks: int | None, counter: int | None, arrival_ns: int,  # noqa: ARG002 - the readers' common shape
+        envelope: MinimumDelayFilter, echo: EchoFit | None = None,  # noqa: ARG002 - the readers' common shape
     ) -> int | None:  # fmt: skip
         """Return sample number times nominal period, ns, or None for a restart."""
         number, period = self._number + 1, self._period_ns

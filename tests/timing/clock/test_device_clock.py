@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jointfit_daemon.model import TickClock
+from jointfit_daemon.model import ClockEcho, TickClock
 from jointfit_daemon.timing.clock import DeviceClock, Stamp
 
 if TYPE_CHECKING:
@@ -264,6 +264,91 @@ def test_backlog_that_ends_while_the_counter_stands_is_no_restart(
         clock.feed_sample(ticks, k, arrival, MICROSECONDS)
         assert clock.epoch == 0
     assert not clock.news
+
+
+class SentFrame(NamedTuple):
+    """Frame of a server: number, exposure and arrival, ns since the start."""
+
+    number: int
+    exposed_ns: int
+    arrived_ns: int
+
+
+def frames_of_a_paused_server(stall_ns: int, still_late_ns: int) -> list[SentFrame]:
+    """Return 10 s of frames, 0.2 s sent after a pause, 0.2 s still late, and 10 s in time."""
+    exposed = PERIOD * np.arange(2000)
+    exposed[1020:] += stall_ns
+    arrived = exposed + 5 * MS
+    exposed[1020:1040] -= still_late_ns
+    arrived[1000:1040] = 1040 * PERIOD + stall_ns + np.arange(40) * 1000
+    return list(map(SentFrame, range(2000), exposed.tolist(), arrived.tolist()))
+
+
+def clock_of_a_server(
+    frames: list[SentFrame], tick_clock: TickClock, *, jump_ns: int = 0, jump_at: int = 1 << 60
+) -> DeviceClock:
+    """Return the clock of a server that answers ten echoes a second, if its clock is its own.
+
+    The server's clock jumps by `jump_ns` at frame `jump_at`. Time is right in the last second.
+    """
+    clock, asked = DeviceClock(PERIOD), 0
+    errors = []
+    for number, exposed, arrived in frames:
+        ahead = 100 * S + (jump_ns if number >= jump_at else 0)
+        host = START + arrived
+        if tick_clock.scale == "own" and arrived >= asked:
+            asked = arrived + 100 * MS
+            clock.feed_echo(
+                ClockEcho(host - MS, host, (arrived + ahead - MS // 2) // 100), tick_clock
+            )
+        stamp = clock.feed_sample((exposed + ahead) // 100, number, host, tick_clock)
+        errors.append(abs(stamp.t_ns - START - exposed))
+    assert max(errors[-100:]) < 6 * MS
+    return clock
+
+
+SERVER = TickClock(1, None, 10_000_000)
+PTP = TickClock(1, None, 10_000_000, "unix")
+
+
+@pytest.mark.parametrize("server", [SERVER, PTP], ids=["echoes", "ptp"])
+@pytest.mark.parametrize("stall", [0.5, 4.0, 30.0])
+@pytest.mark.parametrize("still_late", [0.0, 0.3])
+def test_a_server_that_pauses_and_skips_frames_has_no_clock_jump(
+    server: TickClock, stall: float, still_late: float
+) -> None:
+    """It sends the frames from before the pause late; later frames continue their numbers."""
+    frames = frames_of_a_paused_server(round(stall * S), round(still_late * stall * S))
+    clock = clock_of_a_server(frames, server)
+    assert clock.epoch == 0
+    assert not clock.news
+
+
+@pytest.mark.parametrize("received", [0, 100, 400], ids="buffer of {} frames".format)
+def test_a_stopped_daemon_sees_no_clock_jump(received: int) -> None:
+    """It reads the frames of four seconds at once; the socket's buffer dropped the last ones."""
+    frames = [SentFrame(k, k * PERIOD, max(k * PERIOD, 1400 * PERIOD * (k >= 1000)) + 5 * MS)
+              for k in range(2400) if not 1000 + received <= k < 1400]  # fmt: skip
+    clock = clock_of_a_server(frames, SERVER)
+    assert clock.epoch == 0
+    assert not clock.news
+
+
+@pytest.mark.parametrize("jump", [0.2, 4.0, -4.0])
+def test_a_jump_of_a_server_is_reported(jump: float) -> None:
+    frames = [SentFrame(k, k * PERIOD, k * PERIOD + 5 * MS) for k in range(2000)]
+    clock = clock_of_a_server(frames, SERVER, jump_ns=round(jump * S), jump_at=1000)
+    assert clock.epoch == 1
+    assert "jumped" in clock.news[0].text
+
+
+@pytest.mark.parametrize("jump", [2.0, 6.0])
+def test_a_jump_at_the_end_of_a_pause_is_reported(jump: float) -> None:
+    """It is reported whether the four seconds of the pause are shorter or longer than the jump."""
+    frames = frames_of_a_paused_server(4 * S, 0)
+    clock = clock_of_a_server(frames, SERVER, jump_ns=round(jump * S), jump_at=1020)
+    assert clock.epoch == 1
+    assert "jumped" in clock.news[0].text
 
 
 def test_samples_that_stay_late_are_a_restart_after_two_seconds() -> None:
