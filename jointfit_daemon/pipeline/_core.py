@@ -330,7 +330,8 @@ class Core:
         if isinstance(item, DeviceEvent) and item.kind == "restart" and state.source.kind == "imu":
             self._aligner.reset(source)
             outputs = self._session.restart_sensor(self._now_ns, source)
-        return [*self._limiter.add(self._now_ns, source, item), *outputs]
+        notices = self._limiter.add(self._now_ns, source, item, state.source.rate_hz)
+        return [*notices, *outputs]
 
     def _add_sample(self, source: str, sample: ImuSample, stamp: Stamp) -> list[Output]:
         t_ns, _, synced, epoch, _ = stamp

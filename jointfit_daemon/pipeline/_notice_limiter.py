@@ -1,7 +1,7 @@
 """Rate limit for notices about wires and clocks: one per minute, device and kind.
 
 A condition is reported when it begins, with its totals once a minute while it lasts, and when a
-minute passed without it.
+minute passed without it. Lost samples are a warning above `MOST_LOST` of a minute's samples.
 
 Invariant: the totals of all notices equal the totals of all events; no event is left out of the
 totals.
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Corrupt, DeviceEvent
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
+from jointfit_daemon.pipeline.health import MOST_LOST
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,6 +38,8 @@ _NO_DATA: Mapping[str, object] = MappingProxyType({})
 @dataclass(slots=True)
 class _Condition:
     reported_ns: int
+    rate_hz: float
+    """Sample rate of the device."""
     count: int = 0
     amount: int = 0
     """Lost samples or discarded bytes."""
@@ -52,8 +55,10 @@ class NoticeLimiter:
 
     _conditions: dict[tuple[str, str], _Condition] = field(default_factory=dict)
 
-    def add(self, now_ns: int, source: str, item: Corrupt | DeviceEvent) -> list[Notice]:
-        """Add one event; return the notices that are due."""
+    def add(
+        self, now_ns: int, source: str, item: Corrupt | DeviceEvent, rate_hz: float
+    ) -> list[Notice]:
+        """Add one event of a source with the sample rate `rate_hz`; return the notices due."""
         if isinstance(item, Corrupt):
             kind, amount, text, data = "corrupt", item.discarded, item.reason, _NO_DATA
         elif item.kind == "gap":
@@ -67,10 +72,10 @@ class NoticeLimiter:
             return [Notice(now_ns, NoticeKind.DEVICE, source, item.text, level, dict(item.data))]
 
         key = source, kind
-        condition = self._conditions.setdefault(key, _Condition(reported_ns=now_ns - QUIET_NS))
+        condition = self._conditions.setdefault(key, _Condition(now_ns - QUIET_NS, rate_hz))
         condition.count += 1
         condition.amount += amount
-        condition.text, condition.data = text, data
+        condition.text, condition.data, condition.rate_hz = text, data, rate_hz
         if now_ns - condition.reported_ns < QUIET_NS:
             return []
         condition.lasting = False
@@ -101,6 +106,7 @@ class NoticeLimiter:
 def _notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
     """Return the notice of a condition, and begin its next quiet time."""
     source, kind = key
+    level, elapsed_s = NoticeLevel.WARNING, (now_ns - condition.reported_ns) / _NS_PER_S
     if kind in _JUMPS:
         text, data = condition.text, dict(condition.data)
         if condition.count > 1:
@@ -111,12 +117,18 @@ def _notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
         if kind == "gap":
             text = f"{condition.amount} sample{'s' if condition.amount > 1 else ''} lost"
         if condition.lasting:
-            text = f"{text}, in the last {(now_ns - condition.reported_ns) / _NS_PER_S:.0f} s"
+            text = f"{text}, in the last {elapsed_s:.0f} s"
+        if kind == "gap":
+            # A first notice has no interval; its samples are compared with those of a minute.
+            interval_s = elapsed_s if condition.lasting else QUIET_NS / _NS_PER_S
+            share = condition.amount / (condition.rate_hz * interval_s)
+            text = f"{text} ({100 * share:.2f} %)" if condition.lasting else text
+            level = NoticeLevel.WARNING if share > MOST_LOST else NoticeLevel.INFO
         data = _totals(kind, condition)
 
     condition.reported_ns, condition.count, condition.amount = now_ns, 0, 0
     reported = _JUMPS.get(kind, NoticeKind.WIRE)
-    return Notice(now_ns, reported, source, text, NoticeLevel.WARNING, data)
+    return Notice(now_ns, reported, source, text, level, data)
 
 
 def _totals(kind: str, condition: _Condition) -> dict[str, object]:

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.clock import DelayPercentiles
     from jointfit_daemon.timing.lag import TrackedLag
 
+MOST_LOST = 0.01
+"""Share of lost or corrupt samples above which a device is reported as faulty."""
+
 
 @dataclass(slots=True)
 class WireCounts:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from jointfit_daemon.driver import device_path
+from jointfit_daemon.pipeline.health import MOST_LOST
 from jointfit_daemon.supervisor.state_directory import WRITE_REMEDY, write_fault
 
 if TYPE_CHECKING:
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
 LEAST_RATE = 0.95
 """Share of the configured sample rate below which a device is reported."""
-MOST_LOST = 0.01
-"""Share of lost or corrupt samples above which a device is reported."""
 MOST_DROPPED = 0.05
 """Dropped messages per message sent above which the link is reported: before the connection is
 made, poses are dropped at every start."""
