@@ -110,7 +110,9 @@ def test_single_gap_is_reported_once() -> None:
 
 def test_counter_jumps_give_one_wire_notice_a_minute() -> None:
     limiter = NoticeLimiter()
-    notices = [limiter.add(n, "S1", DeviceEvent("counter", f"jumped to {n}"), HZ) for n in range(100)]
+    notices = [
+        limiter.add(n, "S1", DeviceEvent("counter", f"jumped to {n}"), HZ) for n in range(100)
+    ]
     assert [n.kind for each in notices for n in each] == ["wire"]
     (rest,) = limiter.due(61 * S)
     assert (rest.kind, rest.data["events"]) == ("wire", 99)

@@ -34,6 +34,7 @@ class NatNetMocap:
 
     def __init__(self, settings: NatNetSettings) -> None:
         self._settings = settings
+        self._silent = False
 
     def decoder(self) -> NatNetDecoder:
         """Return the decoder from datagrams to optical frames in SI units."""
@@ -79,4 +80,8 @@ class NatNetMocap:
             raise DeviceMisconfiguredError(
                 f"mocap.interface = {interface!r}: no network card with this name or IPv4 address"
             ) from error
-        await NatNetSession(self._settings, host, local, emit).run()
+        session = NatNetSession(self._settings, host, local, emit, after_silence=self._silent)
+        try:
+            await session.run()
+        finally:
+            self._silent = session.silent

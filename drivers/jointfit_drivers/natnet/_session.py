@@ -5,7 +5,7 @@
 3. Frames; ten echo requests, 50 ms apart, then one a second, and in unicast one KEEPALIVE a second.
    Frames before the tenth answer are unsynchronized.
 
-Every accepted datagram is emitted before it is processed here, so that a replay has the same input.
+Every accepted datagram is emitted, in order of arrival, so that a replay has the same input.
 The receiver of the chunks decodes the frames. This module reads only their flags, and decodes one
 frame a second to check that it can be decoded and that its ids are known.
 
@@ -75,12 +75,26 @@ class NatNetSession:
         Numeric addresses of the server and of this host's network card.
     emit : Emit
         Receives every accepted datagram of the server.
+    after_silence : bool
+        Whether the last connection ended without frames. The answers of the server are then
+        emitted with the first frame, because a server that only answers is still lost.
     """
 
-    def __init__(self, settings: NatNetSettings, host: str, local: str, emit: Emit) -> None:
+    def __init__(
+        self,
+        settings: NatNetSettings,
+        host: str,
+        local: str,
+        emit: Emit,
+        *,
+        after_silence: bool = False,
+    ) -> None:
         self._settings = settings
         self._name = f"NatNet server {settings.server}:{settings.command_port}"
         self._emit = emit
+        self.silent = after_silence
+        """Whether frames have stopped and none has arrived since, in any connection."""
+        self._held: list[Chunk] = []
         self._link = NatNetLink(host, settings.command_port, local, self._take)
         self._open_requests = OpenRequests()
         self._info: natnet.ServerInfo | None = None
@@ -128,10 +142,16 @@ class NatNetSession:
 
     def _take(self, chunk: Chunk) -> None:
         if chunk.data.startswith(FRAME_START):
+            self.silent = False
+            while self._held:
+                self._emit(self._held.pop(0))
             self._emit(chunk)
             self._frame(chunk)
         elif self._open_requests.accept(chunk.data, chunk.t_ns):
-            self._emit(chunk)
+            if self.silent:
+                self._held.append(chunk)
+            else:
+                self._emit(chunk)
             self._message(chunk)
 
     def _frame(self, chunk: Chunk) -> None:
@@ -254,8 +274,14 @@ class NatNetSession:
                 f"NatNet {version}: check that Motive streams the bitstream it announces"
             )
 
-        hint = ""
+        # The text contains no measured duration: it would differ at every attempt, and every
+        # different text is a new line of the log.
+        self.silent, hint = True, ""
         if unicast == info.multicast:
             announced = "multicast" if info.multicast else "unicast"
             hint = f"; it announces {announced}, but transport = {self._settings.transport!r}"
-        raise DeviceLostError(f"{self._name}: no frame for {silent_s:.1f} s{hint}")
+        raise DeviceLostError(
+            f"{self._name}: no frame for {self._settings.silence_s:g} s{hint}: start "
+            "streaming in the camera software and check the network; `jointfit doctor` names the "
+            "cause"
+        )

@@ -15,7 +15,7 @@ from typing_extensions import override
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.files.captures import read_capture
-from jointfit_daemon.model import ClockEcho, MocapFrame
+from jointfit_daemon.model import Chunk, ClockEcho, MocapFrame
 from jointfit_drivers.natnet import NatNetMocap, NatNetSettings, _session
 from jointfit_drivers.ports.udp_socket import UdpSocket, local_address
 from jointfit_protocols.natnet import NatNetMessageId, ServerInfo, encode
@@ -261,6 +261,40 @@ async def test_silence_names_the_transport_where_it_contradicts_the_server(
         error = task.exception()
     assert isinstance(error, DeviceLostError)
     assert "announces multicast, but transport = 'unicast'" in str(error)
+
+
+async def test_a_server_that_answers_but_sends_no_frames_is_lost_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its answers open the source again only together with the first frame."""
+    monkeypatch.setattr(_session, "FIRST_ECHOES", 1)
+    server = serve()
+    table = {"driver": "natnet", "server": "127.0.0.1", "silence_s": 0.2}
+    driver = NatNetMocap(
+        NatNetSettings.model_validate(table | {"command_port": server.command_port})
+    )
+    serving = asyncio.create_task(server.run())
+    chunks: list[Chunk] = []
+    texts: list[str] = []
+    try:
+        for _ in range(2):
+            chunks = []
+            with pytest.raises(DeviceLostError) as lost:
+                await driver.run(chunks.append)
+            texts.append(str(lost.value))
+        assert chunks == [], "the second connection"
+        assert texts[0] == texts[1]
+        assert "no frame for 0.2 s: start streaming in the camera software" in texts[0]
+
+        running = asyncio.create_task(driver.run(chunks.append))
+        await until(lambda: len(chunks) > 2, server)
+        running.cancel()
+        times = [chunk.t_ns for chunk in chunks]
+        assert times == sorted(times), "the answers first, then the frames"
+    finally:
+        serving.cancel()
+        await asyncio.wait([serving])
+        server.unplug()
 
 
 # --- stamps -----------------------------------------------------------------------------------
