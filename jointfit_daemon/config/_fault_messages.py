@@ -51,7 +51,8 @@ class Fault:
 
     def text(self) -> str:
         """Return the message, one line."""
-        value = repr(self.value)
+        written = isinstance(self.value, bool)
+        value = str(self.value).lower() if written else repr(self.value)  # TOML: true, false
         if len(value) > _LONGEST_VALUE:
             value = f"{value[:_LONGEST_VALUE]}…"
         shown = f" = {value}" if self.has_value else ""

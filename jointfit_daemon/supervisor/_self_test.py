@@ -181,6 +181,8 @@ def _calibration(rig: Rig, health: BridgeHealth) -> Iterator[Check]:
                 "lag", name, "warning", "lag behind the cameras unknown: 0 is subtracted",
                 "repeat the functional phase with faster movements, or set lag_ms",
             )  # fmt: skip
+        elif not lag.used_ns and lag.found_by in (None, "none") and lag.source == "calibration":
+            yield Check("lag", name, "ok", "no lag determined (assumed 0 ms)")
         elif lag.used_ns is not None:
             yield Check("lag", name, "ok", f"lag {lag.used_ns * 1e-6:.1f} ms by {lag.source}")
 

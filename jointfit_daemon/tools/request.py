@@ -15,7 +15,7 @@ from jointfit_daemon.tools.completion import complete_request
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-_Rig = Annotated[Path, typer.Option("--rig", help="The rig.toml of the daemon.")]
+_Rig = Annotated[Path, typer.Option("--rig", "--config", help="The rig.toml of the daemon.")]
 _Json = Annotated[bool, typer.Option("--json", help="Print the whole answer as one JSON object.")]
 
 

@@ -1,10 +1,11 @@
 """Command-line interface of the hardware simulator, ``jointfit-sim``.
 
-``jointfit-sim play --directory DIR`` reads one command per line from stdin: ``play NAME``,
-``unplug ID``, ``plug ID``, ``reboot ID``, ``stick ID``, ``free ID``, ``slip ID DEG``, ``drift ID
-DEG``, ``occlude on|off``, ``mocap stop|start|restart``, ``pause on|off``, ``status``, ``quit``. ID
-is a sensor, ``can0`` for the bus adapter, or (to reboot) ``mocap``. ``--at SECONDS=COMMAND``
-schedules a command. The simulator continues after the end of stdin. SIGTERM and SIGINT stop it.
+``jointfit-sim play --directory DIR`` reads one command per line from stdin: ``play NAME``, ``unplug
+ID``, ``plug ID``, ``reboot ID``, ``stick ID``, ``free ID``, ``slip ID DEG``, ``drift ID DEG``,
+``occlude on|off``, ``hide MARKER``, ``show MARKER``, ``exchange MARKER MARKER``, ``mocap
+stop|start|restart``, ``pause on|off``, ``status``, ``quit``. ID is a sensor, ``can0`` for the bus
+adapter, or (to reboot) ``mocap``. ``--at SECONDS=COMMAND`` schedules a command. The simulator
+continues after the end of stdin. SIGTERM and SIGINT stop it.
 
 Invariant: stdout contains JSON lines only: one when all devices are ready, one for each ``status``,
 ``{"error": …}`` for each invalid command, ``{"motion": …}`` for each motion started by
@@ -67,6 +68,8 @@ COMMANDS = """commands, one per line on standard input:
   slip ID DEG                 rotate the sensor on the segment within 0.3 s
   drift ID DEG                heading drift in degrees per minute; 0 stops it
   occlude on, occlude off     hide all markers from the cameras, or show them
+  hide MARKER, show MARKER    hide one marker from the cameras, or show it
+  exchange MARKER MARKER      exchange the labels of two markers
   mocap stop, mocap start     stop or start the motion-capture stream
   mocap restart               close and reopen the server; its clock continues
   pause on, pause off         stop or start all transmission; time continues

@@ -226,7 +226,7 @@ def test_a_bus_without_sensors_is_checked() -> None:
         (f'{RIG}{MOCAP}plate = ""\n', "mocap.plate = '': "),
         (f'{RIG}[mqtt]\nhost = "a b"\ninsecure = true\n', "mqtt.host = 'a b': expected one add"),
         (RIG.replace("0x121", "0x921"),
-         "imu[S4].extended_ids = False: ids.quaternion = 0x921 is above 0x7FF"),
+         "imu[S4].extended_ids = false: ids.quaternion = 0x921 is above 0x7FF"),
         (RIG.replace("0x121", "0x106"), "imu[S4].ids: each identifier once: found 0x106"),
         (RIG.replace("{ sample_time = 0x105, group_counter = 0x106, quaternion = 0x121 }", '"a"'),
          "imu[S4].ids = 'a': expected a table, such as ids = { sample_time = 5 }"),

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from jointfit_daemon.config._load import load_rig
 from jointfit_daemon.model import Corrupt, ImuSample, MocapFrame
+from jointfit_simulators.__main__ import COMMANDS
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -263,3 +264,8 @@ async def test_invalid_command_line_exits_with_2_and_a_reason(
     close_pipes(process)
     assert process.returncode == 2
     assert message in message_bytes.decode()
+
+
+def test_help_of_play_lists_every_command() -> None:
+    listed = {word.strip(",") for line in COMMANDS.splitlines() for word in line.split()}
+    assert {"hide", "show", "exchange", "occlude", "unplug"} <= listed

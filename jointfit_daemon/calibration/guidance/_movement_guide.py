@@ -14,7 +14,7 @@ the phase ends in any case, with these messages.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import degrees, isfinite
+from math import ceil, degrees, isfinite
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.calibration._errors import CalibrationError
@@ -232,7 +232,8 @@ def _missing_movement(one: LiveJointCenter, words: JointInstructions, target: fl
     if noise <= target:
         return one.refused
     more = words.bend if words.hinge else f"{words.bend}, and {words.sideways}"
-    return f"error of {1e3 * noise:.1f} mm, target {1e3 * target:g} mm: {more}"
+    shown_mm = ceil(1e4 * noise) / 10.0  # upwards: an unmet target is never shown as met
+    return f"error of {shown_mm:.1f} mm, target {1e3 * target:g} mm: {more}"
 
 
 def _noise(one: LiveJointCenter, words: JointInstructions) -> float:

@@ -85,10 +85,16 @@ def _read(path: Path, reader: Any) -> tuple[MarkerTrajectories, str | None]:
             f"{path}: POINT:RATE is {rate_hz:g}, expected frames a second (Hz): export it again"
         )
 
+    declared = int(reader.last_frame) - first + 1
+    if len(cells) < declared:
+        raise MalformedFileError(
+            f"{path}: cut off: the header declares {declared} frames, the file holds {len(cells)}:"
+            " copy or export it again"
+        )
+
     positions = cells[..., :3].copy()
     positions[cells[..., 3] < 0.0] = np.nan
     numbers = np.arange(first, first + len(cells), dtype=np.int64)
-    declared = int(reader.last_frame) - first + 1
     trajectories = MarkerTrajectories(
         names,
         (numbers - 1) / rate_hz,

@@ -14,6 +14,7 @@ Positions are returned in metres, in the file's own axes; a missing marker is Na
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -73,7 +74,7 @@ def read_trc(path: Path) -> MarkerTrajectories:
     Raises
     ------
     MalformedFileError
-        Not a TRC file, no markers, no rows, or an unknown unit of length.
+        Not a TRC file, no markers, two markers of one name, no rows, or an unknown unit of length.
     """
     lines = read_lines(path)
     _require_header(path, lines)
@@ -83,6 +84,8 @@ def read_trc(path: Path) -> MarkerTrajectories:
         raise MalformedFileError(
             f"{path}, line 4: no marker names after Frame# and Time: export it again"
         )
+
+    _require_unique_names(path, names)
 
     header_separator = separator_of(lines[1])
     keys, cells = (cells_of(line, header_separator) for line in lines[1:3])
@@ -119,6 +122,17 @@ def read_trc(path: Path) -> MarkerTrajectories:
         rate_hz,
         warnings,
     )
+
+
+def _require_unique_names(path: Path, names: Sequence[str]) -> None:
+    """Raise `MalformedFileError` if two markers have the same name, as OpenSim does."""
+    for name, times in Counter(filter(None, names)).items():
+        if times > 1:
+            columns = [str(3 + 3 * at) for at, other in enumerate(names) if other == name]
+            raise MalformedFileError(
+                f"{path}, line 4: marker {name!r} occurs {times} times, in columns"
+                f" {' and '.join(columns)}, expected once: rename all but one"
+            )
 
 
 def _require_header(path: Path, lines: Sequence[str]) -> None:

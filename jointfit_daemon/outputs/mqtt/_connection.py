@@ -19,7 +19,13 @@ from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from jointfit_daemon.outputs.mqtt._error_messages import NO_ANSWER, broker_fault, session_fault
+from jointfit_daemon.outputs.mqtt._error_messages import (
+    NO_ANSWER,
+    VERSION_REFUSED,
+    broker_fault,
+    refusal_fault,
+    session_fault,
+)
 from jointfit_daemon.outputs.mqtt._packet_limit import PacketLimitSocket
 from jointfit_daemon.outputs.mqtt._secret_files import password_of
 from jointfit_daemon.outputs.mqtt._tls import TlsFilesError, tls_context, tls_remedy
@@ -50,6 +56,8 @@ _REFUSED = 0x80
 """Lowest MQTT reason code of a refusal."""
 _TAKEN_OVER = 0x8E
 """MQTT 5 reason code "session taken over"."""
+_PROTOCOL_ERROR = 0x82
+"""Reason code with which paho ends a connection whose answer refuses MQTT 3.1.1 (code 1)."""
 _CLOSED_EARLY = "the broker closed the connection during the handshake"
 _NOT_STORED = 2
 """MQTT 5 retain handling: the broker sends no stored messages for a subscription."""
@@ -160,7 +168,7 @@ class MqttConnection:
                 stop_if_cancelled()
         except aiomqtt.MqttError as error:
             self._client.abandon()
-            why = f"{broker_fault(error)}{self._remedy(error)}"
+            why = f"{refusal_fault(error)}{self._remedy(error)}"
             raise BrokerLostError(f"{self._address()}: {why}") from error
         except BaseException:
             self._client.abandon()
@@ -455,7 +463,11 @@ class _Client(aiomqtt.Client):
 
         A connection that ends before its acceptance fails at once, without aiomqtt's timeout.
         """
-        self.taken_over |= getattr(reason_code, "value", None) == _TAKEN_OVER
+        code = getattr(reason_code, "value", None)
+        self.taken_over |= code == _TAKEN_OVER
+        old = self._client.protocol != aiomqtt.ProtocolVersion.V5.value
+        if code == _PROTOCOL_ERROR and old and not self._connected.done():
+            self._connected.set_exception(aiomqtt.MqttError(VERSION_REFUSED))
         self._fail_handshake()
         super()._on_disconnect(client, userdata, flags, reason_code, properties)
 

@@ -56,13 +56,40 @@ _MQTT_ERRORS = {
     134: _CREDENTIALS,
     135: _RIGHTS,
     136: _UNAVAILABLE,
+    137: "the broker is busy: wait, or reduce the load of its machine",
     138: "the broker has banned this client: check its log",
+    139: "the broker shuts down: start it again",
+    140: (
+        "the broker does not offer the authentication of this client: enable a user name with a"
+        " password in the broker"
+    ),
+    149: "the broker accepts no packet of this size: raise its limit, such as max_packet_size",
     151: "the broker's quota for this client is used up: check its configuration",
+    156: "the broker asks for the use of another server: correct host and port in [mqtt]",
+    157: "the broker has moved: correct host and port in [mqtt]",
     159: "the broker limits the rate of connections: wait, or check its configuration",
 }
 """Messages by the reason code of MQTT 3.1.1 (below 128) or MQTT 5."""
+VERSION_REFUSED = (  # an answer that is not of MQTT ends in the same fault of the library
+    'the broker refuses MQTT 3.1.1, or this port does not serve MQTT: set version = "5", or correct'
+    " host and port in [mqtt]"
+)
+_UNSPECIFIED = 128
+"""Reason code without a reason, in which paho converts every unknown code of MQTT 3.1.1."""
 _SESSION_LOST = (4, 7, 128)
 """Numbers of paho for "not connected" and "connection lost", and its default reason code."""
+
+
+def refusal_fault(error: BaseException) -> str:
+    """Return cause and remedy of a connection that the broker refused in its answer (CONNACK)."""
+    found = _CODE.search(str(error))
+    if found is None:
+        return broker_fault(error)
+    code = int(found[1])
+    if code == _UNSPECIFIED:
+        return "the broker refused the connection without a known reason: check its log"
+    unknown = f"the broker refused the connection with code {code}: check its log"
+    return _MQTT_ERRORS.get(code, unknown)
 
 
 def broker_fault(error: BaseException) -> str:
@@ -71,7 +98,10 @@ def broker_fault(error: BaseException) -> str:
     if found := _ERRNO.search(text):
         return _SYSTEM_ERRORS.get(int(found[1]), text)
     if found := _CODE.search(text):
-        return _MQTT_ERRORS.get(int(found[1]), text)
+        code = int(found[1])
+        if code > _UNSPECIFIED:  # smaller numbers are errors of paho, with its text
+            text = f"the broker ended the connection with code {code}: check its log"
+        return _MQTT_ERRORS.get(code, text)
     return text
 
 

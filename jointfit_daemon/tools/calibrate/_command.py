@@ -8,7 +8,6 @@ unreachable.
 from __future__ import annotations
 
 import asyncio
-import math
 import sys
 from contextlib import asynccontextmanager, nullcontext, suppress
 from pathlib import Path
@@ -92,7 +91,7 @@ def calibrate(
     ] = None,
     seconds: Annotated[
         float | None,
-        typer.Option(help="Duration of each phase, s. Default: from rig.toml.", max=LONGEST_S),
+        typer.Option(help="Duration of each phase, s, up to 600. Default: from rig.toml."),
     ] = None,
     abort: Annotated[bool, typer.Option("--abort", help="Abort the running phase.")] = False,
     listed: _List = False,
@@ -117,7 +116,7 @@ def calibrate(
     wrong = [name for name in phase or () if name not in _PHASES]
     if wrong:
         raise ValueError(f"--phase {wrong[0]}: expected one of {', '.join(_PHASES)}")
-    if seconds is not None and not (math.isfinite(seconds) and seconds > 0.0):
+    if seconds is not None and not 0.0 < seconds <= LONGEST_S:
         raise ValueError(f"--seconds {seconds:g}: expected 0 < seconds <= {LONGEST_S:g}")
     if sum((abort, listed, use is not None, revert, bool(phase))) > 1:
         raise ValueError("expected one of --phase, --abort, --list, --use and --revert")
@@ -209,7 +208,7 @@ async def _run_phase(
         ended = await tracker.wait_for_end(name)
     except (asyncio.CancelledError, OutputLostError):
         if name not in IMMEDIATE_REQUESTS:
-            await _abort_phase(client, name, request, config)
+            await _abort_phase(client, tracker, name, request, config)
         raise
     final = name == "align" or ended.get("kept") is not None
     return dict(ended if final else await tracker.wait_for_store(ended))
@@ -242,9 +241,15 @@ async def _await_answer(
 
 
 async def _abort_phase(
-    client: MqttClient, name: str, request: asyncio.Task[dict[str, Any]], config: Path
+    client: MqttClient,
+    tracker: PhaseTracker,
+    name: str,
+    request: asyncio.Task[dict[str, Any]],
+    config: Path,
 ) -> None:
     """Abort the phase that this command started and report the outcome.
+
+    A phase that ended before the abort arrived is reported with the daemon's final status.
 
     A refused request started no phase, so the running phase belongs to another client and is not
     aborted. The request runs in its own task because the current task is already cancelled.
@@ -257,7 +262,17 @@ async def _abort_phase(
     ending = asyncio.create_task(client.request("calibrate", {"phase": "abort"}), name="abort")
     await asyncio.wait([ending], timeout=ABORT_S)
     if ending.done() and not ending.cancelled() and ending.exception() is None:
-        _print_note(f"{name}: aborted")
+        # The answer does not say whether a phase was running: the status does.
+        final = asyncio.create_task(tracker.wait_for_final(name), name="final status")
+        await asyncio.wait([final], timeout=ABORT_S)
+        status: Mapping[str, Any] = {}
+        if final.done() and final.exception() is None:
+            status = final.result()
+        final.cancel()
+        if status.get("phase") in (None, "aborted"):
+            _print_note(f"{name}: aborted")
+        else:
+            _print_note(f"{name}: ended before the abort: {status.get('text')}")
     else:
         ending.cancel()
         _print_note(

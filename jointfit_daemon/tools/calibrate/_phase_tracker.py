@@ -55,6 +55,8 @@ class PhaseTracker:
     """Whether the phase was requested; earlier messages are retained or of other phases."""
     _phase_before: object = None
     """Phase of the last status before the request."""
+    _status_before: object = None
+    """The last status before the request."""
 
     def on_status(self, payload: Mapping[str, Any]) -> None:
         """Process a message of topic ``calibration``."""
@@ -111,6 +113,7 @@ class PhaseTracker:
     def begin(self) -> None:
         """Discard the messages received so far."""
         self._requested, self._phase_before = True, self.status.get("phase")
+        self._status_before = self.status
         self._unread.clear()
         self._changed.clear()
         self._waiting = False
@@ -151,6 +154,13 @@ class PhaseTracker:
                     return status
             self._unread.clear()
             await self._next_message()
+
+    async def wait_for_final(self, phase: str) -> Mapping[str, Any]:
+        """Return the status in which a requested `phase` has ended and its result is stored."""
+        while self.status is self._status_before or self.status.get("phase") in (phase, "fitting"):
+            await self._next_message()
+        ended = self.status
+        return ended if ended.get("phase") == "aborted" else await self.wait_for_store(ended)
 
     async def wait_for_store(self, ended: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the status with the stored version or a failure; `ended` if none comes in time."""

@@ -69,8 +69,9 @@ def ik(
 ) -> None:
     """Compute the joint coordinates of a marker trial by inverse kinematics.
 
-    Compares the marker errors with the limits that OpenSim recommends. Exits with 1 if the trial
-    does not fit the model, or if no frame of a .mot or .sto file is complete.
+    Compares the marker errors with the limits that OpenSim recommends, and exits with 0 even if
+    they are larger. Exits with 1 if the trial cannot be of the model (other markers, unit or
+    size), or if no frame of a .mot or .sto file is complete.
     """
     from jointfit_daemon.calibration.marker_refinement import RefinementError
     from jointfit_daemon.tools.ik._output import ENDINGS, write_tables

@@ -29,6 +29,7 @@ from jointfit_daemon.kinematics.inverse_kinematics import (
     restart_local_minima,
     solve_frames,
 )
+from jointfit_daemon.nearest_name import did_you_mean
 from jointfit_daemon.tools.marker_model import motion_trial
 from jointfit_daemon.tools.text_output import list_names
 
@@ -46,6 +47,8 @@ if TYPE_CHECKING:
 
 _LIMIT_M2 = 1.0
 """Weight of the excess over joint limits, m^2/rad^2, as in `jointfit markers`."""
+_MOST_HINTS = 5
+"""Most missing markers with a proposed name in one note."""
 _FEWEST_MARKERS = 3
 """Markers of a frame with a solution: fewer do not determine the position of the first segment."""
 _MISFIT_RAD = 0.0017
@@ -200,7 +203,11 @@ def _check(
     if faults:
         raise RefinementError("; ".join(faults))
     absent = [m.name for m, s, w in zip(model.markers, seen, weights, strict=True) if not s and w]
-    return [f"not in the trial: {list_names(absent)}"] if absent else []
+    spare = set(trial.trajectories.names) - set(model.marker_names)
+    hints = {name: did_you_mean(name, sorted(spare)) for name in absent[:_MOST_HINTS]}
+    shown = [f"{name}: {hint}" for name, hint in hints.items() if hint]
+    listed = "; ".join((f"not in the trial: {list_names(absent)}", *shown))
+    return [listed] if absent else []
 
 
 def _described(

@@ -51,6 +51,16 @@ def positions() -> NDArray[np.float64]:
     return drawn
 
 
+def test_cut_off_file_is_refused_with_its_remedy(
+    tmp_path: Path, positions: NDArray[np.float64]
+) -> None:
+    path = tmp_path / "cut.c3d"
+    write_c3d(path, positions)
+    path.write_bytes(path.read_bytes()[: -20 * 3 * 16])
+    with pytest.raises(MalformedFileError, match=r"declares 40 frames.*copy or export it again"):
+        read_c3d(path)
+
+
 @pytest.mark.parametrize(
     ("name", "first", "missing"),
     [("markers_analogs_first100", 1, 0), ("markers_gaps_frames119to218", 119, 139)],

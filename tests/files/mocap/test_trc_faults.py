@@ -4,13 +4,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
-from jointfit_daemon.files.mocap import read_trc
+from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc, write_trc
 from jointfit_daemon.files.text import MalformedFileError
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+
+def test_marker_name_that_occurs_twice_is_refused_with_its_columns(tmp_path: Path) -> None:
+    positions = np.zeros((2, 3, 3))
+    times, frames = np.array([0.0, 0.01]), np.array([1, 2])
+    names = ("T1", "T3", "T3")
+    write_trc(tmp_path / "m.trc", MarkerTrajectories(names, times, frames, positions, 100.0))
+    with pytest.raises(MalformedFileError, match="'T3' occurs 2 times, in columns 6 and 9"):
+        read_trc(tmp_path / "m.trc")
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import socket
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import aiomqtt
 import orjson
@@ -99,6 +99,48 @@ def test_not_authorized_suggests_the_password_file(code: int) -> None:
 def test_a_connection_that_ended_without_a_reason_is_reported_as_lost() -> None:
     ended = aiomqtt.MqttCodeError(ReasonCode(PacketTypes.DISCONNECT, "Unspecified error"))
     assert "connection was lost" in broker_fault(ended)
+
+
+@contextlib.asynccontextmanager
+async def answering(connack: bytes) -> AsyncIterator[int]:
+    """Run a broker with this answer to every CONNECT; yield its port."""
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read(1000)
+        writer.write(connack)
+        await writer.drain()
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    async with server:
+        yield server.sockets[0].getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    ("version", "code", "remedy"),
+    [
+        ("5", 128, "refused the connection without a known reason: check its log"),
+        ("5", 137, "busy: wait"),
+        ("5", 140, "enable a user name with a password in the broker"),
+        ("5", 149, "raise its limit"),
+        ("5", 156, "correct host and port in [mqtt]"),
+        ("5", 157, "correct host and port in [mqtt]"),
+        ("5", 155, "refused the connection with code 155: check its log"),
+        ("3.1.1", 1, 'refuses MQTT 3.1.1, or this port does not serve MQTT: set version = "5"'),
+        ("3.1.1", 9, "refused the connection without a known reason: check its log"),
+    ],
+)
+async def test_refused_connection_names_cause_and_remedy(
+    version: Literal["3.1.1", "5"], code: int, remedy: str
+) -> None:
+    answer = bytes((0x20, 3, 0, code, 0) if version == "5" else (0x20, 2, 0, code))
+    async with answering(answer) as port:
+        settings = MqttSettings(host="127.0.0.1", port=port, version=version)
+        with pytest.raises(BrokerLostError) as lost:
+            async with MqttConnection(settings):
+                pass
+    assert remedy in str(lost.value)
+    assert "code:" not in str(lost.value)
 
 
 async def test_stop_at_the_connack_is_not_lost(

@@ -253,6 +253,30 @@ async def test_request_without_answer_and_status_is_aborted() -> None:
     assert client.asked == ["static", "abort"]
 
 
+@pytest.mark.parametrize(
+    ("phase", "text", "line"),
+    [
+        ("posed", "stored as version 3", "static: ended before the abort: stored as version 3"),
+        ("aborted", "abort requested", "static: aborted"),
+    ],
+)
+async def test_stop_after_the_end_of_the_phase_reports_its_final_status(
+    capsys: pytest.CaptureFixture[str], phase: str, text: str, line: str
+) -> None:
+    class AnsweringDaemon:
+        async def request(self, *_: object, **__: object) -> dict[str, object]:
+            status = {"phase": phase, "text": "static pose recorded", "version": 2}
+            one.on_status(status)
+            later = status | {"text": text, "version": 3}
+            asyncio.get_running_loop().call_later(0.01, one.on_status, later)
+            return {"status": "ok", "data": {"phase": "calibrated"}}
+
+    one = tracker_after("static")
+    done = asyncio.create_task(AnsweringDaemon().request())
+    await _command._abort_phase(AnsweringDaemon(), one, "static", done, Path("rig.toml"))  # type: ignore[arg-type]
+    assert capsys.readouterr().err.splitlines() == [line]
+
+
 def test_retained_status_of_the_last_phase_is_not_printed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", SimpleNamespace(isatty=lambda: False))
     one = PhaseTracker(lambda *_: None)

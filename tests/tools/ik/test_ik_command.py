@@ -113,6 +113,14 @@ def test_coordinates_of_a_simulated_trial_are_recovered(folder: Path) -> None:
     np.testing.assert_allclose(found.t_s, np.arange(FRAMES) / 50.0)
 
 
+def test_a_missing_marker_is_reported_with_a_similar_label(folder: Path) -> None:
+    path = folder / "walk.trc"
+    name = read_osim(folder / "leg.osim").model.marker_names[-1]
+    path.write_text(path.read_text().replace(f"\t{name}\t", f"\t{name}2\t"))
+    notes = " ".join(answer(folder)["notes"])
+    assert f"not in the trial: {name}; {name}: did you mean '{name}2'?" in notes
+
+
 def test_angles_are_in_radians_on_request(folder: Path) -> None:
     found = table(folder, "--radians")
     assert not found.in_degrees
