@@ -377,7 +377,7 @@ class Daemon:
             await asyncio.sleep(CHECK_S)
             now_s = loop.time()
             self._process.add_delay(now_s - due)
-            for notice in self._outages.due(time.monotonic()):
+            for notice in self._outages.due(now_s, now_s - due):
                 self._log(notice)
 
             if now_s - fed_s > watchdog_s / 3:

@@ -40,3 +40,17 @@ def test_other_notices_have_lines_at_once() -> None:
     lines = OutageLines()
     assert not lines.holds(sensor("stuck"), 10.0, 2.0)
     assert not lines.holds(Notice(0, NoticeKind.DEVICE, "S1", "closed"), 10.0, 2.0)
+
+
+def test_sensors_lost_in_a_stall_of_the_host_have_a_line_only_if_they_stay_lost() -> None:
+    lines = OutageLines()
+    assert lines.holds(sensor("lost"), 10.0, 2.0)
+    (stall,) = lines.due(10.1, 4.95)
+    assert (stall.id, stall.text[:34]) == ("gateway", "stopped or overloaded for 4950 ms,")
+    assert lines.due(13.0) == []
+    assert lines.holds(sensor("ok"), 13.0, 2.0)
+
+    assert lines.due(20.0, 1.0) == [], "one line a minute"
+    assert lines.holds(sensor("lost"), 20.1, 2.0), "reported after the stall was noticed"
+    assert lines.due(23.9) == []
+    assert [notice.text for notice in lines.due(24.0)] == ["lost"]
