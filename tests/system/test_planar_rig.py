@@ -25,12 +25,10 @@ async def test_joints_of_a_planar_movement_without_sensors(tmp_path: Path, broke
         assert listener.client is not None
         await listener.client.subscribe("optical/sticks")
         await wait_for_small_errors(listener)
-        figures = [await next_figure(listener) for _ in range(20)]
+        figures = [await next_figure(listener) for _ in range(60)]  # several times an occlusion
 
         await simulator.say("hide T4")
-        await listener.until(lambda: joints(listener)["hip"]["refused"] == "thigh: T4 not visible")
-        assert joints(listener)["hip"]["p_m"] is None
-        assert joints(listener)["knee"]["p_m"] is not None
+        await listener.until(lambda: only_the_hip_lacks(listener, "thigh: T4 not visible"))
         await simulator.say("show T4")
         await listener.until(lambda: joints(listener)["hip"]["p_m"] is not None)
 
@@ -55,6 +53,12 @@ async def next_figure(listener: Listener) -> dict[str, Any]:
     await listener.until(lambda: listener.latest["optical/sticks"]["t_us"] > before_us)
     found: dict[str, Any] = listener.latest["optical/sticks"]
     return found
+
+
+def only_the_hip_lacks(listener: Listener, reason: str) -> bool:
+    """Return whether the knee has a position beside; the cameras also lose other markers."""
+    hip, knee = joints(listener)["hip"], joints(listener)["knee"]
+    return hip["refused"] == reason and hip["p_m"] is None and knee["p_m"] is not None
 
 
 def joints(listener: Listener) -> dict[str, Any]:

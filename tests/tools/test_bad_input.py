@@ -378,4 +378,9 @@ def test_faults_of_a_broker_have_words(text: str) -> None:
 
 
 def test_an_unknown_fault_of_a_broker_keeps_its_text() -> None:
-    assert broker_fault(OSError("[code:250] strange")) == "[code:250] strange"
+    assert broker_fault(OSError("strange")) == "strange"
+
+
+def test_an_unknown_code_of_a_broker_is_in_its_log() -> None:
+    said = broker_fault(OSError("[code:250] strange"))
+    assert said == "the broker ended the connection with code 250: check its log"

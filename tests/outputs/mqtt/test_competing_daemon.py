@@ -112,13 +112,14 @@ async def test_newer_daemon_publishes_nothing_and_leaves_the_first_connected(
         await asyncio.sleep(0.1)
         assert older.connects == 1
 
-        # With MQTT 3.1.1 the messages that were stored before arrive as retained.
+        # The state that the older one stored before may arrive as retained: always with MQTT
+        # 3.1.1, and from the embedded broker if it was stored at the instant of the subscription.
         reader, new = watcher.messages(), list[Incoming]()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(0.1):
                 while True:
                     new.append(await anext(reader))
-        assert [message for message in new if version == "5" or not message.retained] == []
+        assert [each for each in new if not each.retained or each.payload != ONLINE] == []
 
 
 @pytest.mark.parametrize("stored", [ONLINE, OFFLINE])
