@@ -28,7 +28,7 @@ class Finding:
     """Name of the device, interface or file; empty if the subject is the host."""
     level: Level
     text: str
-    """What was found, and what was expected."""
+    """The state that was found, and the expected one."""
     remedy: str = ""
     """Command or setting that removes the cause; empty if there is nothing to do."""
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.device_search import Finding
 from jointfit_daemon.driver import device_path
 from jointfit_daemon.pipeline.health import MOST_LOST
 from jointfit_daemon.supervisor.state_directory import WRITE_REMEDY, write_fault
@@ -18,10 +19,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from jointfit_daemon.config import Rig, Source
+    from jointfit_daemon.device_search import Level
     from jointfit_daemon.outputs.payloads import BridgeHealth
     from jointfit_daemon.pipeline.health import DeviceHealth
-
-    Level = Literal["ok", "warning", "error"]
 
 LEAST_RATE = 0.95
 """Share of the configured sample rate below which a device is reported."""
@@ -37,19 +37,6 @@ LOW_DISK_BYTES, LEAST_DISK_BYTES = 1_000_000_000, 50_000_000
 HOT_C = 80.0
 """Processor temperature above which the host is reported, °C: a Raspberry Pi slows down at 80."""
 _THERMAL = Path("/sys/class/thermal")
-
-
-@dataclass(frozen=True, slots=True)
-class Check:
-    """One line of the result."""
-
-    check: str
-    """Its subject: ``device``, ``clock``, ``calibration``, ``store``, ``disk`` and so on."""
-    id: str
-    """Name of the device; empty for all other subjects."""
-    level: Level
-    text: str
-    remedy: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +67,7 @@ def read_host(folder: Path) -> HostState:
     return HostState(fault, free, max(found, default=None))
 
 
-def self_test(rig: Rig, health: BridgeHealth, host: HostState) -> list[Check]:
+def self_test(rig: Rig, health: BridgeHealth, host: HostState) -> list[Finding]:
     """Return the result of every check.
 
     Parameters
@@ -101,97 +88,97 @@ def self_test(rig: Rig, health: BridgeHealth, host: HostState) -> list[Check]:
     ]
 
 
-def _devices(rig: Rig, health: BridgeHealth) -> Iterator[Check]:
+def _devices(rig: Rig, health: BridgeHealth) -> Iterator[Finding]:
     for source in rig.sources:
         device = health.core.devices.get(source.id)
         if device is None:
-            yield Check("device", source.id, "error", "not started", "send the request again")
+            yield Finding("device", source.id, "error", "not started", "send the request again")
             continue
         yield _device(source, device)
         if device.online:
             yield _clock(source, device)
 
 
-def _device(source: Source, device: DeviceHealth) -> Check:
+def _device(source: Source, device: DeviceHealth) -> Finding:
     name, wire, rate_hz = source.id, device.wire, device.clock.rate_hz
     port = device_path(source.settings) or getattr(source.settings, "server", None)
     place = f" at {port}" if port else ""
     if not device.online:
         silent = "" if device.silent_ns is None else f" for {device.silent_ns / 1e9:.0f} s"
-        return Check(
+        return Finding(
             "device", name, "error", f"no data{silent or ' since the start'}{place}",
             f"check power and cable{place}; the last event of {name} on bridge/event names the "
             "cause",
         )  # fmt: skip
     if device.sensor == "stuck":
         remedy = f'restart it: power, or the request restart-device {{"device":"{name}"}}'
-        return Check("device", name, "error", "repeats its value while others move", remedy)
+        return Finding("device", name, "error", "repeats its value while others move", remedy)
 
     bad = wire.lost + wire.corrupt
     if bad > MOST_LOST * max(1, wire.received + wire.lost):
-        return Check(
+        return Finding(
             "device", name, "warning",
             f"{wire.lost} samples lost and {wire.corrupt} runs of corrupt bytes among "
             f"{wire.received} samples",
             f"check cable, plug and shield{place}, and that the line is fast enough for the rate",
         )  # fmt: skip
     if source.kind == "imu" and rate_hz is not None and rate_hz < LEAST_RATE * source.rate_hz:
-        return Check(
+        return Finding(
             "device", name, "warning",
             f"{rate_hz:.1f} samples a second, expected {source.rate_hz:g}",
             "set rate_hz to the rate that the device is configured for, or configure the device",
         )  # fmt: skip
     shown = "" if rate_hz is None else f", {rate_hz:.1f} Hz"
-    return Check("device", name, "ok", f"streaming{shown}")
+    return Finding("device", name, "ok", f"streaming{shown}")
 
 
-def _clock(source: Source, device: DeviceHealth) -> Check:
+def _clock(source: Source, device: DeviceHealth) -> Finding:
     name, clock = source.id, device.clock
     text = f"clock {clock.state}"
     if clock.sigma_ns is not None:
         text += f", stamps ± {clock.sigma_ns / 1e6:.2f} ms"
     if clock.state == "settling":
-        return Check("clock", name, "warning", text, "wait some seconds, and repeat the test")
+        return Finding("clock", name, "warning", text, "wait some seconds, and repeat the test")
     if clock.state == "stale":
         remedy = "check the network to the server: round trips stopped"
-        return Check("clock", name, "warning", text, remedy)
+        return Finding("clock", name, "warning", text, remedy)
     if clock.sigma_ns is not None and clock.sigma_ns > CLOCK_SIGMA_NS:
         remedy = "connect it without a hub, or use a synchronization line (docs: Time)"
-        return Check("clock", name, "warning", text, remedy)
-    return Check("clock", name, "ok", text)
+        return Finding("clock", name, "warning", text, remedy)
+    return Finding("clock", name, "ok", text)
 
 
-def _calibration(rig: Rig, health: BridgeHealth) -> Iterator[Check]:
+def _calibration(rig: Rig, health: BridgeHealth) -> Iterator[Finding]:
     core = health.core
     if core.phase == "uncalibrated":
         remedy = "calibrate: jointfit calibrate, or the request calibrate"
-        yield Check("calibration", "", "error", "no calibration is in force", remedy)
+        yield Finding("calibration", "", "error", "no calibration is in force", remedy)
         return
     if (reason := health.state.not_stored) is not None:
-        yield Check("calibration", "", "error", f"not stored: {reason}", WRITE_REMEDY)
+        yield Finding("calibration", "", "error", f"not stored: {reason}", WRITE_REMEDY)
     else:
         version = "" if core.version is None else f", version {core.version}"
-        yield Check("calibration", "", "ok", f"{core.phase}{version}")
+        yield Finding("calibration", "", "ok", f"{core.phase}{version}")
 
     if all(source.kind != "mocap" for source in rig.sources):
         return
     for name, lag in core.lags.items():
         if lag.source == "none":
-            yield Check(
+            yield Finding(
                 "lag", name, "warning", "lag behind the cameras unknown: 0 is subtracted",
                 "repeat the functional phase with faster movements, or set lag_ms",
             )  # fmt: skip
         elif not lag.used_ns and lag.found_by in (None, "none") and lag.source == "calibration":
-            yield Check("lag", name, "ok", "no lag determined (assumed 0 ms)")
+            yield Finding("lag", name, "ok", "no lag determined (assumed 0 ms)")
         elif lag.used_ns is not None:
-            yield Check("lag", name, "ok", f"lag {lag.used_ns * 1e-6:.1f} ms by {lag.source}")
+            yield Finding("lag", name, "ok", f"lag {lag.used_ns * 1e-6:.1f} ms by {lag.source}")
 
 
-def _store(host: HostState, health: BridgeHealth) -> Iterator[Check]:
+def _store(host: HostState, health: BridgeHealth) -> Iterator[Finding]:
     if host.store_fault is None:
-        yield Check("store", "", "ok", "calibrations can be written")
+        yield Finding("store", "", "ok", "calibrations can be written")
     else:
-        yield Check("store", "", "error", f"cannot be written: {host.store_fault}", WRITE_REMEDY)
+        yield Finding("store", "", "error", f"cannot be written: {host.store_fault}", WRITE_REMEDY)
 
     free = host.free_bytes
     remedy = "delete old recordings, or use a larger medium"
@@ -199,45 +186,45 @@ def _store(host: HostState, health: BridgeHealth) -> Iterator[Check]:
         level: Level = "ok" if free > LOW_DISK_BYTES else "warning"
         level = level if free > LEAST_DISK_BYTES else "error"
         text = f"{free / 1e9:.1f} GB free"
-        yield Check("disk", "", level, text, "" if level == "ok" else remedy)
+        yield Finding("disk", "", level, text, "" if level == "ok" else remedy)
 
     recording = health.recording
     if recording is not None and recording.failure is not None:
         text = f"{recording.file} ended early: {recording.failure}"
-        yield Check("recording", "", "error", text, f"{remedy}; then restart the daemon")
+        yield Finding("recording", "", "error", text, f"{remedy}; then restart the daemon")
     elif recording is not None:
-        yield Check("recording", "", "ok", f"{recording.file}, {recording.written_bytes} bytes")
+        yield Finding("recording", "", "ok", f"{recording.file}, {recording.written_bytes} bytes")
 
 
-def _broker(health: BridgeHealth) -> Iterator[Check]:
+def _broker(health: BridgeHealth) -> Iterator[Finding]:
     link = health.link
     if link.denied:
         text = f"the broker refuses {', '.join(link.denied)}"
         remedy = "allow these topics for the daemon in the access list of the broker"
-        yield Check("broker", "", "error", text, remedy)
+        yield Finding("broker", "", "error", text, remedy)
     elif link.dropped > MOST_DROPPED * link.sent:
         text = f"{link.dropped} messages were dropped since the start, {link.sent} sent"
         remedy = "check the network to the broker and its load"
-        yield Check("broker", "", "warning", text, remedy)
+        yield Finding("broker", "", "warning", text, remedy)
     else:
-        yield Check("broker", "", "ok", f"connected, {link.sent} messages sent")
+        yield Finding("broker", "", "ok", f"connected, {link.sent} messages sent")
 
 
-def _process(health: BridgeHealth, host: HostState) -> Iterator[Check]:
+def _process(health: BridgeHealth, host: HostState) -> Iterator[Finding]:
     delay_ms = health.process.loop_delay_p99_ms
     if delay_ms is not None:
         busy = delay_ms > LOOP_DELAY_MS
         remedy = "stop other programs, or lower output_rate_hz" if busy else ""
         text = f"delay of the event loop {delay_ms:.1f} ms (p99 of the last minute)"
-        yield Check("process", "", "warning" if busy else "ok", text, remedy)
+        yield Finding("process", "", "warning" if busy else "ok", text, remedy)
     if host.temperature_c is not None:
         hot = host.temperature_c > HOT_C
         remedy = "cool the gateway: the processor slows down" if hot else ""
         text = f"{host.temperature_c:.0f} °C"
-        yield Check("temperature", "", "warning" if hot else "ok", text, remedy)
+        yield Finding("temperature", "", "warning" if hot else "ok", text, remedy)
 
 
-def result_of(checks: list[Check]) -> dict[str, Any]:
+def result_of(checks: list[Finding]) -> dict[str, Any]:
     """Return the data of the answer: the worst level, and one line for each check."""
     levels = {check.level for check in checks}
     worst = next((level for level in ("error", "warning") if level in levels), "ok")
