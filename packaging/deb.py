@@ -1,8 +1,8 @@
 #!/usr/bin/env python3
 """Build the Debian package: `python packaging/deb.py [--arch amd64|arm64] [--out DIR]`.
 
-Law: what goes in is decided by ``requirements.lock`` and the commit, never by the machine it is
-built on; the same commit gives the same bytes (SOURCE_DATE_EPOCH, default: of the commit). Wheels
+Invariant: the content depends on ``requirements.lock`` and the commit only, not on the machine that
+builds it; the same commit gives the same bytes (SOURCE_DATE_EPOCH, default: of the commit). Wheels
 are only unpacked, so a package for arm64 can be built here, too.
 
 The package carries its own site-packages behind /usr/lib/jointfitd/bin/python3, a link to Debian's
@@ -141,7 +141,7 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
     (tree / HOME / "pyvenv.cfg").write_text(
         "home = /usr/bin\ninclude-system-site-packages = false\n"
     )
-    # never looked at again: the package manager is who changes these files
+    # Python does not compare them with their sources: only the package manager changes both.
     mode = py_compile.PycInvalidationMode.UNCHECKED_HASH
     compileall.compile_dir(
         site, quiet=2, stripdir=str(tree), prependdir="/", invalidation_mode=mode, workers=1
@@ -209,7 +209,7 @@ def _write_control(tree: Path, version: str, architecture: str) -> None:
 
 
 def _md5sums(tree: Path) -> str:
-    """Return what `dpkg --verify` compares the installed files with."""
+    """Return the checksums with which `dpkg --verify` compares the installed files."""
     files = [path for path in sorted(tree.rglob("*")) if path.is_file() and not path.is_symlink()]
     return "".join(
         f"{hashlib.md5(path.read_bytes()).hexdigest()}  {name}\n"  # noqa: S324 - dpkg's format
@@ -219,7 +219,7 @@ def _md5sums(tree: Path) -> str:
 
 
 def _settle(tree: Path, epoch: int) -> None:
-    """Give every file the rights and the date that a package's files have."""
+    """Set rights and date of every file as in a package."""
     for path in sorted(tree.rglob("*"), reverse=True):
         if not path.is_symlink():
             executable = path.is_dir() or path.stat().st_mode & 0o100

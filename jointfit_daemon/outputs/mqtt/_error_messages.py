@@ -1,4 +1,4 @@
-"""Messages for errors of sockets and of MQTT: the cause, and what to do.
+"""Messages for errors of sockets and of MQTT: cause and remedy.
 
 Invariant: for a known error the message contains no error number and no text of a library.
 """

@@ -146,7 +146,7 @@ def _attributes(descriptor: int) -> list[Any]:
 
 
 def _set_speed(descriptor: int, baud: int) -> None:
-    """Set a raw line, 8N1, without flow control, and discard what arrived at another speed."""
+    """Set a raw line, 8N1, without flow control, and discard bytes received at another speed."""
     speed = getattr(termios, f"B{baud}", None)
     if speed is None:
         raise OSError(errno.EINVAL, f"{baud} baud is no speed of this system")
@@ -161,7 +161,7 @@ def _set_speed(descriptor: int, baud: int) -> None:
 
 
 def _receive(descriptor: int, listen_s: float) -> Iterator[Chunk]:
-    """Yield what arrives within `listen_s`, stamped after the read."""
+    """Yield the bytes received within `listen_s`, stamped after the read."""
     until = time.monotonic() + listen_s
     while (left := until - time.monotonic()) > 0:
         ready, _, _ = select.select([descriptor], [], [], min(left, _POLL_S))

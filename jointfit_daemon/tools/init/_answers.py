@@ -1,4 +1,4 @@
-"""Answers of the dialogue, and what follows from them for later questions."""
+"""Answers of the dialogue, and their consequences for later questions."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A question with its subject, and what is shown beside it."""
+    """A question with its subject and its text."""
 
     question: Question
     subject: str

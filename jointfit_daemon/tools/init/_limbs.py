@@ -42,7 +42,7 @@ class Limb:
 
     @property
     def optional_parts(self) -> tuple[str, ...]:
-        """Body parts beside the segments, whose markers are not required."""
+        """Body parts next to the segments, whose markers are not required."""
         children = [joint.get("child") for joint in self.branches]
         parts = [*self.ends.values(), *children]
         return tuple(part for part in parts if part and part not in self.places)

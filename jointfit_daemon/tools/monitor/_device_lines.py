@@ -113,7 +113,7 @@ def _event(rig: RigView, name: str, now: Moment) -> str:
 
 
 def marked(level: Level, text: str) -> tuple[str, Style]:
-    """Return a text with the mark of its level, and its style; what works is not coloured."""
+    """Return a text with the mark of its level, and its style; a good state has no colour."""
     style: Style = "" if level == "good" else level
     return f"{SYMBOLS[level]} {text}", style
 

@@ -28,7 +28,7 @@ STALE_S = 1.5
 _OPTICAL_S = 0.6
 """Age of the cameras' pose, s, from which it is no longer drawn."""
 _WIDE = 72
-"""Least width for the limb beside the curve."""
+"""Least width for the limb to the left of the curve."""
 _LEAST_CURVE, _MOST_CURVE = 3, 24
 """Rows of the curve."""
 _WITH_SD = ("flexion_deg", "elevation_deg", "inner_deg")
@@ -94,7 +94,7 @@ def _is_uncalibrated(rig: RigView) -> bool:
 
 
 def _no_pose(rig: RigView, width: int) -> list[Line]:
-    """Return why there is no angle, and what to do."""
+    """Return the reason for a missing angle, and the remedy."""
     if rig.info is None and rig.pose is not None:
         text = "The layout of the rig (bridge/info) is missing: the account may not read it."
     elif _is_uncalibrated(rig):
