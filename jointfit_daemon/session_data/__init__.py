@@ -1,0 +1,37 @@
+"""A recorded session as arrays, independent of file formats: what files, replay and reports share.
+
+Every series has its own times, seconds since the start of the session. World and segment axes are
+those of CONVENTIONS.md; the optical world differs from the world of the sensors by a heading.
+"""
+
+from jointfit_daemon.session_data._resampling import (
+    interpolate_orientations,
+    interpolate_values,
+    is_uniform,
+    sample_rate_hz,
+    uniform_times,
+)
+from jointfit_daemon.session_data._series import (
+    JointSeries,
+    MarkerSeries,
+    SegmentSeries,
+    SensorSeries,
+    SessionDataError,
+    TimelineEvent,
+)
+from jointfit_daemon.session_data._session import SessionData
+
+__all__ = [
+    "JointSeries",
+    "MarkerSeries",
+    "SegmentSeries",
+    "SensorSeries",
+    "SessionData",
+    "SessionDataError",
+    "TimelineEvent",
+    "interpolate_orientations",
+    "interpolate_values",
+    "is_uniform",
+    "sample_rate_hz",
+    "uniform_times",
+]

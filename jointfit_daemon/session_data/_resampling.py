@@ -1,0 +1,110 @@
+"""Time axes of series: their rate, whether they are uniform, and values at other instants.
+
+Gaps are not bridged: a row between two rows that are further apart than `MAX_GAP_SAMPLES` periods,
+or beside an unknown row, is unknown.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+
+MAX_GAP_SAMPLES = 1.5
+"""Widest interval that is interpolated, in median sample periods: no missing sample is bridged."""
+UNIFORM_SHARE = 0.01
+"""Largest deviation of an instant from a uniform time axis, in sample periods."""
+_EXACT_SHARE = 1e-6
+"""An instant this close to a row takes its value, in sample periods."""
+
+
+def sample_rate_hz(t_s: Array) -> float:
+    """Return the rate of a series, Hz: one over the median interval; NaN for less than two rows."""
+    return 1.0 / float(np.median(np.diff(t_s))) if len(t_s) > 1 else float("nan")
+
+
+def is_uniform(t_s: Array) -> bool:
+    """Return whether all instants lie on a uniform time axis, without gaps."""
+    if len(t_s) < 2:  # noqa: PLR2004 - an interval has two ends
+        return True
+    period = (t_s[-1] - t_s[0]) / (len(t_s) - 1)
+    expected = t_s[0] + period * np.arange(len(t_s))
+    return bool((np.abs(t_s - expected) <= UNIFORM_SHARE * period).all())
+
+
+def uniform_times(axes: Sequence[Array]) -> Array:
+    """Return one uniform time axis for several series, at the highest rate of them, s, shape (n,).
+
+    It is the axis of a series itself if all of them share it and it is uniform. Otherwise instants
+    are whole numbers of periods from the earliest row to the latest.
+    """
+    filled = [t_s for t_s in axes if len(t_s)]
+    if not filled:
+        return np.empty(0)
+    first = filled[0]
+    if is_uniform(first) and all(np.array_equal(t_s, first) for t_s in filled):
+        return first
+
+    rates = [rate for rate in map(sample_rate_hz, filled) if np.isfinite(rate)]
+    rate_hz = max(rates, default=1.0)
+    start, end = min(t_s[0] for t_s in filled), max(t_s[-1] for t_s in filled)
+    count = int((end - start) * rate_hz + _EXACT_SHARE + 0.5) + 1
+    times: Array = start + np.arange(count) / rate_hz
+    return times
+
+
+def interpolate_values(t_s: Array, values: Array, at_s: Array) -> Array:
+    """Interpolate linearly; shape (n, ...) to (m, ...), NaN outside and inside gaps."""
+    i, j, share = _neighbours(t_s, at_s)
+    if not len(t_s):
+        return np.full((len(at_s), *values.shape[1:]), np.nan)
+    share = share.reshape(-1, *([1] * (values.ndim - 1)))
+    # A row at its own instant is taken as it is, whatever follows it: 0 times NaN is NaN.
+    between: Array = np.where(
+        share == 0.0, values[i], (1.0 - share) * values[i] + share * values[j]
+    )
+    return between
+
+
+def interpolate_orientations(t_s: Array, q: Array, at_s: Array) -> Array:
+    """Interpolate along the shortest rotation; shape (n, 4) to (m, 4), NaN as `interpolate_values`.
+
+    Spherical linear interpolation q_i exp(a log(q_i* q_i+1)).
+    """
+    i, j, share = _neighbours(t_s, at_s)
+    if not len(t_s):
+        return np.full((len(at_s), 4), np.nan)
+    turned = rotation.interpolate(q[i], q[j], share)
+    between: Array = np.where(share[:, None] == 0.0, q[i], turned)
+    return between
+
+
+def _neighbours(t_s: Array, at_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Return the rows before and after each instant, and the share between them; NaN: in a gap."""
+    if not len(t_s):
+        none = np.zeros(len(at_s), dtype=np.intp)
+        return none, none, np.full(len(at_s), np.nan)
+    last = len(t_s) - 1
+    period = float(np.median(np.diff(t_s))) if last else np.inf
+    near = _EXACT_SHARE * min(period, 1.0)
+
+    i = np.clip(np.searchsorted(t_s, at_s + near, side="right") - 1, 0, last)
+    j = np.minimum(i + 1, last)
+    width = np.where(j > i, t_s[j] - t_s[i], np.inf)
+    share = (at_s - t_s[i]) / width
+    share[np.abs(at_s - t_s[i]) <= near] = 0.0
+    share[(share < 0.0) | (share > 1.0) | ((share > 0.0) & (width > MAX_GAP_SAMPLES * period))] = (
+        np.nan
+    )
+    beyond = (i == last) & (at_s > t_s[last] + near)
+    share[beyond] = np.nan
+    return i, j, share

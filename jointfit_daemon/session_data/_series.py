@@ -1,0 +1,179 @@
+"""Series of one session: sensors, markers, segments, joints, and events on the same time line.
+
+Invariant: the arrays of a series have as many rows as it has times; times are finite and strictly
+increasing; a quaternion is of unit length or NaN in all components.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_daemon.arrays import Array
+
+_UNIT_TOLERANCE = 1e-3
+"""Largest difference of the length of a quaternion from 1: payloads round components to 1e-5."""
+
+
+class SessionDataError(ValueError):
+    """Arrays that do not form a series; the message names the series, the finding and a remedy."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorSeries:
+    """Samples of an IMU."""
+
+    id: str
+    segment: str
+    """Segment that carries the sensor; empty if unknown."""
+    t_s: Array
+    """Instants since the start of the session, s, shape (n,)."""
+    orientation: Array
+    """q_world_sensor, shape (n, 4); NaN where unknown."""
+    angular_velocity: Array | None = None
+    """In sensor axes, rad/s, shape (n, 3)."""
+    acceleration: Array | None = None
+    """Specific force in sensor axes, m/s^2, shape (n, 3); at rest +9.81 upward."""
+    magnetic_field: Array | None = None
+    """In sensor axes, as the sensor outputs it, shape (n, 3)."""
+
+    def __post_init__(self) -> None:
+        owner = f"sensor {self.id!r}"
+        _check_times(owner, self.t_s)
+        _check_orientation(owner, self.orientation, len(self.t_s))
+        for name in ("angular_velocity", "acceleration", "magnetic_field"):
+            _check_shape(owner, name, getattr(self, name), (len(self.t_s), 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerSeries:
+    """Positions of all optical markers."""
+
+    labels: tuple[str, ...]
+    t_s: Array
+    """Instants since the start of the session, s, shape (n,)."""
+    positions: Array
+    """In the optical world, z up, m, shape (n, len(labels), 3); NaN where occluded."""
+
+    def __post_init__(self) -> None:
+        owner = "markers"
+        _check_unique(owner, self.labels)
+        _check_times(owner, self.t_s)
+        _check_shape(owner, "positions", self.positions, (len(self.t_s), len(self.labels), 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SegmentSeries:
+    """Orientations of a segment."""
+
+    name: str
+    t_s: Array
+    """Instants since the start of the session, s, shape (n,)."""
+    orientation: Array
+    """q_world_segment, shape (n, 4); NaN where unknown."""
+    sd_rad: Array | None = None
+    """Standard deviation per axis, rad, shape (n,); NaN where unknown."""
+
+    def __post_init__(self) -> None:
+        owner = f"segment {self.name!r}"
+        _check_times(owner, self.t_s)
+        _check_orientation(owner, self.orientation, len(self.t_s))
+        _check_shape(owner, "sd_rad", self.sd_rad, (len(self.t_s),))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointSeries:
+    """Angles and position of a joint."""
+
+    name: str
+    t_s: Array
+    """Instants since the start of the session, s, shape (n,)."""
+    angles: Mapping[str, Array] = field(default_factory=dict)
+    """By name (``flexion``, ``adduction`` ...), rad, shape (n,); NaN where unknown."""
+    angle_sd: Mapping[str, Array] = field(default_factory=dict)
+    """Standard deviations of some of the angles, rad, shape (n,)."""
+    position: Array | None = None
+    """Joint center in the world, m, shape (n, 3)."""
+    position_sd: Array | None = None
+    """Standard deviation of the position per axis, m, shape (n,)."""
+
+    def __post_init__(self) -> None:
+        owner, count = f"joint {self.name!r}", len(self.t_s)
+        _check_times(owner, self.t_s)
+        for name, values in self.angles.items():
+            _check_shape(owner, f"angle {name!r}", values, (count,))
+        for name, values in self.angle_sd.items():
+            _check_shape(owner, f"standard deviation of {name!r}", values, (count,))
+        without_angle = sorted(self.angle_sd.keys() - self.angles.keys())
+        if without_angle:
+            raise SessionDataError(
+                f"{owner}: standard deviation of {', '.join(without_angle)} without the angle:"
+                " add the angle"
+            )
+        _check_shape(owner, "position", self.position, (count, 3))
+        _check_shape(owner, "position_sd", self.position_sd, (count,))
+
+
+@dataclass(frozen=True, slots=True)
+class TimelineEvent:
+    """Something that happened at an instant: a mark, a phase, a fault, a gap."""
+
+    t_s: float
+    """Instant since the start of the session, s."""
+    kind: str
+    """Kind in one word: ``mark``, ``phase``, ``device`` ..."""
+    id: str = ""
+    """Sensor, segment or phase concerned; empty: the whole session."""
+    text: str = ""
+    data: Mapping[str, object] = field(default_factory=dict)
+    """Further values; JSON types."""
+
+
+def _check_times(owner: str, t_s: Array) -> None:
+    if t_s.ndim != 1 or t_s.dtype != np.float64:
+        raise SessionDataError(
+            f"{owner}: times have shape {t_s.shape} and type {t_s.dtype}, expected (n,) and float64"
+        )
+    if not np.isfinite(t_s).all():
+        row = int(np.argmin(np.isfinite(t_s))) + 1
+        raise SessionDataError(f"{owner}: row {row} has no time: leave the row out")
+
+    backwards = np.flatnonzero(np.diff(t_s) <= 0.0)
+    if backwards.size:
+        row = int(backwards[0]) + 1
+        raise SessionDataError(
+            f"{owner}: time does not increase from row {row} ({t_s[row - 1]:.6f} s) to row"
+            f" {row + 1} ({t_s[row]:.6f} s): sort the rows, or leave out repeated ones"
+        )
+
+
+def _check_shape(owner: str, name: str, values: Array | None, shape: tuple[int, ...]) -> None:
+    if values is not None and values.shape != shape:
+        raise SessionDataError(
+            f"{owner}: {name} has shape {values.shape}, expected {shape}: one row for each time"
+        )
+
+
+def _check_orientation(owner: str, q: Array, count: int) -> None:
+    _check_shape(owner, "orientation", q, (count, 4))
+    wrong = np.abs(np.linalg.norm(q, axis=1) - 1.0) > _UNIT_TOLERANCE
+    wrong |= np.isnan(q).any(axis=1) != np.isnan(q).all(axis=1)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise SessionDataError(
+            f"{owner}: row {row + 1}: quaternion {q[row].tolist()} is not of unit length:"
+            " normalize it, or set it to NaN"
+        )
+
+
+def _check_unique(owner: str, names: tuple[str, ...]) -> None:
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise SessionDataError(
+            f"{owner}: {', '.join(map(repr, repeated))} occurs more than once: rename all but one"
+        )

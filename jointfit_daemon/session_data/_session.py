@@ -1,0 +1,78 @@
+"""A session: all its series, its start, and its events."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.session_data._series import SessionDataError, _check_unique
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.session_data._series import (
+        JointSeries,
+        MarkerSeries,
+        SegmentSeries,
+        SensorSeries,
+        TimelineEvent,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SessionData:
+    """A session as arrays.
+
+    Invariant: sensors, segments and joints have unique names within their group.
+    """
+
+    name: str
+    start_unix_ns: int | None = None
+    """UNIX time of ``t_s`` = 0, ns; None: unknown, as in most files of motion capture."""
+    sensors: tuple[SensorSeries, ...] = ()
+    markers: MarkerSeries | None = None
+    segments: tuple[SegmentSeries, ...] = ()
+    """From the sensors."""
+    joints: tuple[JointSeries, ...] = ()
+    """From the sensors."""
+    optical_segments: tuple[SegmentSeries, ...] = ()
+    """From the markers: the reference."""
+    optical_joints: tuple[JointSeries, ...] = ()
+    """From the markers: the reference."""
+    events: tuple[TimelineEvent, ...] = ()
+    """In the order of their instants."""
+    description: Mapping[str, str] = field(default_factory=dict)
+    """Where the data come from: rig, software, calibration, file."""
+
+    def __post_init__(self) -> None:
+        _check_unique("sensors", tuple(sensor.id for sensor in self.sensors))
+        for group in ("segments", "joints", "optical_segments", "optical_joints"):
+            _check_unique(group, tuple(series.name for series in getattr(self, group)))
+
+        times = [event.t_s for event in self.events]
+        if not np.isfinite(times).all() or sorted(times) != times:
+            raise SessionDataError("events: instants are not in order: sort the events by time")
+
+    def time_axes(self) -> Iterator[Array]:
+        """Yield the times of every series, s, shape (n,)."""
+        for group in (
+            self.sensors,
+            self.segments,
+            self.joints,
+            self.optical_segments,
+            self.optical_joints,
+        ):
+            yield from (series.t_s for series in group)
+        if self.markers is not None:
+            yield self.markers.t_s
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last row of all series, s; 0 without rows."""
+        filled = [t_s for t_s in self.time_axes() if len(t_s)]
+        if not filled:
+            return 0.0
+        return float(max(t_s[-1] for t_s in filled) - min(t_s[0] for t_s in filled))
