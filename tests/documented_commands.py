@@ -55,7 +55,7 @@ NOT_RUN = {
     r"^jointfit dashboard": "needs port 8080: tests/tools/dashboard starts it on a free one",
     r"^jointfit monitor": "needs a terminal: tests/system runs it in a pseudo-terminal",
     r"^jointfit doctor": "finds the faults of the test machine: tests/tools/doctor runs it",
-    r"^jointfit report --cor-study": "12 s of processor time",
+    r"^jointfit center-study": "12 s of processor time",
     r"/dev/|^candump |^ip link|^udevadm ": "needs hardware",
 }
 """Patterns of commands that a test cannot run, each with the reason."""

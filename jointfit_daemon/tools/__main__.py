@@ -13,6 +13,7 @@ import typer
 from jointfit_daemon.tools import fuse
 from jointfit_daemon.tools.calibrate import calibrate
 from jointfit_daemon.tools.center import center
+from jointfit_daemon.tools.center_study import center_study
 from jointfit_daemon.tools.check import check
 from jointfit_daemon.tools.command_group import EXIT_CODES, CommandGroup
 from jointfit_daemon.tools.dashboard import dashboard
@@ -24,7 +25,6 @@ from jointfit_daemon.tools.init import init
 from jointfit_daemon.tools.markers import markers
 from jointfit_daemon.tools.monitor import monitor
 from jointfit_daemon.tools.probe import probe
-from jointfit_daemon.tools.report import report
 from jointfit_daemon.tools.request import mark, request
 from jointfit_daemon.tools.sample import sample
 from jointfit_daemon.tools.schema import schema
@@ -39,7 +39,7 @@ app = typer.Typer(
 )
 for command in (
     init, check, probe, doctor, demo, dashboard, monitor, calibrate, mark, request, center, decode,
-    ik, markers, report, sample, schema,
+    ik, markers, center_study, sample, schema,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(fuse.app)

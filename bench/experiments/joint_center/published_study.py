@@ -23,7 +23,7 @@ from jointfit_daemon.center_of_rotation.study import (
     effect_of_radius,
     run_study,
 )
-from jointfit_daemon.tools.report.tables import NEAREST, correlations
+from jointfit_daemon.tools.center_study.tables import NEAREST, correlations
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -1,4 +1,4 @@
-"""Command `jointfit report`: repeats published experiments and reports their limits."""
+"""Command `jointfit center-study`: repeats a published experiment and reports its limits."""
 
 from __future__ import annotations
 
@@ -11,14 +11,8 @@ import typer
 from jointfit_daemon.tools.output_files import check_output
 
 
-def report(
+def center_study(
     *,
-    cor_study: Annotated[
-        bool,
-        typer.Option(
-            "--cor-study", help="Centre of rotation: error over arc, noise and radius, nine maps."
-        ),
-    ] = False,
     out: Annotated[
         Path | None, typer.Option("--out", help="Folder for figures (PNG, SVG) and text.")
     ] = None,
@@ -30,30 +24,19 @@ def report(
     ] = 1000,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Random seed.")] = 1,
 ) -> None:
-    """Repeat a published experiment: tables on standard output, figures with --out."""
-    if not cor_study:
-        raise ValueError("no report selected, expected --cor-study")
+    """Repeat a published experiment on centres of rotation: tables, and figures with --out."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from jointfit_daemon.center_of_rotation.study import StudySetup, extend_study, run_study
+    from jointfit_daemon.tools.center_study._plot import draw_study
+    from jointfit_daemon.tools.center_study.tables import as_json, tables
+    from jointfit_daemon.tools.plotting import PlottingUnavailableError
 
     if json is not None:
         check_output("--json", json, (json.suffix.lower(),))
     if out is not None:  # before the computation: it may be impossible
         out.mkdir(parents=True, exist_ok=True)
-
-    _cor_study(out, json, repeats, seed)
-
-
-def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> None:
-    from rich.console import Console
-    from rich.progress import Progress
-
-    from jointfit_daemon.center_of_rotation.study import (
-        StudySetup,
-        extend_study,
-        run_study,
-    )
-    from jointfit_daemon.tools.plotting import PlottingUnavailableError
-    from jointfit_daemon.tools.report._plot import draw_study
-    from jointfit_daemon.tools.report.tables import as_json, tables
 
     plain = StudySetup()
     setup = StudySetup(
@@ -70,6 +53,7 @@ def _cor_study(out: Path | None, json: Path | None, repeats: int, seed: int) -> 
     more = extend_study(setup)
     text = tables(setup, study, more)
     typer.echo(text, nl=False)
+
     if json is not None:
         json.write_bytes(orjson.dumps(as_json(setup, study, more), option=orjson.OPT_INDENT_2))
     if out is None:

@@ -1,4 +1,4 @@
-"""`jointfit report --cor-study` as a user runs it."""
+"""`jointfit center-study` as a user runs it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import pytest
 from typer.testing import CliRunner
 
 from jointfit_daemon.tools.__main__ import app
-from jointfit_daemon.tools.report.tables import CAVEATS
+from jointfit_daemon.tools.center_study.tables import CAVEATS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 run = CliRunner().invoke
-SHORT = ["report", "--cor-study", "--repeats", "4"]
+SHORT = ["center-study", "--repeats", "4"]
 
 
 @pytest.mark.experiment
-def test_report_contains_its_setup_both_tables_and_every_limitation(tmp_path: Path) -> None:
+def test_study_contains_its_setup_both_tables_and_every_limitation(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     out = tmp_path / "made" / "here"
     asked = [*SHORT, "--seed", "7", "--out", str(out), "--json", str(tmp_path / "a.json")]
@@ -64,12 +64,6 @@ def test_without_matplotlib_the_tables_still_print(
     assert "Table 1" in result.stdout
     assert "pip install 'jointfitd[plot]'" in result.stderr
     assert (tmp_path / "cor-study.txt").exists()
-
-
-def test_a_report_that_is_not_named_is_not_guessed() -> None:
-    result = run(app, ["report"])
-    assert result.exit_code == 2
-    assert "--cor-study" in result.stderr
 
 
 def test_a_missing_folder_of_the_results_is_reported_and_nothing_is_created(tmp_path: Path) -> None:
