@@ -53,7 +53,7 @@ from jointfit_daemon.pipeline.sources import (
 from jointfit_daemon.timing.alignment import RateDivider
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from jointfit_daemon.config import Rig, Source
     from jointfit_daemon.limb_model import Calibration
@@ -76,9 +76,16 @@ class Core:
 
     The first event must be ``Configured``. Call ``feed`` with every event, in order of arrival, and
     with a ``Tick`` at ``next_deadline_ns`` if nothing else arrives before.
+
+    Parameters
+    ----------
+    observe
+        Called with the source and every measurement of it, once its instant is known, in the order
+        of processing. It must not change the measurement.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, observe: Callable[[str, StampedMeasurement], None] | None = None) -> None:
+        self._observe = observe
         self._rig: Rig | None = None
         self._sources: dict[str, SourceState] = {}
         self._lines = SyncLines()
@@ -133,6 +140,11 @@ class Core:
     def next_deadline_ns(self) -> int | None:
         """Latest host time of the next ``Tick``; None before the configuration."""
         return None if self._rig is None else self._aligner.next_deadline_ns
+
+    @property
+    def lags_ns(self) -> Mapping[str, int]:
+        """Lags behind the optical system that are subtracted from the stamps, by sensor, ns."""
+        return self._lag_ns
 
     def health(self, now_ns: int) -> CoreHealth:
         """Return the core's part of ``bridge/health``."""
@@ -308,6 +320,8 @@ class Core:
                 outputs.append(DeviceStatus(source, online=True))
                 outputs.append(Notice(self._now_ns, NoticeKind.DEVICE, source, "streaming"))
 
+            if self._observe is not None:
+                self._observe(source, item)
             measurement, stamp = item
             if isinstance(measurement, ImuSample):
                 outputs += self._add_sample(source, measurement, stamp)

@@ -1,0 +1,231 @@
+"""Recorded events in a new core: as recorded, or with another rig, calibration or new fits.
+
+Invariant: without a change the core gets exactly the recorded events, so its outputs are those of
+the daemon, byte for byte. With a change, results that depend on it are computed again: no fit, no
+progress and no stored version of the recording reaches the core.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import orjson
+
+from jointfit_daemon.calibration import FitResult
+from jointfit_daemon.pipeline import Core
+from jointfit_daemon.pipeline.events import (
+    CalibrationReady,
+    CalibrationSelected,
+    CalibrationStored,
+    CancelJob,
+    ChunkArrived,
+    Configured,
+    FitJob,
+    JobFinished,
+    JobProgress,
+    Request,
+    SourceClosed,
+    SourceOpened,
+)
+from jointfit_daemon.reprocessing._errors import ReprocessingError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.pipeline.events import Event, Output
+
+_OF_A_SOURCE = (ChunkArrived, SourceOpened, SourceClosed)
+_FIT_EVENTS = (JobFinished, JobProgress, CalibrationStored)
+"""Events that contain results of fits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """Differences from the recorded run; by default none."""
+
+    rig: Rig | None = None
+    """Rig instead of the recorded ones; None: as recorded."""
+    calibration: Calibration | None = None
+    """Calibration in force from the first to the last event; None: as in the recorded run."""
+    compute_fits: bool = False
+    """Whether fits are computed again although nothing else differs."""
+
+    @property
+    def any(self) -> bool:
+        """Whether the outputs may differ from the recorded ones."""
+        return self.rig is not None or self.calibration is not None or self.compute_fits
+
+
+def process_events(
+    events: Iterable[Event], changes: Changes | None = None, core: Core | None = None
+) -> Iterator[tuple[Event, list[Output]]]:
+    """Yield every event that a core processes, and its outputs, in order.
+
+    Parameters
+    ----------
+    events
+        The events of a recording.
+    changes
+        Differences from the recorded run.
+    core
+        A new core; None: one without observer.
+
+    Raises
+    ------
+    ReprocessingError
+        The first event is no configuration, or the rig or calibration of `changes` does not fit the
+        recording.
+    """
+    core = core or Core()
+    changed = None if changes is None or not changes.any else _ChangedRun(core, changes)
+    configured = False
+    for event in events:
+        if not configured:
+            if not isinstance(event, Configured):
+                raise ReprocessingError(
+                    "the recording does not begin with a configuration: its beginning is missing. "
+                    "Add the first part of the session"
+                )
+            configured = True
+        if changed is None:
+            yield event, core.feed(event)
+        else:
+            yield from changed.feed(event)
+    if changed is not None:
+        yield from changed.finish()
+
+
+class _ChangedRun:
+    """A core with substituted configurations and fits that are computed here.
+
+    With another rig a result is delivered at the instant of its request. With the recorded rig it
+    is delivered at the recorded instant, so that all other inputs keep their order.
+    """
+
+    def __init__(self, core: Core, changes: Changes) -> None:
+        self._core, self._changes = core, changes
+        self._sources: frozenset[str] | None = None
+        """Sources of the rig that is used; None before the first configuration."""
+        self._in_force: Calibration | None = None
+        self._waiting: FitJob | None = None
+        self._now_ns = 0
+
+    def feed(self, event: Event) -> Iterator[tuple[Event, list[Output]]]:
+        """Process one recorded event, or what replaces it."""
+        if isinstance(event, _OF_A_SOURCE):
+            if self._sources is not None and event.source in self._sources:
+                yield from self._pass_on(event)
+        elif isinstance(event, Configured):
+            if (configured := self._configuration(event)) is not None:
+                yield from self._pass_on(configured)
+        elif isinstance(event, _FIT_EVENTS):
+            waiting = self._waiting
+            if isinstance(event, JobFinished) and waiting is not None and waiting.job == event.job:
+                yield from self._finish_job(waiting, event.t_ns)
+        elif self._changes.calibration is None or not _changes_calibration(event):
+            yield from self._pass_on(event)
+
+    def finish(self) -> Iterator[tuple[Event, list[Output]]]:
+        """Deliver the result of a fit that the recorded run did not finish."""
+        if self._waiting is not None:
+            yield from self._finish_job(self._waiting, self._now_ns)
+
+    def _configuration(self, event: Configured) -> Configured | None:
+        """Return the configuration to use instead of a recorded one; None: the last one stays."""
+        changes, first = self._changes, self._sources is None
+        rig = event.rig if changes.rig is None else changes.rig
+        if not first and changes.rig is not None:
+            return None
+        if first and changes.rig is not None:
+            check_sources(event.rig, changes.rig)
+        self._sources = frozenset(source.id for source in rig.sources)
+
+        if changes.calibration is not None:
+            check_calibration(changes.calibration, rig)
+            self._in_force = changes.calibration
+            return replace(
+                event, rig=rig, calibration=changes.calibration, calibration_version=None,
+                calibration_age_s=0.0,
+            )  # fmt: skip
+        if first:
+            recorded = event.calibration
+            self._in_force = recorded if recorded and recorded.fits(rig.chain) else None
+            version = event.calibration_version if self._in_force else None
+            return replace(event, rig=rig, calibration=self._in_force, calibration_version=version)
+        return replace(event, calibration=self._in_force, calibration_version=None)
+
+    def _pass_on(self, event: Event) -> Iterator[tuple[Event, list[Output]]]:
+        self._now_ns = event.chunk.t_ns if isinstance(event, ChunkArrived) else event.t_ns
+        outputs = self._core.feed(event)
+        yield event, outputs
+        for output in outputs:
+            if isinstance(output, CalibrationReady):
+                self._in_force = output.calibration
+            elif isinstance(output, CancelJob):
+                self._waiting = None
+            elif isinstance(output, FitJob) and self._changes.calibration is None:
+                if self._changes.rig is not None:
+                    yield from self._finish_job(output, self._now_ns)
+                else:
+                    self._waiting = output  # the only worker drops the job before
+
+    def _finish_job(self, job: FitJob, t_ns: int) -> Iterator[tuple[Event, list[Output]]]:
+        self._waiting = None
+        yield from self._pass_on(JobFinished(t_ns, job.job, compute_fit(job), None))
+
+
+def compute_fit(job: FitJob) -> FitResult:
+    """Run a fit in this process; the result passes through JSON as that of the worker does."""
+    from jointfit_daemon.calibration.phases import run_job  # noqa: PLC0415 - loads scipy
+
+    text = orjson.dumps(run_job(job.work).to_dict(), option=orjson.OPT_SERIALIZE_NUMPY)
+    return FitResult.from_dict(orjson.loads(text))
+
+
+def _changes_calibration(event: Event) -> bool:
+    """Return whether a client requested a calibration or another stored version."""
+    calibrating = isinstance(event, Request) and event.command != "mark"
+    return calibrating or isinstance(event, CalibrationSelected)
+
+
+def check_sources(recorded: Rig, wanted: Rig) -> None:
+    """Check that every source of `wanted` was recorded, with the same driver.
+
+    Raises
+    ------
+    ReprocessingError
+        A source is missing, or its recorded bytes are those of another driver.
+    """
+    drivers = {source.id: source.driver for source in recorded.sources}
+    known = ", ".join(f"{name} ({driver})" for name, driver in drivers.items())
+    for source in wanted.sources:
+        if source.id not in drivers:
+            raise ReprocessingError(
+                f"the recording contains no source {source.id!r}, expected one of: {known}. "
+                "Use the recorded id in the rig, or remove the device from it"
+            )
+        if source.driver != drivers[source.id]:
+            raise ReprocessingError(
+                f"source {source.id!r}: recorded with driver {drivers[source.id]!r}, but the rig "
+                f"names {source.driver!r}, which cannot read these bytes: use the recorded driver"
+            )
+
+
+def check_calibration(calibration: Calibration, rig: Rig) -> None:
+    """Check that a calibration belongs to the limb and the sensors of a rig.
+
+    Raises
+    ------
+    ReprocessingError
+        It belongs to others.
+    """
+    if not calibration.fits(rig.chain):
+        sensors = ", ".join(calibration.sensor)
+        expected = ", ".join(name for group in rig.chain.sensors for name in group)
+        raise ReprocessingError(
+            f"the calibration belongs to another limb or other sensors ({sensors}) than the rig "
+            f"({expected}): choose the calibration of this rig"
+        )

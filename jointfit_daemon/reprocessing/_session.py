@@ -1,0 +1,89 @@
+"""A recording as arrays: with the recorded configuration, or processed again with another."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon import __version__
+from jointfit_daemon.outputs.recording import read_events
+from jointfit_daemon.pipeline import Core
+from jointfit_daemon.pipeline.events import (
+    CalibrationPhase,
+    CalibrationStatus,
+    ChunkArrived,
+    Configured,
+)
+from jointfit_daemon.reprocessing._errors import ReprocessingError
+from jointfit_daemon.reprocessing._processing import Changes, process_events
+from jointfit_daemon.reprocessing._session_collector import SessionCollector
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.session_data import SessionData
+
+
+def load_session(
+    path: Path, rig: Rig | None = None, calibration: Calibration | None = None
+) -> SessionData:
+    """Process a recording in a new core, and return its measurements and results.
+
+    Parameters
+    ----------
+    path
+        The recording; of a session in several parts, any of them.
+    rig
+        Rig instead of the recorded one; its fits are computed again.
+    calibration
+        Calibration in force from the beginning, instead of those of the recorded run.
+
+    Raises
+    ------
+    ReprocessingError
+        The rig or the calibration does not fit the recording, or the recording is empty.
+    ConfigError
+        The recorded rig cannot be loaded, because a driver is not installed.
+    ValueError
+        The file is no recording.
+    OSError
+        It cannot be read.
+    """
+    collector = SessionCollector()
+    core = Core(collector.add_measurement)
+    last_rig: Rig | None = None
+    in_force, now_ns = "none", 0
+    changes = Changes(rig, calibration)
+    for event, outputs in process_events(read_events(path), changes, core):
+        collector.add_event(event, outputs)
+        if not isinstance(event, ChunkArrived):
+            now_ns = event.t_ns
+        if isinstance(event, Configured):
+            last_rig = event.rig
+        for output in outputs:
+            if isinstance(output, CalibrationStatus):
+                in_force = _calibration_text(output)
+    if last_rig is None:
+        raise ReprocessingError(f"{path}: the recording contains no events")
+
+    collector.add_health(now_ns, last_rig, core.health(now_ns))
+    chain = last_rig.chain
+    description = {
+        "rig": last_rig.name,
+        "recording": path.name,
+        "limb": ", ".join(chain.segments),
+        "side": "both" if chain.parents else "left" if chain.left_side else "right",
+        "subject": last_rig.calibration_store,
+        "calibration": in_force,
+        "software": f"jointfitd {__version__}",
+        "source": "processed again" if changes.any else "as recorded",
+    }
+    return collector.session(last_rig, core.lags_ns, description)
+
+
+def _calibration_text(status: CalibrationStatus) -> str:
+    """Return the calibration in force according to a status."""
+    if status.phase in (CalibrationPhase.CALIBRATED, CalibrationPhase.POSED):
+        return "not stored" if status.version is None else f"version {status.version}"
+    return "none"

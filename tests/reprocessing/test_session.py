@@ -1,0 +1,97 @@
+"""Arrays of a recording: as recorded, and processed again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from jointfit_daemon.config import parse_rig
+from jointfit_daemon.reprocessing import ReprocessingError, load_session
+from tests.pipeline import core_feed
+from tests.pipeline.core_feed import BEGIN_NS, SENSORS
+from tests.reprocessing.recorded_run import END, FITTED, UNIX_NS, RecordedRun, rig_table
+
+if TYPE_CHECKING:
+    from jointfit_daemon.session_data import SessionData
+
+
+@pytest.fixture(scope="module")
+def session(run: RecordedRun) -> SessionData:
+    return load_session(run.path)
+
+
+def test_session_has_every_sample_with_its_instant(session: SessionData) -> None:
+    assert [sensor.id for sensor in session.sensors] == list(SENSORS)
+    assert [sensor.segment for sensor in session.sensors] == ["thigh", "thigh", "shank", "shank"]
+    assert session.start_unix_ns == BEGIN_NS + UNIX_NS
+    for sensor in session.sensors:
+        numbers = np.round(sensor.t_s / 0.01).astype(int)
+        moving = numbers > FITTED + 2
+        expected = [core_feed.orientation(sensor.id, number) for number in numbers[moving]]
+        assert len(expected) > 0.9 * (END - FITTED)
+        found = sensor.orientation[moving]
+        assert np.abs(np.abs((found * expected).sum(axis=1)) - 1.0).max() < 1e-4
+        assert sensor.acceleration is None
+
+
+def test_session_has_the_segments_and_joints_of_the_run(
+    session: SessionData, run: RecordedRun
+) -> None:
+    thigh, knee = session.segments[0], session.joints[1]
+    assert (thigh.name, knee.name) == ("thigh", "knee")
+    assert len(thigh.t_s) == len(knee.t_s) == run.states
+    # unknown before the calibration, known after it
+    assert np.isnan(thigh.orientation[:50]).all()
+    after = thigh.t_s > 0.01 * (FITTED + 2)
+    assert np.isfinite(thigh.orientation[after]).all()
+    assert np.isfinite(knee.angles["flexion"][after]).all()
+
+
+def test_marks_phases_and_losses_are_on_the_time_line(session: SessionData) -> None:
+    found = {(event.kind, event.id): event for event in session.events}
+    assert found["mark", "r"].text == "first step"
+    assert found["mark", "r"].t_s == pytest.approx(3.0)
+    assert found["calibration", "static"].t_s == pytest.approx(0.2)
+    assert ("device", "S1") in found
+    assert ("reload", "r") in found
+
+
+def test_calibration_given_is_in_force_from_the_first_frame(run: RecordedRun) -> None:
+    session = load_session(run.path, calibration=run.calibration)
+    thigh = session.segments[0]
+    early = (thigh.t_s > 0.2) & (thigh.t_s < 1.5)
+    assert np.isfinite(thigh.orientation[early]).all()
+    assert not any(event.id == "static" for event in session.events)
+
+
+def test_another_rig_gives_the_frames_of_that_rig(run: RecordedRun) -> None:
+    half = parse_rig(rig_table(output_rate_hz=50))
+    session = load_session(run.path, rig=half)
+    assert np.median(np.diff(session.segments[0].t_s)) == pytest.approx(0.02)
+    assert np.isfinite(session.segments[0].orientation[-50:]).all()  # the fit was computed again
+
+
+def test_sensor_missing_from_the_recording_is_an_error_with_the_known_ones(
+    run: RecordedRun,
+) -> None:
+    table = rig_table()
+    table["imu"][1]["id"] = "S9"
+    with pytest.raises(ReprocessingError, match=r"no source 'S9', expected one of: S1 \(xbus\)"):
+        load_session(run.path, rig=parse_rig(table))
+
+
+def test_sensor_of_another_driver_is_an_error(run: RecordedRun) -> None:
+    table = rig_table()
+    spare = {"sample_time": 0x305, "group_counter": 0x306, "quaternion": 0x321}
+    table["imu"][2] = table["imu"][1] | {"id": "S3", "segment": "shank", "ids": spare}
+    with pytest.raises(ReprocessingError, match="'S3': recorded with driver 'xbus'"):
+        load_session(run.path, rig=parse_rig(table))
+
+
+def test_calibration_of_another_limb_is_an_error(run: RecordedRun) -> None:
+    other = replace(run.calibration, segments=("thorax", "arm"))
+    with pytest.raises(ReprocessingError, match="belongs to another limb"):
+        load_session(run.path, calibration=other)
