@@ -138,6 +138,8 @@ class FaultyHardware:
         self.absent: XbusDevice | None = None
         self.pushed_us: list[int] = []
         """UNIX time of each push, us."""
+        self.refused = 0
+        """Messages of `modem` for which its line was full: a stalled daemon had not read it."""
 
     async def run(self) -> None:
         async with asyncio.TaskGroup() as tasks:
@@ -166,9 +168,11 @@ class FaultyHardware:
         resting: list[XbusDevice | XcdiDevice] = [self.good, self.slow, *self.twins]
         for sensor in resting:
             sensor.push(t_ns, rest)
+        sent, streaming = self.modem.sent, self.modem.streaming
         for device in (self.modem, self.absent):
             if device is not None:
                 device.push(t_ns, turned)
+        self.refused += streaming and self.modem.sent == sent
         if number % 20 == 0:
             self.gps.write(NMEA)
         self.server.push(t_ns, dict.fromkeys(MARKERS, (0.1, 0.2, 0.3)), {})
@@ -249,7 +253,7 @@ async def test_each_faulty_source_is_reported_with_a_remedy_while_the_others_wor
                 lambda d: d["modem"]["received"] > 3 * MODEM_EVERY and d["twin"]["corrupt"] > 20
             )
             assert devices["modem"]["corrupt"] >= 3
-            assert devices["modem"]["lost"] == 0
+            assert devices["modem"]["lost"] <= hardware.refused
             assert devices["twin"]["received"] < 20
             await listener.connected({"good", "modem", "mocap"})
             assert not {"slow", "gps", "taken", "mute"} & listener.online
