@@ -74,6 +74,12 @@ class Broker(ABC):
         del version  # most brokers serve every version on one port
         return self.port
 
+    @property
+    def pid(self) -> int:
+        """Number of the running process."""
+        assert self._process is not None, "the broker is not running"
+        return self._process.pid
+
     def start(self) -> None:
         """Start the process and wait until it listens."""
         self._process = subprocess.Popen(
