@@ -54,6 +54,13 @@ class DeviceLostError(Exception):
     """The device is absent, in use, unplugged or silent; a retry may succeed."""
 
 
+class DeviceAbsentError(DeviceLostError):
+    """The port of the device is unplugged, or does not exist.
+
+    After a report of this kind, those of the next attempts contain nothing new: they are dropped.
+    """
+
+
 class DeviceMisconfiguredError(Exception):
     """The device cannot work with these settings; the message names the setting to change.
 

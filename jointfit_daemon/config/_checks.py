@@ -187,7 +187,7 @@ def check_procedure(
 
 
 def check_known_name(
-    key: str, name: str, known: Sequence[str], what: str, taken: Collection[str] = ()
+    key: str, name: str, known: Collection[str], what: str, taken: Collection[str] = ()
 ) -> list[Fault]:
     """Check that `name` is one of `known`; the proposal is not one of `taken`."""
     if name in known:

@@ -6,6 +6,7 @@ Invariant: all faults are reported together, before any device is opened.
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -391,16 +392,18 @@ class _RigReader:
         try:
             driver = find_driver(name)
         except UnknownDriverError:
-            faults = _checks.check_known_name(f"{key}.driver", name, driver_names(), "driver")
-            self.faults += faults
-            return _likely_driver(faults[0].near, table, base)
+            named = _checks.check_known_name(f"{key}.driver", name, _drivers(base), "driver")
+            self.faults += named
+            return _likely_driver(named[0].near, table, base)
         except Exception as error:  # noqa: BLE001 - a broken plug-in is a fault of the rig
-            self.faults.append(Fault(f"{key}.driver", f"cannot be loaded: {error!r}", name))
+            text = f"cannot be loaded ({error!r}): install it again, or report it to its author"
+            self.faults.append(Fault(f"{key}.driver", text, name))
             return None
 
         if not issubclass(driver.Settings, base):
             what = "motion capture" if base is ImuSettings else "an IMU"
-            self.faults.append(Fault(f"{key}.driver", f"is a driver for {what}", name))
+            text = f"is a driver for {what}; known here: {', '.join(_drivers(base)) or 'none'}"
+            self.faults.append(Fault(f"{key}.driver", text, name))
             return _likely_driver(None, table, base)
         return driver
 
@@ -443,7 +446,7 @@ def _likely_driver(
     It is the one that a misspelled name resembles (`near`), otherwise the one that knows more than
     any other of the keys which not all drivers have.
     """
-    drivers = {name: driver for name in driver_names() if (driver := _loadable(name, base))}
+    drivers = _drivers(base)
     if near in drivers:
         return drivers[near]
 
@@ -456,12 +459,16 @@ def _likely_driver(
     return drivers[most[0]] if known[most[0]] or "driver" not in table else None
 
 
-def _loadable(name: str, base: type[BaseModel]) -> type[Driver] | None:
-    try:
-        driver = find_driver(name)
-    except Exception:  # noqa: BLE001 - a broken plug-in is a fault of its users only
-        return None
-    return driver if issubclass(driver.Settings, base) else None
+def _drivers(base: type[BaseModel]) -> dict[str, type[Driver]]:
+    """Return the drivers by name whose settings are of the kind `base`, and that can be loaded."""
+    found = {}
+    for name in driver_names():
+        # A broken plug-in is a fault of its users only.
+        with suppress(Exception):
+            driver = find_driver(name)
+            if issubclass(driver.Settings, base):
+                found[name] = driver
+    return found
 
 
 def _imu_source(name: str, settings: Any, driver: type[Driver]) -> Source:

@@ -1,4 +1,8 @@
-"""Detects that the daemon has less processor time or bandwidth than its outputs need."""
+"""Detects that the daemon has less processor time or bandwidth than its outputs need.
+
+Invariant: one cause has one warning. Messages that are dropped because the event loop was delayed
+do not have another one.
+"""
 
 from __future__ import annotations
 
@@ -7,43 +11,68 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from jointfit_daemon.outputs.mqtt import LinkHealth
-    from jointfit_daemon.outputs.payloads import ProcessHealth
 
-DELAY_MS = 500.0
-"""Event loop delay, 0.99 quantile of a minute, ms, above which the daemon is overloaded."""
+STALL_S = 0.5
+"""Delay of the event loop, s, above which sensors appear to have no data."""
+STALL_REPEAT_S = 60.0
+"""Shortest interval between two warnings of stalls, s."""
 DROPPED_SHARE = 0.2
 """Share of dropped MQTT messages in one health interval above which the daemon is overloaded."""
 FEWEST = 20
 """Messages in one health interval below which the share is not evaluated."""
 REPEAT_S = 300.0
-"""Shortest interval between two warnings, s."""
+"""Shortest interval between two warnings of dropped messages, s."""
+_LIGHTEN = "lower output_rate_hz, sensors_hz or chain_hz, "
 
 
 class OverloadMonitor:
-    """Compares successive health reports with the limits of this module."""
+    """Compares delays of the event loop and health reports with the limits of this module."""
 
     def __init__(self) -> None:
+        self._stalls, self._longest_s = 0, 0.0  # since the last warning
+        self._stalled = False  # since the last health report
+        self._stall_due_s = self._due_s = -inf
         self._counts = (0, 0, 0)  # connections, sent and dropped messages at the last report
-        self._due_s = -inf
 
-    def warning(self, process: ProcessHealth, link: LinkHealth, now_s: float) -> str | None:
-        """Return the text of a warning, or None; call once for each health report.
+    def stall_warning(self, delay_s: float, now_s: float) -> str | None:
+        """Return the warning of an event loop that was delayed by `delay_s`, or None."""
+        if delay_s <= STALL_S:
+            return None
+        self._stalled = True
+        self._stalls, self._longest_s = self._stalls + 1, max(self._longest_s, delay_s)
+        if now_s < self._stall_due_s:
+            return None
 
-        An interval in which the connection to the broker was lost is not evaluated.
+        more = ""
+        if self._stalls > 1:
+            since_s = now_s - self._stall_due_s + STALL_REPEAT_S
+            more = f" at most, {self._stalls} times in the last {since_s:.0f} s"
+        text = (
+            f"gateway: stopped or overloaded for {1000 * self._longest_s:.0f} ms{more}, the data "
+            f"of this time are late or lost: stop other programs, {_LIGHTEN}or use a faster "
+            "gateway"
+        )
+        self._stalls, self._longest_s = 0, 0.0
+        self._stall_due_s = now_s + STALL_REPEAT_S
+        return text
+
+    def drop_warning(self, link: LinkHealth, now_s: float) -> str | None:
+        """Return the warning of dropped messages, or None; call once for each health report.
+
+        An interval with a stall, or in which the connection to the broker was lost, is not
+        evaluated.
         """
+        stalled, self._stalled = self._stalled, False
         before, self._counts = self._counts, (link.connects, link.sent, link.dropped)
         sent, dropped = link.sent - before[1], link.dropped - before[2]
         total = sent + dropped
         lossy = total >= FEWEST and dropped > DROPPED_SHARE * total
-        lossy &= link.connected and link.connects == before[0]
-
-        delay_ms = process.loop_delay_p99_ms or 0.0
-        if now_s < self._due_s or not (lossy or delay_ms > DELAY_MS):
+        lossy &= link.connected and link.connects == before[0] and not stalled
+        if now_s < self._due_s or not lossy:
             return None
         self._due_s = now_s + REPEAT_S
         return (
-            f"overloaded: event loop delay {delay_ms:.0f} ms (limit {DELAY_MS:.0f} ms), {dropped} "
-            f"of {total} MQTT messages dropped since the last health report (limit "
-            f"{DROPPED_SHARE:.0%}): lower output_rate_hz, sensors_hz or chain_hz, stop other "
-            "programs, or use a faster gateway or network"
+            f"mqtt: {dropped} of {total} messages dropped since the last health report (limit "
+            f"{DROPPED_SHARE:.0%}), the network or the broker is too slow for them: {_LIGHTEN}or "
+            "use a faster network or broker"
         )

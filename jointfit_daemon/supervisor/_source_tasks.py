@@ -14,7 +14,12 @@ import random
 import time
 from typing import TYPE_CHECKING, Literal
 
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError, device_path
+from jointfit_daemon.driver import (
+    DeviceAbsentError,
+    DeviceLostError,
+    DeviceMisconfiguredError,
+    device_path,
+)
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened
 
 if TYPE_CHECKING:
@@ -41,23 +46,30 @@ class _SourceReporter:
 
     def __init__(self, source: str, deliver: Callable[[Event], None], known: asyncio.Event) -> None:
         self._source, self._deliver, self._known = source, deliver, known
-        self._open = False
+        self._open = self._absent = False
         self._reported = ""
 
     def emit(self, chunk: Chunk) -> None:
         """Pass a chunk to the core."""
         if not self._open:
-            self._open, self._reported = True, ""
+            self._open, self._absent, self._reported = True, False, ""
             self._known.set()
             self._deliver(SourceOpened(chunk.t_ns, self._source))
         self._deliver(ChunkArrived(self._source, chunk))
 
-    def closed(self, reason: Literal["lost", "misconfigured"], text: str) -> None:
-        """Report the end of the source; skip a repetition of the last report."""
+    def closed(
+        self, reason: Literal["lost", "misconfigured"], text: str, *, absent: bool = False
+    ) -> None:
+        """Report the end of the source; skip a repetition of the last report.
+
+        The first report of an `absent` device remains true for all of its next attempts.
+        """
         self._known.set()
-        if self._open or text != self._reported:
+        repeated = text == self._reported or (absent and self._absent)
+        if self._open or not repeated:
             self._deliver(SourceClosed(time.monotonic_ns(), self._source, reason, text))
-        self._open, self._reported = False, text
+            self._reported = text
+        self._open, self._absent = False, absent
 
     def removed(self) -> None:
         """Report the removal of the source if it was open."""
@@ -109,11 +121,12 @@ async def run_source(
         began, device = loop.time(), _device_identity(path)
         try:
             await driver.run(reporter.emit)
-            reporter.closed("lost", "its driver ended by itself")
+            reporter.closed("lost", "its driver ended by itself: report it to its author; retrying")
         except DeviceLostError as lost:
             if loop.time() - began > HEALTHY_S:
                 delay = FIRST_RETRY_S
-            reporter.closed("lost", str(lost))  # the core logs the fault
+            absent = isinstance(lost, DeviceAbsentError)
+            reporter.closed("lost", str(lost), absent=absent)  # the core logs the fault
         except DeviceMisconfiguredError as wrong:
             again = f"retrying with another device on the port, or every {PAUSE_S:g} s"
             reporter.closed("misconfigured", f"{wrong} ({again})")

@@ -53,13 +53,12 @@ from jointfit_daemon.supervisor._calibration_store import (
     CalibrationWriter,
     calibration_age_s,
     store_directory,
-    store_of,
 )
 from jointfit_daemon.supervisor._core_runner import CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
+from jointfit_daemon.supervisor._notice_log import LEVELS, NoticeLog
 from jointfit_daemon.supervisor._optional_sinks import start_metrics, start_recording
-from jointfit_daemon.supervisor._outage_lines import OutageLines
-from jointfit_daemon.supervisor._overload_monitor import OverloadMonitor
+from jointfit_daemon.supervisor._overload_monitor import STALL_S, OverloadMonitor
 from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
 from jointfit_daemon.supervisor._request_handlers import RequestHandlers
@@ -81,10 +80,10 @@ from jointfit_daemon.supervisor.state_directory import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from jointfit_daemon.config import Rig
+    from jointfit_daemon.config import Rig, Source
     from jointfit_daemon.outputs.mqtt import Incoming
     from jointfit_daemon.outputs.recording import EventLogWriter
     from jointfit_daemon.pipeline.events import Event, Output
@@ -96,8 +95,6 @@ CHECK_S = 0.1
 """Interval between checks of the event loop's delay and of due health messages, s."""
 HEALTH_SOON_S = 0.5
 """Delay of the health message after a device was lost or found, s."""
-CLOSED_S = 1.0
-"""Longest time from the silence that a source permits to the message that it is closed, s."""
 KNOWN_S = 2.0
 """Time after the start for which a silent source is awaited, s."""
 FAREWELL_S = 0.5
@@ -106,11 +103,6 @@ _STORING = ("calibrate", "static", "use-calibration")
 """Requests whose results are stored: the state directory is checked at once."""
 STOP_S = 4.8
 """Longest duration of a stop, s; the documentation promises five seconds."""
-_LEVELS = {
-    NoticeLevel.INFO: logging.INFO,
-    NoticeLevel.WARNING: logging.WARNING,
-    NoticeLevel.ERROR: logging.ERROR,
-}
 
 
 class Daemon:
@@ -131,15 +123,14 @@ class Daemon:
         self._clock = UnixClock()
         self._core = CoreRunner(core, self._clock)
         self._core.subscribe(self)
+        self._notices = NoticeLog(rig)
+        self._core.subscribe(self._notices)
         self._process, self._systemd = ProcessStatistics(), SystemdNotifier()
         self._process_health = self._process.health()
         self._progress, self._frame_rate = ProgressMonitor(), FrameRateCounter()
         self._loop_errors = DisconnectErrorFilter()
         self._overload = OverloadMonitor()
         self._recorder: EventLogWriter | None = None
-        self._online: set[str] = set()
-        self._outages = OutageLines()
-        self._version: int | None = None
         self._state_fault: str | None = None
         self._state_lock: int | None = None  # set if the directory was not writable at the start
         self._calibration: CalibrationStatus | None = None
@@ -230,7 +221,7 @@ class Daemon:
         await self._sources.apply(self._rig.sources)
 
         gc.freeze()  # permanent objects are excluded, because scanning them takes milliseconds
-        log.info("%s: running, %d sources", self._rig.name, len(self._rig.sources))
+        log.info("%s: running, %s", self._rig.name, _counted(self._rig.sources))
         tasks.create_task(self._notify_when_ready(), name="ready")
 
     async def _notify_when_ready(self) -> None:
@@ -275,7 +266,7 @@ class Daemon:
     def _report(self, kind: NoticeKind, text: str, level: NoticeLevel = NoticeLevel.INFO) -> None:
         """Report a state of the shell on the log and on ``bridge/event``."""
         fields = journal_fields(kind, self._rig.name)
-        log.log(_LEVELS[level], "%s: %s", kind, text, extra=fields)
+        log.log(LEVELS[level], "%s: %s", kind, text, extra=fields)
         notice = Notice(time.monotonic_ns(), kind, self._rig.name, text, level)
         self._topics.publish_notice(notice)
 
@@ -285,7 +276,7 @@ class Daemon:
         """Ignore the inputs of the core."""
 
     def output(self, output: Output) -> None:
-        """Execute jobs, store calibrations, and log notices of the core."""
+        """Execute jobs of the core, and store its calibrations."""
         match output:
             case FitJob():
                 self._fits.start(output)
@@ -295,34 +286,10 @@ class Daemon:
                 self._calibrations.start(self._rig, calibration, keep_date=keep_date)
             case Reply():
                 self._requests.note_reply(output)
-            case Notice():
-                if not self._outages.holds(
-                    output, time.monotonic(), self._closes_within(output.id)
-                ):
-                    self._log(output)
             case CalibrationStatus():
-                # A change of the calibration, with the file in which it is stored.
-                self._calibration, phase, text = output, output.phase, output.text
-                if output.version is not None and output.version != self._version:
-                    path = store_of(self._rig).path(output.version)
-                    text = f"{text} (version {output.version} in {path})"
-                self._version, fields = output.version, journal_fields("calibration", phase)
-                log.log(_LEVELS[output.level], "calibration %s: %s", phase, text, extra=fields)
-            case DeviceStatus(name, online):
-                self._outages.close(name)
-                (self._online.add if online else self._online.discard)(name)
+                self._calibration = output
+            case DeviceStatus():
                 self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
-
-    def _log(self, notice: Notice) -> None:
-        fields = journal_fields(notice.kind, notice.id)
-        log.log(_LEVELS[notice.level], "%s: %s", notice.id, notice.text, extra=fields)
-
-    def _closes_within(self, name: str) -> float | None:
-        """Return the time after which a silent source is closed, s; None if it is closed."""
-        if name not in self._online:
-            return None
-        settings = [source.settings for source in self._rig.sources if source.id == name]
-        return max((getattr(one, "silence_s", 0.0) for one in settings), default=0.0) + CLOSED_S
 
     # --- requests ----------------------------------------------------------------------------
 
@@ -377,8 +344,10 @@ class Daemon:
             await asyncio.sleep(CHECK_S)
             now_s = loop.time()
             self._process.add_delay(now_s - due)
-            for notice in self._outages.due(now_s, now_s - due):
-                self._log(notice)
+            stalled = now_s - due > STALL_S
+            if (text := self._overload.stall_warning(now_s - due, now_s)) is not None:
+                log.warning("%s", text)
+            self._notices.write_due(now_s, stalled=stalled)
 
             if now_s - fed_s > watchdog_s / 3:
                 health = self._core.core.health(time.monotonic_ns())
@@ -406,11 +375,11 @@ class Daemon:
         self._topics.publish_health(found)
 
         health, link = found.core, found.link
-        if (text := self._overload.warning(found.process, link, time.monotonic())) is not None:
+        if (text := self._overload.drop_warning(link, time.monotonic())) is not None:
             log.warning("%s", text)
         states = health.frames.sent - health.frames.empty
         rate_hz = self._frame_rate.rate_hz(states, time.monotonic())
-        rig, online, connected = self._rig.sources, self._online, link.connected
+        rig, online, connected = self._rig.sources, self._notices.online, link.connected
         line = status_line(rig, online, health.phase, rate_hz, connected=connected)
         self._systemd.status(line)
 
@@ -487,18 +456,22 @@ class Daemon:
                 self._report(NoticeKind.RELOAD, text, NoticeLevel.WARNING)
         await self._sources.retire(rig.sources)
 
+        self._notices.configure(rig)
         self._topics.configure(rig)  # clears topics of removed devices before any are moved
         if before.mqtt != rig.mqtt:
             await self._move_to_broker(before, rig)
         else:
             self._read_request_key(rig)  # the file may contain a new key
-        self._online &= {source.id for source in rig.sources}
 
         await self._calibrations.settle()  # otherwise the store lacks the calibration in force
         self._configure(rig)
         await self._check_state()
         await self._sources.apply(rig.sources)
-        log.info("%s: reloaded, %d sources", rig.name, len(rig.sources))
+        log.info("%s: reloaded, %s", rig.name, _counted(rig.sources))
+
+
+def _counted(sources: Sequence[Source]) -> str:
+    return f"{len(sources)} source{'' if len(sources) == 1 else 's'}"
 
 
 async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreInterface] = Core) -> None:

@@ -143,14 +143,14 @@ async def cancel_and_wait(task: asyncio.Task[None]) -> None:
 
 
 async def require_error(kind: type[Exception], task: asyncio.Task[None], within_s: float) -> None:
-    """Require that `task` ends with exactly `kind` within `within_s`."""
+    """Require that `task` ends with `kind` within `within_s`."""
     _, pending = await asyncio.wait({task}, timeout=within_s)
     if pending:
         await cancel_and_wait(task)
     require(not pending, f"run must raise {kind.__name__} within {within_s:g} s")
 
     error = task.exception()
-    if error is not None and type(error) is not kind:
+    if error is not None and not isinstance(error, kind):
         raise error
     require(error is not None, f"run must raise {kind.__name__}; it returned")
     require(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import itertools
+import logging
 import os
 import signal
 import socket
@@ -16,7 +17,7 @@ import pytest
 
 from jointfit_daemon.calibration import CalibrationSettings, CalibrationTrial, StaticJob
 from jointfit_daemon.config import Rig, parse_rig
-from jointfit_daemon.driver import DeviceLostError
+from jointfit_daemon.driver import DeviceAbsentError, DeviceLostError
 from jointfit_daemon.model import Chain
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
@@ -181,12 +182,37 @@ async def test_lost_device_is_retried_and_reported_once_per_reason(table: dict[s
     ]
 
 
+async def test_unplugged_device_is_reported_once_until_it_is_back(table: dict[str, Any]) -> None:
+    steps = [
+        DeviceAbsentError("unplugged"),
+        DeviceAbsentError("is not there"),
+        DeviceLostError("permission denied"),
+        DeviceAbsentError("is not there"),
+    ]
+    events, _ = await run_script(parse_rig(table), steps)
+    told = [getattr(event, "text", "") for event in events]
+    assert told == ["unplugged", "permission denied", "is not there"]
+
+
 async def test_exception_of_a_driver_propagates(table: dict[str, Any]) -> None:
     _, task = await run_script(parse_rig(table), [ZeroDivisionError("bug")])
     assert isinstance(task.exception(), ZeroDivisionError)
 
 
 # --- the whole shell ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("count", "said"), [(1, "1 source"), (2, "2 sources")])
+async def test_the_log_counts_the_sources(
+    table: dict[str, Any], tmp_path: Path, caplog: pytest.LogCaptureFixture, count: int, said: str
+) -> None:
+    rig = small(table, free_port())
+    rig["chain"] = {"joints": ["hip", "knee", "ankle"][: 1 + count], "segments": ["thigh", "shank"]}
+    rig["chain"]["segments"], rig["imu"] = rig["chain"]["segments"][:count], rig["imu"][:count]
+    caplog.set_level(logging.INFO)
+    async with daemon(rig, tmp_path, RecordingCore()):
+        await until(lambda: "running" in caplog.text)
+    assert any(record.message.endswith(f"running, {said}") for record in caplog.records)
 
 
 async def test_misconfigured_device_pauses_and_others_run(

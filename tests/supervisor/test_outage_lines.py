@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from jointfit_daemon.pipeline.events import Notice, NoticeKind
-from jointfit_daemon.supervisor._outage_lines import OutageLines
+from jointfit_daemon.supervisor._outage_lines import LONGEST_S, OutageLines
 
 
 def sensor(state: str) -> Notice:
@@ -45,12 +45,22 @@ def test_other_notices_have_lines_at_once() -> None:
 def test_sensors_lost_in_a_stall_of_the_host_have_a_line_only_if_they_stay_lost() -> None:
     lines = OutageLines()
     assert lines.holds(sensor("lost"), 10.0, 2.0)
-    (stall,) = lines.due(10.1, 4.95)
-    assert (stall.id, stall.text[:34]) == ("gateway", "stopped or overloaded for 4950 ms,")
+    lines.postpone(10.1)
     assert lines.due(13.0) == []
     assert lines.holds(sensor("ok"), 13.0, 2.0)
 
-    assert lines.due(20.0, 1.0) == [], "one line a minute"
+    lines.postpone(20.0)
     assert lines.holds(sensor("lost"), 20.1, 2.0), "reported after the stall was noticed"
     assert lines.due(23.9) == []
     assert [notice.text for notice in lines.due(24.0)] == ["lost"]
+
+
+def test_a_dead_sensor_has_a_line_within_a_bound_though_the_host_stalls_all_the_time() -> None:
+    lines = OutageLines()
+    assert lines.holds(sensor("lost"), 10.0, 2.0)
+    times_s = [10.0 + step for step in range(60)]
+    reported_s = []
+    for now_s in times_s:
+        lines.postpone(now_s)
+        reported_s += [now_s] * len(lines.due(now_s))
+    assert reported_s == [10.0 + LONGEST_S]

@@ -69,14 +69,19 @@ class NatNetMocap:
         try:
             found = await loop.getaddrinfo(name, None, family=socket.AF_INET)
         except (OSError, UnicodeError) as error:
-            raise DeviceLostError(f"NatNet server {name}: no such host: {error}") from error
+            raise DeviceLostError(
+                f"NatNet server {name}: no such host: correct server, or enter its IPv4 address"
+            ) from error
         host = str(found[0][4][0])
 
         try:
             local = local_address(host, interface)
         except OSError as error:
             if interface is None:
-                raise DeviceLostError(f"NatNet server {host}: {error.strerror or error}") from error
+                raise DeviceLostError(
+                    f"NatNet server {host}: {error.strerror or error}: check network cable, "
+                    "address of the network card, and server"
+                ) from error
             raise DeviceMisconfiguredError(
                 f"mocap.interface = {interface!r}: no network card with this name or IPv4 address"
             ) from error

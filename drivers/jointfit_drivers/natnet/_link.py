@@ -145,5 +145,5 @@ class NatNetLink:
         if isinstance(error, ConnectionRefusedError):
             text = "no program listens on this port: start Motive and switch streaming on"
         else:
-            text = error.strerror or str(error)
+            text = f"{error.strerror or error}: check network cable and network card, and server"
         return DeviceLostError(f"NatNet server {host}:{port}: {text}")

@@ -59,7 +59,8 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
         )
     if not info.clock_hz:
         raise DeviceMisconfiguredError(
-            f"{found} but announces no clock frequency: its stamps cannot be used"
+            f"{found} but announces no clock frequency, so its stamps cannot be used: "
+            "check that server and command_port lead to Motive"
         )
     if usable_hz(info) is None:
         raise DeviceMisconfiguredError(

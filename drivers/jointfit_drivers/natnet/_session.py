@@ -120,7 +120,10 @@ class NatNetSession:
                     try:
                         link.join(info.group, port)
                     except OSError as error:
-                        text = f"cannot join {info.group}:{port}: {error.strerror or error}"
+                        text = (
+                            f"cannot join {info.group}:{port} ({error.strerror or error}): check "
+                            "the network card and its address, or choose another by interface"
+                        )
                         raise DeviceLostError(f"{self._name}: {text}") from error
 
                 # The server's own bitstream is used if it refuses another one.
@@ -131,7 +134,11 @@ class NatNetSession:
                 model = natnet.Bare(NatNetMessageId.REQUEST_MODELDEF)
                 await self._request(model, MODEL_S, lambda: self._known is not None)
                 if self._known is None:
-                    raise DeviceLostError(f"{self._name}: no readable MODELDEF in {MODEL_S:g} s")
+                    raise DeviceLostError(
+                        f"{self._name}: answers, but sends no readable list of markers and bodies "
+                        f"(MODELDEF) within {MODEL_S:g} s: check the network, and restart "
+                        "streaming in the camera software"
+                    )
                 await self._stream(info, unicast)
             finally:
                 # Keep the exception that ended the connection.
@@ -226,7 +233,10 @@ class NatNetSession:
                 f"{self._name}: the program that answers is not a NatNet server: check server and "
                 "command_port (Motive: Streaming pane, command port, 1510 unless changed)"
             )
-        raise DeviceLostError(f"{self._name}: no answer to CONNECT in {CONNECT_S:g} s")
+        raise DeviceLostError(
+            f"{self._name}: no answer within {CONNECT_S:g} s: check that the camera software runs, "
+            "server, command_port and firewalls; `jointfit doctor` names the cause"
+        )
 
     async def _stream(self, info: natnet.ServerInfo, unicast: bool) -> None:
         began_ns = time.monotonic_ns()
@@ -260,22 +270,22 @@ class NatNetSession:
         """Raise DeviceLostError without decodable frames, or if another server answers."""
         if self._info is not None and not same_instance(self._info, info):
             raise DeviceLostError(
-                f"{self._name}: another instance answers: {self._info.application}"
+                f"{self._name}: restarted, or another server took its address "
+                f"({self._info.application} answers): connecting again"
             )
 
-        silent_s = (time.monotonic_ns() - heard_ns) / 1e9
-        if silent_s < self._settings.silence_s:
+        if (time.monotonic_ns() - heard_ns) / 1e9 < self._settings.silence_s:
             return
 
+        # The texts contain no measured duration: it would differ at every attempt, and every
+        # different text is a new line of the log.
         if self._misfits:
             version = "{}.{}".format(*self._bitstream.version)
             raise DeviceLostError(
-                f"{self._name}: frames arrive, but for {silent_s:.1f} s none could be decoded as "
+                f"{self._name}: frames arrive, but none could be decoded as "
                 f"NatNet {version}: check that Motive streams the bitstream it announces"
             )
 
-        # The text contains no measured duration: it would differ at every attempt, and every
-        # different text is a new line of the log.
         self.silent, hint = True, ""
         if unicast == info.multicast:
             announced = "multicast" if info.multicast else "unicast"

@@ -22,7 +22,12 @@ from typing import TYPE_CHECKING, Any
 import can
 from can.typechecking import CanFilter
 
-from jointfit_daemon.driver import CanBusError, DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.driver import (
+    CanBusError,
+    DeviceAbsentError,
+    DeviceLostError,
+    DeviceMisconfiguredError,
+)
 from jointfit_drivers.ports._bus_faults import bus_faults, cannot_load
 from jointfit_drivers.ports._bus_opening import open_in_thread, require_socketcand
 from jointfit_drivers.ports._kernel_stamps import KernelStamps
@@ -243,7 +248,10 @@ class PythonCanBus:
             )
 
         if number in {errno.ENODEV, errno.ENXIO}:
-            return DeviceLostError(f"{channel}: no such CAN interface: plug it in (see `ip link`)")
+            return DeviceAbsentError(
+                f"{channel}: no such CAN interface: plug it in, or correct `channel` (`ip link` "
+                "lists them)"
+            )
 
         if number == errno.ENETDOWN:
             return DeviceLostError(
@@ -251,8 +259,12 @@ class PythonCanBus:
                 f"{self._settings.bitrate}`"
             )
         found = os.strerror(number) if isinstance(number, int) and number > 0 else str(error)
-        hint = ": plug it in, or correct `channel`" if number == errno.ENOENT else ""
-        return DeviceLostError(f"{channel} ({self._settings.interface}): {found}{hint}")
+        hint = "plug it in" if number == errno.ENOENT else "check the adapter and its cable"
+        if self._settings.interface == "socketcand":
+            hint = "check the server and the network"
+        return DeviceLostError(
+            f"{channel} ({self._settings.interface}): {found}: {hint}, or correct `channel`"
+        )
 
 
 def _socket(bus: can.BusABC) -> socket.socket:

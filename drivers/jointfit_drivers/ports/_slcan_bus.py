@@ -47,7 +47,7 @@ class SlcanBus:
 
     def __init__(self, settings: CanBusSettings) -> None:
         self._settings = settings
-        self._port = SerialPort(settings.channel, settings.baud)
+        self._port = SerialPort(settings.channel, settings.baud, "channel")
         baud = settings.baud if settings.transport == "uart" else None
         self._decoder = SlcanCodec(baud, bitrate=settings.bitrate)
         self._understood = 0  # frames and answers of the handshake
@@ -147,11 +147,14 @@ class SlcanBus:
         if lost > _NOT_SLCAN and not self._understood:
             raise DeviceMisconfiguredError(
                 f"{settings.channel}: no SLCAN adapter found at {settings.baud} baud "
-                f"({lost} bytes received, none of them SLCAN): set `channel` to the adapter's port "
+                "(bytes arrive, none of them SLCAN): set `channel` to the adapter's port "
                 "and `baud` to its speed"
             )
         if answer == "\a":
-            raise DeviceLostError(f"{settings.channel}: the adapter refuses to open its bus")
+            raise DeviceLostError(
+                f"{settings.channel}: the adapter refuses to open its bus: check "
+                "power and wiring of the bus, or plug the adapter in again"
+            )
         if answer is None:
             log.debug("%s: the adapter sends no answers; reading anyway", settings.channel)
 

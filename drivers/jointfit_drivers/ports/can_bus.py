@@ -333,8 +333,8 @@ class SharedBus:
         self._failed = error
         for each in self._subscribers:
             if not each.ended.done():
-                lost = isinstance(error, DeviceLostError)
-                each.ended.set_exception(DeviceLostError(str(error)) if lost else error)
+                lost = isinstance(error, DeviceLostError)  # one exception each
+                each.ended.set_exception(type(error)(str(error)) if lost else error)
 
 
 def _advise_id(needed: CanKey, arriving: CanKey, what: str) -> str:

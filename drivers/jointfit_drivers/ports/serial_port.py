@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import serial
 
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.driver import DeviceAbsentError, DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
 
 if TYPE_CHECKING:
@@ -59,6 +59,10 @@ plugged in exists before udev has set its group.
 """
 
 
+_ABSENT = frozenset({errno.ENOENT, errno.ENODEV, errno.ENXIO})
+"""Error numbers of a port that is unplugged."""
+
+
 class SerialPort:
     """One serial port: 8N1, raw, exclusive, open inside its ``with`` block.
 
@@ -68,6 +72,8 @@ class SerialPort:
         Device file, preferably a link under ``/dev/serial/by-id``.
     baud : int
         Line speed, bit/s.
+    key : str
+        Key of rig.toml that contains `path`, for messages.
 
     Raises
     ------
@@ -77,16 +83,16 @@ class SerialPort:
         On entry: the file is no serial port, or the port does not support the speed.
     """
 
-    def __init__(self, path: str, baud: int) -> None:
+    def __init__(self, path: str, baud: int, key: str = "port") -> None:
         self.path = path
-        self._baud = baud
+        self._baud, self._key = baud, key
         self._port: serial.Serial | None = None
 
     def __enter__(self) -> Self:
         try:
             self._port = serial.Serial(self.path, self._baud, timeout=0, exclusive=True)
         except _PORT_ERRORS as error:
-            raise _device_error(self.path, self._baud, error) from error
+            raise _device_error(self.path, self._baud, error, self._key) from error
 
         os.set_blocking(self._fd, False)
         try:
@@ -127,7 +133,7 @@ class SerialPort:
         try:
             self._port.baudrate = baud
         except _PORT_ERRORS as error:
-            raise _device_error(self.path, baud, error) from error
+            raise _device_error(self.path, baud, error, self._key) from error
         self._baud = baud
 
     def flush_input(self) -> None:
@@ -135,7 +141,7 @@ class SerialPort:
         try:
             termios.tcflush(self._fd, termios.TCIFLUSH)
         except termios.error as error:
-            raise DeviceLostError(f"{self.path}: unplugged ({error.args[-1]})") from error
+            raise _unplugged(self.path, error.args[-1]) from error
 
     async def pump(self, emit: Callable[[Chunk], None], silence_s: float | None) -> None:
         """Pass every chunk to `emit` until cancelled.
@@ -247,12 +253,13 @@ class SerialPort:
                         await ready.wait()
                 except TimeoutError as error:
                     raise DeviceLostError(
-                        f"{self.path}: accepted no byte for {_WRITE_TIMEOUT_S:g} s"
+                        f"{self.path}: accepted no byte for {_WRITE_TIMEOUT_S:g} s: check its "
+                        "cable, and that flow control is off, or plug it in again"
                     ) from error
                 finally:
                     loop.remove_writer(fd)
             except OSError as error:
-                raise DeviceLostError(f"{self.path}: unplugged ({error.strerror})") from error
+                raise _unplugged(self.path, error.strerror) from error
 
     def _read(self, fd: int) -> bytes | None:
         """Return the available bytes; None if there are none.
@@ -267,27 +274,32 @@ class SerialPort:
         except BlockingIOError:
             return None
         except OSError as error:
-            raise DeviceLostError(f"{self.path}: unplugged ({error.strerror})") from error
+            raise _unplugged(self.path, error.strerror) from error
         if not data:
-            raise DeviceLostError(f"{self.path}: unplugged (hang-up)")
+            raise _unplugged(self.path, "hang-up")
         return data
 
 
+def _unplugged(path: str, found: object) -> DeviceAbsentError:
+    return DeviceAbsentError(f"{path}: unplugged ({found}): plug it in again, or check its cable")
+
+
 def _device_error(
-    path: str, baud: int, error: Exception
+    path: str, baud: int, error: Exception, key: str
 ) -> DeviceLostError | DeviceMisconfiguredError:
     """Return the error to raise: object, finding, expectation and remedy."""
     number = _error_number(error)
     if number is not None and number not in _NOT_A_PORT:
         found = _LOST.get(number, f"cannot be opened ({os.strerror(number)})")
-        return DeviceLostError(f"{path}: {found}{_remedy(path, number)}")
+        kind = DeviceAbsentError if number in _ABSENT else DeviceLostError
+        return kind(f"{path}: {found}{_remedy(path, number, key)}")
 
     if isinstance(error, ValueError):  # pyserial: the driver of this port refused the speed
         return DeviceMisconfiguredError(
             f"{path}: cannot run at {baud} baud: set `baud` to a speed that port and device share"
         )
     return DeviceMisconfiguredError(
-        f"{path}: not a serial port ({error}): set `port` to a tty, best one of /dev/serial/by-id"
+        f"{path}: not a serial port ({error}): set `{key}` to a tty, best one of /dev/serial/by-id"
     )
 
 
@@ -303,7 +315,7 @@ def _error_number(error: BaseException | None) -> int | None:
     return None
 
 
-def _remedy(path: str, number: int) -> str:
+def _remedy(path: str, number: int, key: str) -> str:
     """Return the remedy for a port that cannot be opened."""
     if number in {errno.EACCES, errno.EPERM}:
         return (
@@ -319,10 +331,8 @@ def _remedy(path: str, number: int) -> str:
 
     if number == errno.ENOENT:
         there = ", ".join(sorted(map(str, Path("/dev/serial/by-id").glob("*"))))
-        return (
-            ": plug it in, or set `port` (of an SLCAN adapter: `channel`) to an existing one: "
-            f"{there or '/dev/serial/by-id is empty'}"
-        )
+        existing = f"an existing one: {there}" if there else "its name (/dev/serial/by-id is empty)"
+        return f": plug it in, or set `{key}` to {existing}"
 
     if number in {errno.EMFILE, errno.ENFILE}:
         return ": raise LimitNOFILE (`ulimit -n`) or find the program that keeps files open"

@@ -61,7 +61,7 @@ class XbusHandshake:
         self._settings = settings
         self._hunt = hunt
         self._conversation = XbusConversation(port, emit)
-        self._who = f"{settings.id} ({settings.port})"
+        self._who = settings.port
         self._product_code = ""
         self._triggers = tuple(map(Item, _sync_lines.trigger_wires(settings.sync or ())))
         self._needs = required_outputs(settings.orientation, magnetometer=settings.magnetometer)
@@ -90,7 +90,7 @@ class XbusHandshake:
             late_s=OUTSTANDING_S, late_if_silent=self._hunt
         )
         if not entered and settings.reset_if_stuck and self._conversation.understood:
-            log.warning("%s: streams but does not answer; resetting it", self._who)
+            log.warning("%s: streams but does not answer; resetting it", settings.id)
             await self._conversation.send(XbusMessageId.RESET)
             entered = await self._conversation.enter_config(tries=_RESETS, wait_s=_RESET_WAIT_S)
         if not entered:
@@ -119,7 +119,9 @@ class XbusHandshake:
         """Return the reply to a request that the device must answer; it may be an error."""
         reply = await self._conversation.request(mid, data, tries=3)
         if reply is None:
-            raise DeviceLostError(f"{self._who}: stopped answering during configuration")
+            raise DeviceLostError(
+                f"{self._who}: stopped answering during configuration: check its power and cable"
+            )
         return reply
 
     async def _ensure_outputs(self) -> None:
@@ -131,7 +133,9 @@ class XbusHandshake:
         if not faults:
             return
         self._refuse_to_write(faults, _rate_hint(found, self._needs))
-        log.warning("%s: writing its output configuration: %s", self._who, "; ".join(faults))
+        log.warning(
+            "%s: writing its output configuration: %s", self._settings.id, "; ".join(faults)
+        )
 
         # Raw measurements are in sensor axes: only an orientation has a world.
         world: World = self._settings.world if self._needs is ORIENTATION else "ENU"
@@ -150,7 +154,8 @@ class XbusHandshake:
         if left:
             hint = _rate_hint(_outputs_of(reply), self._needs)
             raise DeviceMisconfiguredError(
-                f"{self._who}: does not accept the requested outputs: {'; '.join(left)}{hint}"
+                f"{self._who}: does not accept the requested outputs: {'; '.join(left)}{hint}: "
+                "correct `rate_hz`, or update the firmware of the device"
             )
 
     def _refuse_to_write(self, faults: list[str], hint: str = "") -> None:
@@ -170,7 +175,7 @@ class XbusHandshake:
         if not faults:
             return
         self._refuse_to_write(faults)
-        log.warning("%s: writing its sync settings: %s", self._who, "; ".join(faults))
+        log.warning("%s: writing its sync settings: %s", self._settings.id, "; ".join(faults))
 
         reply = await self._answer(
             XbusMessageId.SYNC_SETTINGS, setup.encode_sync(asked) or _NO_SYNC
@@ -210,7 +215,10 @@ class XbusHandshake:
         speed = await self._other_speed() if self._hunt or received else None
         if speed is not None:
             if await self._listen_at(self._settings.baud):  # USB ignores the speed
-                raise DeviceLostError(f"{self._who}: the answer came too late; trying again")
+                raise DeviceLostError(
+                    f"{self._who}: the device answers too late; retrying. If this repeats, check "
+                    "its cable, and the load of the gateway"
+                )
             raise DeviceMisconfiguredError(
                 f"{self._who}: {self._settings.baud} baud, but no message can be decoded; "
                 f"the device answers at {speed}: set baud = {speed}"
@@ -223,10 +231,13 @@ class XbusHandshake:
 
         await self._listen_at(self._settings.baud)
         if not conversation.received:
-            raise DeviceLostError(f"{self._who}: received {received} bytes of noise, then silence")
+            raise DeviceLostError(
+                f"{self._who}: some bytes of noise, then silence: check its power and cable, and "
+                "`port`"
+            )
         raise DeviceMisconfiguredError(
-            f"{self._who}: the device on this port is not Xbus: received {received} bytes, none "
-            "of them Xbus at any common speed: correct `port` or `driver`"
+            f"{self._who}: the device on this port is not Xbus: it sends bytes, none of them "
+            "Xbus at any common speed: correct `port` or `driver`"
         )
 
     async def _other_speed(self) -> int | None:

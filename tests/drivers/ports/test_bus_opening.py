@@ -149,7 +149,10 @@ async def test_a_connection_that_is_reset_is_reported_without_a_traceback() -> N
             with pytest.raises(DeviceLostError) as lost:
                 await bus.pump("S3", {key: "quaternion"}, lambda _: None, 5.0, needed=key)
         thread.join()
-    assert str(lost.value) == "can0 (socketcand): Connection reset by peer"
+    assert str(lost.value) == (
+        "can0 (socketcand): Connection reset by peer: check the server and the network, or correct "
+        "`channel`"
+    )
 
 
 async def test_a_library_that_hangs_is_called_by_one_thread_only_and_its_late_bus_is_closed(

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 import serial
 
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.driver import DeviceAbsentError, DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.ports.serial_port import SerialPort
 
 if TYPE_CHECKING:
@@ -83,13 +83,22 @@ async def test_unplugging_is_noticed_at_once(pty: Pty) -> None:
         await asyncio.sleep(0.02)
         began = time.monotonic()
         pty.close()
-        with pytest.raises(DeviceLostError, match="unplugged"):
+        with pytest.raises(DeviceAbsentError, match=r"unplugged \(.*\): plug it in again"):
             await task
         assert time.monotonic() - began < 0.5
         with pytest.raises(DeviceLostError):
             await port.write(b"x")
         with pytest.raises(DeviceLostError):
             await port.receive(1.0)
+
+
+@pytest.mark.parametrize("key", ["port", "channel"])
+def test_an_absent_port_is_named_with_its_key(tmp_path: Path, key: str) -> None:
+    path = str(tmp_path / "ttyS9")
+    with pytest.raises(DeviceAbsentError) as caught, SerialPort(path, 115200, key):
+        pass
+    assert str(caught.value).startswith(f"{path}: is not there: plug it in, or set `{key}` to ")
+    assert "SLCAN" not in str(caught.value)
 
 
 @pytest.mark.parametrize("bug", [ZeroDivisionError, TimeoutError, BlockingIOError, OSError])

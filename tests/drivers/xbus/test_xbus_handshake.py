@@ -98,7 +98,7 @@ async def test_a_difference_is_named_and_not_written_without_permission(tmp_path
     async with serving(device):
         said = await refusal(make(tmp_path), DeviceMisconfiguredError)
     assert device.flash_writes == 0
-    for part in ("S1", "packet counter", "time", "50 Hz, not 100 Hz", "persist = true"):
+    for part in ("/imu: ", "packet counter", "time", "50 Hz, not 100 Hz", "persist = true"):
         assert part in said
 
 
@@ -182,7 +182,7 @@ async def test_a_wrong_speed_is_named_with_the_right_one(tmp_path: Path) -> None
         said = await refusal(make(tmp_path), DeviceMisconfiguredError)
         assert device.streaming  # left as it was
     assert "set baud = 921600" in said
-    assert "S1" in said
+    assert "S1" not in said, "the log line begins with the id"
 
 
 async def test_a_silent_device_at_another_speed_is_found_at_the_first_attempt(

@@ -1,0 +1,93 @@
+"""Log lines of the core's notices on sources, sensors and calibrations."""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.outputs.log import journal_fields
+from jointfit_daemon.pipeline.events import CalibrationStatus, DeviceStatus, Notice, NoticeLevel
+from jointfit_daemon.supervisor._calibration_store import store_of
+from jointfit_daemon.supervisor._outage_lines import OutageLines
+
+if TYPE_CHECKING:
+    from jointfit_daemon.config import Rig
+    from jointfit_daemon.pipeline.events import Event, Output
+
+log = logging.getLogger(__name__)
+
+CLOSED_S = 1.0
+"""Longest time from the silence that a source permits to the message that it is closed, s."""
+LEVELS = {
+    NoticeLevel.INFO: logging.INFO,
+    NoticeLevel.WARNING: logging.WARNING,
+    NoticeLevel.ERROR: logging.ERROR,
+}
+"""Level of the log line of a notice."""
+
+
+class NoticeLog:
+    """Writes the log lines; a `Sink` of the core.
+
+    Parameters
+    ----------
+    rig
+        The rig in force.
+
+    Attributes
+    ----------
+    online
+        Ids of the connected sources.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._outages = OutageLines()
+        self._version: int | None = None
+        self.online: set[str] = set()
+
+    def configure(self, rig: Rig) -> None:
+        """Use another rig; sources that it lacks are no longer online."""
+        self._rig = rig
+        self.online &= {source.id for source in rig.sources}
+
+    def event(self, event: Event) -> None:
+        """Ignore the inputs of the core."""
+
+    def output(self, output: Output) -> None:
+        """Write the lines of one output."""
+        match output:
+            case Notice():
+                wait_s = self._closes_within(output.id)
+                if not self._outages.holds(output, time.monotonic(), wait_s):
+                    _write(output)
+            case CalibrationStatus(phase=phase, text=text):
+                # A change of the calibration, with the file in which it is stored.
+                if output.version is not None and output.version != self._version:
+                    path = store_of(self._rig).path(output.version)
+                    text = f"{text} (version {output.version} in {path})"
+                self._version, fields = output.version, journal_fields("calibration", phase)
+                log.log(LEVELS[output.level], "calibration %s: %s", phase, text, extra=fields)
+            case DeviceStatus(name, online):
+                self._outages.close(name)
+                (self.online.add if online else self.online.discard)(name)
+
+    def write_due(self, now_s: float, *, stalled: bool) -> None:
+        """Write the lines that were held until `now_s`; `stalled` postpones them."""
+        if stalled:
+            self._outages.postpone(now_s)
+        for notice in self._outages.due(now_s):
+            _write(notice)
+
+    def _closes_within(self, name: str) -> float | None:
+        """Return the time after which a silent source is closed, s; None if it is closed."""
+        if name not in self.online:
+            return None
+        settings = [source.settings for source in self._rig.sources if source.id == name]
+        return max((getattr(one, "silence_s", 0.0) for one in settings), default=0.0) + CLOSED_S
+
+
+def _write(notice: Notice) -> None:
+    fields = journal_fields(notice.kind, notice.id)
+    log.log(LEVELS[notice.level], "%s: %s", notice.id, notice.text, extra=fields)
