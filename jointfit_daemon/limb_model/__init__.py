@@ -36,6 +36,7 @@ from jointfit_daemon.limb_model._kernel_expert import KernelExpert, as_rows
 from jointfit_daemon.limb_model._kernel_features import TILTS, bumps, smooth_terms, widths_of
 from jointfit_daemon.limb_model._kernel_model import KernelModel, mix_corrections, model_inputs
 from jointfit_daemon.limb_model._kernel_trend import LEVEL_AXES, trend
+from jointfit_daemon.limb_model._label_search import LabelFault, LabelSearch, explain_trial
 from jointfit_daemon.limb_model._leverage_variance import FARTHEST, WITHIN, LeverageVariance
 from jointfit_daemon.limb_model._marker_cluster import (
     MarkerCluster,
@@ -89,6 +90,8 @@ __all__ = [
     "JointCalibration",
     "KernelExpert",
     "KernelModel",
+    "LabelFault",
+    "LabelSearch",
     "LeverageVariance",
     "LinkKind",
     "MarkerCluster",
@@ -116,6 +119,7 @@ __all__ = [
     "configured_length",
     "distal_joints",
     "equal_weights",
+    "explain_trial",
     "flexion_sign",
     "fuse",
     "fuse_one",

@@ -18,6 +18,7 @@ from jointfit_daemon.pipeline._notice_limiter import NoticeLimiter, unix_step_no
 from jointfit_daemon.pipeline._optical_comparison import OpticalComparison
 from jointfit_daemon.pipeline._optical_trackers import (
     chain_tracker,
+    label_monitor,
     planar_tracker,
     unused_refinement,
 )
@@ -57,7 +58,8 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig, Source
     from jointfit_daemon.limb_model import Calibration
-    from jointfit_daemon.model import LimbState
+    from jointfit_daemon.model import LimbState, MocapFrame
+    from jointfit_daemon.pipeline._label_monitor import LabelMonitor
     from jointfit_daemon.pipeline.chain_tracking import ChainTracker
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.pipeline.planar_chain import PlanarTracker
@@ -111,6 +113,7 @@ class Core:
         self._sensors_rate: RateDivider | None = None
         self._moving_centers: MovingCenters | None = None
         self._chain_tracker: ChainTracker | None = None
+        self._label_monitor: LabelMonitor | None = None
         self._planar_tracker: PlanarTracker | None = None
         self._handlers: dict[type, Callable[[Any], list[Output]]] = {
             Configured: self._configure,
@@ -251,6 +254,7 @@ class Core:
         if self._moving_centers is None or not self._moving_centers.serves(centers):
             self._moving_centers = centers
         self._chain_tracker = chain_tracker(rig, usable, self._chain_tracker)
+        self._label_monitor = label_monitor(usable, self._chain_tracker, self._label_monitor)
         wanted = rig.calibration.learn_online
         self._collector = OnlineFrameCollector(rig.chain, usable, wanted=wanted)
 
@@ -326,15 +330,7 @@ class Core:
             if isinstance(measurement, ImuSample):
                 outputs += self._add_sample(source, measurement, stamp)
             else:
-                self._mocap.add(self._now_ns, item, self._session, self._lags, self._collector)
-                if measurement.live:
-                    self._comparison.add_frame(stamp.t_ns, measurement, synced=stamp.synced)
-                    if self._moving_centers is not None:
-                        outputs += self._moving_centers.add_frame(stamp.t_ns, measurement)
-                    if self._planar_tracker is not None:
-                        outputs += self._planar_tracker.add_frame(stamp.t_ns, measurement)
-                    if self._chain_tracker is not None:
-                        outputs += self._chain_tracker.add_frame(stamp.t_ns, measurement)
+                outputs += self._add_mocap(measurement, stamp)
         return outputs
 
     def _report(self, source: str, state: SourceState, item: Corrupt | DeviceEvent) -> list[Output]:
@@ -366,6 +362,26 @@ class Core:
         if self._session.collecting:
             return self._session.add_sample(source, t_ns, q)
         return []
+
+    def _add_mocap(self, frame: MocapFrame, stamp: Stamp) -> list[Output]:
+        outputs: list[Output] = []
+        if self._label_monitor is not None and frame.live:
+            # markers are placed and named again while a calibration is made
+            if self._session.phase == CalibrationPhase.CALIBRATED:
+                outputs += self._label_monitor.add_frame(stamp.t_ns, frame)
+                frame = self._label_monitor.hide_faulty(frame)
+            else:
+                self._label_monitor.reset()
+
+        item = StampedMeasurement(frame, stamp)
+        self._mocap.add(self._now_ns, item, self._session, self._lags, self._collector)
+        if not frame.live:
+            return outputs
+        self._comparison.add_frame(stamp.t_ns, frame, synced=stamp.synced)
+        for tracker in (self._moving_centers, self._planar_tracker, self._chain_tracker):
+            if tracker is not None:
+                outputs += tracker.add_frame(stamp.t_ns, frame)
+        return outputs
 
     # --- time --------------------------------------------------------------------------------
 

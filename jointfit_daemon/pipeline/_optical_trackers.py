@@ -1,10 +1,11 @@
-"""Trackers of the cameras that a rig asks for: chain model and planar movement."""
+"""Trackers of the cameras that a rig asks for: chain model, planar movement and marker labels."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.pipeline._label_monitor import LabelMonitor
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.pipeline.planar_chain import PlanarTracker
 
@@ -42,6 +43,17 @@ def planar_tracker(rig: Rig, before: PlanarTracker | None) -> PlanarTracker | No
     if before is not None and before.serves(rig.chain, *rates):
         return before
     return PlanarTracker(rig.chain, rig.calibration.markers, *rates)
+
+
+def label_monitor(
+    calibration: Calibration | None, chain: ChainTracker | None, before: LabelMonitor | None
+) -> LabelMonitor | None:
+    """Return a monitor of the marker labels; None beside a chain model, which has its own."""
+    if calibration is None or chain is not None:
+        return None
+    if before is not None and before.serves(calibration.clusters):
+        return before
+    return LabelMonitor(calibration.clusters)
 
 
 def unused_refinement(rig: Rig, calibration: Calibration | None, t_ns: int) -> list[Output]:

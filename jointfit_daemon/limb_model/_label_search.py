@@ -1,0 +1,410 @@
+"""Search for exchanged marker labels in single frames, by the shapes of the marker clusters.
+
+A hypothesis assigns a measured label to every marker of a cluster. Its cost is the negative
+logarithm of its likelihood: marker errors are Gaussian, an exchanged label is less probable than a
+correct one, and a marker that is somewhere else is less probable still.
+
+Invariant: an explanation is unique. Every hypothesis that disagrees with it has a higher cost by
+`_MARGIN`, and every cluster it changes has an RMS residual of at most `_GAIN` of the one before.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import combinations, pairwise, permutations
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.limb_model._rigid_fit import MAX_FIT_RMS_M, MIN_MARKERS, is_line
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.limb_model._marker_cluster import MarkerCluster
+
+    Rows = NDArray[np.intp]
+
+SUSPICIOUS_M = 0.012
+"""RMS residual of a cluster above which its labels are searched, m."""
+SMALLEST_M = 0.004
+"""RMS residual below which labels are never searched, m: the noise of markers on skin."""
+DISPLACED_M = 0.02
+"""RMS residual of a cluster above which a single marker may be displaced, m: the accepted RMS error
+of markers, which soft-tissue artefact does not exceed for seconds."""
+_SYMMETRY = 0.6
+"""RMS residual above which labels are searched, as a share of that of the least conspicuous
+exchange within the cluster."""
+_MARKER_SD_M = 0.006
+"""Standard deviation of a marker's error, soft-tissue artefact included, m."""
+_EXCHANGED_COST = 2.0
+"""Cost of a marker with the label of another one."""
+_ELSEWHERE_COST = 12.0
+"""Cost of a visible label at no place of a cluster."""
+_MARGIN = 2.5
+"""Least difference in cost of two explanations."""
+_GAIN = 0.55
+"""Largest RMS residual of an explanation, as a share of that of the labels as they are."""
+_NEAR_M = 0.025
+"""RMS residual up to which a label is at the place of a hidden marker, m."""
+_TOLERANCE_M = 0.03
+"""Greatest difference of the distance of two markers from that in the cluster, m."""
+_MOST_CHANGED = 4
+"""Largest number of changed labels in one cluster."""
+_BEST = 12
+"""Number of assignments of one cluster that are combined with those of the others."""
+_MOST_COMBINED = 2000
+"""Largest number of partial combinations: none of a healthy limb has more than a few."""
+_SAMPLED = 40
+"""Frames of a trial in which labels are searched."""
+_CONFIRMED = 0.5
+"""Share of the suspicious frames of a trial that an explanation needs."""
+
+
+class LabelFault(NamedTuple):
+    """Labels of one frame that are not at their own places."""
+
+    markers: tuple[str, ...]
+    """Each is at the place of the next one, and the last at that of the first. A single marker is
+    at no place of a cluster."""
+    parts: tuple[str, ...]
+    """Body parts of these markers, sorted."""
+    cycle: bool = True
+    """Whether the last marker is at the place of the first. Otherwise the last one is hidden."""
+
+    @property
+    def places(self) -> str:
+        """Return which marker is at whose place, as a clause."""
+        names = self.markers
+        following = zip(names, names[1:] + (names[:1] if self.cycle else ()), strict=False)
+        *first, last = [f"{name} is at the place of {other}" for name, other in following]
+        return f"{', '.join(first)} and {last}" if first else last
+
+
+class LabelFinding(NamedTuple):
+    """Result of the search in one frame."""
+
+    rms: Array
+    """RMS residual of each cluster with its own labels, m, shape (P,); NaN without a fit."""
+    faults: tuple[LabelFault, ...]
+
+
+class _Frame(NamedTuple):
+    """Markers of one frame; the last row belongs to no marker."""
+
+    points: Array
+    """m, shape (M + 1, 3)."""
+    seen: NDArray[np.bool_]
+    distances: Array
+    """Distances of all pairs, m, shape (M + 1, M + 1)."""
+
+
+class _Assignment(NamedTuple):
+    """Labels of one cluster in a hypothesis, as columns; -1 is hidden or elsewhere."""
+
+    columns: tuple[int, ...]
+    cost: float
+
+
+class LabelSearch:
+    """Explains the markers of one frame by exchanged labels.
+
+    Parameters
+    ----------
+    clusters : sequence of MarkerCluster
+        Clusters of markers. Rigid bodies are ignored.
+    """
+
+    def __init__(self, clusters: Iterable[MarkerCluster]) -> None:
+        self.clusters = tuple(cluster for cluster in clusters if cluster.body is None)
+        self.labels = tuple(name for cluster in self.clusters for name in cluster.markers)
+        self._part_of = [p for p, cluster in enumerate(self.clusters) for _ in cluster.markers]
+        ends = np.cumsum([0, *(len(cluster.markers) for cluster in self.clusters)])
+        self._own = [np.arange(a, b) for a, b in pairwise(ends)]
+        """Columns of the markers of each cluster."""
+
+        # Clusters of different sizes in one array; unused rows have weight 0.
+        most = max((len(own) for own in self._own), default=0)
+        self._template = np.zeros((len(self.clusters), most, 3))
+        self._columns = np.full((len(self.clusters), most), -1)
+        for p, (own, cluster) in enumerate(zip(self._own, self.clusters, strict=True)):
+            self._template[p, : len(own)] = cluster.template
+            self._columns[p, : len(own)] = own
+        self._lines: dict[tuple[int, bytes], bool] = {}
+        self._limits = np.array([_suspicious_rms(cluster.template) for cluster in self.clusters])
+
+    def explain(self, points: Array) -> LabelFinding:
+        """Return the residuals of the clusters in one frame, and faulty labels that explain them.
+
+        Parameters
+        ----------
+        points : ndarray, shape (M, 3)
+            Markers in the order of `labels`, m; NaN if hidden.
+        """
+        padded = np.concatenate((points, np.full((1, 3), np.nan)))
+        seen = np.isfinite(padded).all(axis=1)
+        if not len(self.clusters):
+            return LabelFinding(np.zeros(0), ())
+        rms = _residual_rms(self._template, padded[self._columns], seen[self._columns])
+        rms[~self._fitted(seen)] = np.nan
+
+        suspects = np.flatnonzero(rms > self._limits).tolist()
+        return LabelFinding(rms, self._faults(padded, seen, rms, suspects) if suspects else ())
+
+    def _fitted(self, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return the clusters whose visible markers determine a pose, shape (P,)."""
+        return np.array(
+            [
+                seen[own].sum() >= MIN_MARKERS and not self._is_line(p, seen[own])
+                for p, own in enumerate(self._own)
+            ]
+        )
+
+    def _faults(
+        self, points: Array, seen: NDArray[np.bool_], rms: Array, suspects: Sequence[int]
+    ) -> tuple[LabelFault, ...]:
+        distances = np.sqrt(((points[:, None] - points[None]) ** 2).sum(axis=-1))
+        frame = _Frame(points, seen, distances)
+        pool = np.concatenate([self._own[p][seen[self._own[p]]] for p in suspects])
+        options = [self._assignments(p, frame, pool, float(rms[p])) for p in suspects]
+        best = _combine(options)
+        if best is None:
+            return ()
+
+        place_of: dict[int, int] = {}
+        elsewhere: list[int] = []
+        for p, columns in zip(suspects, best, strict=True):
+            own = self._own[p].tolist()
+            place_of |= {c: s for c, s in zip(columns, own, strict=True) if c not in (-1, s)}
+            kept = {c for others in best for c in others}
+            # A fit without one marker is always better: soft-tissue artefact is no fault.
+            if rms[p] > DISPLACED_M:
+                elsewhere += [s for s in own if seen[s] and s not in kept]
+        for label in elsewhere:
+            hidden = self._hidden_place(points, seen, rms, suspects, label)
+            if hidden is not None:
+                place_of[label] = hidden
+        return tuple(self._groups(place_of, elsewhere))
+
+    def _assignments(self, p: int, frame: _Frame, pool: Rows, rms: float) -> list[_Assignment]:
+        """Return the best assignments of one cluster, with its own labels first.
+
+        Labels are added marker by marker; an assignment ends where two markers have a distance
+        other than in the cluster.
+        """
+        own, template, seen = self._own[p], self.clusters[p].template, frame.seen
+        apart = np.sqrt(((template[:, None] - template[None]) ** 2).sum(axis=-1))
+        options = np.append(pool, -1)
+        most_hidden = int((~seen[own]).sum()) + 1
+        found: Rows = np.zeros((1, 0), dtype=np.intp)
+        for s in range(len(own)):
+            # Every label, or none, for the next marker.
+            grown = np.column_stack(
+                (np.repeat(found, len(options), axis=0), np.tile(options, len(found)))
+            )
+            new, before = grown[:, -1:], grown[:, :-1]
+            off = np.abs(frame.distances[new, before] - apart[s, :s])
+
+            # Distances of the cluster, every label once, few changes.
+            fits = ((off < _TOLERANCE_M) | (new < 0) | (before < 0)).all(axis=1)
+            fits &= ((new != before) | (new < 0)).all(axis=1)
+            fits &= (grown < 0).sum(axis=1) <= most_hidden
+            visible_change = (grown != own[: s + 1]) & ((grown >= 0) | seen[own[: s + 1]])
+            found = grown[fits & (visible_change.sum(axis=1) <= _MOST_CHANGED)]
+
+        used = found >= 0
+        enough = used.sum(axis=1) >= MIN_MARKERS
+        found, used = found[enough], used[enough]
+        identity = tuple(np.where(seen[own], own, -1).tolist())
+        first = _Assignment(identity, float(_cost(np.array(rms), seen[own].sum())))
+        if not len(found):
+            return [first]
+        tiled = np.broadcast_to(template, (*found.shape, 3))
+        after = _residual_rms(tiled, frame.points[found], used)
+
+        changed = ((found != own) & used).sum(axis=1)
+        count = used.sum(axis=1)
+        cost = _cost(after, count) + _EXCHANGED_COST * changed
+        cost += _ELSEWHERE_COST * (seen[own].sum() - count)
+        good = (after < _GAIN * rms) & (changed + ((found < 0) & seen[own]).sum(axis=1) > 0)
+        order = np.flatnonzero(good)[np.argsort(cost[good], kind="stable")][: 4 * _BEST]
+        kept = [i for i in order.tolist() if not self._is_line(p, used[i])][:_BEST]
+        return [first, *(_Assignment(tuple(found[i].tolist()), float(cost[i])) for i in kept)]
+
+    def _is_line(self, p: int, used: NDArray[np.bool_]) -> bool:
+        """Return whether some markers of a cluster are on a line."""
+        key = (p, used.tobytes())
+        if key not in self._lines:
+            self._lines[key] = is_line(self.clusters[p].template[used])
+        return self._lines[key]
+
+    def _hidden_place(
+        self,
+        points: Array,
+        seen: NDArray[np.bool_],
+        rms: Array,
+        suspects: Sequence[int],
+        label: int,
+    ) -> int | None:
+        """Return the hidden marker of a cluster without faults at whose place a label is."""
+        found = []
+        for p, own in enumerate(self._own):
+            if p in suspects or not np.isfinite(rms[p]):
+                continue
+            for s in own[~seen[own]].tolist():
+                columns = np.where(seen[own], own, -1)
+                columns[s - own[0]] = label
+                after = _residual_rms(
+                    self.clusters[p].template[None], points[columns][None], (columns >= 0)[None]
+                )[0]
+                if after < _NEAR_M:
+                    found.append(s)
+        return found[0] if len(found) == 1 else None
+
+    def _groups(self, place_of: dict[int, int], elsewhere: Sequence[int]) -> list[LabelFault]:
+        """Return the chains and cycles of labels at each other's places."""
+        groups = []
+        left = dict(place_of)
+        ends = [c for c in place_of if c not in set(place_of.values())]  # open chains first
+        for first in [*ends, *sorted(place_of)]:
+            group, c = [], first
+            while c in left:
+                group.append(c)
+                c = left.pop(c)
+            if not group:
+                continue
+            cycle = c == first
+            groups.append(self._fault(group if cycle else [*group, c], cycle=cycle))
+        grouped = {name for group in groups for name in group.markers}
+        return groups + [
+            self._fault([c], cycle=False) for c in elsewhere if self.labels[c] not in grouped
+        ]
+
+    def _fault(self, columns: Sequence[int], *, cycle: bool) -> LabelFault:
+        parts = sorted({self.clusters[self._part_of[c]].name for c in columns})
+        return LabelFault(tuple(self.labels[c] for c in columns), tuple(parts), cycle)
+
+
+def explain_trial(search: LabelSearch, positions: Array) -> tuple[LabelFault, ...]:
+    """Return the faulty labels that explain most of the suspicious frames of a trial.
+
+    Parameters
+    ----------
+    search : LabelSearch
+        The clusters.
+    positions : ndarray, shape (m, M, 3)
+        Markers in the order of its labels, m; NaN if hidden.
+    """
+    rows = np.unique(np.linspace(0, len(positions) - 1, _SAMPLED).astype(int))
+    findings = [search.explain(positions[row]) for row in rows if len(positions)]
+    votes = Counter(fault for finding in findings for fault in finding.faults)
+    return tuple(
+        fault
+        for fault, count in votes.items()
+        if count > _CONFIRMED * sum(_is_suspect(search, finding, fault) for finding in findings)
+    )
+
+
+def _is_suspect(search: LabelSearch, finding: LabelFinding, fault: LabelFault) -> bool:
+    """Return whether a cluster of a fault does not fit in one frame, or is explained by it."""
+    names = [cluster.name for cluster in search.clusters]
+    bad = any(finding.rms[names.index(part)] > MAX_FIT_RMS_M for part in fault.parts)
+    return bad or fault in finding.faults
+
+
+def _suspicious_rms(template: Array) -> float:
+    """Return the residual above which the labels of a cluster are searched, m.
+
+    It is smaller for a cluster that looks almost the same after an exchange of its labels.
+    """
+    count = len(template)
+    orders = [
+        order
+        for moved in (2, 3, 4)
+        for rows in combinations(range(count), moved)
+        for order in _orders(count, rows)
+    ]
+    if not orders:
+        return SUSPICIOUS_M
+    tiled = np.broadcast_to(template, (len(orders), count, 3))
+    seen = np.ones((len(orders), count), dtype=np.bool_)
+    least = float(_residual_rms(tiled, template[np.array(orders)], seen).min())
+    return max(SMALLEST_M, min(SUSPICIOUS_M, _SYMMETRY * least))
+
+
+def _orders(count: int, rows: tuple[int, ...]) -> list[list[int]]:
+    """Return the permutations of a cluster that move exactly these rows."""
+    found = []
+    for order in permutations(rows):
+        if all(a != b for a, b in zip(rows, order, strict=True)):
+            whole = list(range(count))
+            for a, b in zip(rows, order, strict=True):
+                whole[a] = b
+            found.append(whole)
+    return found
+
+
+def _residual_rms(template: Array, points: Array, seen: NDArray[np.bool_]) -> Array:
+    r"""Return the RMS residuals of rigid fits, m, shape (n,); arrays (n, k, 3) and (n, k).
+
+    With the singular values s of the cross moment, the sum of squared residuals is
+    :math:`\sum |a|^2 + \sum |y|^2 - 2 (s_1 + s_2 \pm s_3)` (Kabsch 1976).
+    """
+    w = seen[..., None]
+    count = np.maximum(seen.sum(axis=1), 1)
+    a, y = np.where(w, template, 0.0), np.where(w, points, 0.0)
+    a = np.where(w, a - (a.sum(axis=1) / count[:, None])[:, None], 0.0)
+    y = np.where(w, y - (y.sum(axis=1) / count[:, None])[:, None], 0.0)
+    moment = np.swapaxes(a, 1, 2) @ y
+    s = np.linalg.svd(moment, compute_uv=False)
+    s[:, 2] *= np.sign(np.linalg.det(moment))
+    square = (a * a).sum(axis=(1, 2)) + (y * y).sum(axis=(1, 2)) - 2.0 * s.sum(axis=1)
+    return np.asarray(np.sqrt(np.maximum(square, 0.0) / count))
+
+
+def _cost(rms: Array, count: Array) -> Array:
+    cost: Array = count * (rms / _MARKER_SD_M) ** 2 / 2.0
+    return cost
+
+
+def _combine(options: Sequence[Sequence[_Assignment]]) -> list[tuple[int, ...]] | None:
+    """Return the assignments with the least cost in which every label is used once.
+
+    None if the labels of every cluster are its own, or if another combination is hardly worse.
+    """
+    masks = [[_mask(one.columns) for one in each] for each in options]
+    orders = [np.argsort([-one.cost for one in each]).tolist() for each in options]
+    rest = [0.0]  # least cost of the clusters that are not assigned yet
+    for each in reversed(options):
+        rest.append(rest[-1] + min(one.cost for one in each))
+    rest.reverse()
+
+    found: list[tuple[float, tuple[int, ...]]] = []
+    best, visited = np.inf, 0
+    stack: list[tuple[float, int, tuple[int, ...]]] = [(0.0, 0, ())]
+    while stack and (visited := visited + 1) <= _MOST_COMBINED:
+        cost, taken, chosen = stack.pop()
+        p = len(chosen)
+        if cost + rest[p] > best + _MARGIN:
+            continue
+        if p == len(options):
+            best = min(best, cost)
+            found.append((cost, chosen))
+            continue
+        stack += [
+            (cost + options[p][i].cost, taken | masks[p][i], (*chosen, i))
+            for i in orders[p]  # the last one, with the least cost, is visited first
+            if not taken & masks[p][i]
+        ]
+    close = [chosen for cost, chosen in sorted(found) if cost <= best + _MARGIN]
+    if visited > _MOST_COMBINED or len(close) != 1 or not any(close[0]):
+        return None
+    return [options[p][i].columns for p, i in enumerate(close[0])]
+
+
+def _mask(columns: Iterable[int]) -> int:
+    """Return columns as bits."""
+    return sum(1 << c for c in columns if c >= 0)

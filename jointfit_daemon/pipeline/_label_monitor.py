@@ -1,0 +1,239 @@
+"""Detection of exchanged, mislabelled and displaced markers from the shapes of marker clusters.
+
+For rigs without chain model: the clusters are those of the calibration in force. Markers with
+faulty labels are hidden from fusion until they are at their places again.
+
+Invariant: a fault is reported after it explained the frames of 2 s, and its end after 2 s without
+it. Hidden markers neither begin nor end a fault.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.limb_model import MAX_FIT_RMS_M, LabelFault, LabelSearch, restore_cluster
+from jointfit_daemon.model import MarkerFlag
+from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
+from jointfit_daemon.timing.alignment import RateDivider
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.limb_model import StoredCluster
+    from jointfit_daemon.model import MocapFrame, MocapLayout
+    from jointfit_daemon.pipeline.events import Output
+
+RATE_HZ = 5.0
+"""Examined frames per second: a search takes milliseconds, a fit of all clusters 0.1 ms."""
+FAULT_NS = 2_000_000_000
+"""Time after which a fault begins or ends, ns."""
+MISFIT_NS = 4_000_000_000
+"""Time after which a cluster without explanation is reported, ns."""
+_FEWEST = 7
+"""Frames with the clusters of a fault that decide on it: more than half of those in `FAULT_NS`."""
+_PRESENT = 0.6
+"""Share of the frames that a fault explains at its beginning: the rest may have hidden markers."""
+_ABSENT = 0.1
+"""Share of the frames that a fault explains, or that do not fit, at its end."""
+_REFUSED = 0.8
+"""Share of the frames that do not fit without explanation."""
+
+
+class _Examined(NamedTuple):
+    """One examined frame."""
+
+    t_ns: int
+    fitted: frozenset[str]
+    """Body parts whose visible markers determine a pose."""
+    refused: Mapping[str, float]
+    """RMS residuals of the body parts whose markers do not fit, m."""
+    faults: frozenset[LabelFault]
+
+
+class LabelMonitor:
+    """Monitors the marker labels of a calibrated limb.
+
+    Parameters
+    ----------
+    clusters : mapping of str to StoredCluster
+        Marker clusters of the calibration in force.
+    """
+
+    def __init__(self, clusters: Mapping[str, StoredCluster]) -> None:
+        self._stored = dict(clusters)
+        self._search = LabelSearch(
+            restore_cluster(name, stored)
+            for name, stored in clusters.items()
+            if stored.body is None
+        )
+        self._rate = RateDivider(RATE_HZ)
+        self._examined: deque[_Examined] = deque()
+        self._layout: MocapLayout | None = None
+        self._columns: list[int] = []
+        self._hidden: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
+        """Columns of the layout whose labels are faulty."""
+        self.faults: frozenset[LabelFault] = frozenset()
+        """Faults in force."""
+        self.misfits: frozenset[str] = frozenset()
+        """Body parts whose markers do not fit, without explanation."""
+
+    def serves(self, clusters: Mapping[str, StoredCluster]) -> bool:
+        """Return whether a new monitor of these clusters would be equal to this one."""
+        return self._stored == dict(clusters)
+
+    def reset(self) -> None:
+        """Forget all frames and faults: markers are being placed or calibrated again."""
+        self._examined.clear()
+        self.faults, self.misfits = frozenset(), frozenset()
+        self._hidden = self._hidden[:0]
+
+    def hide_faulty(self, frame: MocapFrame) -> MocapFrame:
+        """Return a frame without the markers whose labels are faulty."""
+        if not self._hidden.size or frame.layout is not self._layout:
+            return frame
+        markers = frame.markers.copy()
+        markers[self._hidden] = np.nan
+        return replace(frame, markers=markers)
+
+    def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
+        """Examine a live frame, if one is due, and return notices."""
+        if not self._search.clusters or not self._rate.is_due(t_ns):
+            return []
+
+        # The markers of the clusters in a frame, m, shape (M, 3); NaN where missing.
+        if frame.layout is not self._layout:
+            self._layout = frame.layout
+            column = {name: k for k, name in enumerate(frame.layout.markers)}
+            self._columns = [column.get(name, -1) for name in self._search.labels]
+            self._hide()
+        padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
+        rms, faults = self._search.explain(padded[self._columns])
+
+        named = dict(zip((one.name for one in self._search.clusters), rms.tolist(), strict=True))
+        fitted = frozenset(name for name, one in named.items() if np.isfinite(one))
+        refused = {name: one for name, one in named.items() if one > MAX_FIT_RMS_M}
+        self._examined.append(_Examined(t_ns, fitted, refused, frozenset(faults)))
+        while t_ns - self._examined[0].t_ns > MISFIT_NS:
+            self._examined.popleft()
+        if (
+            not self.faults
+            and not self.misfits
+            and not any(one.refused or one.faults for one in self._examined)
+        ):
+            return []
+        return [*self._end(t_ns), *self._begin(t_ns)]
+
+    def _frames(self, t_ns: int, parts: Iterable[str], span_ns: int) -> list[_Examined]:
+        """Return the frames of the last time in which all these body parts had visible markers."""
+        needed = set(parts)
+        return [
+            one for one in self._examined if t_ns - one.t_ns <= span_ns and needed <= one.fitted
+        ]
+
+    def _begin(self, t_ns: int) -> list[Output]:
+        """Return notices of the faults and misfits that begin."""
+        recent = Counter(
+            fault
+            for one in self._examined
+            if t_ns - one.t_ns <= FAULT_NS
+            for fault in one.faults - self.faults
+        )
+        notices: list[Output] = []
+        for fault, count in sorted(recent.items()):
+            frames = self._frames(t_ns, fault.parts, FAULT_NS)
+            if len(frames) < _FEWEST or count < _PRESENT * len(frames):
+                continue
+            # It takes the place of an earlier explanation of the same markers.
+            others = {f for f in self.faults if not set(f.markers) & set(fault.markers)}
+            self.faults = frozenset({*others, fault})
+            self.misfits -= set(fault.parts)
+            notices.append(_fault_notice(t_ns, fault))
+
+        explained = {part for fault in self.faults for part in fault.parts} | self.misfits
+        doubtful = {part for one in self._examined for part in one.refused} - explained
+        for part in sorted(doubtful):
+            frames = self._frames(t_ns, [part], MISFIT_NS)
+            refused = [one.refused[part] for one in frames if part in one.refused]
+            if len(frames) > 2 * _FEWEST and len(refused) >= _REFUSED * len(frames):
+                self.misfits |= {part}
+                notices.append(_misfit_notice(t_ns, part, float(np.median(refused))))
+        self._hide()
+        return notices
+
+    def _end(self, t_ns: int) -> list[Output]:
+        """Return notices of the faults and misfits that end."""
+        notices: list[Output] = []
+        for fault in sorted(self.faults):
+            frames = self._frames(t_ns, fault.parts, FAULT_NS)
+            bad = sum(
+                fault in one.faults or not one.refused.keys().isdisjoint(fault.parts)
+                for one in frames
+            )
+            if len(frames) >= _FEWEST and bad <= _ABSENT * len(frames):
+                self.faults -= {fault}
+                text = f"{_joined(fault.markers)}: at the expected place again, and in use"
+                notices.append(_notice(t_ns, fault.markers[0], "ok", text, fault))
+        for part in sorted(self.misfits):
+            frames = self._frames(t_ns, [part], FAULT_NS)
+            bad = sum(part in one.refused for one in frames)
+            if len(frames) >= _FEWEST and bad <= _ABSENT * len(frames):
+                self.misfits -= {part}
+                text = f"{part}: its markers match the static pose again"
+                notices.append(Notice(t_ns, NoticeKind.MARKER, part, text, data={"state": "ok"}))
+        return notices
+
+    def _hide(self) -> None:
+        """Find the columns of the faulty markers in the present layout."""
+        names = {name for fault in self.faults for name in fault.markers}
+        columns = zip(self._search.labels, self._columns, strict=False)
+        found = [column for name, column in columns if name in names and column >= 0]
+        self._hidden = np.array(found, dtype=np.intp)
+
+
+def _fault_notice(t_ns: int, fault: LabelFault) -> Notice:
+    names = fault.markers
+    if len(names) == 1:
+        text = (
+            f"{names[0]}: not at its place on {fault.parts[0]} in the static pose: "
+            "check its label and whether it was displaced, or repeat the calibration. It is not "
+            "used until then"
+        )
+        return _notice(t_ns, names[0], MarkerFlag.MISPLACED, text, fault)
+    if fault.cycle:
+        text = (
+            f"{_joined(names)} look exchanged: {fault.places}. Correct their labels; "
+            "they are not used until then"
+        )
+    else:
+        text = (
+            f"{_joined(names[:-1])} has the label of another marker: {fault.places}, which is "
+            "hidden. Correct the labels; these markers are not used until then"
+        )
+    return _notice(t_ns, names[0], MarkerFlag.EXCHANGED, text, fault)
+
+
+def _misfit_notice(t_ns: int, part: str, rms: float) -> Notice:
+    text = (
+        f"{part}: its markers do not match the static pose: {1000 * rms:.0f} mm RMS, at most "
+        f"{1000 * MAX_FIT_RMS_M:g} mm expected, and no exchange of labels explains it. Check their "
+        f"labels and places, or repeat the calibration. {part} has no optical pose until then"
+    )
+    data = {"state": MarkerFlag.MISFIT.value, "rms_m": round(rms, 4)}
+    return Notice(t_ns, NoticeKind.MARKER, part, text, NoticeLevel.WARNING, data)
+
+
+def _notice(t_ns: int, name: str, state: str, text: str, fault: LabelFault) -> Notice:
+    level = NoticeLevel.INFO if state == "ok" else NoticeLevel.WARNING
+    data = {"state": str(state), "markers": list(fault.markers), "segments": list(fault.parts)}
+    return Notice(t_ns, NoticeKind.MARKER, name, text, level, data)
+
+
+def _joined(words: Iterable[str]) -> str:
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last

@@ -1,0 +1,58 @@
+"""Marker clusters of the synthetic limb, and label mistakes of a camera operator."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.limb_model import MarkerCluster
+from tests.calibration.synthetic_limb import (
+    LOCAL,
+    MARKERS,
+    Imperfections,
+    Subject,
+    static_and_functional,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.arrays import Array
+
+LABELS = tuple(name for part in LOCAL for name in MARKERS[part])
+
+
+def clusters_of(static: Array) -> list[MarkerCluster]:
+    """Return the clusters of static markers, m, shape (M, 3), in the order of LABELS."""
+    found = []
+    for part, names in MARKERS.items():
+        points = static[[LABELS.index(name) for name in names]]
+        origin = points.mean(axis=0)
+        found.append(
+            MarkerCluster(part, names, None, points - origin, origin, np.array([1.0, 0, 0, 0]))
+        )
+    return found
+
+
+@cache
+def person(
+    seed: int, skin_m: float = 0.004, occluded: float = 0.0, seconds: float = 10.0
+) -> tuple[list[MarkerCluster], NDArray[np.int64], Array]:
+    """Return clusters, stamps in ns and markers, m, shape (n, M, 3), of a moving limb."""
+    subject = Subject(seed, flaws=Imperfections(skin_m=skin_m, occluded=occluded))
+    standing, moving, _ = static_and_functional(subject, seconds)
+    assert standing.optical is not None
+    assert moving.optical is not None
+    assert moving.optical.markers == LABELS
+    clusters = clusters_of(np.nanmedian(standing.optical.positions, axis=0))
+    return clusters, moving.optical.t_ns, moving.optical.positions
+
+
+def cycled(points: Array, *labels: str) -> Array:
+    """Return markers, shape (..., M, 3), with each label at the place of the next one."""
+    rows = [LABELS.index(name) for name in labels]
+    changed = points.copy()
+    changed[..., rows, :] = points[..., rows[1:] + rows[:1], :]
+    return changed

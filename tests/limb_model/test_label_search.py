@@ -1,0 +1,117 @@
+"""Exchanged labels are found by the shapes of the clusters, or not at all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jointfit_daemon.limb_model import LabelSearch, MarkerCluster, explain_trial, rigid_fit
+from tests.limb_model.clusters_of_limb import LABELS, cycled, person
+
+EXCHANGES = [
+    ("thigh0", "thigh2"),
+    ("shank1", "shank2"),
+    ("thigh1", "shank3"),
+    ("thigh3", "shank0"),
+    ("foot0", "foot1", "foot2"),
+    ("pelvis0", "thigh1", "shank2"),
+    ("thigh0", "thigh1", "shank2"),
+    ("thigh0", "thigh1", "thigh2", "thigh3"),
+    ("pelvis0", "thigh1", "shank2", "foot3"),
+]
+"""Within a segment, near a joint, across two, three and four segments."""
+
+
+def test_residuals_are_those_of_the_fit_of_a_trial() -> None:
+    clusters, _, positions = person(1, occluded=0.15)
+    search = LabelSearch(clusters)
+    for points in positions[::60]:
+        found = search.explain(points).rms
+        for p, cluster in enumerate(clusters):
+            rows = [LABELS.index(name) for name in cluster.markers]
+            expected = rigid_fit(cluster.template, points[None, rows])[2][0]
+            assert found[p] == pytest.approx(expected, abs=1e-9, nan_ok=True)
+
+
+@pytest.mark.parametrize("labels", EXCHANGES, ids="-".join)
+def test_an_exchange_is_named_in_most_frames_and_hardly_ever_another_one(
+    labels: tuple[str, ...],
+) -> None:
+    clusters, _, positions = person(2, skin_m=0.006, occluded=0.02)
+    search = LabelSearch(clusters)
+    found = [search.explain(cycled(points, *labels)).faults for points in positions[::24]]
+    parts = tuple(sorted({name[:-1] for name in labels}))
+    right = [len(one) == 1 and (one[0].markers, one[0].parts) == (labels, parts) for one in found]
+    wrong = [bool(one) and not ok for one, ok in zip(found, right, strict=True)]
+    assert np.mean(right) > 0.75
+    assert np.mean(wrong) < 0.1
+
+
+def test_two_independent_exchanges_are_two_faults() -> None:
+    clusters, _, positions = person(2)
+    points = cycled(cycled(positions[300], "thigh0", "shank0"), "foot1", "foot2")
+    faults = LabelSearch(clusters).explain(points).faults
+    assert {fault.markers for fault in faults} == {("thigh0", "shank0"), ("foot1", "foot2")}
+
+
+def test_a_label_on_the_marker_of_another_segment_is_named_with_its_place() -> None:
+    clusters, _, positions = person(2)
+    points = positions[300].copy()
+    thigh, shank = LABELS.index("thigh1"), LABELS.index("shank2")
+    points[shank], points[thigh] = points[thigh], np.nan
+    (fault,) = LabelSearch(clusters).explain(points).faults
+    assert (fault.markers, fault.cycle) == (("shank2", "thigh1"), False)
+    assert fault.places == "shank2 is at the place of thigh1"
+
+
+def test_a_displaced_marker_is_named_alone() -> None:
+    clusters, _, positions = person(2)
+    points = positions[300].copy()
+    points[LABELS.index("thigh1")] += [0.08, 0.05, -0.04]
+    (fault,) = LabelSearch(clusters).explain(points).faults
+    assert fault.markers == ("thigh1",)
+
+
+@pytest.mark.parametrize("seed", range(3, 7))
+def test_soft_tissue_artefact_and_occlusions_are_no_exchange(seed: int) -> None:
+    clusters, _, positions = person(seed, skin_m=0.01, occluded=0.1)
+    search = LabelSearch(clusters)
+    found = [search.explain(points).faults for points in positions[::24]]
+    assert np.mean([bool(one) for one in found]) < 0.1
+
+
+def test_markers_that_look_alike_after_an_exchange_are_ambiguous() -> None:
+    # an equilateral triangle: every exchange of two labels is a rotation
+    corners = np.array([[np.cos(a), np.sin(a), 0.0] for a in 2 * np.pi / 3 * np.arange(3)]) * 0.1
+    triangle = MarkerCluster("thigh", LABELS[:3], None, corners, np.zeros(3), np.eye(4)[0])
+    finding = LabelSearch([triangle]).explain(corners[[1, 0, 2]])
+    assert finding.rms == pytest.approx(0.0, abs=1e-9)
+    assert finding.faults == ()
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 16))
+@settings(max_examples=40)
+def test_no_input_raises_and_few_visible_markers_have_no_residual(seed: int, hidden: int) -> None:
+    rng = np.random.default_rng(seed)
+    clusters = person(1)[0]
+    points = rng.normal(0.0, 0.3, (16, 3))
+    points[rng.permutation(16)[:hidden]] = np.nan
+    rms, faults = LabelSearch(clusters).explain(points)
+    for p, cluster in enumerate(clusters):
+        rows = [LABELS.index(name) for name in cluster.markers]
+        if np.isfinite(points[rows]).all(axis=1).sum() < 3:
+            assert np.isnan(rms[p])
+    named = [name for fault in faults for name in fault.markers]
+    assert len(named) == len(set(named))
+
+
+def test_a_trial_names_the_exchange_of_its_second_half() -> None:
+    clusters, _, positions = person(5)
+    mixed = positions.copy()
+    mixed[len(mixed) // 2 :] = cycled(mixed[len(mixed) // 2 :], "shank0", "shank3")
+    (fault,) = explain_trial(LabelSearch(clusters), mixed)
+    assert fault.markers == ("shank0", "shank3")
+    assert explain_trial(LabelSearch(clusters), positions) == ()
+    assert explain_trial(LabelSearch([]), positions[:0, :0]) == ()
