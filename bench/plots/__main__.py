@@ -1,6 +1,6 @@
 """Plots of a run: ``python -m bench.plots clocks|joint-centers FOLDER``.
 
-``clocks`` draws a simulated run with its truth, or with ``--replay EVENTLOG`` a recorded run, as
+``clocks`` draws a simulated run with its truth, or with ``--replay RECORDING`` a recorded run, as
 the daemon writes it. ``joint-centers`` draws the recorded trials with estimated and model centers.
 """
 
@@ -21,7 +21,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m bench.plots", description=__doc__)
     parser.add_argument("subject", choices=("clocks", "joint-centers"))
     parser.add_argument("folder", type=Path, help="folder of the PNG files")
-    parser.add_argument("--replay", type=Path, metavar="EVENTLOG", help="draw this recorded run")
+    parser.add_argument("--replay", type=Path, metavar="RECORDING", help="draw this recorded run")
     options = parser.parse_args(words)
     if options.replay is not None and options.subject != "clocks":
         parser.error("--replay belongs to clocks")
@@ -38,7 +38,7 @@ def draw(subject: str, folder: Path, recorded: Path | None = None) -> int:
             written = import_module("bench.plots.clocks").run(folder, recorded)
         else:
             written = import_module("bench.plots.joint_centers").draw(folder)
-    except (OSError, ValueError) as error:  # the event log is missing or unreadable
+    except (OSError, ValueError) as error:  # the recording is missing or unreadable
         print(error, file=sys.stderr)
         return 2
     for path in written:

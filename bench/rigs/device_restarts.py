@@ -32,7 +32,7 @@ class RestartRun(NamedTuple):
 
     core: ObservedCore
     replayed: bool
-    """The event log replays to byte-identical limb states."""
+    """The recording replays to byte-identical limb states."""
 
     def errors_ns(self, source: str, method: str = "") -> list[int]:
         """Return the errors of all synced stamps of a source, optionally of one method only."""

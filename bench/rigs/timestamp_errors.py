@@ -1,6 +1,6 @@
 """Errors of the daemon's stamps, compared with the instants at which samples were taken.
 
-Invariant: the event log replays to every stamp of the live run, and the simulator's sample log
+Invariant: the recording replays to every stamp of the live run, and the simulator's sample log
 contains the instant of each sample. Their difference is the error, except for a constant that
 arrival times cannot reveal: where a stamp is based on arrivals, the true least delay of the
 transport replaces the assumed one. With a lag in use or with edges of a sync line, nothing is

@@ -52,5 +52,5 @@ class Rig:
     chain_model: LoadedModel | None
     """Chain model for inverse kinematics from the markers; None without one."""
     table: Mapping[str, Any]
-    """The parsed rig.toml, for the event log, with the content of the chain model; it contains no
+    """The parsed rig.toml, for recordings, with the content of the chain model; it contains no
     secrets (passwords are in files)."""

@@ -1,7 +1,7 @@
 """Runs fits in a worker process, so that a calibration fit does not delay acquisition.
 
 Invariant: one job runs at a time, and its process is killed when it is cancelled or the daemon
-ends. Results pass through JSON, so a replay from the event log uses the same values.
+ends. Results pass through JSON, so a replay of a recording uses the same values.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING, Protocol
 
-from jointfit_daemon.outputs.recording import EventLogWriter
+from jointfit_daemon.outputs.recording import Recorder, RecordingReport
 from jointfit_daemon.pipeline.events import NoticeKind, NoticeLevel
 from jointfit_daemon.supervisor.state_directory import state_directory
 
@@ -32,18 +32,17 @@ class Report(Protocol):
 
 def start_recording(
     rig: Rig, core: CoreRunner, tasks: TaskGroup, report: Report
-) -> EventLogWriter | None:
-    """Start to record the events of the core; return the writer, or None without one."""
+) -> Recorder | None:
+    """Start to record the events of the core; return the recorder, or None without one."""
     if rig.recording is None:
         return None
     folder = state_directory() / rig.recording.directory
-    try:
-        recorder = EventLogWriter(folder, rig.name)
-    except OSError as fault:
-        text = f"recording is off: cannot create a file in {folder}: {fault.strerror}"
-        report(NoticeKind.RECORDING, text, NoticeLevel.ERROR)
-        return None
-    log.info("recording events in %s", recorder.path)
+
+    def pass_report(found: RecordingReport) -> None:
+        report(NoticeKind.RECORDING, found.text, found.level)
+
+    recorder = Recorder(folder, rig.name, report=pass_report)
+    log.info("recording in %s", folder)
     core.subscribe(recorder)
     tasks.create_task(recorder.run(), name="recording")
     return recorder

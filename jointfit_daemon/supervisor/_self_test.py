@@ -190,8 +190,8 @@ def _store(host: HostState, health: BridgeHealth) -> Iterator[Finding]:
 
     recording = health.recording
     if recording is not None and recording.failure is not None:
-        text = f"{recording.file} ended early: {recording.failure}"
-        yield Finding("recording", "", "error", text, f"{remedy}; then restart the daemon")
+        text = f"interrupted, {recording.lost} messages lost: {recording.failure}"
+        yield Finding("recording", "", "error", text, f"{remedy}; the recording resumes by itself")
     elif recording is not None:
         yield Finding("recording", "", "ok", f"{recording.file}, {recording.written_bytes} bytes")
 

@@ -8,7 +8,7 @@ Invariant: the daemon ends by cancellation or by a bug only.
     mqtt             publishes the outbox, passes on requests          with its settings
     ready            notifies systemd when every source is known       once notified
     health           publishes health, resets the watchdog             never
-    recording        writes the event log                              when the disk is full
+    recording        writes the recording, in a thread                 never
     metrics          answers Prometheus, in a thread                   never
     fit KIND         runs one calibration fit in a worker process      with its result
     store            writes one calibration                            when written
@@ -34,7 +34,13 @@ from jointfit_daemon.config import ConfigError, Fault, load_rig
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.log import MqttLogHandler, journal_fields
 from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, MqttPublisher, Outbox
-from jointfit_daemon.outputs.payloads import BridgeHealth, StateHealth, TopicWriter
+from jointfit_daemon.outputs.payloads import (
+    BridgeHealth,
+    StateHealth,
+    TopicWriter,
+    health_payload,
+)
+from jointfit_daemon.outputs.recording import DAEMON_HEALTH, DAEMON_NOTICE
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
@@ -85,7 +91,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig, Source
     from jointfit_daemon.outputs.mqtt import Incoming
-    from jointfit_daemon.outputs.recording import EventLogWriter
+    from jointfit_daemon.outputs.recording import Recorder
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.supervisor._core_runner import CoreInterface
 
@@ -130,7 +136,7 @@ class Daemon:
         self._progress, self._frame_rate = ProgressMonitor(), FrameRateCounter()
         self._loop_errors = DisconnectErrorFilter()
         self._overload = OverloadMonitor()
-        self._recorder: EventLogWriter | None = None
+        self._recorder: Recorder | None = None
         self._state_fault: str | None = None
         self._state_lock: int | None = None  # set if the directory was not writable at the start
         self._calibration: CalibrationStatus | None = None
@@ -269,6 +275,8 @@ class Daemon:
         log.log(LEVELS[level], "%s: %s", kind, text, extra=fields)
         notice = Notice(time.monotonic_ns(), kind, self._rig.name, text, level)
         self._topics.publish_notice(notice)
+        if self._recorder is not None:
+            self._recorder.daemon_message(DAEMON_NOTICE, notice)
 
     # --- outputs of the core -----------------------------------------------------------------
 
@@ -373,6 +381,8 @@ class Daemon:
         self._process_health = self._process.health()
         found = self.health()
         self._topics.publish_health(found)
+        if self._recorder is not None:
+            self._recorder.daemon_message(DAEMON_HEALTH, health_payload(found))
 
         health, link = found.core, found.link
         if (text := self._overload.drop_warning(link, time.monotonic())) is not None:

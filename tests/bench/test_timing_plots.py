@@ -8,13 +8,12 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import orjson
 import pytest
 
 from bench.plots import __main__ as plots
 from bench.rigs.core_trace import Trace, traced, true_errors
 from bench.subjects.simulated_clocks import SimulatedRun, simulated
-from jointfit_daemon.outputs.recording._event_log import FORMAT, encode_event
+from tests.outputs.recording.recorded_events import write_recording
 
 ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 16.0
@@ -70,9 +69,8 @@ def _at(trace: Trace, t_s: float) -> int:
 def test_a_recorded_run_is_drawn_like_a_simulated_one(tmp_path: Path) -> None:
     """In a process of its own: matplotlib keeps its fonts open."""
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
-    log, pictures = tmp_path / "run.events.jsonl", tmp_path / "pictures"
-    lines = [orjson.dumps({"log": FORMAT}), *(encode_event(e) for e in simulated(12.0).events)]
-    log.write_bytes(b"".join(line + b"\n" for line in lines))
+    log = write_recording(tmp_path / "recordings", simulated(12.0).events)
+    pictures = tmp_path / "pictures"
     ran = subprocess.run(
         [sys.executable, "-m", "bench.plots", "clocks", str(pictures), "--replay", str(log)],
         cwd=ROOT,
@@ -88,14 +86,14 @@ def test_a_recorded_run_is_drawn_like_a_simulated_one(tmp_path: Path) -> None:
     assert {*ran.stdout.split()} == {str(pictures / name) for name in drawn}
 
 
-def test_unreadable_event_log_is_reported_by_the_plots(
+def test_unreadable_recording_is_reported_by_the_plots(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("matplotlib", reason="matplotlib is not installed")
     (tmp_path / "empty").write_text("")
     assert plots.draw("clocks", tmp_path, tmp_path / "absent") == 2
     assert plots.draw("clocks", tmp_path, tmp_path / "empty") == 2
-    assert "not an event log" in capsys.readouterr().err
+    assert "the file is empty" in capsys.readouterr().err
     with monkeypatch.context() as without:
         without.setattr(plots, "find_spec", lambda _: None)
         assert plots.draw("clocks", tmp_path, None) == 2

@@ -24,14 +24,19 @@ from jointfit_daemon.model import Chunk
 from jointfit_daemon.outputs.mqtt import Incoming, Outbox
 from jointfit_daemon.outputs.mqtt._signature import signed
 from jointfit_daemon.outputs.payloads import TopicWriter
-from jointfit_daemon.outputs.recording import read_events
-from jointfit_daemon.outputs.recording._event_log import encode_event
+from jointfit_daemon.outputs.recording import (
+    RecordingError,
+    decode_event,
+    encode_event,
+    read_events,
+)
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     ChunkArrived,
     Configured,
     Reply,
+    SourceClosed,
     SourceOpened,
     Tick,
 )
@@ -41,6 +46,7 @@ from jointfit_daemon.supervisor.requests import (
 )
 from tests.fuzz.target import Target
 from tests.fuzz.wire_targets import rig
+from tests.outputs.recording.recorded_events import write_recording
 from tests.pipeline.core_feed import (
     BEGIN_NS,
     PERIOD_NS,
@@ -224,16 +230,16 @@ def seeds_calibration() -> list[bytes]:
 # --- recordings -------------------------------------------------------------------------------
 
 
-def run_event_log(data: bytes) -> None:
-    """Read a recording and replay its first events."""
-    path = folder() / "events.jsonl"
-    path.write_bytes(b'{"log":1}\n' + data)
+def run_recording(data: bytes) -> None:
+    """Read a damaged recording, up to its first events."""
+    path = folder() / "recording.mcap"
+    path.write_bytes(data)
     for number, _ in enumerate(read_events(path)):
         if number > 200:
             break
 
 
-def seeds_event_log() -> list[bytes]:
+def seeds_recording() -> list[bytes]:
     """Return events of every kind."""
     events: list[Event] = [
         Configured(BEGIN_NS, parse_rig(table()), good_calibration(), 1),
@@ -241,8 +247,21 @@ def seeds_event_log() -> list[bytes]:
         ChunkArrived("S1", Chunk(BEGIN_NS, xbus_bytes("S1", 1))),
         Tick(BEGIN_NS + 1),
     ]
-    lines = [encode_event(event) for event in events]
-    return [b"\n".join(lines[1:]) + b"\n", b"\n".join(lines) + b"\n"]
+    with tempfile.TemporaryDirectory() as name:
+        return [write_recording(Path(name), events).read_bytes()]
+
+
+def run_recorded_event(data: bytes) -> None:
+    """Decode the content of a recorded event."""
+    kind, _, content = data.partition(b" ")
+    decode_event(kind.decode("ascii", "replace"), content)
+
+
+def seeds_recorded_event() -> list[bytes]:
+    """Return a configuration and a closed source."""
+    configured = Configured(BEGIN_NS, parse_rig(table()), good_calibration(), 1)
+    closed = SourceClosed(BEGIN_NS, "S1", "lost", "unplugged")
+    return [b"configured " + encode_event(configured), b"closed " + encode_event(closed)]
 
 
 TARGETS = (
@@ -257,5 +276,8 @@ TARGETS = (
         0.4,
         32,
     ),
-    Target("event-log", run_event_log, seeds_event_log, (ValueError, ConfigError), share=0.4),
+    Target("recording", run_recording, seeds_recording, (RecordingError, ConfigError), share=0.4),
+    Target(
+        "recorded-event", run_recorded_event, seeds_recorded_event, (ValueError, ConfigError), 0.4
+    ),
 )

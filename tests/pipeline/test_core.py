@@ -7,16 +7,15 @@ import random
 from functools import cache
 from typing import TYPE_CHECKING
 
-import orjson
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.outputs.recording import encode_state
-from jointfit_daemon.outputs.recording._event_log import decode_event, encode_event
 from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened, Tick
 from jointfit_protocols.can import RECORD_BYTES
+from tests.outputs.recording.recorded_events import after_recording
 from tests.pipeline.core_feed import (
     MS,
     PERIOD_NS,
@@ -93,7 +92,7 @@ def test_every_sample_is_counted_once_and_frames_are_in_order(seed: int) -> None
 @given(st.integers(0, 2**32))
 def test_replay_through_the_log_gives_the_same_states(seed: int) -> None:
     bench = fed(troubled(random.Random(seed)))
-    logged = [decode_event(orjson.loads(encode_event(event))) for event in bench.fed]
+    logged = after_recording(bench.fed)
     again = [encode_state(state) for state in replay_states(logged)]
     assert again == [encode_state(state) for state in bench.states]
 

@@ -6,14 +6,12 @@ import itertools
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import orjson
 import pytest
 from typing_extensions import override
 
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, MocapFrame
 from jointfit_daemon.outputs.recording import encode_state
-from jointfit_daemon.outputs.recording._event_log import decode_event, encode_event
 from jointfit_daemon.pipeline import Core, replay_states
 from jointfit_daemon.pipeline.events import (
     ChunkArrived,
@@ -24,6 +22,7 @@ from jointfit_daemon.pipeline.events import (
 )
 from jointfit_protocols.natnet import FrameOfData, ModelDefinition, ServerInfo
 from jointfit_protocols.natnet import encode as encode_natnet
+from tests.outputs.recording.recorded_events import after_recording
 from tests.pipeline.core_feed import BEGIN_NS, MS, PERIOD_NS, SENSORS, Bench, chunk, table
 
 if TYPE_CHECKING:
@@ -197,7 +196,7 @@ def test_steps_of_unix_time_replay_byte_for_byte(rig: UnixTimeRig) -> None:
     rig.stream(3)
     rig.set_unix_time(UNIX_NS + HOUR_NS)
     rig.stream(3)
-    logged = [decode_event(orjson.loads(encode_event(event))) for event in rig.bench.fed]
+    logged = after_recording(rig.bench.fed)
     again = [encode_state(state) for state in replay_states(logged)]
     assert again == [encode_state(state) for state in rig.bench.states]
     assert sum(isinstance(event, UnixOffset) for event in logged) == 2

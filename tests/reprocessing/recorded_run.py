@@ -13,7 +13,7 @@ from typing_extensions import override  # typing has it from Python 3.12
 
 from jointfit_daemon.calibration.phases import run_job
 from jointfit_daemon.config import parse_rig
-from jointfit_daemon.outputs.recording import EventLogWriter
+from jointfit_daemon.outputs.recording import Recorder
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
     CalibrationStored,
@@ -56,7 +56,7 @@ def rig_table(**head: Any) -> dict[str, Any]:
 class RecordingBench(Bench):
     """A core whose events and outputs are recorded."""
 
-    writer: EventLogWriter = field(kw_only=True)
+    writer: Recorder = field(kw_only=True)
 
     @override
     def give(self, event: Event, now_ns: int) -> None:
@@ -92,7 +92,7 @@ def samples(first: int, end: int, *, still: bool = False) -> list[Event]:
 
 def record_run(folder: Path) -> RecordedRun:
     """Run a core on simulated bytes and record it in `folder`."""
-    bench = RecordingBench(writer=EventLogWriter(folder, "r"))
+    bench = RecordingBench(writer=Recorder(folder, "r"))
     rig = parse_rig(rig_table())
     bench.feed([Configured(BEGIN_NS, rig, None), UnixOffset(BEGIN_NS, UNIX_NS)])
     bench.feed([SourceOpened(BEGIN_NS, source.id) for source in rig.sources])
@@ -113,4 +113,5 @@ def record_run(folder: Path) -> RecordedRun:
     bench.feed([Configured(at(400), slower, ready.calibration, 1, 2.4)])
     bench.feed(samples(401, END))
     bench.writer.close()
-    return RecordedRun(bench.writer.path, ready.calibration, len(bench.states))
+    (path,) = folder.glob("r-*.mcap")
+    return RecordedRun(path, ready.calibration, len(bench.states))

@@ -23,6 +23,7 @@ from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.outputs.mqtt import MqttClient
 from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
 from jointfit_daemon.pipeline import replay_states
+from jointfit_daemon.pipeline.events import Configured
 from tests import fake_drivers
 from tests.limb_model.plain_calibration import plain_calibration
 from tests.system.station import load_factor
@@ -229,7 +230,7 @@ def test_a_start_with_a_hostile_file_is_a_clear_message(process: Process, conten
 
 
 def test_damaged_calibrations_are_set_aside_and_the_newest_valid_one_is_used(
-    process: Process,
+    process: Process, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chain = SimpleNamespace(
         joints=("hip", "knee", "ankle"), segments=("thigh", "shank"), sensors=(("S1",), ("S2",))
@@ -256,8 +257,10 @@ def test_damaged_calibrations_are_set_aside_and_the_newest_valid_one_is_used(
     assert sorted(path.name for path in folder.iterdir()) == [
         "0001.json", "0002.json.bad", "0003.json.bad",
     ]  # fmt: skip
+    monkeypatch.setattr("jointfit_daemon.driver.entry_points", fake_drivers.entry_points)
     (recording,) = (process.state / "recordings").iterdir()
-    assert b'"calibration_version":1' in recording.read_bytes()
+    (configured,) = [e for e in read_events(recording) if isinstance(e, Configured)]
+    assert configured.calibration_version == 1
 
 
 def test_all_files_are_private_with_any_umask(process: Process) -> None:

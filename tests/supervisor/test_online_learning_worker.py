@@ -8,12 +8,10 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
-import orjson
 import pytest
 
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.outputs.recording._event_log import decode_event, encode_event
 from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
@@ -28,6 +26,7 @@ from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_protocols.natnet import Body, FrameOfData
 from jointfit_protocols.natnet import encode as encode_natnet
 from tests.calibration.calibrated_subject import TWO_AND_TWO, calibration, moving
+from tests.outputs.recording.recorded_events import after_recording
 from tests.pipeline import core_feed
 from tests.pipeline.core_feed import BEGIN_NS, PERIOD_NS, SENSORS, Bench, chunk
 
@@ -117,7 +116,7 @@ async def test_online_learning_improves_the_calibration_and_replays_identically(
     around = [state.segments[0].q_world_segment for state in bench.states[told - 20 : told + 20]]
     steps = [rotation.angle_between(np.array(a), np.array(b)) for a, b in pairwise(around)]
     assert max(steps[19:21]) < 1.5 * max(steps[:19])  # no jump where models were exchanged
-    logged = [decode_event(orjson.loads(encode_event(event))) for event in bench.fed]
+    logged = after_recording(bench.fed)
     assert list(replay_states(logged)) == bench.states
 
 

@@ -16,7 +16,6 @@ import pytest
 from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.outputs.mqtt import Incoming, signed
 from jointfit_daemon.outputs.payload_models import ANSWERS
-from jointfit_daemon.outputs.recording._event_log import decode_event, encode_event
 from jointfit_daemon.pipeline.events import (
     CalibrationSelected,
     Configured,
@@ -26,6 +25,7 @@ from jointfit_daemon.supervisor import _calibration_store, _self_test
 from jointfit_daemon.supervisor.requests import REQUESTS
 from jointfit_daemon.supervisor.requests._dispatcher import MEMORY_NS
 from tests.limb_model.plain_calibration import plain_calibration
+from tests.outputs.recording.recorded_events import after_recording
 from tests.supervisor.request_gateway import BASE, Running, gateway_fixture  # noqa: F401 - a fixture
 
 if TYPE_CHECKING:
@@ -330,17 +330,17 @@ async def test_a_calibration_of_another_limb_is_listed_and_not_used(gateway: Run
         assert "belongs to another limb" in str(reply.error["message"])
 
 
-def test_the_event_log_repeats_a_selected_calibration_and_a_changed_rate(
+def test_the_recording_repeats_a_selected_calibration_and_a_changed_rate(
     table: dict[str, Any],
 ) -> None:
     rig: Rig = replace(parse_rig(table), output_rate_hz=20.0)
-    found = decode_event(orjson.loads(encode_event(Configured(1, rig, None))))
+    (found,) = after_recording([Configured(1, rig, None)])
     assert isinstance(found, Configured)
     assert found.rig == rig
 
     request = Request(1, "use-calibration", "a", {"version": 1})
     event = CalibrationSelected(2, plain_calibration(rig.chain), 1, 3.0, request)
-    assert decode_event(orjson.loads(encode_event(event))) == event
+    assert after_recording([event]) == [event]
 
 
 async def test_the_self_test_reports_absent_devices_and_a_full_disk_with_remedies(

@@ -186,7 +186,7 @@ async def test_payloads_log_and_replay_of_a_calibrated_run(
         judge_the_running_centers(run)
     with subtests.test("the chain model is fitted to the markers"):
         judge_the_chain_model(run)
-    with subtests.test("the event log replays to byte-identical limb states"):
+    with subtests.test("the recording replays to byte-identical limb states"):
         replay_the_recording(run)
 
 

@@ -26,7 +26,7 @@ REPORT_DELAY_NS: dict[SensorState, int] = {"lost": 200_000_000, "ok": 2_000_000_
 
 
 class SensorReport(NamedTuple):
-    """A change in the state of a sensor or segment, for the event log and MQTT."""
+    """A change in the state of a sensor or segment, for recordings and MQTT."""
 
     id: str
     """Name of the sensor or segment."""

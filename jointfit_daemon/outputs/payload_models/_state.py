@@ -158,6 +158,7 @@ class Recording(Table):
     file: str
     written_bytes: int
     backlog_bytes: int
+    lost: int
     failure: str | None
 
 

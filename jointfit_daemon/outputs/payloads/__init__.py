@@ -5,6 +5,7 @@ from jointfit_daemon.outputs.payloads._health_encoding import (
     BridgeHealth,
     ProcessHealth,
     StateHealth,
+    health_payload,
 )
 from jointfit_daemon.outputs.payloads._quality_units import quality_payload
 from jointfit_daemon.outputs.payloads._topic_writer import TopicWriter
@@ -17,5 +18,6 @@ __all__ = [
     "encode",
     "encode_joint",
     "encode_pose",
+    "health_payload",
     "quality_payload",
 ]

@@ -1,11 +1,44 @@
-"""Recording of all inputs of the core, and their decoding for a replay."""
+"""Recordings: all inputs of the core and its outputs in MCAP files, written and read."""
 
-from jointfit_daemon.outputs.recording._event_log import (
-    EventLogWriter,
-    RecordingHealth,
-    encode_state,
+from jointfit_daemon.outputs.recording._blocks import RecordingError
+from jointfit_daemon.outputs.recording._channels import (
+    DAEMON_HEALTH,
+    DAEMON_NOTICE,
+    STATE,
+    encode_output,
+)
+from jointfit_daemon.outputs.recording._description import RecordingGap, RecordingInfo
+from jointfit_daemon.outputs.recording._event_json import decode_event, encode_event, encode_state
+from jointfit_daemon.outputs.recording._reader import (
+    RecordedMessage,
+    RecordedPart,
+    Recording,
+    open_recording,
     read_events,
     read_states,
 )
+from jointfit_daemon.outputs.recording._recorder import Recorder, RecordingHealth
+from jointfit_daemon.outputs.recording._session_writer import RecordingLimits, RecordingReport
 
-__all__ = ["EventLogWriter", "RecordingHealth", "encode_state", "read_events", "read_states"]
+__all__ = [
+    "DAEMON_HEALTH",
+    "DAEMON_NOTICE",
+    "STATE",
+    "RecordedMessage",
+    "RecordedPart",
+    "Recorder",
+    "Recording",
+    "RecordingError",
+    "RecordingGap",
+    "RecordingHealth",
+    "RecordingInfo",
+    "RecordingLimits",
+    "RecordingReport",
+    "decode_event",
+    "encode_event",
+    "encode_output",
+    "encode_state",
+    "open_recording",
+    "read_events",
+    "read_states",
+]

@@ -221,7 +221,7 @@ def _daemon(rig: RigView, health: Health, width: int, broker: str) -> list[Line]
         failure = health.recording.failure
         written_mb = format_number(health.recording.written_bytes / 1e6, 1, " MB")
         texts.append(
-            (f"✖ recording ended: {failure}", "error") if failure
+            (f"✖ recording interrupted: {failure}", "error") if failure
             else (f"recording {health.recording.file}: {written_mb}", "")
         )  # fmt: skip
     if rig.info is not None:

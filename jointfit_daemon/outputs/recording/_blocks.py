@@ -1,0 +1,265 @@
+"""Reads the records of a recording, also behind damaged places.
+
+Invariant: no content of a file raises anything but `RecordingError`, or takes more memory than a
+record of `MOST_RECORD_BYTES` and its decompressed content.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from io import BytesIO
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Chunk, Header, Metadata
+from mcap.writer import MCAP0_MAGIC
+
+from jointfit_daemon.outputs.recording._channels import PROFILE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import BinaryIO
+
+MOST_RECORD_BYTES = 64 * 1024 * 1024
+"""Largest record, and largest content of a chunk, bytes; the recorder writes chunks of 1 MiB."""
+_PREFIX = struct.Struct("<BQ")
+"""Opcode and length of a record."""
+_RECORD_START = re.compile(
+    rb"\x06.{7}\0.{28}\x04\0\0\0zstd|\x0c.{5}\0\0\0.\0\0\0jointfit\.", re.DOTALL
+)
+"""Start of a compressed chunk, or of metadata of a recording."""
+_LONGEST_START = 64
+"""More bytes than `_RECORD_START` matches."""
+_WINDOW_BYTES = 1024 * 1024
+"""Bytes that are searched at once."""
+_MOST_WASTED_RATIO = 20
+"""Limit of the bytes read in damaged records over the size of the file, against a file made to be
+read for hours."""
+
+
+class RecordingError(ValueError):
+    """A file is not a recording, or cannot be read by this version."""
+
+
+class ChunkBlock(NamedTuple):
+    """A chunk with the right checksum."""
+
+    start: int
+    """Position in the file, bytes."""
+    end: int
+    content: bytes
+    """Its records."""
+
+
+class MetadataBlock(NamedTuple):
+    """A metadata record."""
+
+    start: int
+    end: int
+    name: str
+    values: dict[str, str]
+
+
+class AttachmentBlock(NamedTuple):
+    """An attachment with the right checksum."""
+
+    start: int
+    end: int
+    attachment: Attachment
+
+
+class DamagedBlock(NamedTuple):
+    """Bytes that are no record."""
+
+    start: int
+    end: int
+    reason: str
+
+
+class EndBlock(NamedTuple):
+    """The regular end of the file."""
+
+    end: int
+
+
+Block: TypeAlias = ChunkBlock | MetadataBlock | AttachmentBlock | DamagedBlock | EndBlock
+
+
+class _DamageError(ValueError):
+    """A record cannot be read; its content of `read_bytes` was read for nothing."""
+
+    def __init__(self, text: str, read_bytes: int = 0) -> None:
+        super().__init__(text)
+        self.read_bytes = read_bytes
+
+
+def read_blocks(path: Path) -> Iterator[Block]:
+    """Yield chunks, metadata and attachments of a file in order, and the damage between them.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a recording of jointfitd.
+    OSError
+        It cannot be read.
+    """
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        place = _check_header(file, path, size)
+        most_wasted_bytes = _MOST_WASTED_RATIO * size + _WINDOW_BYTES
+        while place < size:
+            try:
+                block, following = _read_record(file, place, size)
+            except _DamageError as damage:
+                most_wasted_bytes -= damage.read_bytes
+                if most_wasted_bytes < 0:
+                    raise RecordingError(f"{path}: damaged in too many places to be read") from None
+                following = _find_record(file, place + 1, size)
+                block = DamagedBlock(place, following, str(damage))
+            if block is not None:
+                yield block
+            place = following
+
+
+def _check_header(file: BinaryIO, path: Path, size: int) -> int:
+    """Check magic bytes and header; return the position of the first record."""
+    if size == 0:
+        raise RecordingError(f"{path}: the file is empty")
+    file.seek(0)
+    start = file.read(len(MCAP0_MAGIC) + _PREFIX.size)
+    if not start.startswith(MCAP0_MAGIC[: len(start)]):
+        raise RecordingError(f"{path}: not a recording: it does not begin like an MCAP file")
+    if len(start) < len(MCAP0_MAGIC) + _PREFIX.size:
+        raise RecordingError(f"{path}: it ends after {size} bytes, before its first message")
+
+    opcode, length = _PREFIX.unpack(start[len(MCAP0_MAGIC) :])
+    content = file.read(min(length, _LONGEST_HEADER))
+    try:
+        if opcode != Opcode.HEADER or len(content) != length:
+            raise _DamageError("no header")
+        profile = Header.read(_stream(content)).profile
+    except _READING_ERRORS as error:
+        raise RecordingError(f"{path}: the header of the MCAP file is damaged") from error
+    if profile != PROFILE:
+        raise RecordingError(
+            f"{path}: an MCAP file with the profile {profile[:40]!r}, expected {PROFILE!r}: it was "
+            "not recorded by jointfitd"
+        )
+    return len(start) + len(content)
+
+
+_LONGEST_HEADER = 4096
+"""Longest header, bytes."""
+
+
+def _read_record(file: BinaryIO, place: int, size: int) -> tuple[Block | None, int]:
+    """Return the record at `place` (None for one without meaning here) and the next position."""
+    file.seek(place)
+    prefix = file.read(_PREFIX.size)
+    if prefix.startswith(MCAP0_MAGIC) and place + len(MCAP0_MAGIC) == size:
+        return EndBlock(size), size
+    if len(prefix) < _PREFIX.size:
+        raise _DamageError("the file ends within a record")
+    opcode, length = _PREFIX.unpack(prefix)
+    end = place + _PREFIX.size + length
+    if end > size:
+        raise _DamageError("the file ends within a record, or the length of a record is damaged")
+    if opcode not in _READERS:
+        return None, end
+    if length > MOST_RECORD_BYTES:
+        raise _DamageError(f"a record of {length} bytes; the longest permitted one has 64 MiB")
+
+    content = file.read(length)
+    try:
+        return _READERS[opcode](place, end, content), end
+    except _READING_ERRORS as error:
+        # If the next record follows where expected, the length is right.
+        if _starts_record(file, end, size):
+            return DamagedBlock(place, end, f"a damaged record: {error}"), end
+        raise _DamageError(f"a damaged record: {error}", length) from error
+
+
+def _starts_record(file: BinaryIO, place: int, size: int) -> bool:
+    file.seek(place)
+    start = file.read(_LONGEST_START)
+    return place == size or _RECORD_START.match(start) is not None or start[:1] == _DATA_END
+
+
+_DATA_END = bytes([Opcode.DATA_END])
+
+
+def _find_record(file: BinaryIO, place: int, size: int) -> int:
+    """Return the position of the next record that can be found; the end without one."""
+    while place < size:
+        file.seek(place)
+        window = file.read(_WINDOW_BYTES + _LONGEST_START)
+        for match in _RECORD_START.finditer(window):
+            length = _PREFIX.unpack_from(window, match.start())[1]
+            if place + match.start() + _PREFIX.size + length <= size:
+                return place + match.start()
+        place += _WINDOW_BYTES
+    return size
+
+
+def _read_chunk(start: int, end: int, content: bytes) -> Block:
+    chunk = Chunk.read(_stream(content))
+    if 40 + len(chunk.compression.encode()) + len(chunk.data) != len(content):
+        raise _DamageError("the lengths in a chunk contradict each other")
+    if chunk.uncompressed_size > MOST_RECORD_BYTES:
+        raise _DamageError(f"a chunk of {chunk.uncompressed_size} bytes; at most 64 MiB are read")
+
+    data = chunk.data
+    if chunk.compression == "zstd":
+        # A frame that claims another size could expand to any number of bytes.
+        if zstandard.get_frame_parameters(data).content_size != chunk.uncompressed_size:
+            raise _DamageError("the compressed size of a chunk contradicts its content")
+        data = _DECOMPRESSOR.decompress(data)
+    elif chunk.compression:
+        raise _DamageError(f"unknown compression {chunk.compression[:20]!r}")
+    if zlib.crc32(data) != chunk.uncompressed_crc:
+        raise _DamageError("the checksum of a chunk is wrong")
+    return ChunkBlock(start, end, data)
+
+
+_DECOMPRESSOR = zstandard.ZstdDecompressor(max_window_size=MOST_RECORD_BYTES)
+
+
+def _read_metadata(start: int, end: int, content: bytes) -> Block:
+    stream = _stream(content)
+    metadata = Metadata.read(stream)
+    if stream.count != len(content):
+        raise _DamageError("the lengths in metadata contradict each other")
+    return MetadataBlock(start, end, metadata.name, metadata.metadata)
+
+
+def _read_attachment(start: int, end: int, content: bytes) -> Block:
+    if zlib.crc32(content[:-4]) != int.from_bytes(content[-4:], "little"):
+        raise _DamageError("the checksum of an attachment is wrong")
+    return AttachmentBlock(start, end, Attachment.read(_stream(content)))
+
+
+_READERS = {
+    Opcode.CHUNK: _read_chunk,
+    Opcode.METADATA: _read_metadata,
+    Opcode.ATTACHMENT: _read_attachment,
+}
+"""Records that are read; all others repeat their content."""
+_READING_ERRORS = (
+    ValueError,
+    OverflowError,
+    McapError,
+    struct.error,
+    zstandard.ZstdError,
+    MemoryError,
+)
+"""Errors of the library for damaged content; ValueError includes UnicodeDecodeError."""
+
+
+def _stream(content: bytes) -> ReadDataStream:
+    return ReadDataStream(BytesIO(content))

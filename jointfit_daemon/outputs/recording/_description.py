@@ -1,0 +1,112 @@
+"""Description of one file of a recording, and of the messages that are missing in it.
+
+Invariant: a changed bit in a description is detected, because metadata carry their own checksum.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import orjson
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+_CHECKSUM = "crc32"
+"""Key of the checksum: MCAP has none for metadata records."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingInfo:
+    """One file of a recording."""
+
+    format: int
+    """Version of the channels and metadata."""
+    session: str
+    """Random identifier, equal in all parts of one session."""
+    part: int
+    """Number of the file within its session, from 1."""
+    rig: str
+    """``[rig] name``."""
+    began_with_daemon: bool
+    """Whether the session contains every event since the start of the daemon."""
+    unix_offset_ns: int
+    """UNIX time minus CLOCK_MONOTONIC in all stamps of this file."""
+    first_sequence: int
+    """Sequence number of the first message."""
+    start_t_ns: int
+    """Beginning of this file, CLOCK_MONOTONIC ns."""
+    software: str
+    """Names and versions of the programs that wrote the file."""
+
+    def metadata(self) -> dict[str, str]:
+        """Return the metadata record of this file."""
+        return sealed({key: orjson.dumps(value).decode() for key, value in asdict(self).items()})
+
+    @classmethod
+    def from_metadata(cls, given: Mapping[str, str]) -> RecordingInfo:
+        """Return the description in a metadata record whose checksum is right.
+
+        Raises
+        ------
+        ValueError
+            A key is missing or has another type.
+        """
+        values = {key: orjson.loads(text) for key, text in unsealed(given).items()}
+        kinds = {"session": str, "rig": str, "software": str, "began_with_daemon": bool}
+        fields = cls.__dataclass_fields__
+        for key in fields:
+            if type(values.get(key)) is not kinds.get(key, int):
+                raise ValueError(f"{key} of the recording is {values.get(key)!r}")
+        return cls(**{key: values[key] for key in fields})
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingGap:
+    """Consecutive messages that are missing in a recording."""
+
+    first_sequence: int
+    count: int
+    from_t_ns: int
+    """Stamp of the last message before the gap, CLOCK_MONOTONIC ns."""
+    to_t_ns: int
+    """Stamp of the first message after the gap, CLOCK_MONOTONIC ns."""
+    reason: str
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the gap, s."""
+        return (self.to_t_ns - self.from_t_ns) * 1e-9
+
+    def text(self) -> str:
+        """Return the gap as a sentence."""
+        last = self.first_sequence + self.count - 1
+        return (
+            f"{self.count} messages ({self.first_sequence} to {last}, {self.seconds:.3f} s) are "
+            f"missing: {self.reason}"
+        )
+
+
+def sealed(values: Mapping[str, str]) -> dict[str, str]:
+    """Return `values` with their checksum."""
+    return {**values, _CHECKSUM: f"{_checksum(values):08x}"}
+
+
+def unsealed(given: Mapping[str, str]) -> dict[str, str]:
+    """Return the values of a metadata record without their checksum.
+
+    Raises
+    ------
+    ValueError
+        The checksum is missing or wrong.
+    """
+    values = {key: value for key, value in given.items() if key != _CHECKSUM}
+    if given.get(_CHECKSUM) != f"{_checksum(values):08x}":
+        raise ValueError("damaged metadata: their checksum is wrong")
+    return values
+
+
+def _checksum(values: Mapping[str, str]) -> int:
+    return zlib.crc32(repr(sorted(values.items())).encode())

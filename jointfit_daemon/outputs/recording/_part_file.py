@@ -1,0 +1,215 @@
+"""One file of a recording while it is written.
+
+Invariant: after a failed write the file continues at the same byte, so it has no damaged place.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from contextlib import suppress
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, cast
+
+from mcap.writer import IndexType, Writer
+
+from jointfit_daemon.outputs.recording._channels import (
+    CHANNEL_METADATA,
+    END_METADATA,
+    PROFILE,
+    RECORDING_METADATA,
+    channel_form,
+    schema_of,
+)
+from jointfit_daemon.outputs.recording._description import sealed
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+    from jointfit_daemon.outputs.recording._description import RecordingInfo
+
+UNFINISHED = ".part"
+"""Suffix of the name of a file while it is written."""
+_SEQUENCES = 2**32
+"""MCAP stores sequence numbers modulo this."""
+_CHUNK_BYTES = 1024 * 1024
+"""A chunk that reaches this size is closed before the next flush, bytes."""
+
+
+class RecordedAttachment(NamedTuple):
+    """A document that is stored in every file of a recording."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+
+class PartFile:
+    """One file: created as ``NAME.mcap.part``, renamed to ``NAME.mcap`` when it is complete.
+
+    Parameters
+    ----------
+    path
+        Its final name.
+    info
+        Its description.
+    attachments
+        Documents at its beginning.
+
+    Raises
+    ------
+    OSError
+        The file cannot be created (FileExistsError: it exists, also under its final name).
+    """
+
+    def __init__(
+        self, path: Path, info: RecordingInfo, attachments: Sequence[RecordedAttachment]
+    ) -> None:
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+        self.path, self.info = path, info
+        self.open_path = path.with_name(path.name + UNFINISHED)
+        self._fd = os.open(
+            self.open_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600
+        )
+        with suppress(OSError):  # some network file systems have no locks
+            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+        self._buffer = _UnwrittenBytes()
+        # Chunks have their own checksums. Message indexes would take 16 bytes a message.
+        indexes = IndexType.ALL & ~IndexType.MESSAGE
+        output = cast("IO[bytes]", self._buffer)
+        self._writer: Any = Writer(output, _CHUNK_BYTES, index_types=indexes)
+        self._writer.start(PROFILE, info.software)
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {"": 0}
+
+        # Twice, because a file without description is lost.
+        unix_ns = info.start_t_ns + info.unix_offset_ns
+        self._writer.add_metadata(RECORDING_METADATA, info.metadata())
+        for name, media_type, data in attachments:
+            self._writer.add_attachment(unix_ns, unix_ns, name, media_type, data)
+        self._writer.add_metadata(RECORDING_METADATA, info.metadata())
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the file, including those that are not yet written."""
+        return self._buffer.tell()
+
+    @property
+    def unwritten_bytes(self) -> int:
+        """Bytes that the disk did not yet take."""
+        return self._buffer.unwritten_bytes
+
+    def add(self, channel: str, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
+        """Add one message; the stamps are CLOCK_MONOTONIC ns."""
+        number = self._channels.get(channel) or self._register(channel)
+        offset_ns = self.info.unix_offset_ns
+        self._writer.add_message(
+            number, log_ns + offset_ns, data, publish_ns + offset_ns, sequence % _SEQUENCES
+        )
+
+    def _register(self, channel: str) -> int:
+        form = channel_form(channel)
+        if form.schema not in self._schemas:
+            schema = schema_of(form.schema)
+            self._schemas[form.schema] = self._writer.register_schema(
+                form.schema, "jsonschema", schema
+            )
+
+        # A second definition outside of the chunk, which may be damaged.
+        number: int = self._writer.register_channel(
+            channel, form.encoding, self._schemas[form.schema], form.metadata
+        )
+        self._channels[channel] = number
+        self._writer.add_metadata(CHANNEL_METADATA, sealed({"id": str(number), "topic": channel}))
+        return number
+
+    def flush(self) -> None:
+        """Write all messages, and wait until they are on the disk.
+
+        Raises
+        ------
+        OSError
+            The disk did not take all; the rest is written by the next call.
+        """
+        self._writer.flush()
+        self._buffer.write_to(self._fd)
+        os.fdatasync(self._fd)
+
+    def finish(self, next_sequence: int, reason: str) -> None:
+        """Write the end and the index, and give the file its final name.
+
+        Parameters
+        ----------
+        next_sequence
+            Sequence number of the first message after this file.
+        reason
+            Why the file ends: ``rotated`` or ``stopped``.
+
+        Raises
+        ------
+        OSError
+            The disk did not take the end; the file keeps its unfinished name.
+        """
+        try:
+            self._writer.flush()
+            end = sealed({"next_sequence": str(next_sequence), "reason": reason})
+            self._writer.add_metadata(END_METADATA, end)
+            self._writer.finish()
+            self._buffer.write_to(self._fd)
+            os.fsync(self._fd)
+            self.open_path.rename(self.path)
+            sync_directory(self.path.parent)
+        finally:
+            self.close()
+
+    def close(self) -> None:
+        """Close the file as it is."""
+        if self._fd >= 0:
+            fd, self._fd = self._fd, -1
+            with suppress(OSError):
+                os.close(fd)
+
+
+def sync_directory(directory: Path) -> None:
+    """Write the names in a directory to the disk."""
+    fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+class _UnwrittenBytes:
+    """Collects what the library writes, because it loses bytes after a failed write."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+        self._written = 0
+
+    @property
+    def unwritten_bytes(self) -> int:
+        return len(self._data)
+
+    def write(self, data: bytes) -> int:
+        self._data += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._written + len(self._data)
+
+    def flush(self) -> None:
+        """Do nothing: `write_to` writes."""
+
+    def write_to(self, fd: int) -> None:
+        """Write all bytes to `fd`; keep the rest if it raises OSError."""
+        done = 0
+        try:
+            with memoryview(self._data) as view:
+                while done < len(view):
+                    done += os.write(fd, view[done:])
+        finally:
+            del self._data[:done]
+            self._written += done

@@ -1,0 +1,418 @@
+"""Reads recordings: finished ones, those of a crashed or running daemon, and damaged ones.
+
+Invariant: messages are returned in the order in which they were processed, and each missing message
+is part of exactly one `RecordingGap`.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from dataclasses import dataclass
+from functools import cached_property
+from io import BytesIO
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import orjson
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel
+
+from jointfit_daemon.model import Chunk
+from jointfit_daemon.outputs.recording._blocks import (
+    AttachmentBlock,
+    ChunkBlock,
+    DamagedBlock,
+    EndBlock,
+    MetadataBlock,
+    RecordingError,
+    read_blocks,
+)
+from jointfit_daemon.outputs.recording._channels import (
+    CHANNEL_METADATA,
+    END_METADATA,
+    EVENT,
+    FORMAT,
+    GAP,
+    RECORDING_METADATA,
+    SNAPSHOT,
+    SOURCE,
+    STATE,
+)
+from jointfit_daemon.outputs.recording._description import RecordingGap, RecordingInfo, unsealed
+from jointfit_daemon.outputs.recording._event_json import DamagedEventError, decode_event
+from jointfit_daemon.outputs.recording._part_file import UNFINISHED
+from jointfit_daemon.pipeline.events import ChunkArrived
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from jointfit_daemon.pipeline.events import Event
+
+_PART_NAME = re.compile(r"(?P<stem>.+-\d{8}T\d{6})-(?P<part>\d{4,})\.mcap(\.part)?")
+"""Name of a file of a session."""
+_MESSAGE = struct.Struct("<BQHIQQ")
+"""Opcode, length, channel, sequence number, log time and publish time of a message."""
+_PREFIX = struct.Struct("<BQ")
+_SEQUENCES = 2**32
+
+
+class RecordedMessage(NamedTuple):
+    """One message of a recording."""
+
+    sequence: int
+    """Its number in the session; of a snapshot, that of the message after it."""
+    channel: str
+    t_ns: int
+    """Arrival, CLOCK_MONOTONIC ns."""
+    publish_t_ns: int
+    """Instant of the content where it is known, CLOCK_MONOTONIC ns."""
+    data: bytes
+
+    def event(self) -> Event | None:
+        """Return the input event of the core; None if the message is none.
+
+        Raises
+        ------
+        RecordingError
+            The content is no event.
+        ConfigError
+            The rig of the recording cannot be loaded (a driver is missing).
+        """
+        if self.channel.startswith(SOURCE):
+            return ChunkArrived(self.channel[len(SOURCE) :], Chunk(self.t_ns, self.data))
+        for prefix in (EVENT, SNAPSHOT):
+            if self.channel.startswith(prefix):
+                try:
+                    return decode_event(self.channel[len(prefix) :], self.data)
+                except DamagedEventError as error:
+                    raise RecordingError(f"message {self.sequence}: {error}") from error
+        return None
+
+
+@dataclass(frozen=True)
+class RecordedPart:
+    """One file of a recording."""
+
+    path: Path
+    info: RecordingInfo
+    documents: Mapping[str, bytes]
+    """Attachments by their name, such as ``rig.json``."""
+
+    def messages(self) -> Iterator[RecordedMessage | DamagedBlock | PartEnd]:
+        """Yield all messages of this file, its damaged places, and its end."""
+        topics: dict[int, str] = {}
+        expected, offset_ns = self.info.first_sequence, self.info.unix_offset_ns
+        end = PartEnd(None, "", complete=False)
+        for block in read_blocks(self.path):
+            match block:
+                case ChunkBlock(content=content):
+                    for message in _messages(content, topics, expected, offset_ns):
+                        expected = message.sequence
+                        yield message
+                case MetadataBlock(name=name, values=values):
+                    end = _read_metadata(name, values, topics) or end
+                case DamagedBlock():
+                    yield block
+                case EndBlock():
+                    end = end._replace(complete=True)
+        yield end
+
+
+class PartEnd(NamedTuple):
+    """End of a file."""
+
+    next_sequence: int | None
+    """Sequence number after the last message; None for a file that was not closed."""
+    reason: str
+    """``rotated``, ``stopped``, ``recovered``, or empty."""
+    complete: bool
+    """Whether the file has its regular end."""
+
+
+def _read_metadata(name: str, values: dict[str, str], topics: dict[int, str]) -> PartEnd | None:
+    try:
+        if name == CHANNEL_METADATA:
+            found = unsealed(values)
+            topics.setdefault(int(found["id"]), found["topic"])
+        if name == END_METADATA:
+            found = unsealed(values)
+            return PartEnd(int(found["next_sequence"]), found["reason"], complete=False)
+    except (ValueError, KeyError):  # damaged: the chunks contain the channels, too
+        return None
+    return None
+
+
+def _messages(
+    content: bytes, topics: dict[int, str], expected: int, offset_ns: int
+) -> Iterator[RecordedMessage]:
+    """Yield the messages of a chunk, and add its channels to `topics`.
+
+    The checksum of the chunk is right, so a wrong length means a file that was made by hand.
+    """
+    place, size = 0, len(content)
+    while place + _PREFIX.size <= size:
+        opcode, length = _PREFIX.unpack_from(content, place)
+        end = place + _PREFIX.size + length
+        if end > size:
+            return
+        if opcode == Opcode.MESSAGE and length >= _MESSAGE.size - _PREFIX.size:
+            _, _, number, low, log_ns, publish_ns = _MESSAGE.unpack_from(content, place)
+            # Numbers are stored modulo 2**32; the distance to the last one is far smaller.
+            half = _SEQUENCES // 2
+            expected += (low - expected + half) % _SEQUENCES - half
+            data = content[place + _MESSAGE.size : end]
+            yield RecordedMessage(
+                expected, topics.get(number, ""), log_ns - offset_ns, publish_ns - offset_ns, data
+            )
+        elif opcode == Opcode.CHANNEL:
+            try:
+                record = content[place + _PREFIX.size : end]
+                channel = Channel.read(ReadDataStream(BytesIO(record)))
+            except Exception:  # noqa: BLE001 - made by hand: its messages have no name
+                channel = None
+            if channel is not None:
+                topics[channel.id] = channel.topic
+        place = end
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All files of one session."""
+
+    parts: tuple[RecordedPart, ...]
+
+    @property
+    def info(self) -> RecordingInfo:
+        """Description of the first file."""
+        return self.parts[0].info
+
+    @property
+    def name(self) -> str:
+        """``[rig] name``."""
+        return self.info.rig
+
+    @property
+    def start_unix_ns(self) -> int:
+        """UNIX time at which the first file begins, ns."""
+        return self.info.start_t_ns + self.info.unix_offset_ns
+
+    @property
+    def began_with_daemon(self) -> bool:
+        """Whether the files contain every event since the start of the daemon."""
+        return self.info.began_with_daemon and self.info.part == 1
+
+    @cached_property
+    def rig_table(self) -> dict[str, Any] | None:
+        """The parsed rig.toml at the beginning; None if the recording contains none."""
+        document = self.parts[0].documents.get("rig.json")
+        return None if document is None else orjson.loads(document)
+
+    def messages(self) -> Iterator[RecordedMessage | RecordingGap]:
+        """Yield all messages in the order of processing, and the gaps between them.
+
+        Snapshots are yielded at the beginning and after gaps only: elsewhere the events before
+        them have the same content.
+
+        Raises
+        ------
+        OSError
+            A file cannot be read.
+        """
+        sequencer = _Sequencer(self.info)
+        for part in self.parts:
+            sequencer.damage = ""
+            for item in part.messages():
+                yield from sequencer.follow(item)
+
+    def events(self) -> Iterator[Event]:
+        """Yield the input events of the core in order; raises the errors of `messages`."""
+        for message in self.messages():
+            if isinstance(message, RecordedMessage):
+                event = message.event()
+                if event is not None:
+                    yield event
+
+    def states(self) -> Iterator[bytes]:
+        """Yield the limb states as written by `encode_state`."""
+        for message in self.messages():
+            if isinstance(message, RecordedMessage) and message.channel == STATE:
+                yield message.data
+
+    def gaps(self) -> list[RecordingGap]:
+        """Return all gaps; reads all files."""
+        return [message for message in self.messages() if isinstance(message, RecordingGap)]
+
+
+class _Sequencer:
+    """Finds gaps by the sequence numbers, and selects the snapshots that are necessary."""
+
+    def __init__(self, info: RecordingInfo) -> None:
+        self._expected = info.first_sequence
+        self._t_ns = info.start_t_ns
+        self._restoring = True
+        self.damage = ""
+        """Last damaged place, the reason of the next gap."""
+
+    def follow(
+        self, item: RecordedMessage | DamagedBlock | PartEnd
+    ) -> Iterator[RecordedMessage | RecordingGap]:
+        """Yield what follows from the next item of a file."""
+        if isinstance(item, DamagedBlock):
+            self.damage = f"bytes {item.start} to {item.end} are damaged: {item.reason}"
+        elif isinstance(item, PartEnd):
+            if item.next_sequence is not None and item.next_sequence > self._expected:
+                yield self._gap(item.next_sequence, self._t_ns, self.damage)
+        elif item.channel == GAP or item.channel.startswith(SNAPSHOT):
+            if item.sequence > self._expected:
+                reason = self.damage
+                if item.channel == GAP:
+                    reason = str(orjson.loads(item.data).get("reason", ""))
+                yield self._gap(item.sequence, item.t_ns, reason)
+            if item.channel != GAP and self._restoring:
+                yield item
+        else:
+            if item.sequence > self._expected:
+                yield self._gap(item.sequence, item.t_ns, self.damage)
+            self._expected, self._t_ns = item.sequence + 1, item.t_ns
+            self._restoring = False
+            yield item
+
+    def _gap(self, following: int, t_ns: int, reason: str) -> RecordingGap:
+        count, first = following - self._expected, self._expected
+        self._expected, self._restoring, self.damage = following, True, ""
+        reason = reason or "a file of the session is missing"
+        return RecordingGap(first, count, self._t_ns, t_ns, reason)
+
+
+def open_recording(path: Path) -> Recording:
+    """Return the recording at `path`, without reading its messages.
+
+    Parameters
+    ----------
+    path
+        Any file of a session, or a folder that contains the files of one session; the other files
+        of the session are found by their names.
+
+    Raises
+    ------
+    RecordingError
+        A file is not a recording or of a later version; the folder contains none, or several.
+    OSError
+        A file cannot be read.
+    """
+    parts: list[RecordedPart] = []
+    for file in session_files(path):
+        try:
+            part = open_part(file)
+        except RecordingError:
+            if file == path:
+                raise
+            continue  # another session, or a file without a message
+        if not parts or part.info.session == parts[0].info.session:
+            parts.append(part)
+    if not parts:
+        raise RecordingError(f"{path}: the folder contains no recording (NAME.mcap)")
+    return Recording(tuple(sorted(parts, key=lambda part: part.info.part)))
+
+
+def session_files(path: Path) -> list[Path]:
+    """Return the files that belong to the session of `path` by their names.
+
+    Raises
+    ------
+    RecordingError
+        `path` is a folder with files of several sessions.
+    """
+    if path.is_dir():
+        stems = {m["stem"] for m in map(_name_match, path.iterdir()) if m is not None}
+        if len(stems) > 1:
+            listed = ", ".join(sorted(stems)[:5])
+            raise RecordingError(f"{path}: {len(stems)} recordings: name one of {listed}")
+        found = [other for other in path.iterdir() if _name_match(other) is not None]
+    else:
+        match = _name_match(path)
+        if match is None:
+            return [path]
+        found = [
+            other
+            for other in path.parent.iterdir()
+            if (one := _name_match(other)) is not None and one["stem"] == match["stem"]
+        ]
+
+    # A file that was completed while it was listed appears once.
+    complete = {other.name for other in found}
+    return sorted(p for p in found if p.name.removesuffix(UNFINISHED) not in complete - {p.name})
+
+
+def _name_match(path: Path) -> re.Match[str] | None:
+    return _PART_NAME.fullmatch(path.name)
+
+
+def open_part(path: Path) -> RecordedPart:
+    """Return one file of a recording.
+
+    Raises
+    ------
+    RecordingError
+        It is not a recording, or of a later version.
+    OSError
+        It cannot be read.
+    """
+    info: RecordingInfo | None = None
+    documents: dict[str, bytes] = {}
+    for block in read_blocks(path):
+        match block:
+            case MetadataBlock(name=name, values=values) if name == RECORDING_METADATA:
+                info = info or _read_info(path, values)
+            case AttachmentBlock(attachment=attachment):
+                documents[attachment.name] = attachment.data
+            case ChunkBlock():
+                break
+    if info is None:
+        raise RecordingError(f"{path}: the description of the recording is missing or damaged")
+    return RecordedPart(path, info, documents)
+
+
+def _read_info(path: Path, values: dict[str, str]) -> RecordingInfo | None:
+    """Return the description; None if it is damaged, because the file has a second one."""
+    try:
+        version = int(unsealed(values)["format"])
+    except (ValueError, KeyError):
+        return None
+    if version > FORMAT:
+        raise RecordingError(
+            f"{path}: a recording of format {version}, expected at most {FORMAT}: a later "
+            "jointfitd wrote it; update this one"
+        )
+    try:
+        return RecordingInfo.from_metadata(values)
+    except ValueError:
+        return None
+
+
+def read_events(path: Path) -> Iterator[Event]:
+    """Yield the input events of the recording at `path` in order, as `Recording.events`.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a recording, of a later version, or contains a damaged event.
+    OSError
+        It cannot be read.
+    """
+    yield from open_recording(path).events()
+
+
+def read_states(path: Path) -> Iterator[bytes]:
+    """Yield the limb states of the recording at `path`, as written by `encode_state`.
+
+    Raises
+    ------
+    RecordingError
+        The file is not a recording, or of a later version.
+    OSError
+        It cannot be read.
+    """
+    yield from open_recording(path).states()
