@@ -6,7 +6,9 @@ import asyncio
 import contextlib
 import gc
 import inspect
+import itertools
 import os
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,11 +32,15 @@ settings.register_profile("search", deadline=None, max_examples=500)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "suite"))
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the unit has it: read when numpy loads
+# jsonschema imports it for the format `iri`, which our schemas do not use: two seconds of a worker.
+sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]  # None: import fails
 
 PARTS = ("parallel", "alone", "experiments", "experiments-alone")
 """Which tests run together: by the markers `experiment` and `alone`."""
 GRACE_S = 1.0
 """How long a descriptor may take to close: executors and child processes end a little later."""
+QUEUES_THAT_WAIT = 2
+"""Number of workers that begin with system tests: they wait for half of their time."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -46,21 +52,47 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+@pytest.hookimpl(trylast=True)  # after pytest has sorted by parameters of fixtures
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect the tests of the other parts; start the longest test first."""
-    items.sort(key=lambda item: item.get_closest_marker("first") is None)
+    """Deselect the tests of the other parts; start the longest tests first."""
     part = config.getoption("part")
-    if part is None:
-        return
+    if part is not None:
+        chosen = [item for item in items if _part_of(item) == part]
+        config.hook.pytest_deselected(items=[item for item in items if _part_of(item) != part])
+        items[:] = chosen
+    items[:] = _longest_first(items, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
 
-    def belongs(item: pytest.Item) -> bool:
-        experiment, alone = (
-            item.get_closest_marker(name) is not None for name in ("experiment", "alone")
-        )
-        return bool(part == PARTS[2 * experiment + alone])
 
-    config.hook.pytest_deselected(items=[item for item in items if not belongs(item)])
-    items[:] = [item for item in items if belongs(item)]
+def _part_of(item: pytest.Item) -> str:
+    experiment, alone = (
+        item.get_closest_marker(name) is not None for name in ("experiment", "alone")
+    )
+    return PARTS[2 * experiment + alone]
+
+
+def _longest_first(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
+    """Sort the tests so that the long ones, which wait, run beside those that compute.
+
+    xdist gives each worker a queue of equal length, in the order of the tests, and an idle worker
+    takes tests from the end of the longest queue. The system tests go to the beginning of two
+    queues, file by file, those with the marker `first` before the others.
+    """
+
+    def file_of(item: pytest.Item) -> tuple[bool, Path]:
+        return item.get_closest_marker("first") is None, item.path
+
+    long = sorted((item for item in items if item.get_closest_marker("system")), key=file_of)
+    waiting: list[list[pytest.Item]] = [[] for _ in range(min(QUEUES_THAT_WAIT, workers))]
+    for _, tests in itertools.groupby(long, key=file_of):
+        min(waiting, key=len).extend(tests)
+    others = iter([item for item in items if item.get_closest_marker("system") is None])
+
+    ordered: list[pytest.Item] = []
+    for worker in range(workers):
+        length = (len(items) - len(ordered)) // (workers - worker)
+        queue = waiting[worker] if worker < len(waiting) else []
+        ordered += [*queue, *itertools.islice(others, max(0, length - len(queue)))]
+    return [*ordered, *others]
 
 
 @pytest.fixture(scope="session")
