@@ -4,6 +4,9 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 
+# Thousands of processes import the project: without bytecode each of them compiles it anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .PHONY: help install demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
 
@@ -30,7 +33,7 @@ test: $(STAMP)  ## all tests that this machine can run, on all cores; what is sk
 test-experiments: $(STAMP)  ## the short experiments of bench against their targets
 	@$(BIN)/python .ci/suite.py --experiments $(ARGS)
 
-test-cpu: $(STAMP)  ## the numerical tests six times, as on other processors
+test-cpu: $(STAMP)  ## the numerical tests four times, as on other processors
 	@$(BIN)/python .ci/cpu_features.py $(ARGS)
 
 test-root:  ## the tests and the demo on a fresh minimal Debian, as a user without root (mmdebstrap; root or sudo)

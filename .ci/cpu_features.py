@@ -4,8 +4,8 @@
 
 Kernels of OpenBLAS and loops of numpy round differently on each processor. A decision that
 depends on last bits shows itself by a test that passes in one of these runs and fails in another.
-The runs differ in ``OPENBLAS_CORETYPE`` and ``NPY_DISABLE_CPU_FEATURES``. A run that this processor
-cannot execute is skipped with its reason.
+Each run has the kernels (``OPENBLAS_CORETYPE``) and the loops (``NPY_DISABLE_CPU_FEATURES``) of one
+processor. A run that this processor cannot execute is skipped with its reason.
 
 Exit status: 0 if every run passed, 1 otherwise.
 """
@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from numpy._core import _multiarray_umath as umath  # type: ignore[attr-defined]  # no stub
@@ -30,43 +31,58 @@ TESTS = [
 ]  # fmt: skip
 """Tests of packages that compute with numpy. Plain Python, such as the device clocks and the frames
 of the core, rounds alike on all processors."""
-CORE_TYPES = {"Nehalem": "sse4_2", "Haswell": "avx2", "SkylakeX": "avx512f", "Zen": "avx2"}
-"""Kernels of OpenBLAS, and the flag of /proc/cpuinfo that a processor needs for them."""
+
+
+@dataclass(frozen=True)
+class Processor:
+    """A processor as OpenBLAS and numpy distinguish them."""
+
+    core_type: str
+    """Name of its kernels in OpenBLAS."""
+    flag: str
+    """Flag of /proc/cpuinfo that the kernels need."""
+    steps: int | None
+    """Steps of numpy above its baseline that this processor has; None: all that this one has."""
+
+
+PROCESSORS = (
+    Processor("Nehalem", "sse4_2", 0),
+    Processor("Haswell", "avx2", 1),
+    Processor("Zen", "avx2", 1),
+    Processor("SkylakeX", "avx512f", None),
+)
+"""Each kernel and each kind of loop occurs in one of them."""
 
 
 def main(arguments: list[str]) -> int:
     """Run all; print a line for each; return the exit status."""
     flags = Path("/proc/cpuinfo").read_text(encoding="utf-8").split()
+    steps = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
     failed = 0
-    for name, text, flag in _runs():
-        if flag not in flags:
-            print(f"{name}={text}: skipped, this processor lacks {flag}", flush=True)
+    for processor in PROCESSORS:
+        if processor.flag not in flags:
+            print(f"{processor.core_type}: skipped, this one lacks {processor.flag}", flush=True)
             continue
+        disabled = [] if processor.steps is None else steps[processor.steps :]
+        name = processor.core_type + (f" without {','.join(disabled)}" if disabled else "")
         began = time.monotonic()
         command = [
             sys.executable, "-m", "pytest", "-q", "-n", str(len(os.sched_getaffinity(0))),
             "--dist", "worksteal", "--part", "parallel",
             *(arguments or TESTS),
         ]  # fmt: skip
-        environment = os.environ | {name: text, "HYPOTHESIS_PROFILE": "few"}  # `make test` has all
+        environment = os.environ | {
+            "OPENBLAS_CORETYPE": processor.core_type,
+            "NPY_DISABLE_CPU_FEATURES": ",".join(disabled),
+            "HYPOTHESIS_PROFILE": "few",  # `make test` draws more
+        }
         status = subprocess.run(  # noqa: S603 - our own command
             command, check=False, env=environment
         ).returncode
         failed += status != 0
         outcome = "passed" if status == 0 else f"FAILED with {status}"
-        print(f"{name}={text}: {outcome} in {time.monotonic() - began:.0f} s", flush=True)
+        print(f"{name}: {outcome} in {time.monotonic() - began:.0f} s", flush=True)
     return 1 if failed else 0
-
-
-def _runs() -> list[tuple[str, str, str]]:
-    """Return variable, value, and the processor's flag that the run needs."""
-    found = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
-    every = next(iter(CORE_TYPES.values()))
-    return [
-        *(("OPENBLAS_CORETYPE", core, flag) for core, flag in CORE_TYPES.items()),
-        ("NPY_DISABLE_CPU_FEATURES", ",".join(found), every),  # the baseline only
-        ("NPY_DISABLE_CPU_FEATURES", ",".join(found[1:]), every),  # and the first step above it
-    ]
 
 
 if __name__ == "__main__":

@@ -42,8 +42,6 @@ def main(arguments: list[str]) -> int:
         else ("tests", ("parallel", "alone"))
     )
     arguments = [word for word in arguments if word != "--experiments"]
-    # A thousand processes import the project: each would compile it anew.
-    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     reports = BUILD / name
     shutil.rmtree(reports, ignore_errors=True)
     cores = len(os.sched_getaffinity(0))
