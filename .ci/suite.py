@@ -45,7 +45,7 @@ def main(arguments: list[str]) -> int:
     reports = BUILD / name
     shutil.rmtree(reports, ignore_errors=True)
     cores = len(os.sched_getaffinity(0))
-    workers = cores if experiments else WORKERS_PER_CORE * cores  # experiments compute
+    workers = WORKERS_PER_CORE * cores
 
     # An idle worker takes tests from the others: there are few long ones.
     parallel = _run(parts[0], reports, ["-n", str(workers), "--dist", "worksteal", *arguments])

@@ -75,16 +75,20 @@ def _longest_first(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
 
     xdist gives each worker a queue of equal length, in the order of the tests, and an idle worker
     takes tests from the end of the longest queue. The system tests go to the beginning of two
-    queues, file by file, those with the marker `first` before the others.
+    queues, file by file, those with the longest time limit first.
     """
 
-    def file_of(item: pytest.Item) -> tuple[bool, Path]:
-        return item.get_closest_marker("first") is None, item.path
+    def limit_s(item: pytest.Item) -> float:
+        marker = item.get_closest_marker("timeout")
+        return float(marker.args[0] if marker else item.config.getini("timeout"))
 
-    long = sorted((item for item in items if item.get_closest_marker("system")), key=file_of)
+    def in_file(item: pytest.Item) -> tuple[float, Path]:
+        return -limit_s(item), item.path
+
+    long = sorted((item for item in items if item.get_closest_marker("system")), key=in_file)
     waiting: list[list[pytest.Item]] = [[] for _ in range(min(QUEUES_THAT_WAIT, workers))]
-    for _, tests in itertools.groupby(long, key=file_of):
-        min(waiting, key=len).extend(tests)
+    for _, tests in itertools.groupby(long, key=in_file):
+        min(waiting, key=lambda queue: sum(map(limit_s, queue))).extend(tests)
     others = iter([item for item in items if item.get_closest_marker("system") is None])
 
     ordered: list[pytest.Item] = []
