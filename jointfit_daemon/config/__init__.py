@@ -6,6 +6,7 @@ Invariant: degrees and millimetres exist in this package only; no device is open
 from jointfit_daemon.config._checks import drifting_imus, heading_warning, missing_files
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._load import load_rig, parse_rig
+from jointfit_daemon.config._open_places import LATER
 from jointfit_daemon.config._rig import Rig, Source
 from jointfit_daemon.config._schema import rig_schema
 from jointfit_daemon.config._tables import (
@@ -17,6 +18,7 @@ from jointfit_daemon.config._tables import (
 )
 
 __all__ = [
+    "LATER",
     "ConfigError",
     "Fault",
     "MetricsSettings",

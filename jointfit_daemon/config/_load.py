@@ -18,6 +18,7 @@ from jointfit_daemon.config import _bandwidth, _checks
 from jointfit_daemon.config._branched_limb import branched_limb
 from jointfit_daemon.config._bus_faults import complete_bus, likely_interface, unusable_keys
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
+from jointfit_daemon.config._open_places import fill_open_places
 from jointfit_daemon.config._readable import contradictions, readable_part
 from jointfit_daemon.config._rig import MOCAP, Rig, Source
 from jointfit_daemon.config._syntax import read_table, without_unreadable
@@ -119,8 +120,7 @@ class _RigReader:
     """Reads one rig.toml and collects its faults."""
 
     def __init__(self, table: dict[str, Any]) -> None:
-        self.table = table
-        self.faults: list[Fault] = []
+        self.table, self.faults = fill_open_places(table)
         self.partial: dict[str, Any] = {}
         """Tables with faults, by key, as partial models for the checks across tables."""
         self.cameras: MocapSettings | None = None

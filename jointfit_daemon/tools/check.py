@@ -48,7 +48,10 @@ def check(
     for column in ("source", "driver", "segment", "rate"):
         table.add_column(column)
     for source in rig.sources:
-        table.add_row(source.id, source.driver, source.segment or "—", f"{source.rate_hz:g} Hz")
+        # Cameras send at their own rate, unless their driver has a key for it.
+        is_set = source.kind == "imu" or hasattr(source.settings, "rate_hz")
+        rate = f"{source.rate_hz:g} Hz" if is_set else "of the cameras"
+        table.add_row(source.id, source.driver, source.segment or "—", rate)
 
     console = Console()
     console.print(table)

@@ -44,7 +44,7 @@ _DESCRIPTIONS = {
     "connect": "start simulated sensors, cameras and the daemon",
     "align": "all sensors on one plate, rotated by hand",
     "static": "sensors on the body, standing still",
-    "functional": "moving all joints widely, as the instructions ask",
+    "functional": "moving all joints widely, as in a calibration",
     "live": "joint angles from the IMUs only",
 }
 

@@ -36,8 +36,8 @@ def doctor(
 
     Checks permissions, other programs and latency of serial ports, CAN interfaces, clock, disk,
     memory and processor; with a rig.toml also the broker, and the cameras by a connection as the
-    daemon makes it. Changes nothing, and needs no root access. Exit codes: 0 no fault; 1 a warning
-    or an error; 2 invalid options or rig.toml.
+    daemon makes it. Changes nothing, and needs no root access. Exit codes: 0 no error, with
+    warnings or without; 1 an error; 2 invalid options or rig.toml.
     """
     from rich.console import Console
     from rich.progress import Progress
@@ -61,7 +61,7 @@ def doctor(
         for finding in findings:
             for line in finding_lines(finding):
                 typer.echo(line)
-    if report.level != "ok":
+    if report.level == "error":
         raise typer.Exit(EXIT_FAILED)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.config import LATER
 from jointfit_daemon.tools.init._limbs import LIMBS
 
 if TYPE_CHECKING:
@@ -34,8 +35,15 @@ def sensors_of(answers: Mapping[Key, Any]) -> dict[str, str]:
 
 
 def wiring_of(answers: Mapping[Key, Any], device: str) -> str:
-    """Return ``serial`` for the path of a port that is no CAN adapter, else ``can``."""
+    """Return ``serial`` for a port that is no CAN adapter, or for an open place; else ``can``."""
+    if device == LATER:
+        return "serial"
     return "serial" if "/" in device and device not in answers["can_adapters", ""] else "can"
+
+
+def is_connected(answers: Mapping[Key, Any], sensor: str) -> bool:
+    """Return whether the connection of `sensor` is known."""
+    return bool(answers.get(("device", sensor), LATER) != LATER)
 
 
 def drivers_for(answers: Mapping[Key, Any], found: Found, sensor: str) -> tuple[ImuDriver, ...]:

@@ -16,9 +16,9 @@ from jointfit_daemon.tools.output_files import check_output
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.config import Rig
     from jointfit_daemon.tools.init._answers import Answers
     from jointfit_daemon.tools.init._dialogue import Dialogue
+    from jointfit_daemon.tools.init._writing import WrittenRig
 
 PASSWORD_VARIABLE = "JOINTFIT_MQTT_PASSWORD"  # noqa: S105 - its name
 """Environment variable with the password of the broker."""
@@ -55,7 +55,7 @@ def init(
     input are the answers. An interrupted dialogue continues at the next start. Exit codes: 0 the
     file is written; 2 it exists, cannot be written, or an answer is missing; 130 interrupted.
     """
-    from jointfit_daemon.tools.init._writing import next_commands, state_of, write_rig
+    from jointfit_daemon.tools.init._writing import state_of, write_rig
 
     path = rig_path(folder, config, force=force)
     state = state_of(path)
@@ -69,28 +69,32 @@ def init(
     dialogue = _new_dialogue(show, state, answers, ports, network=network)
     given = _finished(dialogue, state)
     password = _write_password(path, given, show)
-    rig, warnings = write_rig(path, given, dialogue.found)
-    state.unlink(missing_ok=True)
+    written = write_rig(path, given, dialogue.found)
     if json:
         result = {
-            "ok": True, "rig": str(path), "password_file": password, "table": rig.table,
-            "warnings": warnings, "next": next_commands(path, rig),
+            "ok": True, "rig": str(path), "password_file": password, "table": written.table,
+            "open": written.open_places, "warnings": written.warnings,
+            "next": written.next_commands,
         }  # fmt: skip
         typer.echo(orjson.dumps(result, default=str))
         return
-    _show_result(path, rig, warnings)
+    _show_result(written)
 
 
-def _show_result(path: Path, rig: Rig, warnings: list[str]) -> None:
-    from jointfit_daemon.tools.init._writing import next_commands
-
-    typer.echo(f"\n{path} is written and valid.")
-    for warning in warnings:
+def _show_result(written: WrittenRig) -> None:
+    if written.open_places:
+        typer.echo(f"\n{written.path} is written. These places are not filled in yet:")
+        for place in written.open_places:
+            typer.echo(f"  {place}")
+    else:
+        typer.echo(f"\n{written.path} is written and valid.")
+    for warning in written.warnings:
         typer.echo(f"warning: {warning}")
+
     typer.echo("Next:")
-    following = next_commands(path, rig)
-    for command, use in following.items():
-        typer.echo(f"  {command:{max(map(len, following))}}  {use}")
+    width = max(map(len, written.next_commands))
+    for command, use in written.next_commands.items():
+        typer.echo(f"  {command:{width}}  {use}")
 
 
 def _new_dialogue(
@@ -186,7 +190,7 @@ def _finished(dialogue: Dialogue, state: Path) -> Answers:
         code, reason = EXIT_MISUSE, "the input ended before the last question"
     except UnansweredError as error:
         code, reason = EXIT_MISUSE, str(error)
-    kept = f"{len(dialogue.answers)} answers are in {state}; the same command continues with them"
+    kept = f"{len(dialogue.known)} answers are in {state}; the same command continues with them"
     typer.echo(f"\njointfit init: {reason}\n{kept}", err=True)
     raise typer.Exit(code)
 

@@ -6,9 +6,10 @@ once.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.config import LATER
 from jointfit_daemon.nearest_name import did_you_mean
 from jointfit_daemon.tools.init._answers import split_address
 from jointfit_daemon.tools.init._engine import accept, complete, next_question
@@ -47,6 +48,13 @@ class Dialogue:
     is_script: bool = False
     """Whether questions without a prepared answer take their default, or fail."""
     answers: Answers = field(default_factory=dict)
+    _stored: Answers = field(default_factory=dict)
+    """Answers of an interrupted dialogue to questions that were not asked again yet."""
+
+    @property
+    def known(self) -> Answers:
+        """All answers: those that were accepted, and stored ones whose questions follow."""
+        return {**self._stored, **self.answers}
 
     def run(self) -> Answers:
         """Ask until the dialogue is complete; return the answers.
@@ -69,28 +77,48 @@ class Dialogue:
 
     def next(self) -> Asked | None:
         """Return the next question; the list of devices is the current one."""
-        asked = next_question(self.answers, self.found)
+        asked = self.asked()
         if asked is None or asked.question.kind != "device":
             return asked
         self.found = self.search.refresh(self.found)
-        return next_question(self.answers, self.found)
+        return self.asked()
+
+    def asked(self) -> Asked | None:
+        """Return the next question, without the ports of stored answers that follow."""
+        stored = {value for (key, _), value in self._stored.items() if key == "device"}
+        taken = stored - {*self.answers.get(("can_adapters", ""), ())}
+        free = tuple(port for port in self.found.ports if port.address not in taken)
+        return next_question(self.answers, replace(self.found, ports=free))
 
     def resume(self, stored: Answers) -> None:
-        """Take over stored answers; report those that are not accepted any more."""
+        """Take over stored answers; open places, and answers not accepted any more, are asked."""
+        self._stored = {key: value for key, value in stored.items() if value != LATER}
+        self._take_stored()
+
+    def _take_stored(self) -> None:
+        """Take over stored answers up to the first question without one."""
         while (asked := next_question(self.answers, self.found)) is not None:
-            if asked.key not in stored:
+            if asked.key not in self._stored:
                 break
+            value = self._stored.pop(asked.key)
             try:
-                self.accept_answer(asked, stored[asked.key])
+                self._accept(asked, value)
             except AnswerError as error:
-                self.show(f"{asked.name} = {stored[asked.key]!r} is asked again: {error}")
+                self.show(f"{asked.name} = {value!r} is asked again: {error}")
                 break
 
     def accept_answer(self, asked: Asked, given: Any) -> None:
         """Accept an answer, store it, and read what it makes available."""
+        self._accept(asked, given)
+        self._take_stored()
+
+    def _accept(self, asked: Asked, given: Any) -> None:
         self.answers = accept(asked, given, self.answers, self.found)
-        self.store(self.answers)
+        self.store(self.known)
         value = self.answers[asked.key]
+        if value == LATER:
+            return
+
         if asked.question.key == "device" and not self.search.is_present(self.found, value):
             self.show(f"  note: {value} is absent now; connect it before the daemon starts")
         if asked.question.key == "server":
@@ -148,7 +176,8 @@ class Dialogue:
             line = self.read_line(self._prompt(asked)).strip()
             if line == HELP:
                 self.show(f"  {asked.question.help}")
-                self.show("  Enter takes the proposal in brackets, '<' returns.")
+                proposal = "Enter takes the proposal in brackets, "
+                self.show(f"  {proposal if answer_text(asked.proposal) else ''}'<' returns.")
                 continue
             if line == BACK:
                 self.go_back()
@@ -157,14 +186,14 @@ class Dialogue:
                 if line == FIND and asked.question.finder is not None:
                     self.find(asked)
                 else:
-                    self.accept_answer(asked, line or (None if asked.default is not None else ""))
+                    self.accept_answer(asked, line or asked.entered)
             except AnswerError as error:
                 self.show(f"  {error}")
                 continue
             return
 
     def _prompt(self, asked: Asked) -> str:
-        shown = answer_text(asked.default)
+        shown = answer_text(asked.proposal)
         find = " ('find' searches)" if asked.question.finder else ""
         if not shown:
             return f"  empty: none{find} > " if asked.optional else f" {find} > "
@@ -174,7 +203,7 @@ class Dialogue:
         if self.answers:
             key, _ = self.answers.popitem()
             self.prepared.pop(key, None)
-            self.store(self.answers)
+            self.store(self.known)
 
     def find(self, asked: Asked) -> None:
         """Start the search of a question, and accept its result.

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
-from jointfit_daemon.config import ConfigError, parse_rig
+from jointfit_daemon.config import LATER, ConfigError, parse_rig
 from jointfit_daemon.tools.init._answers import drivers_for, limb_of, wiring_of
-from jointfit_daemon.tools.init._parsing import AnswerError, parse_answer
+from jointfit_daemon.tools.init._parsing import NEEDED, AnswerError, parse_answer
 from jointfit_daemon.tools.init._proposals import is_optional
 from jointfit_daemon.tools.init._questions import QUESTIONS, Question
 from jointfit_daemon.tools.init._rig_table import rig_table
@@ -41,6 +41,17 @@ class Asked:
     def key(self) -> Key:
         """Key of the answer."""
         return self.question.key, self.subject
+
+    @property
+    def proposal(self) -> Any:
+        """Answer of the Enter key: the default, ``later`` for an open place, or None."""
+        is_open = self.default is None and self.question.postponable
+        return LATER if is_open else self.default
+
+    @property
+    def entered(self) -> Any:
+        """Value for `accept` if nothing was typed: None accepts the default."""
+        return "" if self.proposal is None else (None if self.default is not None else LATER)
 
     @property
     def name(self) -> str:
@@ -118,9 +129,9 @@ def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -
     if given is None:
         value = asked.default
         if value is None and not asked.optional:
-            raise AnswerError(
-                "there is no proposal: an answer is needed, '?' explains the question"
-            )
+            raise AnswerError(NEEDED)
+    elif given == LATER and asked.question.postponable:
+        value = LATER
     else:
         values = [choice.address for choice in asked.choices]
         value = parse_answer(asked.question.kind, given, values, optional=asked.optional)
@@ -128,7 +139,7 @@ def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -
         value = ()
 
     extended = {**answers, asked.key: value}
-    if asked.question.kind == "device":
+    if asked.question.kind == "device" and value != LATER:
         _check_device(extended, found, asked.subject)
     if faults := rig_faults(extended, found) - rig_faults(answers, found):
         raise AnswerError("; ".join(sorted(faults)))
@@ -164,10 +175,18 @@ def complete(answers: Mapping[Key, Any], found: Found) -> Answers:
     return filled
 
 
+def without_open_places(answers: Mapping[Key, Any], found: Found) -> Answers:
+    """Return complete answers with stand-ins in the open places."""
+    return complete({key: value for key, value in answers.items() if value != LATER}, found)
+
+
 def rig_faults(answers: Mapping[Key, Any], found: Found) -> set[str]:
-    """Return the faults of the rig that the answers and defaults for the others yield."""
+    """Return the faults of the rig that the answers and defaults for the others yield.
+
+    An open place is none.
+    """
     try:
         parse_rig(rig_table(complete(answers, found), found))
     except ConfigError as error:
-        return {fault.text() for fault in error.faults}
+        return {fault.text() for fault in error.faults if fault.value != LATER}
     return set()

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 Kind = Literal["text", "names", "number", "yes_no", "choice", "device", "address", "ids"]
 """Kind of an answer."""
 
+NEEDED = "an answer is needed here: '?' explains the question, Ctrl-C stores the others for later"
+"""Message for an empty answer without a proposal."""
 _YES, _NO = ("y", "yes", "true", "1"), ("n", "no", "false", "0")
 
 
@@ -50,7 +52,7 @@ def parse_answer(
     if given in ("", [], None):
         if optional:
             return () if kind == "names" else None
-        raise AnswerError("an answer is needed here: '?' explains the question")
+        raise AnswerError(NEEDED)
     if isinstance(given, dict):
         raise AnswerError("found a table, expected one value")
     return _PARSERS[kind](given, choices)

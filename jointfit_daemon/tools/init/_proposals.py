@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from jointfit_daemon.tools.init._answers import (
     Key,
     driver_of,
+    is_connected,
     limb_of,
     marked_parts,
     sensors_of,
@@ -67,7 +68,7 @@ def devices(answers: Given, found: Found, _sensor: str) -> tuple[FoundDevice, ..
 def device(answers: Given, found: Found, sensor: str) -> str | None:
     """Return the only device that is left; None if there is a choice, or nothing."""
     listed = devices(answers, found, sensor)
-    waiting = [name for name in sensors_of(answers) if ("device", name) not in answers]
+    waiting = [name for name in sensors_of(answers) if not is_connected(answers, name)]
     return listed[0].address if len(listed) == 1 and len(waiting) == 1 else None
 
 

@@ -17,6 +17,7 @@ from jointfit_daemon.tools.init._answers import (
     driver_of,
     drivers_for,
     has_cameras,
+    is_connected,
     lengths_asked,
     limb_of,
     marked_parts,
@@ -73,6 +74,8 @@ class Question:
     """Entries of the list that is shown."""
     optional: bool = False
     """Whether the answer may be empty."""
+    postponable: bool = False
+    """Whether the word ``later`` is an answer, and the proposal where there is no other one."""
     finder: Finder | None = None
 
 
@@ -187,8 +190,10 @@ QUESTIONS: tuple[Question, ...] = (
         "device",
         "Connection of the sensor {subject}",
         "A number of the list, the path of a serial port, or a CAN interface. 'find' detects the"
-        " sensor by its movement: it opens the free ports and buses of the list.",
+        " sensor by its movement: it opens the free ports and buses of the list. 'later' leaves"
+        " the place open until the sensor is connected.",
         group="sensor",
+        postponable=True,
         subjects=_sensors,
         default=_proposals.device,
         stand_in=_proposals.unused_port,
@@ -204,7 +209,7 @@ QUESTIONS: tuple[Question, ...] = (
         subjects=lambda answers, found: tuple(
             name
             for name in sensors_of(answers)
-            if ("device", name) in answers and len(drivers_for(answers, found, name)) > 1
+            if is_connected(answers, name) and len(drivers_for(answers, found, name)) > 1
         ),
         default=lambda answers, found, sensor: driver_of(answers, found, sensor).name,
         choices=lambda answers, found, sensor: tuple(
@@ -220,7 +225,7 @@ QUESTIONS: tuple[Question, ...] = (
         subjects=lambda answers, found: tuple(
             name
             for name in sensors_of(answers)
-            if ("device", name) in answers and driver_of(answers, found, name).baud is not None
+            if is_connected(answers, name) and driver_of(answers, found, name).baud is not None
         ),
         default=_proposals.baud,
     ),
@@ -229,12 +234,13 @@ QUESTIONS: tuple[Question, ...] = (
         "ids",
         "CAN identifiers of the sensor {subject}",
         "Identifiers of the messages of this sensor, as 0x105 0x106 0x121. 'find' receives on a"
-        " CAN interface and proposes the identifiers of its sensors.",
+        " CAN interface and proposes the identifiers of its sensors. If they are unknown, return"
+        " with '<' and leave the connection for 'later'.",
         group="sensor",
         subjects=lambda answers, found: tuple(
             name
             for name in sensors_of(answers)
-            if ("device", name) in answers and driver_of(answers, found, name).ids
+            if is_connected(answers, name) and driver_of(answers, found, name).ids
         ),
         default=_proposals.ids,
         stand_in=_proposals.unused_ids,
@@ -270,7 +276,8 @@ QUESTIONS: tuple[Question, ...] = (
         "address",
         "Computer of the motion-capture system",
         "Name or address of the computer that runs Motive, with :PORT if its command port is not"
-        " 1510. 'find' connects to it and reads the names of markers.",
+        " 1510. 'later' leaves the place open.",
+        postponable=True,
         subjects=_if(has_cameras),
         default=lambda _answers, found, _: next((s.address for s in found.servers), None),
         stand_in=_always("192.168.1.10"),

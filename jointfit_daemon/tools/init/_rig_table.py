@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.config import LATER
 from jointfit_daemon.tools.init._answers import (
     Key,
     driver_of,
@@ -102,7 +103,7 @@ def _imu(answers: Given, found: Found, buses: Mapping[str, str], name: str) -> d
         "driver": driver.name,
     }
     table |= {"port": device} if driver.wiring == "serial" else {"can": buses[device]}
-    if driver.baud is not None:
+    if driver.baud is not None and device != LATER:
         table["baud"] = answers["baud", name]
     if driver.ids:
         table["ids"] = dict(zip(driver.ids, answers["ids", name], strict=True))

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import os
 import shlex
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
-from jointfit_daemon.config import heading_warning, load_rig, missing_files
+from jointfit_daemon.config import (
+    LATER,
+    ConfigError,
+    heading_warning,
+    load_rig,
+    missing_files,
+    parse_rig,
+)
 from jointfit_daemon.tools.init._answer_file import replace_file
+from jointfit_daemon.tools.init._engine import without_open_places
 from jointfit_daemon.tools.init._rig_table import rig_table
 from jointfit_daemon.tools.init._rig_text import rig_text
 
@@ -31,16 +40,52 @@ def write_password(path: Path, password: str) -> None:
         stream.write(f"{password}\n")
 
 
-def write_rig(path: Path, given: Answers, found: Found) -> tuple[Rig, list[str]]:
-    """Write the rig, and return it as the daemon reads it, with the warnings of the check."""
-    replace_file(path, rig_text(rig_table(given, found)))
-    rig = load_rig(path)
+@dataclass(frozen=True, slots=True)
+class WrittenRig:
+    """A rig.toml that was written."""
+
+    path: Path
+    table: dict[str, Any]
+    open_places: tuple[str, ...]
+    """Keys with the word ``later``, as ``imu[S1].port``."""
+    warnings: tuple[str, ...]
+    """Warnings of the check."""
+    next_commands: dict[str, str]
+    """Commands that follow, with their use."""
+
+
+def write_rig(path: Path, given: Answers, found: Found) -> WrittenRig:
+    """Write the rig; the stored answers remain while it has open places."""
+    table = rig_table(given, found)
+    replace_file(path, rig_text(table))
+    open_places: list[str] = []
+    try:
+        rig = load_rig(path)
+    except ConfigError as error:
+        # The check accepted every answer, so that only open places are left.
+        open_places += [fault.key for fault in error.faults if fault.value == LATER]
+        if len(open_places) < len(error.faults):
+            raise
+        rig = parse_rig(rig_table(without_open_places(given, found), found))
+    if not open_places:
+        state_of(path).unlink(missing_ok=True)
+
     heading = heading_warning(rig.sources)
-    return rig, [*missing_files(rig.mqtt), *([] if heading is None else [heading])]
+    warnings = (*missing_files(rig.mqtt), *(() if heading is None else (heading,)))
+    following = _next_commands(path, rig)
+    if open_places:
+        following = {_same_command(path): "fill in these places later"} | following
+    return WrittenRig(path, table, tuple(open_places), warnings, following)
 
 
-def next_commands(path: Path, rig: Rig) -> dict[str, str]:
-    """Return the commands that follow, with their use."""
+def _same_command(path: Path) -> str:
+    """Return the command that asks for the open places of a rig.toml."""
+    if path.name == "rig.toml":
+        return f"jointfit init {shlex.quote(str(path.parent))} --force"
+    return f"jointfit init --config {shlex.quote(str(path))} --force"
+
+
+def _next_commands(path: Path, rig: Rig) -> dict[str, str]:
     scheme = "mqtt" if rig.mqtt.tls is None else "mqtts"
     broker = f"{scheme}://{rig.mqtt.host}:{rig.mqtt.tcp_port}"
     name = shlex.quote(str(path))

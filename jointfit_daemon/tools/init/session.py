@@ -17,7 +17,6 @@ from jointfit_daemon.tools.init._rig_table import rig_table
 from jointfit_daemon.tools.init._rig_text import rig_text
 from jointfit_daemon.tools.init._search import DeviceSearch
 from jointfit_daemon.tools.init._writing import (
-    next_commands,
     state_of,
     write_password,
     write_rig,
@@ -93,8 +92,7 @@ class SetUpSession:
         elif action == "find" and asked is not None and asked.question.finder is not None:
             dialogue.find(asked)
         elif action == "answer" and asked is not None:
-            proposal = None if asked.default is not None else ""
-            dialogue.accept_answer(asked, message.get("value") or proposal)
+            dialogue.accept_answer(asked, message.get("value") or asked.entered)
 
     def _write(self, password: str) -> None:
         """Write rig and password of a complete dialogue.
@@ -112,10 +110,10 @@ class SetUpSession:
         secret = self._password_file()
         if secret is not None and password:
             write_password(secret, password)
-        rig, warnings = write_rig(self.path, dialogue.answers, dialogue.found)
-        state_of(self.path).unlink(missing_ok=True)
+        written = write_rig(self.path, dialogue.answers, dialogue.found)
         self._written = {
-            "path": str(self.path), "warnings": warnings, "next": next_commands(self.path, rig)
+            "path": str(self.path), "warnings": written.warnings, "open": written.open_places,
+            "next": written.next_commands,
         }  # fmt: skip
 
     def _password_file(self) -> Path | None:
@@ -127,7 +125,7 @@ class SetUpSession:
 
     def _state(self) -> dict[str, Any]:
         dialogue = self.dialogue
-        asked = next_question(dialogue.answers, dialogue.found)
+        asked = dialogue.asked()
         found = dialogue.found
         secret = self._password_file() if asked is None else None
         return {
@@ -153,7 +151,7 @@ def _question(asked: Asked) -> dict[str, Any]:
         "name": asked.name,
         "text": asked.text,
         "help": asked.question.help,
-        "default": answer_text(asked.default),
+        "default": answer_text(asked.proposal),
         "optional": asked.optional,
         "finder": asked.question.finder,
         "closed": asked.question.kind in ("choice", "yes_no"),

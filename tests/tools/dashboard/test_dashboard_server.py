@@ -7,6 +7,7 @@ import contextlib
 import gzip
 import hashlib
 import json
+import signal
 import socket
 import sys
 from pathlib import Path
@@ -284,10 +285,24 @@ def test_a_used_port_is_named() -> None:
     assert f"--listen {HOST}:{port}: Address already in use" in result.stderr
 
 
+STOPPED = [
+    pytest.param([], [signal.SIGTERM], id="SIGTERM"),
+    pytest.param([], [signal.SIGINT], id="SIGINT"),
+    pytest.param(
+        ["sh", "-c", 'trap "" INT; exec "$@"', "sh"], [signal.SIGINT, signal.SIGTERM],
+        id="SIGTERM, where the shell ignores SIGINT",
+    ),
+]  # fmt: skip
+"""Commands before that of the server, and the signals that it gets."""
+
+
 @pytest.mark.system
-async def test_the_command_prints_its_url_and_the_missing_broker_and_stops_with_0() -> None:
+@pytest.mark.parametrize(("shell", "signals"), STOPPED)
+async def test_the_command_prints_its_url_and_the_missing_broker_and_stops_with_0(
+    shell: list[str], signals: list[signal.Signals]
+) -> None:
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "jointfit_daemon.tools.__main__", "dashboard",
+        *shell, sys.executable, "-m", "jointfit_daemon.tools.__main__", "dashboard",
         "--listen", f"{HOST}:0", "--broker", f"mqtt://{HOST}:{free_port()}",
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
     )  # fmt: skip
@@ -296,7 +311,10 @@ async def test_the_command_prints_its_url_and_the_missing_broker_and_stops_with_
     async with asyncio.timeout(30):
         assert b"dashboard: http://127.0.0.1:" in await process.stdout.readline()
         assert b"start the broker" in await process.stderr.readline()
-        process.terminate()
+        for number in signals:
+            assert process.returncode is None
+            process.send_signal(number)
+            await asyncio.sleep(0.3 if number != signals[-1] else 0.0)
         await process.communicate()
     assert process.returncode == 0
 

@@ -16,9 +16,11 @@ import pytest
 from typer.testing import CliRunner
 
 from jointfit_daemon.config import load_rig
+from jointfit_daemon.device_search import Finding
 from jointfit_daemon.outputs import topics
 from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
 from jointfit_daemon.tools.__main__ import app
+from jointfit_daemon.tools.doctor import _command
 from jointfit_daemon.tools.doctor._command import examine
 from jointfit_daemon.tools.doctor._doctor_report import doctor_schema
 from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, RigidBodyAsset
@@ -29,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from jointfit_daemon.device_search import Finding
+    from jointfit_daemon.device_search import Level
     from tests.broker_fixture import Broker
 
 run = CliRunner().invoke
@@ -182,7 +184,16 @@ def test_the_json_of_this_host_follows_its_schema_and_decides_the_exit_code(
     code, text = printed([], tmp_path)
     assert "broker and cameras were not checked" in text
     levels = {line.split()[0] for line in text.splitlines() if line[0] != " "}
-    assert code == bool(levels & {"warning", "error"})
+    assert code == ("error" in levels)
+
+
+@pytest.mark.parametrize(("level", "code"), [("note", 0), ("warning", 0), ("error", 1)])
+def test_an_error_alone_ends_with_1(
+    monkeypatch: pytest.MonkeyPatch, level: Level, code: int
+) -> None:
+    found = [Finding("disk", "", "ok", "fine"), Finding("memory", "", level, "few", "stop others")]
+    monkeypatch.setattr(_command, "examine", lambda *_: found)
+    assert run(app, ["doctor"]).exit_code == code
 
 
 def test_a_faulty_rig_ends_with_2(tmp_path: Path) -> None:

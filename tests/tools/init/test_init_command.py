@@ -91,6 +91,79 @@ def test_a_typed_dialogue_writes_a_rig_that_check_accepts(tmp_path: Path, machin
     assert checked.exit_code == 0
 
 
+def test_enter_at_every_question_leaves_open_places_that_check_explains_and_init_fills(
+    tmp_path: Path, machine: Machine
+) -> None:
+    rig, state = tmp_path / "rig.toml", tmp_path / "rig.answers.toml"
+    assert machine.ports == []
+    done = init(tmp_path, lines=[""] * 18)
+    assert done.exit_code == 0, done.output
+    assert "imu[thigh-front].port" in done.output
+    assert f"jointfit init {tmp_path} --force" in done.output
+
+    checked = CliRunner().invoke(app, ["check", str(rig)])
+    assert checked.exit_code == 2
+    assert checked.output.count("not filled in yet: connect the sensor") == 4
+    assert "4 faults" in checked.output
+
+    # Later, only the open places are asked: two of them, the others remain open.
+    machine.ports = [f"/dev/ttyUSB{k}" for k in range(4)]
+    done = init(tmp_path, "--force", lines=["1", "", "later", "1", "", ""])
+    assert done.exit_code == 0, done.output
+    ports = [imu["port"] for imu in tomllib.loads(rig.read_text())["imu"]]
+    assert ports == ["/dev/ttyUSB0", "later", "/dev/ttyUSB1", "later"]
+    done = init(tmp_path, "--force", lines=["1", "", "/dev/ttyUSB3", ""])
+    assert done.exit_code == 0, done.output
+    assert [s.settings.port for s in load_rig(rig).sources] == [
+        "/dev/ttyUSB0", "/dev/ttyUSB2", "/dev/ttyUSB1", "/dev/ttyUSB3",
+    ]  # fmt: skip
+    assert not state.exists()
+
+
+def test_an_interruption_while_open_places_are_filled_loses_no_answer(
+    tmp_path: Path, machine: Machine
+) -> None:
+    assert init(tmp_path, lines=["rig-7", *[""] * 17]).exit_code == 0
+    machine.ports = ["/dev/ttyUSB0", "/dev/ttyUSB1"]
+    assert init(tmp_path, "--force", lines=["1"]).exit_code == 2  # the input ends
+    done = init(tmp_path, "--force", lines=[""] * 4)
+    assert done.exit_code == 0, done.output
+    table = tomllib.loads((tmp_path / "rig.toml").read_text())
+    assert table["rig"]["name"] == "rig-7"
+    assert [imu["port"] for imu in table["imu"]] == ["/dev/ttyUSB0", *["later"] * 3]
+
+
+def test_a_script_is_asked_for_a_connection_unless_it_postpones_it(
+    tmp_path: Path, machine: Machine
+) -> None:
+    assert machine.ports == []
+    file = answer_file(tmp_path / "a.toml", PORTS.replace('"/dev/ttyUSB3"', '"later"'))
+    done = init(tmp_path / "lab", "--answers", file, "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["open"] == ["imu[shank-side].port"]
+
+
+def test_the_computer_of_the_cameras_can_be_postponed(tmp_path: Path, machine: Machine) -> None:
+    assert machine.ports == []
+    lines = ["", "planar", *[""] * 12]
+    assert init(tmp_path, lines=lines).exit_code == 0
+    checked = CliRunner().invoke(app, ["check", str(tmp_path / "rig.toml")])
+    assert "mocap.server = 'later': not filled in yet" in checked.output
+    assert "1 fault" in checked.output
+
+
+def test_help_names_the_enter_key_only_where_there_is_a_proposal(
+    tmp_path: Path, machine: Machine
+) -> None:
+    machine.ports = ["/dev/ttyUSB0"]
+    done = init(tmp_path, lines=[*[""] * 8, "?", "", "can0", "?", ""])
+    before, _, ids = done.output.partition("CAN identifiers of")
+    assert "Enter takes the proposal" not in before.partition("Serial ports that are")[2]
+    assert "Enter takes the proposal" not in ids
+    assert "'<' returns." in ids
+    assert "an answer is needed here: '?' explains the question, Ctrl-C stores the others" in ids
+
+
 @pytest.mark.parametrize("kept", range(0, len(TYPED), 3))
 def test_an_interrupted_dialogue_continues_with_its_answers(
     tmp_path: Path, machine: Machine, monkeypatch: pytest.MonkeyPatch, kept: int

@@ -96,7 +96,7 @@ function showQuestion(question, position) {
 
 function showText(state) {
   setText(byId("question-text"), "Check and write the file");
-  setText(byId("question-help"), `The answers are complete and valid. The file is ${state.path}.`);
+  setText(byId("question-help"), `The answers are complete. The file is ${state.path}.`);
   const password = state.password_file && createElement("label", { class: "typed" }, `Password for the broker, written to ${state.password_file}`,
     createElement("input", { id: "password", type: "password", autocomplete: "off" }));
   byId("question-field").replaceChildren(...[
@@ -119,8 +119,10 @@ function download(text) {
 
 function showWritten(written) {
   setText(byId("question-text"), "The rig is written");
-  setText(byId("question-help"), `${written.path} is valid. Continue in a terminal of the gateway:`);
+  const open = written.open.length > 0;
+  setText(byId("question-help"), `${written.path} ${open ? "has places that are not filled in yet" : "is valid"}. Continue in a terminal of the gateway:`);
   byId("question-field").replaceChildren(
+    ...(open ? [createElement("ul", {}, ...written.open.map((place) => createElement("li", {}, place)))] : []),
     ...written.warnings.map((warning) => createElement("p", { class: "fault" }, `Warning: ${warning}`)),
     createElement("div", { class: "commands" }, ...Object.entries(written.next).map(
       ([command, use]) => createElement("p", {}, use, createElement("code", {}, command)))));
