@@ -11,7 +11,7 @@ import typer
 from jointfit_daemon.tools.command_group import EXIT_MISUSE
 
 if TYPE_CHECKING:
-    from jointfit_daemon.config import Rig
+    from jointfit_daemon.config import Rig, Source
 
 
 def check(
@@ -48,10 +48,7 @@ def check(
     for column in ("source", "driver", "segment", "rate"):
         table.add_column(column)
     for source in rig.sources:
-        # Cameras send at their own rate, unless their driver has a key for it.
-        is_set = source.kind == "imu" or hasattr(source.settings, "rate_hz")
-        rate = f"{source.rate_hz:g} Hz" if is_set else "of the cameras"
-        table.add_row(source.id, source.driver, source.segment or "—", rate)
+        table.add_row(source.id, source.driver, source.segment or "—", _rate(source))
 
     console = Console()
     console.print(table)
@@ -73,6 +70,13 @@ def check(
     for warning in warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}")
     console.print(f"installed drivers: {', '.join(driver_names())}")
+
+
+def _rate(source: Source) -> str:
+    """Return the rate that is set; cameras send at their own, unless their driver has a key."""
+    if source.kind == "mocap" and not hasattr(source.settings, "rate_hz"):
+        return "its own"
+    return f"{source.rate_hz:g} Hz"
 
 
 def _joints(rig: Rig) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import re
 import shlex
 import subprocess
 import sys
@@ -93,6 +94,7 @@ def test_every_error_that_commands_report_is_importable(module: str, name: str) 
 
 def test_the_example_rig_is_right_and_its_sources_are_listed() -> None:
     result = run(app, ["check", str(EXAMPLE)])
+    assert re.search(r"mocap .* its own", result.stdout)  # Motive sets the rate of the cameras
     assert result.exit_code == 0
     for name in ("S1", "S2", "S3", "S4", "mocap"):
         assert name in result.stdout

@@ -5,6 +5,7 @@ from __future__ import annotations
 from math import degrees, isfinite
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.tools.flag_words import flag_sentence
 from jointfit_daemon.tools.text_output import align_columns
 
 if TYPE_CHECKING:
@@ -102,7 +103,9 @@ def fusion_summary(found: FusedTrial) -> str:
     lines = [f"{count} frames, {found.t_s[-1] - found.t_s[0]:.2f} s"]
     for name, known in found.known.items():
         lines.append(f"{name}: known in {100 * known:.0f} % of the frames")
-    lines += [f"{flag}: {100 * share:.0f} % of the frames" for flag, share in found.flags.items()]
+    for flag, share in found.flags.items():
+        words = flag_sentence(flag).removesuffix(".")
+        lines.append(f"{words} ({flag}): {100 * share:.0f} % of the frames")
     lines += found.notes
     return "\n".join(lines)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.tools.flag_words import flag_sentence, serious_flags
 from jointfit_daemon.tools.monitor._angle_curve import curve_lines
 from jointfit_daemon.tools.monitor._big_digits import big_digits
 from jointfit_daemon.tools.monitor._device_lines import device_lines
@@ -12,9 +13,7 @@ from jointfit_daemon.tools.monitor._monitor_state import chosen_angle
 from jointfit_daemon.tools.monitor._text_lines import Line, beside, wrap
 from jointfit_daemon.tools.monitor._words import (
     angle_name,
-    flag_sentence,
     format_number,
-    serious_flags,
     title_of,
 )
 

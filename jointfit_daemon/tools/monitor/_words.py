@@ -22,29 +22,6 @@ RUNNING = frozenset({"align", "static", "functional", "fitting"})
 """Phases during which the daemon records or fits."""
 LARGE_SIGMA_US = 2000.0
 """Standard deviation of a clock, µs, above which it is a warning."""
-_FLAGS = {
-    "uncalibrated": "Not calibrated: angles are unknown.",
-    "other_chain": "The stored calibration belongs to another limb: calibrate again.",
-    "headings_from_static": "Headings come from the static pose: there was no align phase.",
-    "same_pose_assumed": "The static pose was recorded without cameras: the last one is assumed.",
-    "stuck": "% repeats its value and is not used.",
-    "slipped": "% moved on the body and is not used.",
-    "pair_disagrees": "The two sensors of % contradict each other: check their straps.",
-    "heading_disagrees": "Magnetic disturbance at the %: angles are corrected, headings uncertain.",
-    "heading_unseen": "The limb may have turned about the vertical; joint angles are not affected.",
-    "one_sensor": "Only one sensor of % contributes.",
-    "held": "No data from the sensors of %: the last orientation is held.",
-    "lost": "No data from the sensors of %.",
-    "untrained": "% is outside of the movements of the calibration.",
-    "extrapolating": "A sensor is late and was extrapolated.",
-    "origin_fixed": "The cameras do not see the first joint.",
-    "axis_vertical": "% uses the vertical as its axis: the calibration found no joint centre.",
-    "facing_unknown": "The flexion axis of % is unknown; the facing direction is used.",
-    "uncorrected": "Sensors are used without correction (procedure of the patent).",
-    "gimbal": "Gimbal lock: flexion and rotation cannot be separated.",
-}
-_MINOR = {"extrapolating", "headings_from_static", "origin_fixed", "uncorrected"}
-"""Flags that need no action."""
 _PHASES = {
     "uncalibrated": "Not calibrated",
     "align": "Align phase runs",
@@ -115,17 +92,6 @@ def title_of(name: str) -> str:
 def angle_name(key: str) -> str:
     """Return the words of an angle's key: ``flexion_deg`` as ``flexion``."""
     return "inner angle" if key == "inner_deg" else key.removesuffix("_deg").replace("_", " ")
-
-
-def flag_sentence(flag: str) -> str:
-    """Return the sentence of a flag of a pose; an unknown flag is its own text."""
-    kind, _, name = flag.partition(":")
-    return _FLAGS.get(kind, flag).replace("%", name.replace("_", " "))
-
-
-def serious_flags(flags: list[str]) -> list[str]:
-    """Return the flags that may need an action."""
-    return [flag for flag in flags if flag.partition(":")[0] not in _MINOR]
 
 
 def calibration_sentence(calibration: CalibrationState | None) -> str:

@@ -202,7 +202,7 @@ def test_missing_sensor_is_reported_and_the_others_are_fused(
     trial.sensors["B"][50:100] = np.nan
     write_orientations_npz(files / "gap.npz", trial)
     result = run("apply", fitted(), files / "gap.npz", "--out", files / "out.npz")
-    assert "one_sensor:thigh: 25 %" in result.stdout
+    assert "(one_sensor:thigh): 25 %" in result.stdout
     assert "thigh: known in 100 %" in result.stdout
 
 

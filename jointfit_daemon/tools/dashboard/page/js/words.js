@@ -57,7 +57,7 @@ const FLAGS = {
   one_sensor: "Only one sensor of % contributes.",
   held: "No data from the sensors of %: the last orientation is held.",
   lost: "No data from the sensors of %.",
-  untrained: "% is outside of the movements of the calibration.",
+  untrained: "% is outside the movements of the calibration: its error may be larger.",
   extrapolating: "A sensor is late and was extrapolated.",
   origin_fixed: "The cameras do not see the first joint.",
   axis_vertical: "% uses the vertical as its axis: the calibration found no joint centre.",
