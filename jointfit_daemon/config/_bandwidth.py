@@ -162,7 +162,8 @@ def check_can_buses(
             for source in members
             for frame in getattr(source.settings, "can_frames", ())
         ]
-        needing = f"{', '.join(source.id for source in members)} need"
+        verb = "needs" if len(members) == 1 else "need"
+        needing = f"{', '.join(source.id for source in members)} {verb}"
         on_bus = sum(hz * frame_bits(size, extended=ext) for hz, (size, ext) in sent)
         if on_bus > bus.bitrate:
             yield Fault(

@@ -78,7 +78,7 @@ def load_chain_model(
     except MalformedFileError as error:
         return None, [Fault(KEY, str(error))]
     except OSError as error:
-        text = f"cannot be read: {error.strerror}; expected a .toml, .json or .osim file"
+        text = f"cannot be read ({error.strerror}): expected a .toml, .json or .osim file there"
         return None, [Fault(KEY, text, given)]
     if mocap is None:
         return loaded, [Fault(KEY, "needs cameras, which track its markers: add [mocap]")]
@@ -117,7 +117,8 @@ def load_refinement(
         weights = read_marker_weights(Path(given)) if isinstance(given, str) else given
         model = with_weights(model, weights, "marker")
     except OSError as error:
-        fail("weights", f"cannot be read: {error.strerror}", table.weights)
+        text = f"cannot be read ({error.strerror}): check the path, or write the weights here"
+        fail("weights", text, table.weights)
     except ValueError as error:  # includes MalformedFileError
         fail("weights", str(error), table.weights)
     for key, locked in (("unlock", False), ("lock", True)):

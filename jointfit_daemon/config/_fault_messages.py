@@ -100,6 +100,7 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
     match detail["type"]:
         case "extra_forbidden" if SECRET.search(str(loc[-1]).lower()):
             files = [name for name in fields if name.endswith("_file")]
+            files = [f"{loc[-1]}_file"] if f"{loc[-1]}_file" in files else files
             instead = f" and name it: {' or '.join(files)}" if files else ""
             return Fault(
                 path,

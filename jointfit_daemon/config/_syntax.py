@@ -71,7 +71,8 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
     try:
         text = read_text(path, _MOST_BYTES)
     except MalformedFileError as error:
-        fault = Fault("file", str(error).removeprefix(f"{path}: "))
+        missing = "" if path.exists() else ", or write one: `jointfit init`"
+        fault = Fault("file", str(error).removeprefix(f"{path}: ") + missing)
         raise ConfigError(str(path), [fault]) from error
 
     table, faults = _parse(text.replace("\r\n", "\n"))

@@ -7,7 +7,13 @@ import time
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.outputs.log import journal_fields
-from jointfit_daemon.pipeline.events import CalibrationStatus, DeviceStatus, Notice, NoticeLevel
+from jointfit_daemon.pipeline.events import (
+    CalibrationPhase,
+    CalibrationStatus,
+    DeviceStatus,
+    Notice,
+    NoticeLevel,
+)
 from jointfit_daemon.supervisor._calibration_store import store_of
 from jointfit_daemon.supervisor._outage_lines import OutageLines
 
@@ -62,13 +68,8 @@ class NoticeLog:
                 wait_s = self._closes_within(output.id)
                 if not self._outages.holds(output, time.monotonic(), wait_s):
                     _write(output)
-            case CalibrationStatus(phase=phase, text=text):
-                # A change of the calibration, with the file in which it is stored.
-                if output.version is not None and output.version != self._version:
-                    path = store_of(self._rig).path(output.version)
-                    text = f"{text} (version {output.version} in {path})"
-                self._version, fields = output.version, journal_fields("calibration", phase)
-                log.log(LEVELS[output.level], "calibration %s: %s", phase, text, extra=fields)
+            case CalibrationStatus():
+                self._write_status(output)
             case DeviceStatus(name, online):
                 self._outages.close(name)
                 (self.online.add if online else self.online.discard)(name)
@@ -79,6 +80,21 @@ class NoticeLog:
             self._outages.postpone(now_s)
         for notice in self._outages.due(now_s):
             _write(notice)
+
+    def _write_status(self, status: CalibrationStatus) -> None:
+        """Write the line of a change of the calibration, with the file in which it is stored."""
+        phase, text, version = status.phase, status.text, status.version
+        if phase == CalibrationPhase.FITTING:
+            text = text.partition("; ")[0]  # its remarks are notices, with lines of their own
+        if version is not None and version != self._version:
+            path = store_of(self._rig).path(version)
+            named = f"version {version}"
+            text = f"{text} ({path if text.endswith(named) else f'{named} in {path}'})"
+        self._version = version
+
+        title = "calibration" if text == phase else f"calibration {phase}"
+        fields = journal_fields("calibration", phase)
+        log.log(LEVELS[status.level], "%s: %s", title, text, extra=fields)
 
     def _closes_within(self, name: str) -> float | None:
         """Return the time after which a silent source is closed, s; None if it is closed."""

@@ -99,7 +99,10 @@ class StoredVersions:
                 parts = tuple(content[name] for name in ("joints", "segments", "chain_sensors"))
                 self._seen[key] = _figures(content), orjson.dumps(parts)
             except _UNREADABLE as error:
-                text = f"{path}: cannot be read ({str(error) or type(error).__name__:.200})"
+                text = (
+                    f"{path}: cannot be read ({str(error) or type(error).__name__:.200}): use "
+                    "another version, or restore the file from a copy"
+                )
                 return VersionSummary(version, fault=text)
 
         figures, layout = self._seen[key]

@@ -254,6 +254,13 @@ def test_links_to_one_port_are_the_same_port(table: Table, tmp_path: Path) -> No
     assert any("is the port of imu[S1] already" in line for line in complaints(table))
 
 
+def test_a_password_is_directed_to_its_file(table: Table) -> None:
+    table["mqtt"] = {"password": "hunter2"}
+    (line,) = complaints(table)
+    assert line.endswith("name it: password_file")
+    assert "hunter2" not in line
+
+
 def test_unknown_driver_causes_one_fault(table: Table) -> None:
     table["imu"][0]["driver"] = "fkae"
     assert len(complaints(table)) == 1
@@ -275,7 +282,7 @@ def test_broken_driver_is_a_fault_of_its_users_only(
     [
         (b"[rig\nname = 1", "line 1"),
         (b"\xff\xfe", "is not UTF-8"),
-        (None, "cannot be read: No such file or directory"),
+        (None, "no such file: check the path, or write one: `jointfit init`"),
     ],
 )
 def test_syntax_error_names_its_line(tmp_path: Path, content: bytes | None, said: str) -> None:

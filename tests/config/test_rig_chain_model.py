@@ -209,7 +209,7 @@ def test_weights_of_a_file_replace_its_name(rig: Table, tmp_path: Path) -> None:
         ({"unlock": ["Q"]}, "unknown marker; there are: T1, T2, T3, C1, C2, C3"),
         ({"weights": {"T9": 1.0}}, "marker T9: unknown marker; did you mean"),
         ({"weights": {"T1": -1.0}}, "weight of T1: expected a number of 0 or more"),
-        ({"weights": "nowhere.toml"}, "nowhere.toml: cannot be read: No such file"),
+        ({"weights": "nowhere.toml"}, "nowhere.toml: no such file: check the path"),
         ({"threshold_mm": 9.0}, "threshold_mm = 9.0: expected first_step_mm = 8 or less"),
         ({"method": "search", "cost": "l1"}, "method search has no loss function"),
         ({"method": "serach"}, "did you mean 'search'?"),

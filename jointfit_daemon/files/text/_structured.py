@@ -6,6 +6,7 @@ waits for a writer, and yields no value that exceeds the recursion limit of a la
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -31,6 +32,12 @@ _KINDS = {
     stat.S_IFBLK: "a device",
     stat.S_IFSOCK: "a socket",
 }
+_REFUSALS = {
+    errno.ENOENT: "no such file: check the path",
+    errno.ENOTDIR: "a parent of the path is a file: check the path",
+    errno.EACCES: "cannot be read (permission denied): allow this user to read it: `chmod a+r`",
+}
+"""Texts of common errors."""
 _PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*')"""
 _DEEP_KEY = re.compile(
     rf"(?:^|[\[{{,])[ \t]*(?:{_PART}[ \t]*\.[ \t]*){{{MAX_NESTING}}}{_PART}", re.MULTILINE
@@ -108,7 +115,9 @@ def read_bounded(path: Path, most_bytes: int) -> bytes:
             raise
         raise MalformedFileError(f"{str(path)!r}: not a valid file name: {error}") from error
     except OSError as error:
-        raise MalformedFileError(f"{path}: cannot be read: {error.strerror or error}") from error
+        other = f"cannot be read ({error.strerror}): check the path and the disk"
+        found = _REFUSALS.get(error.errno or 0, other)
+        raise MalformedFileError(f"{path}: {found}") from error
     if len(data) > most_bytes:
         raise MalformedFileError(f"{path}: larger than {most_bytes} bytes: is it the right file?")
     return data

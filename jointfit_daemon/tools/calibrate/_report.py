@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -76,12 +77,13 @@ def movement_lines(data: Mapping[str, Any]) -> list[str]:
     lines = []
     for name, joint in (data.get("joints") or {}).items():
         noise, total = joint.get("noise_error_mm"), joint.get("predicted_error_mm")
+        bends, source = joint.get("bends"), joint.get("source")
         words = [
             "center unknown" if total is None else f"center ± {total:.1f} mm",
-            *([] if noise is None else [f"random error {noise:.1f} mm"]),
+            *([] if noise is None else [f"random error {ceil(10 * noise) / 10:.1f} mm"]),
             *([] if joint.get("arc_deg") is None else [f"{joint['arc_deg']:.0f}° range"]),
-            *([] if joint.get("bends") is None else [f"{joint['bends']} bends"]),
-            *([] if joint.get("source") == "markers" else [f"from {joint.get('source')}"]),
+            *([] if bends is None else [f"{bends} bend{'' if bends == 1 else 's'}"]),
+            *([f"from {source}"] if source not in {None, "unknown", "markers"} else []),
         ]
         lines.append(f"{'✔' if joint.get('met') else '…'} {name}: {', '.join(words)}")
 

@@ -128,9 +128,11 @@ def test_movement_lines_contain_one_line_per_joint() -> None:
     hip = {"met": True, "source": "markers", "predicted_error_mm": 16.66, "noise_error_mm": 2.11,
            "arc_deg": 64.2}  # fmt: skip
     knee = {"met": False, "source": "sensors", "predicted_error_mm": None, "bends": 3}
-    assert movement_lines({"joints": {"hip": hip, "knee": knee}}) == [
-        "✔ hip: center ± 16.7 mm, random error 2.1 mm, 64° range",
+    ankle = {"met": False, "source": "unknown", "bends": 1}
+    assert movement_lines({"joints": {"hip": hip, "knee": knee, "ankle": ankle}}) == [
+        "✔ hip: center ± 16.7 mm, random error 2.2 mm, 64° range",  # upwards, as the target's text
         "… knee: center unknown, 3 bends, from sensors",
+        "… ankle: center unknown, 1 bend",
     ]
     assert movement_lines({}) == []
 
