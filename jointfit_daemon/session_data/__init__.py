@@ -8,6 +8,7 @@ from jointfit_daemon.session_data._resampling import (
     interpolate_orientations,
     interpolate_values,
     is_uniform,
+    rows_on_axis,
     sample_rate_hz,
     uniform_times,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "interpolate_orientations",
     "interpolate_values",
     "is_uniform",
+    "rows_on_axis",
     "sample_rate_hz",
     "uniform_times",
 ]

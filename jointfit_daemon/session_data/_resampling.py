@@ -45,7 +45,7 @@ def uniform_times(axes: Sequence[Array]) -> Array:
     """Return one uniform time axis for several series, at the highest rate of them, s, shape (n,).
 
     It is the axis of a series itself if all of them share it and it is uniform. Otherwise instants
-    are whole numbers of periods from the earliest row to the latest.
+    are whole numbers of periods from the first row of the fastest series, over the range of all.
     """
     filled = [t_s for t_s in axes if len(t_s)]
     if not filled:
@@ -54,12 +54,44 @@ def uniform_times(axes: Sequence[Array]) -> Array:
     if is_uniform(first) and all(np.array_equal(t_s, first) for t_s in filled):
         return first
 
-    rates = [rate for rate in map(sample_rate_hz, filled) if np.isfinite(rate)]
-    rate_hz = max(rates, default=1.0)
-    start, end = min(t_s[0] for t_s in filled), max(t_s[-1] for t_s in filled)
-    count = int((end - start) * rate_hz + _EXACT_SHARE + 0.5) + 1
-    times: Array = start + np.arange(count) / rate_hz
+    fastest = min(filled, key=_period)
+    period = _period(fastest)
+    if not np.isfinite(period):
+        period = 1.0
+    before = np.floor((min(t_s[0] for t_s in filled) - fastest[0]) / period + UNIFORM_SHARE)
+    after = np.ceil((max(t_s[-1] for t_s in filled) - fastest[0]) / period - UNIFORM_SHARE)
+    times: Array = fastest[0] + period * np.arange(before, after + 1.0)
     return times
+
+
+def _period(t_s: Array) -> float:
+    """Return the period of a series with missing rows, s; infinity for less than two rows."""
+    if len(t_s) < 2:  # noqa: PLR2004 - an interval has two ends
+        return float("inf")
+    steps = np.diff(t_s)
+    periods = np.round(steps / np.median(steps)).sum()
+    return float((t_s[-1] - t_s[0]) / max(periods, 1.0))
+
+
+def rows_on_axis(t_s: Array, axis_s: Array) -> NDArray[np.intp] | None:
+    """Return the row of a uniform axis for every instant; None if one lies between two rows.
+
+    Parameters
+    ----------
+    t_s
+        Instants of a series, s, shape (n,).
+    axis_s
+        Uniform axis, s, shape (m,).
+    """
+    if len(axis_s) < 2:  # noqa: PLR2004 - an interval has two ends
+        return np.zeros(len(t_s), np.intp) if len(t_s) <= len(axis_s) else None
+    period = (axis_s[-1] - axis_s[0]) / (len(axis_s) - 1)
+    rows = np.round((t_s - axis_s[0]) / period).astype(np.intp)
+    inside = (rows >= 0) & (rows < len(axis_s))
+    if not inside.all() or len(np.unique(rows)) < len(rows):
+        return None
+    near = np.abs(t_s - axis_s[rows]) <= 2.0 * UNIFORM_SHARE * period
+    return rows if near.all() else None
 
 
 def interpolate_values(t_s: Array, values: Array, at_s: Array) -> Array:

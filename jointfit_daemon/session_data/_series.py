@@ -172,6 +172,11 @@ def _check_orientation(owner: str, q: Array, count: int) -> None:
 
 
 def _check_unique(owner: str, names: tuple[str, ...]) -> None:
+    for name in names:
+        if not name.isprintable() or not name.strip():
+            raise SessionDataError(
+                f"{owner}: name {name!r} is empty or has control characters: rename it"
+            )
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise SessionDataError(

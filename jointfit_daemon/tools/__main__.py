@@ -20,6 +20,7 @@ from jointfit_daemon.tools.dashboard import dashboard
 from jointfit_daemon.tools.decode import decode
 from jointfit_daemon.tools.demo import demo
 from jointfit_daemon.tools.doctor import doctor
+from jointfit_daemon.tools.export import export
 from jointfit_daemon.tools.ik import ik
 from jointfit_daemon.tools.init import init
 from jointfit_daemon.tools.markers import markers
@@ -39,7 +40,7 @@ app = typer.Typer(
 )
 for command in (
     init, check, probe, doctor, demo, dashboard, monitor, calibrate, mark, request, center, decode,
-    ik, markers, center_study, sample, schema,
+    export, ik, markers, center_study, sample, schema,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(fuse.app)

@@ -1,112 +1,17 @@
-"""Writes tables that OpenSim can read: STO and MOT files without empty cells.
-
-OpenSim rejects empty cells. Invariant: all cells of a written table are known; columns that are
-mostly unknown are left out first, then frames with unknown values.
-"""
+"""Outcome of tables written for OpenSim, as the commands report it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import typer
 
-from jointfit_daemon.files.orientations import (
-    OrientationTable,
-    TimeTable,
-    write_orientations_sto,
-    write_sto,
-)
 from jointfit_daemon.tools.command_group import EXIT_FAILED
-from jointfit_daemon.tools.text_output import list_names
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
-    from numpy.typing import NDArray
-
-LEAST_KNOWN = 0.5
-"""Least share of frames in which a written column is known; of the frames with any known value."""
-
-
-@dataclass(frozen=True, slots=True)
-class WrittenTable:
-    """Outcome of writing one table."""
-
-    path: Path
-    frames: int
-    """Written frames; 0: no file was written."""
-    notes: tuple[str, ...] = ()
-    """Omitted columns and frames."""
-
-
-def write_known_values(path: Path, table: TimeTable) -> WrittenTable:
-    """Write the known part of a table, see `complete_part`; no file without a complete frame."""
-    rows, columns = complete_part(np.isfinite(table.values))
-    if rows.any():
-        names = tuple(np.array(table.columns)[columns].tolist())
-        values = table.values[rows][:, columns]
-        write_sto(path, replace(table, columns=names, t_s=table.t_s[rows], values=values))
-    return _outcome(path, table.columns, rows, columns)
-
-
-def write_known_orientations(path: Path, table: OrientationTable) -> WrittenTable:
-    """Write the known part of a table of orientations, as `write_known_values`."""
-    rows, columns = complete_part(np.asarray(np.isfinite(table.quaternions).all(axis=-1)))
-    if rows.any():
-        names = tuple(np.array(table.names)[columns].tolist())
-        q = table.quaternions[rows][:, columns]
-        write_orientations_sto(path, OrientationTable(names, table.t_s[rows], q, table.rate_hz))
-    return _outcome(path, table.names, rows, columns)
-
-
-def complete_part(known: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the rows and columns of a table without unknown cells.
-
-    A column remains if it is known in at least `LEAST_KNOWN` of the rows with any known cell. A row
-    remains if all remaining columns are known.
-
-    Parameters
-    ----------
-    known
-        Cells with a value, shape (T, K).
-
-    Returns
-    -------
-    rows, columns
-        Masks, shapes (T,) and (K,). No row remains if no column does.
-    """
-    count = int(known.any(axis=1).sum())
-    columns: NDArray[np.bool_] = known.sum(axis=0) >= max(LEAST_KNOWN * count, 1)
-    rows: NDArray[np.bool_] = np.asarray(known[:, columns].all(axis=1) & columns.any())
-    return rows, columns
-
-
-def _outcome(
-    path: Path, names: Sequence[str], rows: NDArray[np.bool_], columns: NDArray[np.bool_]
-) -> WrittenTable:
-    frames, count = int(rows.sum()), len(rows)
-    if not frames:
-        text = (
-            f"{path}: 0 of {count} frames written, because no frame has values in all columns:"
-            " write .csv, which may have empty cells"
-        )
-        return WrittenTable(path, 0, (text,))
-
-    notes = []
-    if not columns.all():
-        left_out = [name for name, kept in zip(names, columns, strict=True) if not kept]
-        notes.append(
-            f"{path.name}: columns known in less than half of the frames left out:"
-            f" {list_names(left_out)}"
-        )
-    if frames < count:
-        notes.append(
-            f"{path.name}: {frames} of {count} frames written, the others have unknown values"
-        )
-    return WrittenTable(path, frames, tuple(notes))
+    from jointfit_daemon.files.orientations import WrittenTable
 
 
 def table_notes(tables: Sequence[WrittenTable]) -> tuple[str, ...]:

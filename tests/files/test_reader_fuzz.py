@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.files.captures._capture import UnreadableCaptureError
 from jointfit_daemon.files.captures._packet_capture import read_udp
-from jointfit_daemon.files.mocap import MarkerTrajectories, read_trc, write_trc
+from jointfit_daemon.files.mocap import MarkerTrajectories, c3d_bytes, read_trc, write_trc
 from jointfit_daemon.files.mocap._c3d import read_c3d
 from jointfit_daemon.files.models import read_osim
 from jointfit_daemon.files.orientations import (
@@ -37,7 +37,6 @@ from jointfit_daemon.files.orientations import (
 )
 from jointfit_daemon.files.text import MalformedFileError
 from jointfit_simulators.body import SimulatedSubject, Step
-from jointfit_simulators.sample._c3d_file import c3d_bytes
 from jointfit_simulators.sample._sample_data import _write_models
 from jointfit_simulators.settings import Knobs
 

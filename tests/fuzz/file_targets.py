@@ -15,7 +15,7 @@ import numpy as np
 
 from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.files.captures._candump import read_candump
-from jointfit_daemon.files.mocap import read_trc
+from jointfit_daemon.files.mocap import c3d_bytes, read_trc
 from jointfit_daemon.files.mocap._c3d import read_c3d
 from jointfit_daemon.files.models import read_model, read_osim
 from jointfit_daemon.files.orientations import (
@@ -24,7 +24,6 @@ from jointfit_daemon.files.orientations import (
     read_sto,
 )
 from jointfit_simulators.sample import write_sample
-from jointfit_simulators.sample._c3d_file import c3d_bytes
 from tests.fuzz.broker_targets import folder
 from tests.fuzz.target import Target
 

@@ -85,7 +85,7 @@ def test_rate_and_uniformity_of_an_axis() -> None:
 
 def test_a_common_axis_has_the_highest_rate_and_the_whole_range() -> None:
     common = uniform_times([T_S, 0.05 + np.arange(20) / 20.0])
-    np.testing.assert_allclose(common, np.arange(21) / 20.0)
+    np.testing.assert_allclose(common, np.arange(21) / 20.0, atol=1e-12)
 
 
 @given(st.floats(0.0, 0.4), st.integers(0, 2**32 - 1))

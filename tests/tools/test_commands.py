@@ -39,6 +39,7 @@ def test_the_version_is_the_packages() -> None:
         "mark",
         "request",
         "decode",
+        "export",
         "ik",
         "schema",
     ],

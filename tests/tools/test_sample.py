@@ -9,13 +9,12 @@ import orjson
 import pytest
 from typer.testing import CliRunner
 
-from jointfit_daemon.files.mocap import read_trc
+from jointfit_daemon.files.mocap import c3d_bytes, read_trc
 from jointfit_daemon.files.mocap._c3d import read_c3d
 from jointfit_daemon.files.models import read_model, read_osim
 from jointfit_daemon.files.orientations import read_orientations_npz, read_orientations_sto
 from jointfit_daemon.tools.__main__ import app
 from jointfit_simulators.sample import write_sample
-from jointfit_simulators.sample._c3d_file import c3d_bytes
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -58,9 +57,10 @@ def test_a_folder_with_something_in_it_is_refused_unless_forced(tmp_path: Path) 
 
 def test_the_c3d_file_holds_the_markers_of_the_trc_file(sample: Path) -> None:
     pytest.importorskip("c3d")
-    c3d, up = read_c3d(sample / "squats.c3d")
+    trial = read_c3d(sample / "squats.c3d")
     trc = read_trc(sample / "squats.trc")
-    assert up == "y"
+    c3d = trial.trajectories
+    assert trial.up_axis == "y"
     assert c3d.names == trc.names
     assert c3d.warnings == trc.warnings == ()
     np.testing.assert_allclose(c3d.t_s, trc.t_s)

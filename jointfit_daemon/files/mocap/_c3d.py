@@ -9,14 +9,17 @@ from __future__ import annotations
 
 import math
 import warnings
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jointfit_daemon.files.mocap._c3d_writer import C3dEvent
 from jointfit_daemon.files.mocap._trc import METRES, MarkerTrajectories
 from jointfit_daemon.files.text import MalformedFileError, reject_device
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 
@@ -24,8 +27,21 @@ class MissingPackageError(ImportError):
     """The optional package for this file format is not installed; the message names it."""
 
 
-def read_c3d(path: Path) -> tuple[MarkerTrajectories, str | None]:
-    """Return the points of a C3D file, and the vertical screen axis "x", "y" or "z" if declared.
+@dataclass(frozen=True, slots=True)
+class C3dTrial:
+    """Content of a C3D file."""
+
+    trajectories: MarkerTrajectories
+    up_axis: str | None
+    """Vertical screen axis "x", "y" or "z", if declared."""
+    events: tuple[C3dEvent, ...] = ()
+    """In the order of the file."""
+    own_texts: Mapping[str, str] = field(default_factory=dict)
+    """Parameters of the group JOINTFIT."""
+
+
+def read_c3d(path: Path) -> C3dTrial:
+    """Return points and events of a C3D file.
 
     Labels are returned as written (``Subject:LASI``). Frame numbers and `t_s` start at the first
     frame of the trial, which is rarely 1. Analog channels are ignored.
@@ -56,15 +72,8 @@ def read_c3d(path: Path) -> tuple[MarkerTrajectories, str | None]:
             ) from fault
 
 
-def _read(path: Path, reader: Any) -> tuple[MarkerTrajectories, str | None]:
-    # More than 255 labels continue in LABELS2, LABELS3, ...
-    names: tuple[str, ...] = ()
-    for suffix in ("", *map(str, range(2, 257))):
-        found = reader.get(f"POINT:LABELS{suffix}")
-        if found is None:
-            break
-        names += tuple(str(label).strip() for label in found.string_array)
-    names = names[: reader.point_used]
+def _read(path: Path, reader: Any) -> C3dTrial:
+    names = _labels(reader)
     if not names:
         raise MalformedFileError(
             f"{path}: no points with labels in this C3D file: export it with markers"
@@ -106,7 +115,40 @@ def _read(path: Path, reader: Any) -> tuple[MarkerTrajectories, str | None]:
         else (f"header declares {declared} frames, counted {len(cells)}",),
     )
     screen = _text(reader, "POINT:Y_SCREEN").lstrip("+").lower()
-    return trajectories, screen if screen in ("x", "y", "z") else None
+    group = reader.get("JOINTFIT")
+    keys = () if group is None else group.param_keys()
+    own = {name: _text(reader, f"JOINTFIT:{name}") for name in keys}
+    return C3dTrial(
+        trajectories, screen if screen in ("x", "y", "z") else None, _events(reader), own
+    )
+
+
+def _labels(reader: Any) -> tuple[str, ...]:
+    """Return the labels of the points; more than 255 continue in LABELS2, LABELS3, ..."""
+    names: tuple[str, ...] = ()
+    for suffix in ("", *map(str, range(2, 257))):
+        found = reader.get(f"POINT:LABELS{suffix}")
+        if found is None:
+            break
+        names += tuple(str(label).strip() for label in found.string_array)
+    return names[: reader.point_used]
+
+
+def _events(reader: Any) -> tuple[C3dEvent, ...]:
+    """Return the events that have a time; times are minutes and seconds."""
+    times = reader.get("EVENT:TIMES")
+    if times is None:
+        return ()
+    pairs = np.asarray(times.float_array, dtype=np.float64).reshape(-1, 2)
+    columns = []
+    for name in ("LABELS", "CONTEXTS", "DESCRIPTIONS"):
+        found = reader.get(f"EVENT:{name}")
+        texts = [] if found is None else [str(text).strip() for text in found.string_array]
+        columns.append([*texts, *[""] * (len(pairs) - len(texts))])
+    return tuple(
+        C3dEvent(60.0 * float(minutes) + float(seconds), *texts)
+        for (minutes, seconds), texts in zip(pairs, zip(*columns, strict=False), strict=False)
+    )
 
 
 def _text(reader: Any, key: str) -> str:

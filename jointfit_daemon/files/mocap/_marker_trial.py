@@ -108,7 +108,8 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
     if kind == ".trc":
         trajectories, declared, custom = read_trc(path), None, "y"
     elif kind == ".c3d":
-        (trajectories, declared), custom = read_c3d(path), "z"
+        found = read_c3d(path)
+        trajectories, declared, custom = found.trajectories, found.up_axis, "z"
     else:
         raise MalformedFileError(f"{path}: expected a file that ends in .trc or .c3d")
 

@@ -30,6 +30,7 @@ from jointfit_daemon.files.text import (
     separator_of,
     strip_trailing_empty,
     written,
+    written_time,
 )
 
 if TYPE_CHECKING:
@@ -168,5 +169,5 @@ def write_trc(path: Path, trajectories: MarkerTrajectories) -> None:
     ]
     flat = trajectories.positions.reshape(count, -1)
     for frame, t_s, cells in zip(trajectories.frames, trajectories.t_s, flat, strict=True):
-        rows.append("\t".join([str(int(frame)), written(t_s), *map(written, cells)]))
+        rows.append("\t".join([str(int(frame)), written_time(t_s), *map(written, cells)]))
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")

@@ -7,7 +7,7 @@ table of orientations (``DataType=Quaternion``) every cell is ``w,x,y,z``, body 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,16 +23,21 @@ from jointfit_daemon.files.text import (
     separator_of,
     strip_trailing_empty,
     written,
+    written_time,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
 
 _ROW_KEYS = ("nrows", "datarows")
 _COLUMN_KEYS = ("ncolumns", "datacolumns")
+_FIXED_KEYS = {
+    *_ROW_KEYS, *_COLUMN_KEYS, "indegrees", "version", "datarate", "datatype", "opensimversion",
+}  # fmt: skip
+"""Keys of the header that belong to the format, in lower case."""
 _QUATERNION = 4
 _SHOWN = 60
 """Most characters of a cell quoted in a message."""
@@ -52,6 +57,8 @@ class TimeTable:
     name: str = ""
     """First header line."""
     warnings: tuple[str, ...] = ()
+    header: Mapping[str, str] = field(default_factory=dict)
+    """Further ``key=value`` lines; keys in lower case."""
 
     def column(self, name: str) -> NDArray[np.float64]:
         """Return one column, shape (n,); ValueError if there is no such column."""
@@ -68,6 +75,8 @@ class OrientationTable:
     quaternions: NDArray[np.float64]
     """q_world_body in the file's axes, shape (n, len(names), 4); NaN where missing."""
     rate_hz: float | None = None
+    header: Mapping[str, str] = field(default_factory=dict)
+    """Further ``key=value`` lines; keys in lower case."""
 
 
 def read_sto(path: Path) -> TimeTable:
@@ -91,7 +100,9 @@ def read_sto(path: Path) -> TimeTable:
     )
 
     in_degrees = header.get("indegrees", "no").lower() in {"yes", "true", "1"}
-    return TimeTable(columns[1:], rows[:, 0], rows[:, 1:], in_degrees, name, doubts)
+    return TimeTable(
+        columns[1:], rows[:, 0], rows[:, 1:], in_degrees, name, doubts, _further(header)
+    )
 
 
 def read_orientations_sto(path: Path) -> OrientationTable:
@@ -126,7 +137,7 @@ def read_orientations_sto(path: Path) -> OrientationTable:
     for to, row in zip(quaternions, found, strict=True):
         to[: len(row)] = row or np.empty((0, _QUATERNION))
     rate_hz = number(path, 1, header["datarate"]) if "datarate" in header else None
-    return OrientationTable(columns[1:], t_s, quaternions, rate_hz)
+    return OrientationTable(columns[1:], t_s, quaternions, rate_hz, _further(header))
 
 
 def _quaternion(path: Path, at: int, cell: str) -> list[float]:
@@ -174,6 +185,10 @@ def _open(
     return lines[0].rstrip(", \t"), header, columns, separator, body
 
 
+def _further(header: Mapping[str, str]) -> dict[str, str]:
+    return {key: value for key, value in header.items() if key not in _FIXED_KEYS}
+
+
 def write_sto(path: Path, table: TimeTable) -> None:
     """Write a STO or MOT file: tab-separated, 8 significant digits, empty cells for missing."""
     rows = [
@@ -182,12 +197,13 @@ def write_sto(path: Path, table: TimeTable) -> None:
         f"nRows={len(table.t_s)}",
         f"nColumns={1 + len(table.columns)}",
         f"inDegrees={'yes' if table.in_degrees else 'no'}",
+        *(f"{key}={value}" for key, value in table.header.items()),
         "endheader",
         "\t".join(("time", *table.columns)),
     ]
 
     for t_s, values in zip(table.t_s, table.values, strict=True):
-        rows.append("\t".join(map(written, (t_s, *values))))
+        rows.append("\t".join((written_time(t_s), *map(written, values))))
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
@@ -198,11 +214,12 @@ def write_orientations_sto(path: Path, table: OrientationTable) -> None:
         "DataType=Quaternion",
         "version=3",
         "OpenSimVersion=4.4",
+        *(f"{key}={value}" for key, value in table.header.items()),
         "endheader",
         "\t".join(("time", *table.names)),
     ]
 
     for t_s, quaternions in zip(table.t_s, table.quaternions, strict=True):
         cells = ("" if np.isnan(q[0]) else ",".join(map(written, q)) for q in quaternions)
-        rows.append("\t".join((written(t_s), *cells)))
+        rows.append("\t".join((written_time(t_s), *cells)))
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")

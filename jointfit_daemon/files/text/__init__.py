@@ -22,6 +22,7 @@ from jointfit_daemon.files.text._tables import (
     separator_of,
     strip_trailing_empty,
     written,
+    written_time,
 )
 
 __all__ = [
@@ -44,4 +45,5 @@ __all__ = [
     "separator_of",
     "strip_trailing_empty",
     "written",
+    "written_time",
 ]

@@ -184,3 +184,8 @@ def rows_of_numbers(
 def written(value: float) -> str:
     """Return a number as text: 8 significant digits, empty if missing."""
     return "" if math.isnan(value) else f"{value:.{DIGITS}g}"
+
+
+def written_time(t_s: float) -> str:
+    """Return an instant as text: to the nanosecond, without trailing zeros."""
+    return f"{t_s:.9f}".rstrip("0").rstrip(".")

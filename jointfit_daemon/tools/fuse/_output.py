@@ -17,6 +17,9 @@ from jointfit_daemon.files.orientations import (
     OrientationTable,
     OrientationTrial,
     TimeTable,
+    WrittenTable,
+    write_known_orientations,
+    write_known_values,
     write_orientations_npz,
 )
 from jointfit_daemon.fusion import LimbFuser
@@ -25,11 +28,6 @@ from jointfit_daemon.limb_model import configured_length, inner_joints, visible
 from jointfit_daemon.model import ANGLE_NAMES, AngleConvention, Chain
 from jointfit_daemon.tools.fuse._lengths import left_out_positions, placed_joints
 from jointfit_daemon.tools.fuse._notes import calibration_notes
-from jointfit_daemon.tools.opensim_tables import (
-    WrittenTable,
-    write_known_orientations,
-    write_known_values,
-)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -210,7 +208,7 @@ def write_fused(
     ``.npz``: readable by `read_orientations_npz`; joint quantities by name, rad and m.
     ``.csv``: all columns in one table.
 
-    STO and MOT files contain the known part of their table, see `tools.opensim_tables`.
+    STO and MOT files contain the known part of their table, see `files.orientations`.
     """
     kind = path.suffix.lower()
     if kind in {".npz", ".csv"}:

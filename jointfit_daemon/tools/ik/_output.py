@@ -1,7 +1,7 @@
 """Writes joint coordinates and marker errors: OpenSim's MOT and STO tables, and CSV.
 
 OpenSim reads no empty cells: a MOT or STO file contains the known part of the table, see
-`tools.opensim_tables`. A CSV file contains all columns and frames.
+`files.orientations`. A CSV file contains all columns and frames.
 """
 
 from __future__ import annotations
@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.files.orientations import TimeTable
+from jointfit_daemon.files.orientations import TimeTable, WrittenTable, write_known_values
 from jointfit_daemon.files.text import written
-from jointfit_daemon.tools.opensim_tables import WrittenTable, write_known_values
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

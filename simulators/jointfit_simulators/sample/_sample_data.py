@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
-from jointfit_daemon.files.mocap import MarkerTrajectories, write_trc
+from jointfit_daemon.files.mocap import MarkerTrajectories, c3d_bytes, write_trc
 from jointfit_daemon.files.orientations import (
     OrientationTable,
     OrientationTrial,
@@ -31,7 +31,6 @@ from jointfit_simulators.body import (
     to_wxyz,
 )
 from jointfit_simulators.devices import Cameras, OrientationSensor, XcdiDevice, XcdiDeviceOptions
-from jointfit_simulators.sample._c3d_file import c3d_bytes
 from jointfit_simulators.sample._sample_captures import candump_text, natnet_pcap, xbus_bytes
 from jointfit_simulators.scene import RigOptions, ids_toml, rig_toml
 from jointfit_simulators.settings import Knobs

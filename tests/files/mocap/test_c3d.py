@@ -69,7 +69,7 @@ def test_an_independent_reader_sees_the_same_points_and_gaps(
     shared_data: Path, name: str, first: int, missing: int
 ) -> None:
     path = shared_data / "mocap" / "c3d_trc_pyomeca" / f"{name}.c3d"
-    trial, _ = read_c3d(path)
+    trial = read_c3d(path).trajectories
     judge = ezc3d.c3d(str(path))
     expected = judge["data"]["points"][:3].transpose(2, 1, 0) / 1000.0
     np.testing.assert_allclose(trial.positions, expected, rtol=1e-6, atol=1e-9)
@@ -93,7 +93,7 @@ def test_written_osim_is_read_in_metres(
     tmp_path: Path, positions: NDArray[np.float64], units: str, scale: float
 ) -> None:
     write_c3d(tmp_path / "trial.c3d", positions, units=units)
-    trial, _ = read_c3d(tmp_path / "trial.c3d")
+    trial = read_c3d(tmp_path / "trial.c3d").trajectories
     np.testing.assert_allclose(trial.positions, positions * scale, rtol=1e-6, atol=1e-6)
     assert trial.names == NAMES
 

@@ -1,0 +1,230 @@
+"""A session as streams of described channels, as XDF, Motion-BIDS and LSL hold it.
+
+Every channel names the object it belongs to (sensor, marker, segment or joint), its quantity, its
+component and its unit. Invariant: `session_of` of the streams of `streams_of` is the session.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.session_data import (
+    JointSeries,
+    MarkerSeries,
+    SegmentSeries,
+    SensorSeries,
+    SessionData,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.session_data import TimelineEvent
+
+Group = Literal[
+    "sensors", "markers", "segments", "joints", "optical_segments", "optical_joints"
+]  # fmt: skip
+GROUPS: tuple[Group, ...] = (
+    "sensors", "markers", "segments", "joints", "optical_segments", "optical_joints",
+)  # fmt: skip
+ORIENTATION, POSITION = "orientation", "position"
+ANGLE, ANGLE_SD = "angle", "angle_sd"
+ORIENTATION_SD, POSITION_SD = "orientation_sd", "position_sd"
+UNITS = {
+    ORIENTATION: "",
+    ORIENTATION_SD: "rad",
+    "angular_velocity": "rad/s",
+    "acceleration": "m/s^2",
+    "magnetic_field": "",
+    POSITION: "m",
+    POSITION_SD: "m",
+    ANGLE: "rad",
+    ANGLE_SD: "rad",
+}
+"""Unit of every quantity; empty: none, or as the sensor outputs it."""
+_INERTIAL = ("angular_velocity", "acceleration", "magnetic_field")
+
+
+class Channel(NamedTuple):
+    """Description of one column of a stream."""
+
+    object: str
+    """Sensor, marker, segment or joint."""
+    quantity: str
+    """Key of `UNITS`."""
+    component: str = ""
+    """``w``, ``x``, ``y``, ``z``, or the name of an angle; empty for a scalar."""
+    placement: str = ""
+    """Segment that carries a sensor."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of the column; empty if it has none."""
+        return UNITS[self.quantity]
+
+    @property
+    def label(self) -> str:
+        """Name of the column, unique within its stream."""
+        return "_".join(filter(None, (self.object, self.quantity, self.component)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelStream:
+    """Channels with common times."""
+
+    group: Group
+    name: str
+    """Name of the object, or of the group if the stream holds several objects."""
+    t_s: Array
+    """Instants since the start of the session, s, shape (n,)."""
+    channels: tuple[Channel, ...]
+    values: Array
+    """Shape (n, len(channels)); NaN where unknown."""
+
+
+def streams_of(session: SessionData) -> list[ChannelStream]:
+    """Return one stream for each series of a session."""
+    streams = []
+    for sensor in session.sensors:
+        columns = _vectors(sensor.id, ORIENTATION, sensor.orientation, "wxyz", sensor.segment)
+        for quantity in _INERTIAL:
+            values = getattr(sensor, quantity)
+            columns |= _vectors(sensor.id, quantity, values, "xyz", sensor.segment)
+        streams.append(_stream("sensors", sensor.id, sensor.t_s, columns))
+    if session.markers is not None:
+        columns = {}
+        for k, label in enumerate(session.markers.labels):
+            columns |= _vectors(label, POSITION, session.markers.positions[:, k], "xyz")
+        streams.append(_stream("markers", "markers", session.markers.t_s, columns))
+
+    for group in ("segments", "optical_segments"):
+        for segment in getattr(session, group):
+            columns = _vectors(segment.name, ORIENTATION, segment.orientation, "wxyz")
+            columns |= _scalar(segment.name, ORIENTATION_SD, segment.sd_rad)
+            streams.append(_stream(group, segment.name, segment.t_s, columns))
+    for group in ("joints", "optical_joints"):
+        streams += [
+            _stream(group, joint.name, joint.t_s, _joint_columns(joint))
+            for joint in getattr(session, group)
+        ]
+    return streams
+
+
+def merge_streams(streams: Sequence[ChannelStream]) -> list[ChannelStream]:
+    """Return the streams with those of a group merged into one where all share their times."""
+    merged = []
+    for group in GROUPS:
+        own = [stream for stream in streams if stream.group == group]
+        if len(own) > 1 and all(np.array_equal(own[0].t_s, stream.t_s) for stream in own):
+            channels = tuple(channel for stream in own for channel in stream.channels)
+            values = np.concatenate([stream.values for stream in own], axis=1)
+            own = [ChannelStream(group, group, own[0].t_s, channels, values)]
+        merged += own
+    return merged
+
+
+def session_of(
+    streams: Iterable[ChannelStream],
+    name: str,
+    *,
+    start_unix_ns: int | None = None,
+    events: Sequence[TimelineEvent] = (),
+    description: Mapping[str, str] | None = None,
+) -> SessionData:
+    """Return the session of some streams."""
+    found: dict[str, list[Any]] = {group: [] for group in GROUPS}
+    markers: MarkerSeries | None = None
+    for stream in streams:
+        if stream.group == "markers":
+            labels = tuple(dict.fromkeys(channel.object for channel in stream.channels))
+            positions = [
+                _required(_matrix(stream, label, POSITION, "xyz"), len(stream.t_s), 3)
+                for label in labels
+            ]
+            cells = np.stack(positions, axis=1) if labels else np.empty((len(stream.t_s), 0, 3))
+            markers = MarkerSeries(labels, stream.t_s, cells)
+            continue
+        for item in dict.fromkeys(channel.object for channel in stream.channels):
+            found[stream.group].append(_series(stream, item))
+    return SessionData(
+        name,
+        start_unix_ns,
+        markers=markers,
+        events=tuple(events),
+        description=dict(description or {}),
+        **{group: tuple(found[group]) for group in GROUPS if group != "markers"},
+    )
+
+
+def _series(stream: ChannelStream, item: str) -> SensorSeries | SegmentSeries | JointSeries:
+    """Return the series of one object of a stream."""
+    count = len(stream.t_s)
+    if stream.group in ("joints", "optical_joints"):
+        return JointSeries(
+            item,
+            stream.t_s,
+            _named(stream, item, ANGLE),
+            _named(stream, item, ANGLE_SD),
+            _matrix(stream, item, POSITION, "xyz"),
+            _named(stream, item, POSITION_SD).get(""),
+        )
+    orientation = _required(_matrix(stream, item, ORIENTATION, "wxyz"), count, 4)
+    if stream.group == "sensors":
+        placement = next(c.placement for c in stream.channels if c.object == item)
+        signals = (_matrix(stream, item, quantity, "xyz") for quantity in _INERTIAL)
+        return SensorSeries(item, placement, stream.t_s, orientation, *signals)
+    return SegmentSeries(
+        item, stream.t_s, orientation, _named(stream, item, ORIENTATION_SD).get("")
+    )
+
+
+def _joint_columns(joint: JointSeries) -> dict[Channel, Array]:
+    columns = {Channel(joint.name, ANGLE, name): angle for name, angle in joint.angles.items()}
+    columns |= {Channel(joint.name, ANGLE_SD, name): sd for name, sd in joint.angle_sd.items()}
+    columns |= _vectors(joint.name, POSITION, joint.position, "xyz")
+    return columns | _scalar(joint.name, POSITION_SD, joint.position_sd)
+
+
+def _vectors(
+    item: str, quantity: str, values: Array | None, components: str, placement: str = ""
+) -> dict[Channel, Array]:
+    if values is None:
+        return {}
+    return {
+        Channel(item, quantity, component, placement): values[:, k]
+        for k, component in enumerate(components)
+    }
+
+
+def _scalar(item: str, quantity: str, values: Array | None) -> dict[Channel, Array]:
+    return {} if values is None else {Channel(item, quantity): values}
+
+
+def _stream(group: Any, name: str, t_s: Array, columns: Mapping[Channel, Array]) -> ChannelStream:
+    values = np.column_stack(list(columns.values())) if columns else np.empty((len(t_s), 0))
+    return ChannelStream(group, name, t_s, tuple(columns), values)
+
+
+def _named(stream: ChannelStream, item: str, quantity: str) -> dict[str, Array]:
+    """Return the columns of an object and a quantity by component."""
+    return {
+        channel.component: stream.values[:, k]
+        for k, channel in enumerate(stream.channels)
+        if channel.object == item and channel.quantity == quantity
+    }
+
+
+def _matrix(stream: ChannelStream, item: str, quantity: str, components: str) -> Array | None:
+    """Return the columns of all components, shape (n, len(components)); None if one is missing."""
+    columns = _named(stream, item, quantity)
+    if any(component not in columns for component in components):
+        return None
+    return np.column_stack([columns[component] for component in components])
+
+
+def _required(values: Array | None, count: int, width: int) -> Array:
+    return np.full((count, width), np.nan) if values is None else values

@@ -1,0 +1,156 @@
+"""Text files that Xsens programs (MT Manager, MTw) export: one sensor in each file.
+
+Lines beginning with ``//`` are comments, of which ``// Update Rate: 100.0Hz`` is read; then follow
+column names and rows, separated by tabs. The packet counter (16 bit) or the sample time (32 bit,
+0.1 ms) number the rows, so lost packets are gaps in time.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.files.text import (
+    MalformedFileError,
+    cells_of,
+    read_lines,
+    require_times,
+    rows_of_numbers,
+    separator_of,
+    strip_trailing_empty,
+)
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.session_data import SensorSeries, SessionData
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+
+_RATE = re.compile(r"Update Rate:\s*([0-9.]+)\s*Hz", re.IGNORECASE)
+_COUNTER, _SAMPLE_TIME = "PacketCounter", "SampleTimeFine"
+_COUNTER_TURN, _SAMPLE_TIME_TURN = 1 << 16, 1 << 32
+_TICK_S = 1e-4
+_QUATERNIONS = (
+    ("Quat_q0", "Quat_q1", "Quat_q2", "Quat_q3"),
+    ("Quat_w", "Quat_x", "Quat_y", "Quat_z"),
+)
+_EULER = ("Roll", "Pitch", "Yaw")
+_SERIAL = re.compile(r"([0-9A-F]{8})$", re.IGNORECASE)
+
+
+def is_mtb_text(path: Path) -> bool:
+    """Return whether a text file begins as an export of an Xsens program."""
+    with path.open("rb") as file:
+        head = file.read(4096)
+    return head.startswith(b"//") or b"PacketCounter" in head.split(b"\n")[0]
+
+
+def read_mtb_session(files: Sequence[Path], name: str) -> SessionData:
+    """Return the sensors of one recording, from one exported text file for each sensor.
+
+    The counters of all sensors have a common start, so the earliest row of all is at 0 s. The id of
+    a sensor is the serial number at the end of the file name.
+
+    Raises
+    ------
+    MalformedFileError
+        Without column names, without times, or without any signal.
+    """
+    read = [(path, *_read_sensor(path)) for path in files]
+    first_s = min(start_s for _, start_s, _ in read)
+    return SessionData(
+        name,
+        sensors=tuple(
+            replace(sensor, t_s=sensor.t_s + (start_s - first_s)) for _, start_s, sensor in read
+        ),
+        description={"files": ", ".join(path.name for path in files)},
+    )
+
+
+def _read_sensor(path: Path) -> tuple[float, SensorSeries]:
+    """Return the first instant on the counter of the recording, s, and the sensor from 0 s."""
+    lines = read_lines(path)
+    at = next((k for k, line in enumerate(lines) if not line.startswith("//")), None)
+    if at is None or (_COUNTER not in lines[at] and _SAMPLE_TIME not in lines[at]):
+        raise MalformedFileError(
+            f"{path}: no column {_COUNTER} or {_SAMPLE_TIME} after the lines of comments: export"
+            " the recording again, with one of them"
+        )
+    separator = separator_of(lines[at])
+    names = strip_trailing_empty(cells_of(lines[at], separator))
+    body = enumerate(lines[at + 1 :], start=at + 2)
+    rows = rows_of_numbers(path, body, separator, len(names))
+    columns = {name: rows[:, k] for k, name in enumerate(names)}
+
+    start_s, t_s = _times(path, columns, _rate_hz(lines[:at]))
+    require_times(path, t_s)
+    orientation = _orientation(columns, len(t_s))
+    signals = [_vector(columns, f"{word}_{{}}") for word in ("Gyr", "Acc", "Mag")]
+    if np.isnan(orientation).all() and all(signal is None for signal in signals):
+        raise MalformedFileError(
+            f"{path}: found the columns {', '.join(names[:8])}, expected an orientation (Quat, Mat"
+            " or Roll, Pitch, Yaw), Gyr, Acc or Mag: export them"
+        )
+    serial = _SERIAL.search(path.stem)
+    return start_s, SensorSeries(serial[1] if serial else path.stem, "", t_s, orientation, *signals)
+
+
+def _rate_hz(comments: Sequence[str]) -> float | None:
+    found = _RATE.search("\n".join(comments))
+    return float(found[1]) if found else None
+
+
+def _times(path: Path, columns: Mapping[str, Array], rate_hz: float | None) -> tuple[float, Array]:
+    """Return the first instant on its counter, s, and the instants of the rows since then, s."""
+    ticks = columns.get(_SAMPLE_TIME)
+    if ticks is not None and len(ticks) and np.isfinite(ticks).all():
+        return float(ticks[0]) * _TICK_S, _unwrapped(ticks, _SAMPLE_TIME_TURN) * _TICK_S
+    counter = columns.get(_COUNTER)
+    if counter is None or rate_hz is None or not rate_hz > 0.0:
+        raise MalformedFileError(
+            f"{path}: no {_SAMPLE_TIME} and no '// Update Rate', so the rows have no times: export"
+            " the recording again, with its header"
+        )
+    first = float(counter[0]) / rate_hz if len(counter) else 0.0
+    return first, _unwrapped(counter, _COUNTER_TURN) / rate_hz
+
+
+def _unwrapped(counter: Array, turn: int) -> Array:
+    """Return a counter since its first row, without its turns."""
+    steps = np.diff(counter)
+    turned = steps < -turn / 2
+    counted: Array = np.concatenate([[0.0], np.cumsum(steps + turn * turned)])[: len(counter)]
+    return counted
+
+
+def _orientation(columns: Mapping[str, Array], count: int) -> Array:
+    """Return q_world_sensor, shape (count, 4); NaN where the file has none."""
+    for names in _QUATERNIONS:
+        if all(name in columns for name in names):
+            return rotation.normalize(np.column_stack([columns[name] for name in names]))
+    cells = [f"Mat[{row}][{column}]" for row in (1, 2, 3) for column in (1, 2, 3)]
+    if all(cell in columns for cell in cells):
+        matrices = np.column_stack([columns[cell] for cell in cells]).reshape(-1, 3, 3)
+        known = np.isfinite(matrices).all(axis=(1, 2))
+        q = np.full((count, 4), np.nan)
+        q[known] = rotation.from_matrix(matrices[known])
+        return q
+    if all(name in columns for name in _EULER):
+        # Xsens: R = Rz(yaw) Ry(pitch) Rx(roll), degrees.
+        turns = [
+            rotation.exp(np.deg2rad(columns[name])[:, None] * np.eye(3)[k])
+            for k, name in enumerate(_EULER)
+        ]
+        return rotation.multiply(turns[2], rotation.multiply(turns[1], turns[0]))
+    return np.full((count, 4), np.nan)
+
+
+def _vector(columns: Mapping[str, Array], pattern: str) -> Array | None:
+    parts = [columns.get(pattern.format(axis)) for axis in "XYZ"]
+    known = [part for part in parts if part is not None]
+    return np.column_stack(known) if len(known) == 3 else None  # noqa: PLR2004 - three axes

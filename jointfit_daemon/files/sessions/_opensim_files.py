@@ -1,0 +1,245 @@
+"""Orientations and joint angles of a session as files of OpenSim: STO and MOT.
+
+Orientations are q_world_body with z up, as OpenSense expects of sensors: its set-up files turn them
+by ``sensor_to_opensim_rotations`` = -pi/2 0 0. Positions in MOT files have the axes of OpenSim,
+y up. Frames with unknown values are left out, because OpenSim reads no empty cells.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from jointfit_daemon.files.axes import from_z_up, to_z_up
+from jointfit_daemon.files.orientations import (
+    OrientationTable,
+    TimeTable,
+    WrittenTable,
+    read_orientations_sto,
+    read_sto,
+    write_known_orientations,
+    write_known_values,
+)
+from jointfit_daemon.files.sessions._header import header_facts, header_line, start_of
+from jointfit_daemon.files.sessions._uniform_axis import UniformAxis
+from jointfit_daemon.files.sessions._written_session import NothingToWriteError, WrittenSession
+from jointfit_daemon.files.text import read_lines
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.session_data import JointSeries, SegmentSeries, SensorSeries, SessionData
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+
+_POSITION_PARTS = (("_x", "_y", "_z"), ("_tx", "_ty", "_tz"))
+"""Endings of position columns: ours, and those of OpenSim's coordinates."""
+_TRANSLATION = re.compile(r"_t?[xyz]$")
+_GROUPS = ("sensors", "segments", "optical_segments")
+
+
+def write_sto_session(
+    session: SessionData, folder: Path, names: Mapping[str, str] | None = None
+) -> WrittenSession:
+    """Write ``NAME_sensors.sto``, ``NAME_segments.sto`` and ``NAME_optical_segments.sto``.
+
+    Parameters
+    ----------
+    session, folder
+        Groups without series are left out.
+    names
+        Column names of sensors and segments, ``{"S1": "femur_r_imu"}`` for example. OpenSense finds
+        the body of a column by its name.
+    """
+    files: list[Path] = []
+    notes: list[str] = []
+    for group in _GROUPS:
+        series = _orientations_of(session, group)
+        if not series:
+            continue
+        axis = UniformAxis([t_s for _, t_s, _ in series])
+        columns = [axis.orientations(name, t_s, q) for name, t_s, q in series]
+        header = header_line(
+            group=group,
+            start_unix_ns=session.start_unix_ns,
+            resampled=axis.resampled or None,
+            segments={(names or {}).get(s.id, s.id): s.segment for s in session.sensors}
+            if group == "sensors"
+            else None,
+        )
+        table = OrientationTable(
+            tuple((names or {}).get(name, name) for name, _, _ in series),
+            axis.t_s,
+            np.stack(columns, axis=1),
+            axis.rate_hz,
+            header,
+        )
+        path = folder / f"{session.name}_{group}.sto"
+        written = write_known_orientations(path, table)
+        _collect(written, files, notes)
+        notes += axis.note(path.name)
+    return _written(session, "orientations, which STO files hold", files, notes)
+
+
+def read_sto_session(path: Path) -> SessionData:
+    """Return the orientations of a STO file, or its numbers as `read_mot_session` does.
+
+    Orientations of a foreign file are those of sensors, named by column.
+    """
+    if not any(line.lower().startswith("datatype=quaternion") for line in read_lines(path)[:40]):
+        return read_mot_session(path)
+    table = read_orientations_sto(path)
+    facts = header_facts(table.header)
+    quaternions = rotation.normalize(table.quaternions)
+    columns = [(name, quaternions[:, k]) for k, name in enumerate(table.names)]
+    group, segments = facts.get("group"), facts.get("segments")
+    if group in ("segments", "optical_segments"):
+        series = tuple(SegmentSeries(name, table.t_s, q) for name, q in columns)
+        own, optical = (series, ()) if group == "segments" else ((), series)
+        return SessionData(path.stem, start_of(facts), segments=own, optical_segments=optical)
+
+    carried_by = segments if isinstance(segments, dict) else {}
+    sensors = tuple(
+        SensorSeries(name, str(carried_by.get(name, "")), table.t_s, q) for name, q in columns
+    )
+    return SessionData(path.stem, start_of(facts), sensors=sensors)
+
+
+def write_mot_session(session: SessionData, folder: Path) -> WrittenSession:
+    """Write ``NAME.mot`` and, from markers, ``NAME_optical.mot``: angles and positions of joints.
+
+    Columns are ``JOINT_ANGLE`` and ``JOINT_ANGLE_sd`` in degrees, ``JOINT_x``, ``_y``, ``_z`` and
+    ``JOINT_position_sd`` in m.
+    """
+    files: list[Path] = []
+    notes: list[str] = []
+    for ending, joints in (("", session.joints), ("_optical", session.optical_joints)):
+        if not joints:
+            continue
+        axis = UniformAxis([joint.t_s for joint in joints])
+        columns: dict[str, Array] = {}
+        for joint in joints:
+            columns |= _joint_columns(joint, axis)
+        if not columns:
+            continue
+        header = header_line(
+            group="optical_joints" if ending else "joints",
+            start_unix_ns=session.start_unix_ns,
+            resampled=axis.resampled or None,
+            joints={joint.name: sorted(joint.angles) for joint in joints},
+        )
+        path = folder / f"{session.name}{ending}.mot"
+        values = np.column_stack(list(columns.values()))
+        table = TimeTable(
+            tuple(columns), axis.t_s, values, in_degrees=True, name=path.stem, header=header
+        )
+        _collect(write_known_values(path, table), files, notes)
+        notes += axis.note(path.name)
+    return _written(session, "joints, which MOT files hold", files, notes)
+
+
+def read_mot_session(path: Path) -> SessionData:
+    """Return the joints of a MOT or STO file with one number in each cell.
+
+    In a foreign file every column is a joint of its own with the angle ``angle``, but for positions
+    ``NAME_tx``, ``NAME_ty`` and ``NAME_tz`` in m, y up.
+    """
+    table = read_sto(path)
+    facts = header_facts(table.header)
+    values = {name: table.values[:, k] for k, name in enumerate(table.columns)}
+    if table.in_degrees:
+        values = {
+            name: column if _is_length(name) else np.deg2rad(column)
+            for name, column in values.items()
+        }
+    declared = facts.get("joints")
+    found = tuple(
+        _declared_joints(table.t_s, values, declared)
+        if isinstance(declared, dict)
+        else _foreign_joints(table.t_s, values)
+    )
+    own, optical = ((), found) if facts.get("group") == "optical_joints" else (found, ())
+    return SessionData(path.stem, start_of(facts), joints=own, optical_joints=optical)
+
+
+def _orientations_of(session: SessionData, group: str) -> list[tuple[str, Array, Array]]:
+    if group == "sensors":
+        return [(s.id, s.t_s, s.orientation) for s in session.sensors if len(s.t_s)]
+    found: Sequence[SegmentSeries] = getattr(session, group)
+    return [(s.name, s.t_s, s.orientation) for s in found if len(s.t_s)]
+
+
+def _joint_columns(joint: JointSeries, axis: UniformAxis) -> dict[str, Array]:
+    columns: dict[str, Array] = {}
+    for name, angle in joint.angles.items():
+        columns[f"{joint.name}_{name}"] = np.rad2deg(axis.values(joint.name, joint.t_s, angle))
+        if name in joint.angle_sd:
+            sd = axis.values(joint.name, joint.t_s, joint.angle_sd[name])
+            columns[f"{joint.name}_{name}_sd"] = np.rad2deg(sd)
+    if joint.position is not None:
+        position = from_z_up(axis.values(joint.name, joint.t_s, joint.position), "y")
+        columns |= {f"{joint.name}_{part}": position[:, k] for k, part in enumerate("xyz")}
+    if joint.position_sd is not None:
+        sd = axis.values(joint.name, joint.t_s, joint.position_sd)
+        columns[f"{joint.name}_position_sd"] = sd
+    return columns
+
+
+def _is_length(name: str) -> bool:
+    return bool(_TRANSLATION.search(name)) or name.endswith("_position_sd")
+
+
+def _declared_joints(
+    t_s: Array, values: Mapping[str, Array], declared: Mapping[str, Any]
+) -> Iterable[JointSeries]:
+    for joint, angles in declared.items():
+        names = [name for name in angles if f"{joint}_{name}" in values]
+        yield JointSeries(
+            joint,
+            t_s,
+            {name: values[f"{joint}_{name}"] for name in names},
+            {name: values[sd] for name in names if (sd := f"{joint}_{name}_sd") in values},
+            _position(values, joint, _POSITION_PARTS[0]),
+            values.get(f"{joint}_position_sd"),
+        )
+
+
+def _foreign_joints(t_s: Array, values: Mapping[str, Array]) -> Iterable[JointSeries]:
+    used: set[str] = set()
+    for name in values:
+        for parts in _POSITION_PARTS:
+            joint = name.removesuffix(parts[0])
+            position = _position(values, joint, parts) if joint != name else None
+            if position is not None:
+                used |= {joint + part for part in parts}
+                yield JointSeries(joint, t_s, position=position)
+    for name, column in values.items():
+        if name not in used:
+            yield JointSeries(name, t_s, {"angle": column})
+
+
+def _position(values: Mapping[str, Array], joint: str, parts: Sequence[str]) -> Array | None:
+    columns = [values.get(joint + part) for part in parts]
+    known = [column for column in columns if column is not None]
+    return to_z_up(np.column_stack(known), "y") if len(known) == len(parts) else None
+
+
+def _collect(written: WrittenTable, files: list[Path], notes: list[str]) -> None:
+    if written.frames:
+        files.append(written.path)
+    notes += written.notes
+
+
+def _written(
+    session: SessionData, contents: str, files: Sequence[Path], notes: Sequence[str]
+) -> WrittenSession:
+    if not files:
+        reason = f": {notes[0]}" if notes else ""
+        raise NothingToWriteError(
+            f"session {session.name!r} has no {contents}{reason}: choose another format, csv for"
+            " example"
+        )
+    return WrittenSession(tuple(files), tuple(notes))

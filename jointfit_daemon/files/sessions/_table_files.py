@@ -1,0 +1,178 @@
+"""Sessions as tidy tables in files: ``NAME_TABLE.csv``, or ``NAME_TABLE.parquet``.
+
+Any of the files of a session is read together with its siblings.
+"""
+
+from __future__ import annotations
+
+import csv
+from math import isnan
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import orjson
+
+from jointfit_daemon.files.sessions._missing_extra import import_extra
+from jointfit_daemon.files.sessions._tidy_tables import (
+    TABLES,
+    TEXT_COLUMNS,
+    session_of_tables,
+    tables_of,
+)
+from jointfit_daemon.files.sessions._written_session import WrittenSession
+from jointfit_daemon.files.text import MalformedFileError, number, read_lines
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.files.sessions._tidy_tables import Table
+    from jointfit_daemon.session_data import SessionData
+
+_NEEDS_QUOTES = frozenset(',"\n\r')
+
+
+def write_csv_session(session: SessionData, folder: Path) -> WrittenSession:
+    """Write the tables as CSV: units in the column names, 9 significant digits, times to 1 ns."""
+    files = []
+    for name, table in tables_of(session).items():
+        path = folder / f"{session.name}_{name}.csv"
+        cells = [_texts_of(column, values) for column, values in table.items()]
+        with path.open("w", encoding="utf-8", newline="") as file:
+            file.write(",".join(table) + "\n")
+            file.writelines(f"{','.join(row)}\n" for row in zip(*cells, strict=True))
+        files.append(path)
+    return WrittenSession(tuple(files))
+
+
+def _texts_of(name: str, values: NDArray[Any]) -> list[str]:
+    if name in TEXT_COLUMNS:
+        quoted = {text: _quoted(text) for text in set(values.tolist())}
+        return [quoted[text] for text in values.tolist()]
+    form = "{:.9f}" if name == "t_s" else "{:.9g}"
+    return ["" if isnan(value) else form.format(value) for value in values.tolist()]
+
+
+def _quoted(text: str) -> str:
+    return f'"{text.replace(chr(34), 2 * chr(34))}"' if _NEEDS_QUOTES & set(text) else text
+
+
+def read_csv_session(path: Path) -> SessionData:
+    """Return the session of a CSV file of `write_csv_session` and its siblings.
+
+    Raises
+    ------
+    MalformedFileError
+        Another table, missing columns, or a cell that is no number.
+    """
+    return _read_session(path, ".csv", _read_csv)
+
+
+def _read_csv(path: Path, columns: Sequence[str]) -> Table:
+    rows = list(csv.reader(f"{line}\n" for line in read_lines(path)))
+    if not rows or rows[0] != list(columns):
+        found = ",".join(rows[0])[:80] if rows else "nothing"
+        raise MalformedFileError(
+            f"{path}, line 1: found {found}, expected the columns {','.join(columns)}: export the"
+            " session again"
+        )
+    short = next((k for k, row in enumerate(rows) if len(row) != len(columns)), None)
+    if short is not None:
+        raise MalformedFileError(
+            f"{path}, row {short + 1}: {len(rows[short])} cells, expected {len(columns)}: the file"
+            " is cut off or was edited; export it again"
+        )
+    table: Table = {}
+    cells = list(zip(*rows[1:], strict=True)) or [()] * len(columns)
+    for name, texts in zip(columns, cells, strict=True):
+        if name in TEXT_COLUMNS:
+            table[name] = np.array(texts, dtype=object)
+        else:
+            table[name] = _numbers(path, texts)
+    return table
+
+
+def _numbers(path: Path, texts: Sequence[str]) -> NDArray[np.float64]:
+    try:
+        return np.array([text or "nan" for text in texts], dtype=np.float64)
+    except ValueError:  # find the cell
+        return np.array([number(path, k, text) for k, text in enumerate(texts, start=2)])
+
+
+def write_parquet_session(session: SessionData, folder: Path) -> WrittenSession:
+    """Write the tables as Parquet; unknown values are null, texts are dictionaries.
+
+    Raises
+    ------
+    MissingPackageError
+        The package pyarrow is not installed.
+    """
+    arrow, parquet = import_extra("pyarrow", "parquet"), import_extra("pyarrow.parquet", "parquet")
+    files = []
+    for name, table in tables_of(session).items():
+        columns = {
+            column: arrow.array(values, arrow.string()).dictionary_encode()
+            if column in TEXT_COLUMNS
+            else arrow.array(values, from_pandas=True)
+            for column, values in table.items()
+        }
+        path = folder / f"{session.name}_{name}.parquet"
+        facts = {"start_unix_ns": session.start_unix_ns, "name": session.name}
+        whole = arrow.table(columns).replace_schema_metadata({"jointfit": orjson.dumps(facts)})
+        parquet.write_table(whole, path, compression="zstd")
+        files.append(path)
+    return WrittenSession(tuple(files))
+
+
+def read_parquet_session(path: Path) -> SessionData:
+    """Return the session of a Parquet file of `write_parquet_session` and its siblings.
+
+    Raises
+    ------
+    MalformedFileError
+        Not a Parquet file, or another table.
+    MissingPackageError
+        The package pyarrow is not installed.
+    """
+    arrow, parquet = import_extra("pyarrow", "parquet"), import_extra("pyarrow.parquet", "parquet")
+
+    def read(file: Path, columns: Sequence[str]) -> Table:
+        try:
+            found = parquet.read_table(file, partitioning=None)
+        except (arrow.ArrowException, OSError) as fault:
+            raise MalformedFileError(
+                f"{file}: not a Parquet file, or cut off: export it again"
+            ) from fault
+        if found.column_names != list(columns):
+            raise MalformedFileError(
+                f"{file}: found the columns {', '.join(found.column_names)}, expected"
+                f" {', '.join(columns)}: export the session again"
+            )
+        return {
+            name: np.array(found[name].to_pylist(), dtype=object)
+            if name in TEXT_COLUMNS
+            else found[name].to_numpy().astype(np.float64)
+            for name in columns
+        }
+
+    return _read_session(path, ".parquet", read)
+
+
+def _read_session(
+    path: Path, suffix: str, read: Callable[[Path, Sequence[str]], Table]
+) -> SessionData:
+    name, _, table = path.stem.rpartition("_")
+    if table not in TABLES or not name:
+        raise MalformedFileError(
+            f"{path}: expected a name that ends in _{f'{suffix}, _'.join(TABLES)}{suffix}, as"
+            " jointfit export writes it"
+        )
+    files: Mapping[str, Path] = {
+        table: file
+        for table in TABLES
+        if (file := path.with_name(f"{name}_{table}{suffix}")).exists()
+    }
+    tables = {table: read(file, TABLES[table]) for table, file in files.items()}
+    return session_of_tables(tables, name)

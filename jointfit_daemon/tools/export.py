@@ -1,0 +1,118 @@
+"""Command `jointfit export`: writes a recording or a trial file in a format of other programs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jointfit_daemon.tools.activity import show_activity
+from jointfit_daemon.tools.text_output import check_choice, echo_json
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.session_data import SessionData
+
+File = Annotated[
+    Path,
+    typer.Argument(
+        help="Recording (.mcap), or a file to convert: .trc, .c3d, .sto, .mot, .npz, .csv,"
+        " .parquet, .xdf, .txt of an Xsens program, or a folder: Motion-BIDS, Xsens text."
+    ),
+]
+To = Annotated[
+    str,
+    typer.Option(
+        "--to",
+        help="Format: trc, c3d, sto, mot, csv, parquet, xdf, bids-motion, mcap-foxglove.",
+    ),
+]
+Out = Annotated[Path, typer.Option("--out", help="Output folder, created if missing.")]
+Name = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--name",
+        help="Column name in .sto files: S1=femur_r_imu, so that OpenSense finds the body."
+        " Repeatable.",
+    ),
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the files as one JSON object.")]
+
+
+def export(
+    file: File,
+    *,
+    to: To,
+    out: Out = Path(),
+    name: Name = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Write a recording or a trial in a format of OpenSim, pandas, MNE, Foxglove and others.
+
+    Series keep their own rates where the format can hold them. What is left out or resampled is
+    reported. If the export fails, no file is written.
+    """
+    from jointfit_daemon.files.sessions import SESSION_FORMATS, write_session
+
+    check_choice("--to", to, [*SESSION_FORMATS])
+    with show_activity("reading"):
+        session = load_data(file)
+    names = _read_names(name or (), session)
+    out.mkdir(parents=True, exist_ok=True)
+    with show_activity("writing"):
+        written = write_session(session, out, to, names=names, overwrite=force)
+
+    if json:
+        echo_json({"files": [str(path) for path in written.files], "notes": written.notes})
+        return
+    for note in written.notes:
+        typer.echo(f"note: {note}", err=True)
+    for path in written.files:
+        typer.echo(path)
+
+
+def load_data(file: Path) -> SessionData:
+    """Return the session of a recording, or of any other file or folder that can be imported.
+
+    Raises
+    ------
+    ValueError
+        Not a file of a known kind, or damaged.
+    """
+    if file.suffix.lower() in (".mcap", ".jsonl"):
+        from jointfit_daemon.reprocessing import load_session
+
+        return load_session(file)
+
+    from jointfit_daemon.files.sessions import read_session
+
+    return read_session(file)
+
+
+def _read_names(given: Sequence[str], session: SessionData) -> dict[str, str]:
+    """Return the column names of option ``--name``.
+
+    Raises
+    ------
+    ValueError
+        Not of the form ID=NAME, an unknown sensor or segment, or one name for two of them.
+    """
+    from jointfit_daemon.nearest_name import unknown_name
+
+    known = [sensor.id for sensor in session.sensors]
+    known += [s.name for s in (*session.segments, *session.optical_segments)]
+    names: dict[str, str] = {}
+    for text in given:
+        item, equals, name = text.partition("=")
+        if not equals or not name.isprintable() or not name.strip():
+            raise ValueError(f"--name {text}: expected ID=NAME, for example S1=femur_r_imu")
+        if item not in known:
+            raise ValueError(f"--name {text}: {unknown_name('sensor or segment', item, known)}")
+        if name in names.values():
+            raise ValueError(f"--name {text}: the name {name!r} is given twice: choose another")
+        names[item] = name
+    return names

@@ -1,0 +1,107 @@
+"""What a format holds is read back as it was: values, gaps, events, names and start."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from jointfit_daemon.files.sessions import read_session, write_session
+from tests.files.sessions.session_strategy import (
+    assert_same_group,
+    assert_same_series,
+    known_rows,
+    session_data,
+    time_axes,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.session_data import SessionData
+
+FEW = settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
+WHOLE = {"csv": 1e-8, "parquet": 1e-12, "xdf": 1e-12, "bids-motion": 1e-8}
+"""Formats that hold everything, with their relative precision."""
+GROUPS = ("sensors", "segments", "joints", "optical_segments", "optical_joints")
+
+
+def there_and_back(session: SessionData, to: str, *, file: int = 0) -> SessionData:
+    with tempfile.TemporaryDirectory() as folder:
+        written = write_session(session, Path(folder), to)
+        path = written.files[file]
+        return read_session(path if to != "bids-motion" else Path(folder) / f"{session.name}_bids")
+
+
+@pytest.mark.parametrize("to", WHOLE)
+@FEW
+@given(session=session_data())
+def test_a_whole_session_comes_back(to: str, session: SessionData) -> None:
+    if to == "parquet":
+        pytest.importorskip("pyarrow")
+    found = there_and_back(session, to)
+    assert found.name == session.name
+    assert found.start_unix_ns == session.start_unix_ns
+    assert session.description.items() <= found.description.items()
+    for group in GROUPS:
+        assert_same_group(getattr(found, group), getattr(session, group), WHOLE[to])
+    assert_same_series(found.markers, session.markers, WHOLE[to])
+    assert [(e.kind, e.id, e.data) for e in found.events] == [
+        (e.kind, e.id, e.data) for e in session.events
+    ]
+    texts = [" ".join(e.text.split()) for e in found.events]
+    assert texts == [" ".join(e.text.split()) for e in session.events]
+    np.testing.assert_allclose(
+        [e.t_s for e in found.events], [e.t_s for e in session.events], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(("to", "precision"), [("trc", 1e-7), ("c3d", 2e-7)])
+@FEW
+@given(session=session_data())
+def test_markers_come_back(to: str, precision: float, session: SessionData) -> None:
+    if to == "c3d":
+        pytest.importorskip("c3d")
+    found = there_and_back(session, to)
+    assert_same_series(found.markers, session.markers, precision, time_s=1e-4)
+    if to == "c3d":
+        assert found.start_unix_ns == session.start_unix_ns
+        assert [(e.kind, e.id) for e in found.events] == [(e.kind, e.id) for e in session.events]
+        assert [e.text for e in found.events] == [e.text for e in session.events]
+        np.testing.assert_allclose(
+            [e.t_s for e in found.events], [e.t_s for e in session.events], atol=1e-5
+        )
+
+
+@FEW
+@given(st.data())
+def test_orientations_come_back_but_for_frames_with_a_gap(data: st.DataObject) -> None:
+    axis = data.draw(time_axes())
+    session = data.draw(session_data(axis=axis))
+    complete = ~np.isnan([s.orientation for s in session.sensors]).any(axis=(0, 2))
+    found = there_and_back(session, "sto")
+    assert found.start_unix_ns == session.start_unix_ns
+    for there, back in zip(session.sensors, found.sensors, strict=True):
+        assert (back.id, back.segment) == (there.id, there.segment)
+        np.testing.assert_allclose(back.t_s, axis[complete], atol=1e-4)
+        np.testing.assert_allclose(back.orientation, there.orientation[complete], atol=1e-7)
+
+
+@FEW
+@given(st.data())
+def test_joints_come_back_if_all_is_known(data: st.DataObject) -> None:
+    session = data.draw(session_data(axis=data.draw(time_axes()), gaps=False))
+    for group, file in (("joints", 0), ("optical_joints", 1)):
+        with tempfile.TemporaryDirectory() as folder:
+            files = sorted(write_session(session, Path(folder), "mot").files)
+            found = read_session(files[file])
+        assert found.start_unix_ns == session.start_unix_ns
+        assert_same_group(getattr(found, group), getattr(session, group), 1e-7, time_s=1e-4)
+
+
+def test_known_rows_leave_out_unknown_ones_only() -> None:
+    values = np.array([[1.0, 2.0], [np.nan, np.nan], [np.nan, 3.0]])
+    assert known_rows(np.arange(3.0), values)[0].tolist() == [0.0, 2.0]
