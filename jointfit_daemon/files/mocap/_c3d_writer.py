@@ -119,8 +119,13 @@ def c3d_bytes(
     cells = np.concatenate(
         [np.where(missing, 0.0, positions * 1e3), np.where(missing, _MISSING, 0.0)], axis=-1
     )
-    sections = (header, parameters, cells.astype("<f4").tobytes())
-    return b"".join(section + bytes(-len(section) % _BLOCK) for section in sections)
+    data = cells.astype("<f4").tobytes()
+    sections = [header, parameters]
+    if last_frame <= _MOST_WORD:
+        sections.append(data)
+        data = b""
+    # Readers that know the header only read a longer file to its end: no frames of padding there.
+    return b"".join(section + bytes(-len(section) % _BLOCK) for section in sections) + data
 
 
 def _entries(
