@@ -39,6 +39,8 @@ _FIXED_KEYS = {
 }  # fmt: skip
 """Keys of the header that belong to the format, in lower case."""
 _QUATERNION = 4
+_UNKNOWN = "nan,nan,nan,nan"
+"""Cell of an unknown orientation: OpenSim rejects empty cells, and ignores a sensor with NaN."""
 _SHOWN = 60
 """Most characters of a cell quoted in a message."""
 
@@ -220,6 +222,6 @@ def write_orientations_sto(path: Path, table: OrientationTable) -> None:
     ]
 
     for t_s, quaternions in zip(table.t_s, table.quaternions, strict=True):
-        cells = ("" if np.isnan(q[0]) else ",".join(map(written, q)) for q in quaternions)
+        cells = (_UNKNOWN if np.isnan(q[0]) else ",".join(map(written, q)) for q in quaternions)
         rows.append("\t".join((written_time(t_s), *cells)))
     path.write_text("\n".join(rows) + "\n", encoding="utf-8")

@@ -151,7 +151,7 @@ def _description_of(session: SessionData) -> dict[str, Any]:
         "BIDSVersion": BIDS_VERSION,
         "DatasetType": "raw",
         "GeneratedBy": [{"Name": "jointfitd", "Version": jointfit_daemon.__version__}],
-        "Description": dict(session.description),
+        "JointfitDescription": dict(session.description),
     }
 
 
@@ -287,7 +287,7 @@ def read_bids_session(root: Path) -> SessionData:
         if stream is not None:
             streams.append(stream)
         starts.append(start_of({"start_unix_ns": facts.get("JointfitStartUnixNs")}))
-    description = _json_object(root / "dataset_description.json").get("Description")
+    description = _json_object(root / "dataset_description.json").get("JointfitDescription")
     return session_of(
         streams,
         name,

@@ -2,7 +2,8 @@
 
 Orientations are q_world_body with z up, as OpenSense expects of sensors: its set-up files turn them
 by ``sensor_to_opensim_rotations`` = -pi/2 0 0. Positions in MOT files have the axes of OpenSim,
-y up. Frames with unknown values are left out, because OpenSim reads no empty cells.
+y up. An unknown orientation is NaN, which OpenSense ignores. A MOT file has no unknown values:
+its frames and columns with them are left out, because OpenSim's Storage misreads NaN.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from jointfit_daemon.files.orientations import (
     WrittenTable,
     read_orientations_sto,
     read_sto,
-    write_known_orientations,
     write_known_values,
+    write_orientations_sto,
 )
 from jointfit_daemon.files.sessions._header import header_facts, header_line, start_of
 from jointfit_daemon.files.sessions._uniform_axis import UniformAxis
@@ -70,17 +71,18 @@ def write_sto_session(
             if group == "sensors"
             else None,
         )
-        table = OrientationTable(
-            tuple((names or {}).get(name, name) for name, _, _ in series),
-            axis.t_s,
-            np.stack(columns, axis=1),
-            axis.rate_hz,
-            header,
-        )
+        quaternions = np.stack(columns, axis=1)
+        rows = ~np.isnan(quaternions).all(axis=(1, 2))
+        if not rows.any():
+            continue
         path = folder / f"{session.name}_{group}.sto"
-        written = write_known_orientations(path, table)
-        _collect(written, files, notes)
+        labels = tuple((names or {}).get(name, name) for name, _, _ in series)
+        table = OrientationTable(labels, axis.t_s[rows], quaternions[rows], axis.rate_hz, header)
+        write_orientations_sto(path, table)
+        files.append(path)
         notes += axis.note(path.name)
+        if np.isnan(table.quaternions[0]).any():
+            notes.append(f"{path.name}: IMUPlacer needs all orientations of the first frame")
     return _written(session, "orientations, which STO files hold", files, notes)
 
 
