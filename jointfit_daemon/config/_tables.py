@@ -375,10 +375,25 @@ class MqttSettings(Settings):
 
 
 class RecordingSettings(Settings):
-    """``[recording]``: if present, the daemon records all its input events."""
+    """``[recording]``: if present, the daemon records all its input events and its results."""
 
     directory: str = Field(
         "recordings", min_length=1, description="folder, relative to $STATE_DIRECTORY"
+    )
+    autostart: bool = Field(
+        True, description="record from the start of the daemon; false: when requested"
+    )
+    file_mb: float = Field(
+        1000.0, ge=1, le=1_000_000, description="size after which the next file begins, MB"
+    )
+    file_minutes: float = Field(
+        60.0, ge=0.1, le=10_000, description="time after which the next file begins, minutes"
+    )
+    keep_gb: float | None = Field(
+        None,
+        gt=0,
+        description="size of all recordings of the rig, GB, above which the oldest files are "
+        "deleted; absent: none is deleted",
     )
 
 

@@ -1,4 +1,4 @@
-"""Sinks that rig.toml switches on: the recording and the metrics.
+"""Sinks that rig.toml or a request switches on: the recording and the metrics.
 
 Invariant: one that cannot start is reported, and the daemon runs without it.
 """
@@ -6,9 +6,11 @@ Invariant: one that cannot start is reported, and the daemon runs without it.
 from __future__ import annotations
 
 import logging
+import math
 from typing import TYPE_CHECKING, Protocol
 
-from jointfit_daemon.outputs.recording import Recorder, RecordingReport
+from jointfit_daemon.config import RecordingSettings
+from jointfit_daemon.outputs.recording import Recorder, RecordingLimits, RecordingReport
 from jointfit_daemon.pipeline.events import NoticeKind, NoticeLevel
 from jointfit_daemon.supervisor.state_directory import state_directory
 
@@ -30,19 +32,22 @@ class Report(Protocol):
         """Publish and log it."""
 
 
-def start_recording(
-    rig: Rig, core: CoreRunner, tasks: TaskGroup, report: Report
-) -> Recorder | None:
-    """Start to record the events of the core; return the recorder, or None without one."""
-    if rig.recording is None:
-        return None
-    folder = state_directory() / rig.recording.directory
+def create_recorder(rig: Rig, core: CoreRunner, tasks: TaskGroup, report: Report) -> Recorder:
+    """Return the recorder, which records from now on if rig.toml says so, else when requested."""
+    settings = rig.recording or RecordingSettings(autostart=False)
+    folder = state_directory() / settings.directory
+    limits = RecordingLimits(
+        file_bytes=settings.file_mb * 1e6,
+        file_s=settings.file_minutes * 60.0,
+        keep_bytes=math.inf if settings.keep_gb is None else settings.keep_gb * 1e9,
+    )
 
     def pass_report(found: RecordingReport) -> None:
         report(NoticeKind.RECORDING, found.text, found.level)
 
-    recorder = Recorder(folder, rig.name, report=pass_report)
-    log.info("recording in %s", folder)
+    recorder = Recorder(folder, rig.name, limits, pass_report, autostart=settings.autostart)
+    if settings.autostart:
+        log.info("recording in %s", folder)
     core.subscribe(recorder)
     tasks.create_task(recorder.run(), name="recording")
     return recorder

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Protocol
 
 from jointfit_daemon.calibration.record import CalibrationFileError
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.payloads import BridgeHealth
+    from jointfit_daemon.outputs.recording import Recorder, RecordingHealth
     from jointfit_daemon.pipeline.events import Event, Reply, Request
     from jointfit_daemon.supervisor.requests import Handler
 
@@ -39,6 +41,10 @@ class DaemonInterface(Protocol):
 
     def health(self) -> BridgeHealth:
         """Return counters and clocks of this instant."""
+
+    @property
+    def recorder(self) -> Recorder:
+        """The recorder."""
 
     async def reload(self, before_move: Callable[[Rig], None] | None = None) -> Rig | None:
         """Load rig.toml again and apply it; raise `ConfigError` for a faulty one."""
@@ -74,6 +80,7 @@ class RequestHandlers:
             "calibrations": self.calibrations,
             "use-calibration": self.use_calibration,
             "selftest": self.selftest,
+            "record": self.record,
         }
 
     async def reload(self, request: Request) -> Reply | None:
@@ -157,6 +164,29 @@ class RequestHandlers:
         age_s = calibration_age_s(chosen)
         self._daemon.feed(CalibrationSelected(time.monotonic_ns(), chosen, number, age_s, request))
         return None
+
+    async def record(self, request: Request) -> Reply:
+        """Start or stop to record, or return the state; repetitions change nothing."""
+        recorder, action = self._daemon.recorder, request.arguments["action"]
+        try:
+            health: RecordingHealth | None
+            if action == "start":
+                health = await recorder.start()
+            elif action == "stop":
+                health = await recorder.stop()
+            else:
+                health = recorder.health()
+        except OSError as error:
+            text = f"the file cannot be created: {error}: correct the folder of [recording]"
+            return request.refusal("record.action", text)
+
+        state = {"directory": str(recorder.directory)}
+        if health is None:
+            nothing = {"file": "", "written_bytes": 0, "lost": 0, "failure": None, "active": False}
+            return request.reply("ok", state | nothing)
+        found = asdict(health)
+        del found["backlog_bytes"]
+        return request.reply("ok", state | found)
 
     async def selftest(self, request: Request) -> Reply:
         """Check devices, clocks, store, broker and host."""

@@ -63,7 +63,7 @@ from jointfit_daemon.supervisor._calibration_store import (
 from jointfit_daemon.supervisor._core_runner import CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_daemon.supervisor._notice_log import LEVELS, NoticeLog
-from jointfit_daemon.supervisor._optional_sinks import start_metrics, start_recording
+from jointfit_daemon.supervisor._optional_sinks import create_recorder, start_metrics
 from jointfit_daemon.supervisor._overload_monitor import STALL_S, OverloadMonitor
 from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
@@ -215,7 +215,7 @@ class Daemon:
             handlers.table(),
         )
         rig, core, report = self._rig, self._core, self._report
-        self._recorder = start_recording(rig, core, tasks, report)
+        self._recorder = create_recorder(rig, core, tasks, report)
         start_metrics(rig, self.health, core, tasks, report)
         self._state_check = tasks.create_task(self._check_state(), name="state check")
         self._mqtt = tasks.create_task(self._link.run(), name="mqtt")
@@ -334,6 +334,12 @@ class Daemon:
         """Apply the rig in force with another output rate, until the next reload."""
         async with self._changes:
             await self._change_to(replace(self._rig, output_rate_hz=rate_hz))
+
+    @property
+    def recorder(self) -> Recorder:
+        """The recorder."""
+        assert self._recorder is not None  # noqa: S101 - it exists before the first request
+        return self._recorder
 
     async def restart_device(self, name: str) -> None:
         """Close the port of one device, and open it again."""

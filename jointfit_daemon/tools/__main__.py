@@ -26,6 +26,8 @@ from jointfit_daemon.tools.init import init
 from jointfit_daemon.tools.markers import markers
 from jointfit_daemon.tools.monitor import monitor
 from jointfit_daemon.tools.probe import probe
+from jointfit_daemon.tools.record import record
+from jointfit_daemon.tools.recover import recover
 from jointfit_daemon.tools.request import mark, request
 from jointfit_daemon.tools.sample import sample
 from jointfit_daemon.tools.schema import schema
@@ -39,8 +41,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 for command in (
-    init, check, probe, doctor, demo, dashboard, monitor, calibrate, mark, request, center, decode,
-    export, ik, markers, center_study, sample, schema,
+    init, check, probe, doctor, demo, dashboard, monitor, calibrate, mark, record, request, recover,
+    export, center, decode, ik, markers, center_study, sample, schema,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(fuse.app)

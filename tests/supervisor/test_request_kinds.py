@@ -37,6 +37,7 @@ VALID: dict[str, dict[str, Any]] = {
     "calibrate": {"phase": "abort"},
     "static": {"seconds": 5.0},
     "mark": {"text": "heel strike"},
+    "record": {"action": "status"},
     "reload": {},
     "restart-device": {"device": "S1"},
     "rate": {"hz": 50.0},

@@ -37,6 +37,8 @@ def test_the_version_is_the_packages() -> None:
         "monitor",
         "calibrate",
         "mark",
+        "record",
+        "recover",
         "request",
         "decode",
         "export",

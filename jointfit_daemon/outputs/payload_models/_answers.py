@@ -93,6 +93,17 @@ class SelftestAnswer(Table):
     checks: list[CheckLine]
 
 
+class RecordAnswer(Table):
+    """Answer to ``record``."""
+
+    directory: str
+    file: str = Field(description="name of the open file, after `stop` of the last one; or empty")
+    written_bytes: int
+    lost: int = Field(description="messages that the disk did not take")
+    failure: str | None = Field(description="why the recording is interrupted")
+    active: bool
+
+
 ANSWERS: dict[str, type[Table]] = {
     "calibrate": PhaseAnswer,
     "static": PhaseAnswer,
@@ -103,5 +114,6 @@ ANSWERS: dict[str, type[Table]] = {
     "calibrations": CalibrationsAnswer,
     "use-calibration": UseCalibrationAnswer,
     "selftest": SelftestAnswer,
+    "record": RecordAnswer,
 }
 """Model of the ``data`` of an answer that is no error, by request."""

@@ -160,6 +160,7 @@ class Recording(Table):
     backlog_bytes: int
     lost: int
     failure: str | None
+    active: bool
 
 
 class Health(Payload):

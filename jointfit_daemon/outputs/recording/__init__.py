@@ -18,6 +18,7 @@ from jointfit_daemon.outputs.recording._reader import (
     read_states,
 )
 from jointfit_daemon.outputs.recording._recorder import Recorder, RecordingHealth
+from jointfit_daemon.outputs.recording._repair import RepairResult, repair_recording
 from jointfit_daemon.outputs.recording._session_writer import RecordingLimits, RecordingReport
 
 __all__ = [
@@ -34,6 +35,7 @@ __all__ = [
     "RecordingInfo",
     "RecordingLimits",
     "RecordingReport",
+    "RepairResult",
     "decode_event",
     "encode_event",
     "encode_output",
@@ -41,4 +43,5 @@ __all__ = [
     "open_recording",
     "read_events",
     "read_states",
+    "repair_recording",
 ]

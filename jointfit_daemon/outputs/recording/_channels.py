@@ -11,6 +11,7 @@ recording/gap   messages that the disk did not take
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import orjson
@@ -79,6 +80,15 @@ def encode_input(event: Event) -> tuple[str, bytes]:
 
 
 _ENCODERS: dict[str, Callable[[Any], bytes]] = {STATE: encode_state}
+
+
+_FILE_NAME = re.compile(r"(?P<rig>.+)-\d{8}T\d{6}-\d{4,}\.mcap(\.part)?")
+
+
+def recorded_rig_name(file_name: str) -> str | None:
+    """Return the rig of a file by its name; None for other files."""
+    match = _FILE_NAME.fullmatch(file_name)
+    return None if match is None else match["rig"]
 
 
 class ChannelForm(NamedTuple):

@@ -56,6 +56,8 @@ class PartFile:
         Its description.
     attachments
         Documents at its beginning.
+    suffix
+        Suffix of its name while it is written.
 
     Raises
     ------
@@ -64,12 +66,17 @@ class PartFile:
     """
 
     def __init__(
-        self, path: Path, info: RecordingInfo, attachments: Sequence[RecordedAttachment]
+        self,
+        path: Path,
+        info: RecordingInfo,
+        attachments: Sequence[RecordedAttachment],
+        *,
+        suffix: str = UNFINISHED,
     ) -> None:
         if path.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
         self.path, self.info = path, info
-        self.open_path = path.with_name(path.name + UNFINISHED)
+        self.open_path = path.with_name(path.name + suffix)
         self._fd = os.open(
             self.open_path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600
         )
@@ -207,9 +214,8 @@ class _UnwrittenBytes:
         """Write all bytes to `fd`; keep the rest if it raises OSError."""
         done = 0
         try:
-            with memoryview(self._data) as view:
-                while done < len(view):
-                    done += os.write(fd, view[done:])
+            while done < len(self._data):
+                done += os.write(fd, self._data[done : done + _CHUNK_BYTES])
         finally:
             del self._data[:done]
             self._written += done

@@ -119,6 +119,19 @@ class RecordedPart:
                     end = end._replace(complete=True)
         yield end
 
+    def survey(self) -> PartSurvey:
+        """Return the end and the damaged places; reads the whole file."""
+        found = [item for item in self.messages() if isinstance(item, DamagedBlock | PartEnd)]
+        (end,) = [item for item in found if isinstance(item, PartEnd)]
+        return PartSurvey([item for item in found if isinstance(item, DamagedBlock)], end)
+
+
+class PartSurvey(NamedTuple):
+    """State of a file."""
+
+    damage: list[DamagedBlock]
+    end: PartEnd
+
 
 class PartEnd(NamedTuple):
     """End of a file."""

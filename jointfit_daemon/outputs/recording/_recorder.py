@@ -7,14 +7,16 @@ the limit are counted, and the recording contains a gap in their place.
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import LimbState
 from jointfit_daemon.outputs.recording._channels import OUTPUT_KINDS
 from jointfit_daemon.outputs.recording._description import RecordingGap
 from jointfit_daemon.outputs.recording._part_file import UNFINISHED
+from jointfit_daemon.outputs.recording._repair import repair_unfinished
 from jointfit_daemon.outputs.recording._session_writer import (
     Batch,
     DaemonMessage,
@@ -46,7 +48,7 @@ class RecordingHealth:
     """State of a recording."""
 
     file: str
-    """Name of the open file; empty before the first one."""
+    """Name of the open file; empty without one."""
     written_bytes: int
     backlog_bytes: int
     """Memory of messages that are not yet written."""
@@ -54,10 +56,12 @@ class RecordingHealth:
     """Messages that the disk did not take."""
     failure: str | None
     """Reason for which messages are not written at present; None while they are."""
+    active: bool = True
+    """Whether the recorder is started."""
 
 
 class Recorder:
-    """Records events and outputs; a `Sink` of the core.
+    """Records events and outputs between `begin` and `stop`; a `Sink` of the core.
 
     Parameters
     ----------
@@ -66,9 +70,11 @@ class Recorder:
     name
         Beginning of the file names; the time follows.
     limits
-        When a file ends and the next one begins.
+        When a file ends and the next one begins, and when old ones are deleted.
     report
         Receives each interruption and resumption.
+    autostart
+        Whether to record from the first event on.
     """
 
     def __init__(
@@ -77,18 +83,37 @@ class Recorder:
         name: str,
         limits: RecordingLimits | None = None,
         report: Callable[[RecordingReport], None] = lambda _: None,
+        *,
+        autostart: bool = True,
     ) -> None:
-        self._writer = SessionWriter(
-            directory, name, began_with_daemon=True, limits=limits or RecordingLimits()
-        )
+        self._directory, self._name = directory, name
+        self._limits = limits or RecordingLimits()
         self._report = report
+        self._writing = asyncio.Lock()
+        """Held while the thread writes: one call at a time."""
+        self._writer: SessionWriter | None = None
         self._snapshot = self._before = Snapshot()
+        self._t_ns = time.monotonic_ns()
+        self._clear()
+        if autostart:
+            self.begin(with_daemon=True)
+
+    def _clear(self) -> None:
         self._pending: list[object] = []
         self._pending_bytes = 0
         self._first_sequence = 0
         self._lost = 0
         self._gap: RecordingGap | None = None
-        self._t_ns = time.monotonic_ns()
+
+    def begin(self, *, with_daemon: bool = False) -> SessionWriter:
+        """Record from now on; the file is created by the next write."""
+        self._clear()
+        self._before = self._snapshot
+        writer = SessionWriter(self._directory, self._name, with_daemon, self._limits)
+        self._writer = writer
+        return writer
+
+    # --- messages ----------------------------------------------------------------------------
 
     def event(self, event: Event) -> None:
         """Record one input event."""
@@ -114,51 +139,124 @@ class Recorder:
         self._add(DaemonMessage(channel, time.monotonic_ns(), content), _OTHER_BYTES)
 
     def _add(self, message: object, size_bytes: int) -> None:
+        if self._writer is None:
+            return
         if self._pending_bytes > PENDING_BYTES:
             self._lost += 1
         else:
             self._pending.append(message)
             self._pending_bytes += size_bytes
 
-    def health(self) -> RecordingHealth:
-        """Return the state of the recording."""
-        writer = self._writer
+    # --- state -------------------------------------------------------------------------------
+
+    def health(self) -> RecordingHealth | None:
+        """Return the state of the recording; None while nothing is recorded."""
+        return None if self._writer is None else self._health(self._writer)
+
+    def _health(self, writer: SessionWriter) -> RecordingHealth:
         return RecordingHealth(
             "" if writer.file is None else writer.file.name.removesuffix(UNFINISHED),
             writer.written_bytes,
             self._pending_bytes + writer.unwritten_bytes,
-            writer.lost + self._lost,
+            writer.lost + self._lost + (0 if self._gap is None else self._gap.count),
             writer.fault,
         )
 
     @property
+    def directory(self) -> Path:
+        """Folder of the files."""
+        return self._directory
+
+    @property
     def path(self) -> Path | None:
         """The open file; None before the first write and after the last one."""
-        return self._writer.file
+        return None if self._writer is None else self._writer.file
+
+    # --- writing -----------------------------------------------------------------------------
+
+    async def start(self) -> RecordingHealth:
+        """Begin to record and return once the file exists; do nothing if a recording runs.
+
+        Raises
+        ------
+        OSError
+            The file cannot be created: nothing is recorded.
+        """
+        writer = self._writer
+        if writer is None:
+            writer = self.begin()
+            await self._write()
+            if writer.file is None and writer.fault is not None:
+                self._writer = None
+                raise OSError(writer.fault)
+        return self._health(writer)
+
+    async def stop(self) -> RecordingHealth | None:
+        """Write the rest, close the file and return its last state; None without a recording."""
+        async with self._writing:
+            writer = self._writer
+            if writer is None:
+                return None
+            last, rest = self._health(writer), self._take_rest()
+            self._writer = None
+            self._clear()
+            await _in_thread(lambda: _close(writer, rest))
+            self._pass_reports(writer)
+        return replace(
+            last,
+            written_bytes=writer.written_bytes,
+            backlog_bytes=0,
+            failure=writer.fault,
+            active=False,
+        )
 
     async def run(self) -> None:
-        """Write twice per second until cancelled; then write the rest and close the file."""
+        """Write twice per second until cancelled; then write the rest and close the file.
+
+        Unfinished files of earlier runs are repaired meanwhile.
+        """
+        stopped = threading.Event()
+        repair = asyncio.create_task(self._repair(stopped), name="recording repair")
         try:
             while True:
-                writing = asyncio.create_task(
-                    asyncio.to_thread(self._writer.write, self._take()), name="recording writer"
-                )
-                try:
-                    await asyncio.shield(writing)
-                finally:  # a thread cannot be cancelled; later messages must follow it
-                    await asyncio.wait([writing])
-                self._pass_reports()
+                await self._write()
                 await asyncio.sleep(FLUSH_S)
         finally:
+            stopped.set()
+            repair.cancel()
             self.close()
 
+    async def _repair(self, stopped: threading.Event) -> None:
+        found = await asyncio.to_thread(
+            repair_unfinished, self._directory, self._name, stopped.is_set
+        )
+        for result in found:
+            if isinstance(result, str):
+                self._report(RecordingReport(result, NoticeLevel.WARNING))
+            else:
+                text = f"{result.path.name}: unfinished recording of an earlier run repaired"
+                texts = [text, *(gap.text() for gap in result.gaps)]
+                self._report(RecordingReport("; ".join(texts)))
+
+    async def _write(self) -> None:
+        async with self._writing:
+            writer = self._writer
+            if writer is not None:
+                batch = self._take()
+                await _in_thread(lambda: writer.write(batch))
+                self._pass_reports(writer)
+
     def close(self) -> None:
-        """Write the rest and close the file."""
-        batch = self._take()
-        self._writer.pause_s = 0.0
-        self._writer.write(batch)
-        self._writer.close(batch.next_sequence)
-        self._pass_reports()
+        """Write the rest and close the file, without a thread."""
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            _close(writer, self._take_rest())
+            self._pass_reports(writer)
+
+    def _take_rest(self) -> list[Batch]:
+        """Return the messages that wait, and the gap after them, if any."""
+        rest = [self._take()]
+        return rest if self._gap is None else [*rest, self._take()]
 
     def _take(self) -> Batch:
         """Return the messages that wait, and begin to collect again."""
@@ -180,7 +278,26 @@ class Recorder:
             self._lost = 0
         return batch
 
-    def _pass_reports(self) -> None:
-        reports, self._writer.reports = self._writer.reports, []
+    def _pass_reports(self, writer: SessionWriter) -> None:
+        reports, writer.reports = writer.reports, []
         for report in reports:
             self._report(report)
+
+
+def _close(writer: SessionWriter, rest: list[Batch]) -> None:
+    writer.pause_s = 0.0
+    for batch in rest:
+        writer.write(batch)
+    writer.close(rest[-1].next_sequence)
+
+
+async def _in_thread(work: Callable[[], None]) -> None:
+    """Run `work` in a thread; a cancellation waits for its end, because a thread cannot be stopped.
+
+    Later work must follow it.
+    """
+    running = asyncio.create_task(asyncio.to_thread(work), name="recording writer")
+    try:
+        await asyncio.shield(running)
+    finally:
+        await asyncio.wait([running])

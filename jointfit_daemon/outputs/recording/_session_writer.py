@@ -31,6 +31,7 @@ from jointfit_daemon.outputs.recording._channels import (
 from jointfit_daemon.outputs.recording._description import RecordingGap, RecordingInfo
 from jointfit_daemon.outputs.recording._event_json import EVENT_KINDS, encode_event, encode_json
 from jointfit_daemon.outputs.recording._part_file import PartFile, RecordedAttachment
+from jointfit_daemon.outputs.recording._retention import delete_oldest
 from jointfit_daemon.pipeline.events import ChunkArrived, NoticeLevel
 
 if TYPE_CHECKING:
@@ -94,10 +95,12 @@ class RecordingReport(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RecordingLimits:
-    """When a file ends."""
+    """When a file ends, and when the oldest files are deleted."""
 
     file_bytes: float = float("inf")
     file_s: float = float("inf")
+    keep_bytes: float = float("inf")
+    """Largest size of all recordings of the rig; the oldest complete files are deleted."""
 
 
 @dataclass(slots=True)
@@ -217,7 +220,20 @@ class SessionWriter:
         self._retry_s = 0.0
         self._now_ns = self._now_ns or t_ns
         self._add_snapshot(part, before, batch.first_sequence)
+        self._delete_oldest()
         return part
+
+    def _delete_oldest(self) -> None:
+        try:
+            deleted = delete_oldest(self.directory, self.rig, self.limits.keep_bytes)
+        except OSError as error:
+            text = f"old recordings cannot be deleted: {error.filename}: {error.strerror}"
+            self.reports.append(RecordingReport(text, NoticeLevel.WARNING))
+            return
+        if deleted:
+            names = ", ".join(path.name for path in deleted)
+            text = f"oldest recordings deleted, because [recording] keep_gb is reached: {names}"
+            self.reports.append(RecordingReport(text))
 
     def _create(self, info: RecordingInfo, attachments: Sequence[RecordedAttachment]) -> PartFile:
         """Create the file of `info`; all files of a session are named for its first second."""

@@ -110,6 +110,14 @@ class SelftestArguments(RequestArguments):
     """``bridge/request/selftest``."""
 
 
+class RecordArguments(RequestArguments):
+    """``bridge/request/record``."""
+
+    action: Literal["start", "stop", "status"] = Field(
+        description="`start` or `stop` to record; `status` changes nothing"
+    )
+
+
 class RequestKind(NamedTuple):
     """One request that the daemon accepts."""
 
@@ -139,5 +147,6 @@ REQUESTS: dict[str, RequestKind] = {
         UseCalibrationArguments, "Use a stored calibration again, or the previous one."
     ),
     "selftest": RequestKind(SelftestArguments, "Check devices, clocks, store, broker and host."),
+    "record": RequestKind(RecordArguments, "Start or stop to record, or return the state."),
 }
 """Every request by its name, the last level of its topic."""

@@ -20,11 +20,13 @@ BATCH = 500
 def write_recording(directory: Path, events: Iterable[Event], name: str = "rig") -> Path:
     """Write `events` to a recording in `directory`, and return its only file."""
     recorder = Recorder(directory, name)
-    recorder._writer.pause_s = 0.0
+    writer = recorder._writer
+    assert writer is not None
+    writer.pause_s = 0.0
     for number, event in enumerate(events, 1):
         recorder.event(event)
         if number % BATCH == 0:
-            recorder._writer.write(recorder._take())
+            writer.write(recorder._take())
     recorder.close()
     (path,) = directory.glob(f"{name}-*.mcap")
     return path

@@ -123,7 +123,7 @@ async def test_recording_returns_events_and_states_in_order(tmp_path: Path) -> N
     for event in given_events:
         recorder.event(event)
         recorder.output(state)
-    while recorder.health().backlog_bytes or recorder.path is None:
+    while recorder.path is None or recorder._pending or recorder._writing.locked():
         await asyncio.sleep(_recorder.FLUSH_S / 5)
     unfinished = recorder.path
     assert list(read_events(unfinished)) == given_events  # readable while it is written
@@ -189,12 +189,26 @@ def test_slow_disk_causes_a_gap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     recorder = Recorder(tmp_path, "rig")
     for n in range(200):
         recorder.event(Tick(n))
+    assert recorder._writer is not None
     recorder._writer.write(recorder._take())
     recorder.event(Tick(200))
+    assert recorder._gap is not None
+    health = recorder.health()
     recorder.close()
     (path,) = tmp_path.iterdir()
     (gap,) = open_recording(path).gaps()
     kept = gap.first_sequence
     assert list(read_events(path)) == [*map(Tick, range(kept)), Tick(200)]
     assert (gap.count, gap.reason) == (200 - kept, "the disk is too slow")
-    assert recorder.health().lost == gap.count
+    assert health is not None
+    assert health.lost == gap.count
+
+
+def test_messages_lost_at_the_end_are_a_gap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("jointfit_daemon.outputs.recording._recorder.PENDING_BYTES", 5000)
+    path = write_recording(tmp_path, map(Tick, range(200)))
+    (gap,) = open_recording(path).gaps()
+    assert gap.first_sequence + gap.count == 200
+    assert gap.reason == "the disk is too slow"

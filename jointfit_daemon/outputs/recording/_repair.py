@@ -1,0 +1,206 @@
+"""Copies the readable messages of a damaged or unfinished recording to a clean file.
+
+Invariant: the source is not changed, and no partial copy is left behind.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import orjson
+
+from jointfit_daemon.outputs.recording._blocks import RecordingError
+from jointfit_daemon.outputs.recording._channels import GAP, recorded_rig_name
+from jointfit_daemon.outputs.recording._description import RecordingGap
+from jointfit_daemon.outputs.recording._part_file import UNFINISHED, PartFile, RecordedAttachment
+from jointfit_daemon.outputs.recording._reader import Recording, open_part
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+_COPYING = ".repair"
+"""Suffix of the copy while it is written."""
+DAMAGED = ".bad"
+"""Suffix of an unfinished file with damage before its end, after its repair."""
+_FLUSH_MESSAGES = 4096
+"""Messages between two writes."""
+_PAUSE_MESSAGES, _PAUSE_S = 32, 0.001
+"""Messages copied at once in a running daemon, and the pause after them, s."""
+
+
+class RepairStoppedError(Exception):
+    """The repair was stopped before its end."""
+
+
+@dataclass(frozen=True, slots=True)
+class RepairResult:
+    """A repaired recording."""
+
+    source: Path
+    path: Path
+    """The clean file."""
+    messages: int
+    seconds: float
+    """From the first to the last message, s."""
+    gaps: tuple[RecordingGap, ...]
+    """Missing messages before the end."""
+    unreadable_bytes: int
+    """Bytes of the source that are no record: damaged, or written in part."""
+    closed: bool
+    """Whether the source was closed; else the messages of its last second may be missing."""
+
+
+def repair_recording(
+    source: Path,
+    target: Path,
+    *,
+    pause: bool = False,
+    stopped: Callable[[], bool] = lambda: False,
+) -> RepairResult:
+    """Copy all readable messages of one file.
+
+    Parameters
+    ----------
+    source
+        The file; it may be unfinished or damaged.
+    target
+        Name of the clean file, which must not exist.
+    pause
+        Whether to pause after every 32 messages, because the process acquires data.
+    stopped
+        Returns whether to stop early.
+
+    Raises
+    ------
+    RecordingError
+        The source is not a recording, contains no message, or is being written.
+    FileExistsError
+        The target exists.
+    OSError
+        The source cannot be read, or the target cannot be written.
+    RepairStoppedError
+        `stopped` returned True.
+    """
+    with _unused(source):
+        part = open_part(source)
+        attachments = [
+            RecordedAttachment(name, "application/json", data)
+            for name, data in part.documents.items()
+        ]
+        clean = PartFile(target, part.info, attachments, suffix=_COPYING)
+        try:
+            result = _copy(Recording((part,)), clean, pause=pause, stopped=stopped)
+        except BaseException:
+            clean.close()
+            clean.open_path.unlink(missing_ok=True)
+            raise
+    return result
+
+
+def _copy(
+    recording: Recording, clean: PartFile, *, pause: bool, stopped: Callable[[], bool]
+) -> RepairResult:
+    gaps: list[RecordingGap] = []
+    count, first_ns = 0, None
+    sequence, t_ns = recording.info.first_sequence, recording.info.start_t_ns
+    for message in recording.messages():
+        if isinstance(message, RecordingGap):
+            gaps.append(message)
+            sequence, t_ns = message.first_sequence + message.count, message.to_t_ns
+            clean.add(GAP, t_ns, t_ns, sequence, orjson.dumps(message))
+            continue
+
+        clean.add(*message[1:4], message.sequence, message.data)
+        count, t_ns = count + 1, message.t_ns
+        first_ns = t_ns if first_ns is None else first_ns
+        sequence = max(sequence, message.sequence + 1)
+        if count % _FLUSH_MESSAGES == 0:
+            clean.flush()
+        if pause and count % _PAUSE_MESSAGES == 0:
+            time.sleep(_PAUSE_S)
+        if stopped():
+            raise RepairStoppedError
+    if first_ns is None:
+        raise RecordingError(f"{recording.parts[0].path}: the recording contains no message")
+
+    source = recording.parts[0]
+    survey = source.survey()
+    clean.finish(sequence, survey.end.reason or "recovered")
+    return RepairResult(
+        source.path,
+        clean.path,
+        count,
+        (t_ns - first_ns) * 1e-9,
+        tuple(gaps),
+        sum(block.end - block.start for block in survey.damage),
+        survey.end.next_sequence is not None,
+    )
+
+
+@contextmanager
+def _unused(source: Path) -> Iterator[None]:
+    """Check that no daemon writes the file."""
+    fd = os.open(source, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RecordingError(
+                f"{source}: a daemon is writing this recording: stop the recording first"
+            ) from error
+        except OSError:  # a file system without locks
+            pass
+        yield
+    finally:
+        os.close(fd)
+
+
+def repair_unfinished(
+    directory: Path, rig: str, stopped: Callable[[], bool]
+) -> list[RepairResult | str]:
+    """Repair the files that earlier runs of `rig` left unfinished.
+
+    A repaired file gets its final name. The unfinished one is deleted; if it was damaged before its
+    end, it is renamed to ``….bad`` instead.
+
+    Returns
+    -------
+    list of RepairResult or str
+        What was repaired, or the reason why a file was not.
+    """
+    found: list[RepairResult | str] = []
+    try:
+        sources = sorted(directory.glob(f"*.mcap{UNFINISHED}"))
+    except OSError:
+        return found
+    for source in sources:
+        if recorded_rig_name(source.name) != rig:
+            continue
+        target = source.with_name(source.name.removesuffix(UNFINISHED))
+        try:
+            result = repair_recording(source, target, pause=True, stopped=stopped)
+            if result.gaps:
+                source.rename(source.with_name(source.name + DAMAGED))
+            else:
+                source.unlink()
+            found.append(result)
+        except RepairStoppedError:
+            break
+        except (RecordingError, OSError) as error:
+            if not _is_written(source):
+                found.append(f"cannot be repaired: {error}")
+    return found
+
+
+def _is_written(source: Path) -> bool:
+    try:
+        with _unused(source):
+            return False
+    except (RecordingError, OSError):
+        return True

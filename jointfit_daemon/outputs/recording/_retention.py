@@ -1,0 +1,48 @@
+"""Deletes the oldest recordings of a rig."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.outputs.recording._channels import recorded_rig_name
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def delete_oldest(directory: Path, rig: str, keep_bytes: float) -> list[Path]:
+    """Delete complete recordings of `rig`, the oldest first, until its files fit `keep_bytes`.
+
+    Parameters
+    ----------
+    directory
+        Folder of the recordings.
+    rig
+        Beginning of the file names; files of other rigs stay.
+    keep_bytes
+        Largest sum of the sizes, the open file included, bytes.
+
+    Returns
+    -------
+    list of Path
+        The deleted files.
+
+    Raises
+    ------
+    OSError
+        A file cannot be deleted.
+    """
+    sizes = {
+        path: path.stat().st_size
+        for path in directory.iterdir()
+        if recorded_rig_name(path.name) == rig
+    }
+    used, deleted = sum(sizes.values()), []
+    for path in sorted(sizes):
+        if used <= keep_bytes:
+            break
+        if path.suffix == ".mcap":
+            path.unlink()
+            used -= sizes[path]
+            deleted.append(path)
+    return deleted

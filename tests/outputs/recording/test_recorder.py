@@ -1,0 +1,266 @@
+"""The recorder starts, stops, rotates, deletes old files and survives failures of the disk."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import time
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from jointfit_daemon.config import parse_rig
+from jointfit_daemon.model import Chunk
+from jointfit_daemon.outputs.recording import (
+    Recorder,
+    RecordingLimits,
+    RecordingReport,
+    _session_writer,
+    open_recording,
+    read_events,
+)
+from jointfit_daemon.pipeline.events import (
+    ChunkArrived,
+    Configured,
+    SourceClosed,
+    SourceOpened,
+    Tick,
+    UnixOffset,
+)
+from tests.outputs.recording.recorded_events import write_recording
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from jointfit_daemon.pipeline.events import Event
+
+
+def write(recorder: Recorder, events: list[Event]) -> None:
+    """Record `events` as one batch."""
+    writer = recorder._writer
+    assert writer is not None
+    for event in events:
+        recorder.event(event)
+    writer.pause_s = 0.0
+    writer.write(recorder._take())
+    recorder._pass_reports(writer)
+
+
+def chunks(first: int, end: int) -> list[Event]:
+    return [ChunkArrived("S1", Chunk(number, os.urandom(200))) for number in range(first, end)]
+
+
+def test_rotated_files_are_one_recording(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, "rig", RecordingLimits(file_bytes=10_000))
+    some = [SourceOpened(0, "S1"), *chunks(1, 400)]
+    for begin in range(0, 400, 50):
+        write(recorder, some[begin : begin + 50])
+    recorder.close()
+    files = sorted(tmp_path.iterdir())
+    assert len(files) >= 4
+    assert [path.name[-9:] for path in files[:3]] == ["0001.mcap", "0002.mcap", "0003.mcap"]
+    for path in (files[0], files[2], tmp_path):
+        recording = open_recording(path)
+        assert list(recording.events()) == some
+        assert recording.gaps() == []
+
+    files[0].unlink()  # the next file contains the state of its beginning
+    recording = open_recording(files[1])
+    first, *rest = recording.events()
+    assert isinstance(first, SourceOpened)
+    assert rest == some[-len(rest) :]
+    assert not recording.began_with_daemon
+    assert recording.gaps() == []
+
+    files[2].unlink()
+    (gap,) = open_recording(files[1]).gaps()
+    assert gap.reason == "a file of the session is missing"
+
+
+def test_files_rotate_by_time(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, "rig", RecordingLimits(file_s=0.0))
+    for number in range(3):
+        write(recorder, [Tick(number)])
+    recorder.close()
+    assert len(list(tmp_path.glob("*.mcap"))) >= 3
+    assert list(read_events(tmp_path)) == [Tick(0), Tick(1), Tick(2)]
+
+
+def test_the_oldest_files_of_the_rig_are_deleted_and_reported(tmp_path: Path) -> None:
+    (tmp_path / "rig-20200101T000000-0001.mcap").write_bytes(bytes(30_000))
+    (tmp_path / "rig-2-20200101T000000-0001.mcap").write_bytes(bytes(30_000))
+    (tmp_path / "rig-notes.txt").write_bytes(bytes(30_000))
+    reports: list[RecordingReport] = []
+    limits = RecordingLimits(file_bytes=10_000, keep_bytes=45_000)
+    recorder = Recorder(tmp_path, "rig", limits, reports.append)
+    for begin in range(0, 1000, 50):
+        write(recorder, chunks(begin, begin + 50))
+    recorder.close()
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"rig-2-20200101T000000-0001.mcap", "rig-notes.txt"} <= names
+    own = [path for path in tmp_path.glob("rig-*-*.mcap") if not path.name.startswith("rig-2-")]
+    assert sum(path.stat().st_size for path in own) < 60_000
+    assert "rig-20200101T000000-0001.mcap" in reports[0].text
+    assert "keep_gb" in reports[0].text
+
+
+async def test_a_recording_started_later_begins_with_the_state(
+    tmp_path: Path, table: dict[str, Any]
+) -> None:
+    recorder = Recorder(tmp_path, "rig", autostart=False)
+    configured = Configured(1, parse_rig(table), None)
+    for event in (
+        configured,
+        UnixOffset(2, 5),
+        SourceOpened(3, "S1"),
+        SourceOpened(3, "S2"),
+        SourceClosed(4, "S2", "lost", "unplugged"),
+        *chunks(5, 9),
+    ):
+        recorder.event(event)
+    assert recorder.health() is None
+
+    health = await recorder.start()
+    again = await recorder.start()
+    assert health.file == again.file
+    assert recorder.path == tmp_path / f"{health.file}.part"
+    recorder.event(Tick(10))
+    stopped = await recorder.stop()
+    assert stopped is not None
+    assert (stopped.file, stopped.active) == (health.file, False)
+    assert await recorder.stop() is None
+
+    recording = open_recording(tmp_path / health.file)
+    assert not recording.began_with_daemon
+    first, unix, opened, *rest = recording.events()
+    assert isinstance(first, Configured)
+    assert first.rig == configured.rig
+    assert isinstance(unix, UnixOffset)
+    assert isinstance(opened, SourceOpened)
+    assert (unix.offset_ns, opened.source, rest) == (5, "S1", [Tick(10)])
+    assert recording.rig_table is not None
+
+
+async def test_a_start_that_creates_no_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    recorder = Recorder(tmp_path / "file", "rig", autostart=False)
+    with pytest.raises(OSError, match=r"file: (Not a directory|File exists)"):
+        await recorder.start()
+    assert recorder.health() is None
+
+
+class FailingDisk:
+    """Fails every write beyond a limit."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+        self.room_bytes: float = float("inf")
+        write, sync = os.write, os.fdatasync
+
+        def write_some(fd: int, data: bytes) -> int:
+            if self.room_bytes <= 0:
+                raise OSError(number, os.strerror(number))
+            count = write(fd, data[: int(min(len(data), self.room_bytes))])
+            self.room_bytes -= count
+            return count
+
+        monkeypatch.setattr("os.write", write_some)
+        monkeypatch.setattr("os.fdatasync", sync)
+
+
+@pytest.mark.parametrize("room_bytes", [0, 1, 977, 5003])
+def test_a_disk_that_is_full_for_a_while_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room_bytes: int
+) -> None:
+    disk = FailingDisk(monkeypatch, errno.ENOSPC)
+    reports: list[RecordingReport] = []
+    recorder = Recorder(tmp_path, "rig", report=reports.append)
+    some = chunks(0, 200)
+    write(recorder, some[:50])
+    disk.room_bytes = room_bytes
+    write(recorder, some[50:100])
+    write(recorder, some[100:150])
+    health = recorder.health()
+    assert health is not None
+    assert "No space left" in str(health.failure)
+    disk.room_bytes = float("inf")
+    write(recorder, some[150:])
+    recorder.close()
+    assert list(read_events(tmp_path)) == some
+    assert open_recording(tmp_path).gaps() == []
+    assert ["interrupted" in reports[0].text, "resumed, 0" in reports[1].text] == [True, True]
+
+
+def test_a_disk_that_stays_full_causes_one_gap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(_session_writer, "MOST_UNWRITTEN_BYTES", 10_000)
+    disk = FailingDisk(monkeypatch, errno.ENOSPC)
+    recorder = Recorder(tmp_path, "rig")
+    some = [SourceOpened(0, "S1"), *chunks(1, 600)]
+    write(recorder, some[:50])
+    disk.room_bytes = 1000
+    for begin in range(50, 500, 50):
+        write(recorder, some[begin : begin + 50])
+    disk.room_bytes = float("inf")
+    write(recorder, some[500:])
+    health = recorder.health()
+    recorder.close()
+    (gap,) = open_recording(tmp_path).gaps()
+    assert gap.first_sequence + gap.count == 500
+    assert "No space left" in gap.reason
+    assert health is not None
+    assert (health.failure, health.lost) == (None, gap.count)
+    found = list(read_events(tmp_path))
+    restored = found.pop(gap.first_sequence)  # the state after the gap
+    assert isinstance(restored, SourceOpened)
+    assert found == some[: gap.first_sequence] + some[500:]
+
+
+@pytest.mark.parametrize("number", [errno.EFBIG, errno.EIO])
+def test_a_file_that_cannot_be_continued_is_followed_by_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    monkeypatch.setattr(_session_writer, "ABANDON_S", -1.0)
+    monkeypatch.setattr(_session_writer, "RETRY_S", 0.0)
+    disk = FailingDisk(monkeypatch, number)
+    recorder = Recorder(tmp_path, "rig")
+    some = [SourceOpened(0, "S1"), *chunks(1, 300)]
+    write(recorder, some[:100])
+    disk.room_bytes = 3000
+    write(recorder, some[100:200])
+    disk.room_bytes = float("inf")
+    write(recorder, some[200:])
+    recorder.close()
+    (gap,) = open_recording(tmp_path).gaps()
+    assert (gap.first_sequence, gap.count) == (100, 100)
+    found = [event for event in read_events(tmp_path) if isinstance(event, ChunkArrived)]
+    assert found == some[1:100] + some[200:]
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 20.0
+    while not condition():
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.02)
+
+
+async def test_files_of_earlier_runs_are_repaired_at_the_start(tmp_path: Path) -> None:
+    some: list[Event] = [Tick(number) for number in range(100)]
+    path = write_recording(tmp_path, some)
+    torn = path.with_name("rig-20200101T000000-0001.mcap.part")
+    torn.write_bytes(path.read_bytes()[:-300])
+    other = torn.with_name("other-20200101T000000-0001.mcap.part")
+    other.write_bytes(b"")
+    path.unlink()
+    reports: list[RecordingReport] = []
+    recorder = Recorder(tmp_path, "rig", report=reports.append)
+    running = asyncio.create_task(recorder.run(), name="recorder")
+    await until(lambda: bool(reports))
+    running.cancel()
+    await asyncio.wait([running])
+    assert "unfinished recording of an earlier run repaired" in reports[0].text
+    assert not torn.exists()
+    assert other.exists()
+    assert list(read_events(torn.with_suffix(""))) == some
