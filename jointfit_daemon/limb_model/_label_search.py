@@ -1,11 +1,12 @@
-"""Search for exchanged marker labels in single frames, by the shapes of the marker clusters.
+"""Search for exchanged marker labels in single frames, by clusters and their joint centers.
 
 A hypothesis assigns a measured label to every marker of a cluster. Its cost is the negative
 logarithm of its likelihood: marker errors are Gaussian, an exchanged label is less probable than a
-correct one, and a marker that is somewhere else is less probable still.
+correct one, and a marker that is somewhere else is less probable still. A cluster that looks the
+same after an exchange is turned by it: its joint centers leave those of the adjacent clusters.
 
 Invariant: an explanation is unique. Every hypothesis that disagrees with it has a higher cost by
-`_MARGIN`, and every cluster it changes has an RMS residual of at most `_GAIN` of the one before.
+`_MARGIN`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from jointfit_daemon.limb_model._rigid_fit import MAX_FIT_RMS_M, MIN_MARKERS, is_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -48,13 +49,23 @@ _MARGIN = 2.5
 """Least difference in cost of two explanations."""
 _GAIN = 0.55
 """Largest RMS residual of an explanation, as a share of that of the labels as they are."""
+_SMALL_M = 0.008
+"""RMS residual of an explanation that is always small enough, m."""
+_LARGE_M = 0.02
+"""RMS residual that is too large for an explanation, m."""
+GAP_M = 0.08
+"""Distance of the two centers of a joint above which labels are searched, m."""
+_GAP_SD_M = 0.03
+"""Standard deviation of this distance, soft-tissue artefact and error of the center included, m."""
+_MOST_GAP_COST = 12.0
+"""Largest cost of the distance at one joint: it is evidence like a marker elsewhere."""
 _NEAR_M = 0.025
 """RMS residual up to which a label is at the place of a hidden marker, m."""
 _TOLERANCE_M = 0.03
 """Greatest difference of the distance of two markers from that in the cluster, m."""
 _MOST_CHANGED = 4
 """Largest number of changed labels in one cluster."""
-_BEST = 12
+_BEST = 16
 """Number of assignments of one cluster that are combined with those of the others."""
 _MOST_COMBINED = 2000
 """Largest number of partial combinations: none of a healthy limb has more than a few."""
@@ -107,6 +118,25 @@ class _Assignment(NamedTuple):
 
     columns: tuple[int, ...]
     cost: float
+    centers: Array
+    """Joint centers fixed in the cluster, m, shape (J, 3); NaN for other joints."""
+
+
+class _Fits(NamedTuple):
+    """Rigid fits of n sets of markers."""
+
+    rms: Array
+    """m, shape (n,)."""
+    rotation: Array
+    """From the template to the frame, shape (n, 3, 3)."""
+    template_mean: Array
+    mean: Array
+    """Means of the markers in template and frame, m, shape (n, 3)."""
+
+    def carry(self, points: Array) -> Array:
+        """Return points of the template in the frame, m, shapes (n, J, 3)."""
+        turned = (points - self.template_mean[:, None]) @ np.swapaxes(self.rotation, 1, 2)
+        return np.asarray(turned + self.mean[:, None])
 
 
 class LabelSearch:
@@ -114,11 +144,17 @@ class LabelSearch:
 
     Parameters
     ----------
-    clusters : sequence of MarkerCluster
+    clusters : iterable of MarkerCluster
         Clusters of markers. Rigid bodies are ignored.
+    centers : mapping of tuple of str to ndarray, optional
+        Joint centers in the static world, m, shape (3,), by the body parts beside each joint.
     """
 
-    def __init__(self, clusters: Iterable[MarkerCluster]) -> None:
+    def __init__(
+        self,
+        clusters: Iterable[MarkerCluster],
+        centers: Mapping[tuple[str, str], Array] | None = None,
+    ) -> None:
         self.clusters = tuple(cluster for cluster in clusters if cluster.body is None)
         self.labels = tuple(name for cluster in self.clusters for name in cluster.markers)
         self._part_of = [p for p, cluster in enumerate(self.clusters) for _ in cluster.markers]
@@ -133,6 +169,14 @@ class LabelSearch:
         for p, (own, cluster) in enumerate(zip(self._own, self.clusters, strict=True)):
             self._template[p, : len(own)] = cluster.template
             self._columns[p, : len(own)] = own
+
+        # Joint centers in the coordinates of the templates, NaN for parts beside other joints.
+        given = {} if centers is None else centers
+        self._centers = np.full((len(self.clusters), len(given), 3), np.nan)
+        for j, (parts, center) in enumerate(given.items()):
+            for p, cluster in enumerate(self.clusters):
+                if cluster.name in parts:
+                    self._centers[p, j] = center - cluster.origin
         self._lines: dict[tuple[int, bytes], bool] = {}
         self._limits = np.array([_suspicious_rms(cluster.template) for cluster in self.clusters])
 
@@ -148,11 +192,27 @@ class LabelSearch:
         seen = np.isfinite(padded).all(axis=1)
         if not len(self.clusters):
             return LabelFinding(np.zeros(0), ())
-        rms = _residual_rms(self._template, padded[self._columns], seen[self._columns])
-        rms[~self._fitted(seen)] = np.nan
+        fits = _fit(self._template, padded[self._columns], seen[self._columns])
+        fitted = self._fitted(seen)
+        rms, centers = fits.rms, fits.carry(self._centers)
+        rms[~fitted], centers[~fitted] = np.nan, np.nan
 
-        suspects = np.flatnonzero(rms > self._limits).tolist()
-        return LabelFinding(rms, self._faults(padded, seen, rms, suspects) if suspects else ())
+        # Clusters that do not fit, and both sides of a joint whose centers are apart.
+        suspect = rms > self._limits
+        for at in np.swapaxes(centers, 0, 1):
+            (beside,) = np.nonzero(np.isfinite(at[:, 0]))
+            if len(beside) > 1 and np.linalg.norm(at[beside[0]] - at[beside[1]]) > GAP_M:
+                suspect[beside] = True
+        if not suspect.any():
+            return LabelFinding(rms, ())
+        return LabelFinding(rms, self._faults(padded, seen, rms, centers, suspect))
+
+    def neighbors(self, parts: Iterable[str]) -> frozenset[str]:
+        """Return the body parts that share a joint with some parts."""
+        rows = [p for p, cluster in enumerate(self.clusters) if cluster.name in set(parts)]
+        shared = np.isfinite(self._centers[rows, :, 0]).any(axis=0)
+        near = np.isfinite(self._centers[:, shared, 0]).any(axis=1)
+        return frozenset(self.clusters[p].name for p in np.flatnonzero(near))
 
     def _fitted(self, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return the clusters whose visible markers determine a pose, shape (P,)."""
@@ -164,12 +224,24 @@ class LabelSearch:
         )
 
     def _faults(
-        self, points: Array, seen: NDArray[np.bool_], rms: Array, suspects: Sequence[int]
+        self,
+        points: Array,
+        seen: NDArray[np.bool_],
+        rms: Array,
+        centers: Array,
+        suspect: NDArray[np.bool_],
     ) -> tuple[LabelFault, ...]:
+        suspects = np.flatnonzero(suspect).tolist()
         distances = np.sqrt(((points[:, None] - points[None]) ** 2).sum(axis=-1))
         frame = _Frame(points, seen, distances)
         pool = np.concatenate([self._own[p][seen[self._own[p]]] for p in suspects])
         options = [self._assignments(p, frame, pool, float(rms[p])) for p in suspects]
+        for i, each in enumerate(options):
+            known = _gap_costs(np.array([one.centers for one in each]), centers[~suspect])
+            costs = [one.cost for one in each] + known.sum(axis=1)
+            options[i] = [
+                one._replace(cost=cost) for one, cost in zip(each, costs.tolist(), strict=True)
+            ]
         best = _combine(options)
         if best is None:
             return ()
@@ -218,21 +290,23 @@ class LabelSearch:
         used = found >= 0
         enough = used.sum(axis=1) >= MIN_MARKERS
         found, used = found[enough], used[enough]
-        identity = tuple(np.where(seen[own], own, -1).tolist())
-        first = _Assignment(identity, float(_cost(np.array(rms), seen[own].sum())))
-        if not len(found):
-            return [first]
-        tiled = np.broadcast_to(template, (*found.shape, 3))
-        after = _residual_rms(tiled, frame.points[found], used)
-
-        changed = ((found != own) & used).sum(axis=1)
-        count = used.sum(axis=1)
+        identity = np.where(seen[own], own, -1)
+        # The labels as they are come first.
+        found = np.concatenate(([identity], found))
+        used = np.concatenate(([seen[own]], used))
+        fits = _fit(np.broadcast_to(template, (*found.shape, 3)), frame.points[found], used)
+        after, centers = fits.rms, fits.carry(self._centers[p])
+        changed, count = ((found != own) & used).sum(axis=1), used.sum(axis=1)
         cost = _cost(after, count) + _EXCHANGED_COST * changed
         cost += _ELSEWHERE_COST * (seen[own].sum() - count)
-        good = (after < _GAIN * rms) & (changed + ((found < 0) & seen[own]).sum(axis=1) > 0)
+
+        small = after < min(max(_GAIN * rms, _SMALL_M), _LARGE_M)
+        good = small & (changed + ((found < 0) & seen[own]).sum(axis=1) > 0)
         order = np.flatnonzero(good)[np.argsort(cost[good], kind="stable")][: 4 * _BEST]
         kept = [i for i in order.tolist() if not self._is_line(p, used[i])][:_BEST]
-        return [first, *(_Assignment(tuple(found[i].tolist()), float(cost[i])) for i in kept)]
+        return [
+            _Assignment(tuple(found[i].tolist()), float(cost[i]), centers[i]) for i in (0, *kept)
+        ]
 
     def _is_line(self, p: int, used: NDArray[np.bool_]) -> bool:
         """Return whether some markers of a cluster are on a line."""
@@ -257,9 +331,9 @@ class LabelSearch:
             for s in own[~seen[own]].tolist():
                 columns = np.where(seen[own], own, -1)
                 columns[s - own[0]] = label
-                after = _residual_rms(
+                after = _fit(
                     self.clusters[p].template[None], points[columns][None], (columns >= 0)[None]
-                )[0]
+                ).rms[0]
                 if after < _NEAR_M:
                     found.append(s)
         return found[0] if len(found) == 1 else None
@@ -331,7 +405,7 @@ def _suspicious_rms(template: Array) -> float:
         return SUSPICIOUS_M
     tiled = np.broadcast_to(template, (len(orders), count, 3))
     seen = np.ones((len(orders), count), dtype=np.bool_)
-    least = float(_residual_rms(tiled, template[np.array(orders)], seen).min())
+    least = float(_fit(tiled, template[np.array(orders)], seen).rms.min())
     return max(SMALLEST_M, min(SUSPICIOUS_M, _SYMMETRY * least))
 
 
@@ -347,22 +421,43 @@ def _orders(count: int, rows: tuple[int, ...]) -> list[list[int]]:
     return found
 
 
-def _residual_rms(template: Array, points: Array, seen: NDArray[np.bool_]) -> Array:
-    r"""Return the RMS residuals of rigid fits, m, shape (n,); arrays (n, k, 3) and (n, k).
+def _fit(template: Array, points: Array, seen: NDArray[np.bool_]) -> _Fits:
+    r"""Return the rigid fits of n sets of k markers (Kabsch 1976).
 
     With the singular values s of the cross moment, the sum of squared residuals is
-    :math:`\sum |a|^2 + \sum |y|^2 - 2 (s_1 + s_2 \pm s_3)` (Kabsch 1976).
+    :math:`\sum |a|^2 + \sum |y|^2 - 2 (s_1 + s_2 \pm s_3)`.
+
+    Parameters
+    ----------
+    template, points : ndarray, shape (n, k, 3)
+        Markers of the cluster and of the frame, m.
+    seen : ndarray, shape (n, k)
+        Markers to fit.
     """
     w = seen[..., None]
-    count = np.maximum(seen.sum(axis=1), 1)
+    count = np.maximum(seen.sum(axis=1), 1)[:, None]
     a, y = np.where(w, template, 0.0), np.where(w, points, 0.0)
-    a = np.where(w, a - (a.sum(axis=1) / count[:, None])[:, None], 0.0)
-    y = np.where(w, y - (y.sum(axis=1) / count[:, None])[:, None], 0.0)
-    moment = np.swapaxes(a, 1, 2) @ y
-    s = np.linalg.svd(moment, compute_uv=False)
-    s[:, 2] *= np.sign(np.linalg.det(moment))
+    a_mean, y_mean = a.sum(axis=1) / count, y.sum(axis=1) / count
+    a, y = np.where(w, a - a_mean[:, None], 0.0), np.where(w, y - y_mean[:, None], 0.0)
+    u, s, vt = np.linalg.svd(np.swapaxes(a, 1, 2) @ y)
+    sign = np.sign(np.linalg.det(u @ vt))
+    s[:, 2] *= sign
+    vt[:, 2] *= sign[:, None]
     square = (a * a).sum(axis=(1, 2)) + (y * y).sum(axis=(1, 2)) - 2.0 * s.sum(axis=1)
-    return np.asarray(np.sqrt(np.maximum(square, 0.0) / count))
+    rms = np.sqrt(np.maximum(square, 0.0) / count[:, 0])
+    return _Fits(rms, np.swapaxes(u @ vt, 1, 2), a_mean, y_mean)
+
+
+def _gap_costs(one: Array, other: Array) -> Array:
+    """Return the costs of distances of the same joint centers, shape (n, m).
+
+    Parameters
+    ----------
+    one, other : ndarray, shapes (n, J, 3) and (m, J, 3)
+        Joint centers of n assignments of a cluster and m of another one, m.
+    """
+    square = ((one[:, None] - other[None]) ** 2).sum(axis=-1) / (2.0 * _GAP_SD_M**2)
+    return np.asarray(np.nansum(np.minimum(square, _MOST_GAP_COST), axis=-1))
 
 
 def _cost(rms: Array, count: Array) -> Array:
@@ -382,12 +477,23 @@ def _combine(options: Sequence[Sequence[_Assignment]]) -> list[tuple[int, ...]] 
         rest.append(rest[-1] + min(one.cost for one in each))
     rest.reverse()
 
+    # Cost of the joints between two of the clusters, for every pair of their assignments.
+    centers = [np.array([one.centers for one in each]) for each in options]
+    gaps = {
+        (q, p): _gap_costs(centers[q], centers[p]).tolist()
+        for q, p in combinations(range(len(options)), 2)
+        if np.isfinite(centers[q][0] + centers[p][0]).any()
+    }
+
     found: list[tuple[float, tuple[int, ...]]] = []
     best, visited = np.inf, 0
     stack: list[tuple[float, int, tuple[int, ...]]] = [(0.0, 0, ())]
     while stack and (visited := visited + 1) <= _MOST_COMBINED:
         cost, taken, chosen = stack.pop()
         p = len(chosen)
+        cost += sum(
+            gaps[q, p - 1][chosen[q]][chosen[-1]] for q in range(p - 1) if (q, p - 1) in gaps
+        )
         if cost + rest[p] > best + _MARGIN:
             continue
         if p == len(options):

@@ -254,7 +254,7 @@ class Core:
         if self._moving_centers is None or not self._moving_centers.serves(centers):
             self._moving_centers = centers
         self._chain_tracker = chain_tracker(rig, usable, self._chain_tracker)
-        self._label_monitor = label_monitor(usable, self._chain_tracker, self._label_monitor)
+        self._label_monitor = label_monitor(rig, usable, self._label_monitor)
         wanted = rig.calibration.learn_online
         self._collector = OnlineFrameCollector(rig.chain, usable, wanted=wanted)
 

@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jointfit_daemon.limb_model import MAX_FIT_RMS_M, LabelFault, LabelSearch, restore_cluster
+from jointfit_daemon.limb_model import (
+    MAX_FIT_RMS_M,
+    LabelFault,
+    LabelSearch,
+    body_parts,
+    joint_parts,
+    restore_cluster,
+)
 from jointfit_daemon.model import MarkerFlag
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.timing.alignment import RateDivider
@@ -25,8 +32,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from jointfit_daemon.limb_model import StoredCluster
-    from jointfit_daemon.model import MocapFrame, MocapLayout
+    from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.model import Chain, MocapFrame, MocapLayout, Vector
     from jointfit_daemon.pipeline.events import Output
 
 RATE_HZ = 5.0
@@ -61,16 +68,17 @@ class LabelMonitor:
 
     Parameters
     ----------
-    clusters : mapping of str to StoredCluster
-        Marker clusters of the calibration in force.
+    chain : Chain
+        The limb.
+    calibration : Calibration
+        Marker clusters and joint centers in force.
     """
 
-    def __init__(self, clusters: Mapping[str, StoredCluster]) -> None:
-        self._stored = dict(clusters)
+    def __init__(self, chain: Chain, calibration: Calibration) -> None:
+        self._given = chain, dict(calibration.clusters), _centers(chain, calibration)
         self._search = LabelSearch(
-            restore_cluster(name, stored)
-            for name, stored in clusters.items()
-            if stored.body is None
+            (restore_cluster(name, stored) for name, stored in calibration.clusters.items()),
+            {parts: np.array(center) for parts, center in self._given[2].items()},
         )
         self._rate = RateDivider(RATE_HZ)
         self._examined: deque[_Examined] = deque()
@@ -78,19 +86,20 @@ class LabelMonitor:
         self._columns: list[int] = []
         self._hidden: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
         """Columns of the layout whose labels are faulty."""
-        self.faults: frozenset[LabelFault] = frozenset()
-        """Faults in force."""
+        self.faults: dict[LabelFault, frozenset[str]] = {}
+        """Faults in force, with the body parts whose markers must be visible to end them."""
         self.misfits: frozenset[str] = frozenset()
         """Body parts whose markers do not fit, without explanation."""
 
-    def serves(self, clusters: Mapping[str, StoredCluster]) -> bool:
-        """Return whether a new monitor of these clusters would be equal to this one."""
-        return self._stored == dict(clusters)
+    def serves(self, chain: Chain, calibration: Calibration) -> bool:
+        """Return whether a new monitor with these arguments would be equal to this one."""
+        given = chain, dict(calibration.clusters), _centers(chain, calibration)
+        return self._given == given
 
     def reset(self) -> None:
         """Forget all frames and faults: markers are being placed or calibrated again."""
         self._examined.clear()
-        self.faults, self.misfits = frozenset(), frozenset()
+        self.faults, self.misfits = {}, frozenset()
         self._hidden = self._hidden[:0]
 
     def hide_faulty(self, frame: MocapFrame) -> MocapFrame:
@@ -142,7 +151,7 @@ class LabelMonitor:
             fault
             for one in self._examined
             if t_ns - one.t_ns <= FAULT_NS
-            for fault in one.faults - self.faults
+            for fault in one.faults - self.faults.keys()
         )
         notices: list[Output] = []
         for fault, count in sorted(recent.items()):
@@ -150,8 +159,13 @@ class LabelMonitor:
             if len(frames) < _FEWEST or count < _PRESENT * len(frames):
                 continue
             # It takes the place of an earlier explanation of the same markers.
-            others = {f for f in self.faults if not set(f.markers) & set(fault.markers)}
-            self.faults = frozenset({*others, fault})
+            for other in [f for f in self.faults if not set(f.markers).isdisjoint(fault.markers)]:
+                del self.faults[other]
+            # Clusters that fit in spite of it are at fault only in relation to adjacent ones.
+            bad = sum(not one.refused.keys().isdisjoint(fault.parts) for one in frames)
+            parts = frozenset(fault.parts)
+            fits = bad < _PRESENT * len(frames)
+            self.faults[fault] = parts | self._search.neighbors(parts) if fits else parts
             self.misfits -= set(fault.parts)
             notices.append(_fault_notice(t_ns, fault))
 
@@ -169,14 +183,14 @@ class LabelMonitor:
     def _end(self, t_ns: int) -> list[Output]:
         """Return notices of the faults and misfits that end."""
         notices: list[Output] = []
-        for fault in sorted(self.faults):
-            frames = self._frames(t_ns, fault.parts, FAULT_NS)
+        for fault, needed in sorted(self.faults.items()):
+            frames = self._frames(t_ns, needed, FAULT_NS)
             bad = sum(
                 fault in one.faults or not one.refused.keys().isdisjoint(fault.parts)
                 for one in frames
             )
             if len(frames) >= _FEWEST and bad <= _ABSENT * len(frames):
-                self.faults -= {fault}
+                del self.faults[fault]
                 text = f"{_joined(fault.markers)}: at the expected place again, and in use"
                 notices.append(_notice(t_ns, fault.markers[0], "ok", text, fault))
         for part in sorted(self.misfits):
@@ -194,6 +208,17 @@ class LabelMonitor:
         columns = zip(self._search.labels, self._columns, strict=False)
         found = [column for name, column in columns if name in names and column >= 0]
         self._hidden = np.array(found, dtype=np.intp)
+
+
+def _centers(chain: Chain, calibration: Calibration) -> dict[tuple[str, str], Vector]:
+    """Return the known joint centers, static world, m, by the body parts beside each joint."""
+    parts, found = body_parts(chain), {}
+    for name, (proximal, distal) in zip(chain.joints, joint_parts(chain), strict=True):
+        joint = calibration.joint.get(name)
+        above, below = parts[proximal], parts[distal] if distal < len(parts) else None
+        if joint is not None and joint.center is not None and above and below:
+            found[above, below] = joint.center
+    return found
 
 
 def _fault_notice(t_ns: int, fault: LabelFault) -> Notice:
@@ -221,8 +246,8 @@ def _fault_notice(t_ns: int, fault: LabelFault) -> Notice:
 def _misfit_notice(t_ns: int, part: str, rms: float) -> Notice:
     text = (
         f"{part}: its markers do not match the static pose: {1000 * rms:.0f} mm RMS, at most "
-        f"{1000 * MAX_FIT_RMS_M:g} mm expected, and no exchange of labels explains it. Check their "
-        f"labels and places, or repeat the calibration. {part} has no optical pose until then"
+        f"{1000 * MAX_FIT_RMS_M:g} mm expected, and no single exchange of labels explains it. "
+        "Check labels and places, or repeat the calibration. Until then, cameras give no pose of it"
     )
     data = {"state": MarkerFlag.MISFIT.value, "rms_m": round(rms, 4)}
     return Notice(t_ns, NoticeKind.MARKER, part, text, NoticeLevel.WARNING, data)

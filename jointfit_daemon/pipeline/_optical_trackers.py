@@ -46,14 +46,15 @@ def planar_tracker(rig: Rig, before: PlanarTracker | None) -> PlanarTracker | No
 
 
 def label_monitor(
-    calibration: Calibration | None, chain: ChainTracker | None, before: LabelMonitor | None
+    rig: Rig, calibration: Calibration | None, before: LabelMonitor | None
 ) -> LabelMonitor | None:
-    """Return a monitor of the marker labels; None beside a chain model, which has its own."""
-    if calibration is None or chain is not None:
+    """Return a monitor of the marker labels; `before` if it is equal."""
+    # the tracker of a chain model has its own
+    if calibration is None or (rig.chain_model is not None and rig.mqtt.chain_hz > 0.0):
         return None
-    if before is not None and before.serves(calibration.clusters):
+    if before is not None and before.serves(rig.chain, calibration):
         return before
-    return LabelMonitor(calibration.clusters)
+    return LabelMonitor(rig.chain, calibration)
 
 
 def unused_refinement(rig: Rig, calibration: Calibration | None, t_ns: int) -> list[Output]:

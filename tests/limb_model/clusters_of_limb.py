@@ -7,8 +7,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.limb_model import MarkerCluster
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.limb_model import (
+    Calibration,
+    JointCalibration,
+    MarkerCluster,
+    cluster_record,
+    rigid_fit,
+    vector,
+)
 from tests.calibration.synthetic_limb import (
+    CHAIN,
+    LENGTH,
     LOCAL,
     MARKERS,
     Imperfections,
@@ -21,6 +31,12 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
 
+CENTERS = {
+    ("pelvis", "thigh"): (0.0, 0.0, 0.0),
+    ("thigh", "shank"): (0.0, 0.0, -LENGTH["thigh"]),
+    ("shank", "foot"): (0.0, 0.0, -LENGTH["thigh"] - LENGTH["shank"]),
+}
+"""Joint centers of the standing limb from the hip, axes of the segments, m."""
 LABELS = tuple(name for part in LOCAL for name in MARKERS[part])
 
 
@@ -56,3 +72,22 @@ def cycled(points: Array, *labels: str) -> Array:
     changed = points.copy()
     changed[..., rows, :] = points[..., rows[1:] + rows[:1], :]
     return changed
+
+
+def centers_of(clusters: list[MarkerCluster]) -> dict[tuple[str, str], Array]:
+    """Return the joint centers beside standing clusters, static world, m, shape (3,)."""
+    # All segment frames of the standing limb have the same axes.
+    pelvis, local = clusters[0], np.array(LOCAL["pelvis"])
+    q, t, _ = rigid_fit(local, (pelvis.template + pelvis.origin)[None])
+    return {parts: rotation.rotate(q[0], np.array(at)) + t[0] for parts, at in CENTERS.items()}
+
+
+def calibration_of(clusters: list[MarkerCluster]) -> Calibration:
+    """Return a calibration with these clusters and the joint centers beside them."""
+    found = centers_of(clusters)
+    joints = {
+        name: JointCalibration(vector(center), 0.0, "fit")
+        for name, center in zip(CHAIN.joints, found.values(), strict=True)
+    }
+    stored = {cluster.name: cluster_record(cluster) for cluster in clusters}
+    return Calibration("mean", CHAIN.joints, CHAIN.segments, CHAIN.sensors, {}, {}, joints, stored)

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from jointfit_daemon.limb_model import cluster_record
 from jointfit_daemon.model import MocapFrame, MocapLayout
 from jointfit_daemon.pipeline._label_monitor import LabelMonitor
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
-from tests.limb_model.clusters_of_limb import LABELS, cycled, person
+from tests.calibration.synthetic_limb import CHAIN
+from tests.limb_model.clusters_of_limb import LABELS, calibration_of, cycled, person
 from tests.limb_model.test_label_search import EXCHANGES
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def watch(
 ) -> tuple[LabelMonitor, list[Notice]]:
     """Return the monitor after 10 s of movement, and its notices."""
     clusters, stamps, positions = person(seed, skin_m, occluded)
-    monitor = LabelMonitor({cluster.name: cluster_record(cluster) for cluster in clusters})
+    monitor = LabelMonitor(CHAIN, calibration_of(clusters))
     notices: list[Notice] = []
     for k, (t_ns, points) in enumerate(zip(stamps.tolist(), positions, strict=True)):
         outputs = monitor.add_frame(t_ns, camera_frame(k, change(t_ns / 1e9, points)))
@@ -154,12 +154,23 @@ def test_healthy_people_have_no_notice(seed: int) -> None:
 
 def test_rigid_bodies_are_not_monitored() -> None:
     clusters, stamps, positions = person(2)
-    stored = {cluster.name: cluster_record(cluster) for cluster in clusters}
-    stored["thigh"] = replace(stored["thigh"], body="Thigh", markers=())
-    monitor = LabelMonitor(stored)
+    calibration = calibration_of(clusters)
+    body = replace(calibration.clusters["thigh"], body="Thigh", markers=())
+    changed = replace(calibration, clusters={**calibration.clusters, "thigh": body})
+    monitor = LabelMonitor(CHAIN, changed)
     mixed = cycled(positions, "thigh0", "shank2")
     for t_ns, points in zip(stamps.tolist(), mixed, strict=True):
         monitor.add_frame(t_ns, camera_frame(0, points))
     # the marker of the thigh belongs to no cluster, so its place is unknown
     assert [fault.markers for fault in monitor.faults] == [("shank2",)]
-    assert LabelMonitor({}).add_frame(0, camera_frame(0, positions[0])) == []
+    without = replace(calibration, clusters={})
+    assert LabelMonitor(CHAIN, without).add_frame(0, camera_frame(0, positions[0])) == []
+
+
+def test_a_monitor_serves_a_calibration_with_equal_clusters_and_centers_only() -> None:
+    calibration = calibration_of(person(2)[0])
+    monitor = LabelMonitor(CHAIN, calibration)
+    assert monitor.serves(CHAIN, replace(calibration, notes=("refit",)))
+    fewer = {name: one for name, one in calibration.clusters.items() if name != "foot"}
+    assert not monitor.serves(CHAIN, replace(calibration, clusters=fewer))
+    assert not monitor.serves(CHAIN, replace(calibration, joint={}))
