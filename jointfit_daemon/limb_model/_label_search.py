@@ -94,6 +94,18 @@ class LabelFault(NamedTuple):
         *first, last = [f"{name} is at the place of {other}" for name, other in following]
         return f"{', '.join(first)} and {last}" if first else last
 
+    @property
+    def text(self) -> str:
+        """Return what is wrong with two or more markers, as a sentence without its end."""
+        if self.cycle:
+            *first, last = self.markers
+            return f"{', '.join(first)} and {last} look exchanged: {self.places}"
+        *first, last = self.markers[:-1]
+        if first:
+            names = f"{', '.join(first)} and {last}"
+            return f"{names} have labels of other markers: {self.places}, which is hidden"
+        return f"{last} has the label of another marker: {self.places}, which is hidden"
+
 
 class LabelFinding(NamedTuple):
     """Result of the search in one frame."""

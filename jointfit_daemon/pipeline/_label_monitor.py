@@ -230,16 +230,7 @@ def _fault_notice(t_ns: int, fault: LabelFault) -> Notice:
             "used until then"
         )
         return _notice(t_ns, names[0], MarkerFlag.MISPLACED, text, fault)
-    if fault.cycle:
-        text = (
-            f"{_joined(names)} look exchanged: {fault.places}. Correct their labels; "
-            "they are not used until then"
-        )
-    else:
-        text = (
-            f"{_joined(names[:-1])} has the label of another marker: {fault.places}, which is "
-            "hidden. Correct the labels; these markers are not used until then"
-        )
+    text = f"{fault.text}. Correct the labels; these markers are not used until then"
     return _notice(t_ns, names[0], MarkerFlag.EXCHANGED, text, fault)
 
 

@@ -62,7 +62,7 @@ def test_an_exchange_is_reported_after_two_seconds_and_its_end_too(labels: tuple
     assert begin.data["segments"] == sorted({name[:-1] for name in labels})
     for name, other in zip(labels, labels[1:] + labels[:1], strict=True):
         assert f"{name} is at the place of {other}" in begin.text
-    assert "Correct their labels" in begin.text
+    assert "Correct the labels" in begin.text
     assert 2.0 < begin.t_ns / 1e9 < 3.5
     assert 7.5 < end.t_ns / 1e9 < 8.5
 

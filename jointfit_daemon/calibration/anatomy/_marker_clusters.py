@@ -21,8 +21,11 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import (
     MAX_FIT_RMS_M,
     MIN_MARKERS,
+    LabelFault,
+    LabelSearch,
     MarkerCluster,
     body_parts,
+    explain_trial,
     is_line,
     rigid_fit,
     steady_fit,
@@ -195,6 +198,26 @@ def track_clusters(
 ) -> dict[str, ClusterTrack]:
     """Return the poses of every body part in a trial."""
     return {name: track_cluster(track, cluster) for name, cluster in clusters.items()}
+
+
+def exchanged_labels(
+    track: OpticalTrack, clusters: Mapping[str, MarkerCluster]
+) -> list[LabelFault]:
+    """Return exchanges of marker labels that explain most frames of a trial.
+
+    Raises
+    ------
+    CalibrationError
+        The stream of the trial does not have a marker.
+    """
+    search = LabelSearch(clusters.values())
+    order = [
+        column
+        for cluster in search.clusters
+        for column in _marker_columns(track, cluster.name, cluster.markers)
+    ]
+    faults = explain_trial(search, track.positions[:, order])
+    return [fault for fault in faults if len(fault.markers) > 1]
 
 
 def moving_template(positions: Array) -> Array:

@@ -24,6 +24,7 @@ from jointfit_daemon.calibration.guidance._live_joint_centers import (
     LiveJointCenter,
     LiveJointCenters,
 )
+from jointfit_daemon.calibration.guidance._live_labels import LiveLabels
 from jointfit_daemon.calibration.guidance._movement_instructions import (
     JointInstructions,
     instructions_for,
@@ -98,6 +99,7 @@ class MovementGuide:
         self._one_axis = {j for j in chain.joints if settings.center_method_of(j) in ONE_AXIS}
         clusters, self._faults = _clusters(chain, settings, optical)
         self._centers = LiveJointCenters(chain, clusters)
+        self._labels = LiveLabels(clusters)
 
         # The last orientation of each sensor in the static pose is the zero of its flexion.
         tracks = {} if standing is None else standing.sensors
@@ -111,6 +113,7 @@ class MovementGuide:
     def add_mocap(self, frame: MocapFrame) -> None:
         """Process one camera frame."""
         self._centers.feed(frame)
+        self._labels.feed(frame)
 
     def look(self, latest: Mapping[str, Quaternion], elapsed_s: float) -> MovementStatus:
         """Return the current state.
@@ -131,7 +134,11 @@ class MovementGuide:
         # Conditions on the body parts, after a short delay.
         missing = list(self._faults)
         if elapsed_s > PATIENCE_S:
-            missing += [text for name, part in figures.items() if (text := _fault(name, part))]
+            exchanges = self._labels.exchanges()
+            missing += [f"{e.text}; correct the labels and repeat the phase" for e in exchanges]
+            explained = {part for exchange in exchanges for part in exchange.parts}
+            others = {name: part for name, part in figures.items() if name not in explained}
+            missing += [text for name, part in others.items() if (text := _fault(name, part))]
 
         # Conditions on each joint: center from markers, then flexion measured by sensors.
         joints: dict[str, Mapping[str, object]] = {}

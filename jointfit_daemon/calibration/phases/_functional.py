@@ -21,6 +21,7 @@ from jointfit_daemon.calibration.anatomy import (
     Anatomy,
     CenterChoice,
     ClusterTrack,
+    exchanged_labels,
     find_anatomy,
     track_clusters,
 )
@@ -63,6 +64,7 @@ from jointfit_daemon.calibration.soft_tissue import (
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import as_quaternion
 from jointfit_daemon.limb_model import (
+    MAX_FIT_RMS_M,
     Calibration,
     SegmentCalibration,
     SensorCalibration,
@@ -188,7 +190,19 @@ def _tracks(
     ]
 
     tracks = track_clusters(functional.optical, pose.clusters)
+    exchanges = exchanged_labels(functional.optical, pose.clusters)
+    reasons += [f"{one.text}; correct the labels and repeat the phase" for one in exchanges]
+    explained = {part for one in exchanges for part in one.parts}
     for segment in chain.segments:
+        if segment in explained:
+            continue
+        misfit = float((tracks[segment].rms > MAX_FIT_RMS_M).mean()) if segment in tracks else 0.0
+        if misfit > MIN_SEEN:
+            reasons.append(
+                f"{segment}: in {100 * misfit:.0f} % of the trial its markers do not fit the "
+                "static pose; check their names, and whether one was displaced, and repeat it"
+            )
+            continue
         share = float(visible(tracks[segment].q).mean()) if segment in tracks else 1.0
         if share < MIN_SEEN:
             reasons.append(

@@ -28,6 +28,8 @@ from jointfit_daemon.limb_model import (
     UNREFERENCED_SD,
     Calibration,
     JointCalibration,
+    LabelFault,
+    LabelSearch,
     MeanModel,
     SegmentCalibration,
     SensorCalibration,
@@ -35,6 +37,7 @@ from jointfit_daemon.limb_model import (
     configured_length,
     equal_weights,
     model_key,
+    restore_cluster,
     rigid_fit,
 )
 from jointfit_daemon.model import FrameFlag
@@ -198,6 +201,11 @@ def with_new_static(
             *(f"{name}: no data in the new static pose; switch it on" for name in missing)
         )
 
+    if exchanges := _exchanged(calibration, pose):
+        raise CalibrationError(
+            *(f"{one.text}; correct the labels and repeat the phase" for one in exchanges)
+        )
+
     # Current orientation of every segment, from cameras or as before.
     q_now: dict[str, Quaternion] = {}
     assumed = False
@@ -231,6 +239,23 @@ def with_new_static(
     if alignment is not None:
         quality["alignment"] = quality_table(alignment.quality)
     return replace(calibration, sensor=sensors, flags=tuple(flags), quality=quality)
+
+
+def _exchanged(calibration: Calibration, pose: StaticPose) -> list[LabelFault]:
+    """Return exchanges of marker labels since the calibration, of parts that do not fit."""
+    stored = calibration.clusters
+    same = [
+        name
+        for name, one in pose.clusters.items()
+        if name in stored and one.body is None and stored[name].markers == one.markers
+    ]
+    if not same:
+        return []
+    search = LabelSearch(restore_cluster(name, stored[name]) for name in same)
+    points = [pose.clusters[name].template + pose.clusters[name].origin for name in same]
+    rms, faults = search.explain(np.concatenate(points))
+    wrong = {name for name, one in zip(same, rms.tolist(), strict=True) if one > MAX_TEMPLATE_RMS_M}
+    return [fault for fault in faults if len(fault.markers) > 1 and wrong & set(fault.parts)]
 
 
 def _turned(old: StoredCluster | None, new: MarkerCluster | None) -> NDArray[np.float64] | None:
