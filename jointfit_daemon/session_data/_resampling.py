@@ -54,7 +54,9 @@ def uniform_times(axes: Sequence[Array]) -> Array:
     if is_uniform(first) and all(np.array_equal(t_s, first) for t_s in filled):
         return first
 
-    fastest = min(filled, key=_period)
+    # Of equally fast series the first: their periods differ by rounding only.
+    shortest = min(map(_period, filled))
+    fastest = next(t_s for t_s in filled if _period(t_s) <= shortest * (1.0 + UNIFORM_SHARE))
     period = _period(fastest)
     if not np.isfinite(period):
         period = 1.0

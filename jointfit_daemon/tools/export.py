@@ -53,8 +53,7 @@ def export(
 ) -> None:
     """Write a recording or a trial in a format of OpenSim, pandas, MNE, Foxglove and others.
 
-    Series keep their own rates where the format can hold them. What is left out or resampled is
-    reported. If the export fails, no file is written.
+    Reports what is left out or resampled. If the export fails, no file is written.
     """
     from jointfit_daemon.files.sessions import SESSION_FORMATS, write_session
 
@@ -83,7 +82,7 @@ def load_data(file: Path) -> SessionData:
     ValueError
         Not a file of a known kind, or damaged.
     """
-    if file.suffix.lower() in (".mcap", ".jsonl"):
+    if {".mcap", ".jsonl"} & {suffix.lower() for suffix in file.suffixes}:
         from jointfit_daemon.reprocessing import load_session
 
         return load_session(file)

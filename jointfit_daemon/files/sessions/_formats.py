@@ -9,6 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import orjson
+
 from jointfit_daemon.files.orientations import read_orientations_npz
 from jointfit_daemon.files.sessions._bids_motion import read_bids_session, write_bids_session
 from jointfit_daemon.files.sessions._foxglove import write_foxglove_session
@@ -118,7 +120,7 @@ def write_session(
         existing = [target for _, target in entries if target.exists()]
         if existing and not overwrite:
             raise FileExistsError(
-                f"{existing[0]} exists: choose another folder or name, or overwrite it"
+                f"{existing[0]} exists: choose another folder, or replace it (--force)"
             )
         for entry, target in entries:
             if target.is_dir():
@@ -197,6 +199,6 @@ def read_session(path: Path) -> SessionData:
     read = _read_folder if path.is_dir() else _READERS[suffix]
     try:
         session = read(path)
-    except SessionDataError as fault:
+    except (SessionDataError, orjson.JSONDecodeError) as fault:
         raise MalformedFileError(f"{path}: {fault}") from fault
     return replace(session, description={"file": path.name} | dict(session.description))

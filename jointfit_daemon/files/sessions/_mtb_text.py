@@ -122,9 +122,9 @@ def _times(path: Path, columns: Mapping[str, Array], rate_hz: float | None) -> t
 
 def _unwrapped(counter: Array, turn: int) -> Array:
     """Return a counter since its first row, without its turns."""
-    steps = np.diff(counter)
-    turned = steps < -turn / 2
-    counted: Array = np.concatenate([[0.0], np.cumsum(steps + turn * turned)])[: len(counter)]
+    # A step beyond half a turn is one in the other direction: rows in disorder run backwards.
+    steps = np.mod(np.diff(counter) + turn / 2, turn) - turn / 2
+    counted: Array = np.concatenate([[0.0], np.cumsum(steps)])[: len(counter)]
     return counted
 
 
