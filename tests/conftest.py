@@ -20,7 +20,7 @@ from tests.broker_fixture import EmbeddedBroker, MosquittoBroker, chosen_broker
 from tests.fake_rig import fakes, table  # noqa: F401 - fixtures
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable, Iterator
+    from collections.abc import AsyncIterator, Callable, Generator, Iterator
 
     from tests.broker_fixture import Broker
 
@@ -50,6 +50,17 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         choices=PARTS,
         help="only the tests of this part of the suite",
     )
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Keep the garbage collector from scanning the million objects of all modules and tests."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.hookimpl(trylast=True)  # after pytest has sorted by parameters of fixtures

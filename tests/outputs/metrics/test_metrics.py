@@ -248,15 +248,14 @@ def test_an_address_without_host_or_port_is_refused(table: dict[str, Any], liste
         parse_rig(table | {"metrics": {"listen": listen}})
 
 
-@pytest.mark.alone
 def test_a_frame_costs_less_than_5_us() -> None:
     frames, frame = FrameStatistics(), FRAME._replace(completed_ns=time.monotonic_ns())
 
     def duration_ns() -> float:
-        began = time.perf_counter_ns()
+        began = time.thread_time_ns()
         for _ in range(2000):
             frames.output(frame)
-        return (time.perf_counter_ns() - began) / 2000
+        return (time.thread_time_ns() - began) / 2000
 
     assert min(duration_ns() for _ in range(5)) < 5000
 
