@@ -157,6 +157,8 @@ class CalibrationStored:
 
     t_ns: int
     version: int
+    created_utc: str = ""
+    """Date of the stored calibration, ISO 8601; empty if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,6 +273,10 @@ class CalibrationStatus:
     """Reason why a new result was rejected and the calibration in force is kept."""
     refused: Mapping[str, object] = field(default_factory=dict)
     """Quality of the rejected result."""
+    done: tuple[CalibrationPhase, ...] = ()
+    """Recorded phases whose results the functional phase uses."""
+    created_utc: str | None = None
+    """Date of the version in force, ISO 8601; None if there is none or it is unknown."""
 
     @property
     def level(self) -> NoticeLevel:

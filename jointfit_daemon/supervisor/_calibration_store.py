@@ -93,8 +93,12 @@ def save(rig: Rig, calibration: Calibration, *, keep_date: bool = False) -> int:
     """
     if keep_date:
         return store_of(rig).save(calibration)
+    return store_of(rig).save(_with_present_date(calibration))
+
+
+def _with_present_date(calibration: Calibration) -> Calibration:
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    return store_of(rig).save(dataclasses.replace(calibration, created_utc=now))
+    return dataclasses.replace(calibration, created_utc=now)
 
 
 class CalibrationWriter:
@@ -152,8 +156,9 @@ class CalibrationWriter:
 
     async def _write(self, rig: Rig, calibration: Calibration, *, keep_date: bool) -> None:
         async with self._lock:
+            dated = calibration if keep_date else _with_present_date(calibration)
             try:
-                version = await asyncio.to_thread(save, rig, calibration, keep_date=keep_date)
+                version = await asyncio.to_thread(save, rig, dated, keep_date=True)
             except OSError as error:
                 if (fault := describe_write_error(error, store_directory(rig))) != self.fault:
                     self.fault = fault
@@ -169,7 +174,7 @@ class CalibrationWriter:
                 self._unwritten = self.fault = None
 
         if rig.calibration_store == self._store:  # otherwise a reload selected another store
-            self._deliver(CalibrationStored(time.monotonic_ns(), version))
+            self._deliver(CalibrationStored(time.monotonic_ns(), version, dated.created_utc))
 
     async def settle(self) -> None:
         """Wait until no write is in progress."""

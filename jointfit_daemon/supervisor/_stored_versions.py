@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration
 
+_ONLINE = ("rounds", "from_version", "before_deg", "after_deg")
+"""Figures of the last refit by online learning."""
 _UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, MalformedFileError)
 
 
@@ -34,6 +36,9 @@ class VersionSummary:
     procedure: str | None = None
     restored_from: int | None = None
     """Version of which this one is a copy."""
+    online: dict[str, Any] | None = None
+    """Last refit by online learning that its models contain: number of refits since the functional
+    phase, version before it, and errors before and after; None without one."""
     functional: bool | None = None
     """Whether a movement in view of cameras determined it."""
     usable: bool = False
@@ -109,13 +114,14 @@ class StoredVersions:
 def _figures(content: dict[str, Any]) -> dict[str, Any]:
     """Return the figures of one file that do not depend on the rig."""
     quality, method = quality_payload(content["quality"]), content["method"]
-    holdout = quality.get("holdout") or {}
+    holdout, learned = quality.get("holdout") or {}, quality.get("online")
     return {
         "created_utc": content["created_utc"],
         "software": content["software"],
         "method": method,
         "procedure": content.get("procedure", "corrected"),
         "restored_from": (quality.get("restored") or {}).get("from_version"),
+        "online": learned and {key: learned.get(key) for key in _ONLINE},
         "functional": bool(holdout),
         **{
             table: {name: errors.get(method) for name, errors in (holdout.get(table) or {}).items()}

@@ -22,7 +22,7 @@ PAYLOADS = {
     f"{BASE}/joint/knee": json.loads(encode_joint(STATE, 1, 1_795_250_060_351_823)),
     f"{BASE}/calibration": {
         "v": 1, "t_us": 1_795_250_060_351_823, "phase": "calibrated", "text": "done", "version": 3,
-        "kept": None, "quality": {},
+        "created_utc": None, "kept": None, "done": [], "quality": {},
     },
 }  # fmt: skip
 

@@ -7,12 +7,14 @@ import os
 import pickle
 import subprocess
 import sys
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.supervisor import _calibration_store
+from jointfit_daemon.supervisor._stored_versions import StoredVersions
 from jointfit_daemon.supervisor.worker import HEADER
 from tests.limb_model.plain_calibration import plain_calibration
 
@@ -38,6 +40,19 @@ def test_saved_calibration_is_loaded_with_version_and_date(rig: Rig) -> None:
     assert found.calibration is not None
     assert found.calibration.created_utc.endswith("+00:00")
     assert found.warnings == ()
+
+
+def test_a_version_with_online_learning_is_listed_with_its_errors(rig: Rig) -> None:
+    learned = {"rounds": 2, "from_version": 1, "before_rad": {"knee": 0.1}, "frames": 900,
+               "after_rad": {"knee": 0.05}}  # fmt: skip
+    for quality in ({}, {"online": learned}):
+        plain = plain_calibration(rig.chain)
+        _calibration_store.save(rig, replace(plain, quality=quality))
+    last, first = StoredVersions().list(rig, 9)["versions"]
+    assert first["online"] is None
+    assert last["online"] == {
+        "rounds": 2, "from_version": 1, "before_deg": {"knee": 5.73}, "after_deg": {"knee": 2.865}
+    }  # fmt: skip
 
 
 def test_a_calibration_of_another_limb_is_not_used(rig: Rig) -> None:

@@ -240,7 +240,7 @@ def _missing_movement(one: LiveJointCenter, words: JointInstructions, target: fl
         return one.refused
     more = words.bend if words.hinge else f"{words.bend}, and {words.sideways}"
     shown_mm = ceil(1e4 * noise) / 10.0  # upwards: an unmet target is never shown as met
-    return f"error of {shown_mm:.1f} mm, target {1e3 * target:g} mm: {more}"
+    return f"random error {shown_mm:.1f} mm, target {1e3 * target:g} mm: {more}"
 
 
 def _noise(one: LiveJointCenter, words: JointInstructions) -> float:

@@ -44,6 +44,15 @@ class RateAnswer(Table):
     output_rate_hz: float
 
 
+class OnlineRefit(Table):
+    """Last refit by online learning: RMS errors against the cameras on its newest frames."""
+
+    rounds: int = Field(description="number of accepted refits since the functional phase")
+    from_version: int | None
+    before_deg: dict[str, Number] = Field(description="by segment and joint, models before")
+    after_deg: dict[str, Number] = Field(description="by segment and joint, these models")
+
+
 class StoredVersion(Table):
     """One stored calibration."""
 
@@ -53,6 +62,7 @@ class StoredVersion(Table):
     method: str | None
     procedure: str | None
     restored_from: int | None
+    online: OnlineRefit | None
     functional: bool | None
     usable: bool
     segments_deg: dict[str, Number]

@@ -207,7 +207,11 @@ class CalibrationState(Payload):
     phase: CalibrationPhase
     text: str
     version: int | None
+    created_utc: str | None = Field(description="date of the version, ISO 8601")
     kept: str | None
+    done: list[CalibrationPhase] = Field(
+        description="recorded phases whose results the functional phase uses"
+    )
     quality: dict[str, Any]
 
 

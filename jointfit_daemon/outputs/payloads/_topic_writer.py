@@ -207,7 +207,9 @@ class TopicWriter:
             "phase": status.phase,
             "text": status.text,
             "version": status.version,
+            "created_utc": status.created_utc,
             "kept": status.kept,
+            "done": status.done,
             "quality": quality_payload(status.quality),
         }
         self._publish(topics.CALIBRATION, self._stamped(payload, status.t_ns))

@@ -101,6 +101,8 @@ class CalibrationSession:
         self.calibration = calibration
         self.version = version
         """Version of the calibration in force; None while it is not stored."""
+        self._created_utc = "" if calibration is None else calibration.created_utc
+        """Date of `version`."""
         self.lags: LagMonitor | None = None
         """Configured lags, and lags estimated during operation."""
         self._state = self._resting_phase
@@ -143,6 +145,20 @@ class CalibrationSession:
         if self.calibration is None:
             return CalibrationPhase.UNCALIBRATED
         return CalibrationPhase.CALIBRATED
+
+    @property
+    def _done(self) -> tuple[CalibrationPhase, ...]:
+        """Recorded phases whose results the functional phase uses, without the running one."""
+        running = None if self._fit is None else self._fit.work.name
+        if self._recording is not None:
+            running = self._recording.phase
+        results = {
+            CalibrationPhase.ALIGN: self._alignment,
+            CalibrationPhase.STATIC: self._static,
+        }
+        return tuple(
+            phase for phase, result in results.items() if result is not None and phase != running
+        )
 
     # --- measurements ------------------------------------------------------------------------
 
@@ -438,7 +454,7 @@ class CalibrationSession:
 
     def set_stored_version(self, event: CalibrationStored) -> list[Output]:
         """Set the version of the calibration in force after it was stored."""
-        self.version = event.version
+        self.version, self._created_utc = event.version, event.created_utc
         return [self.status(event.t_ns, f"stored as version {event.version}")]
 
     def status(
@@ -451,7 +467,16 @@ class CalibrationSession:
         """Return a status, by default of the present phase and the calibration in force."""
         if quality is None:
             quality = {} if self.calibration is None else self.calibration.quality
-        return CalibrationStatus(t_ns, phase or self.phase, text, self.version, quality)
+        created_utc = None if self.version is None else self._created_utc or None
+        return CalibrationStatus(
+            t_ns,
+            phase or self.phase,
+            text,
+            self.version,
+            quality,
+            done=self._done,
+            created_utc=created_utc,
+        )
 
     def abort(self, t_ns: int, reason: str) -> list[Output]:
         """Abort the running phase or fit, if any."""

@@ -59,6 +59,9 @@ def _note(version: Mapping[str, Any]) -> str:
         return str(version["fault"])
     if not version["usable"]:
         return "of another limb or other sensors"
-    if version["restored_from"]:
-        return f"copy of version {version['restored_from']}"
-    return "" if version["functional"] else "static pose only"
+    notes = [f"copy of version {version['restored_from']}"] if version["restored_from"] else []
+    if (online := version["online"]) is not None:
+        notes.append(f"online learning, round {online['rounds']}")
+    if not notes and not version["functional"]:
+        notes.append("static pose only")
+    return ", ".join(notes)

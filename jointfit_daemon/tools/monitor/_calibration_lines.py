@@ -102,7 +102,7 @@ def _joint_lines(joints: Mapping[str, Any], width: int) -> list[Line]:
     wide = width >= _WIDE
     columns = [Column("joint centre"), Column("error", right=True)]
     if wide:
-        columns += [Column("of it random", right=True), Column("arc", right=True), Column("from")]
+        columns += [Column("random error", right=True), Column("arc", right=True), Column("from")]
     rows = []
     for name, joint in joints.items():
         one = _table(joint)
@@ -193,7 +193,9 @@ def _version_state(one: StoredVersion, in_force: int | None) -> tuple[str, Style
         return "✔ in force", "good"
     if not one.usable:
         return "○ of another limb", "muted"
-    return ("stored" if one.restored_from is None else f"copy of {one.restored_from}"), ""
+    if one.restored_from is not None:
+        return f"copy of {one.restored_from}", ""
+    return ("stored" if one.online is None else f"learned, round {one.online.rounds}"), ""
 
 
 def _errors(one: StoredVersion) -> str:

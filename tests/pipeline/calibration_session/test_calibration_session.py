@@ -43,6 +43,9 @@ PLAIN = Calibration(
 )
 
 
+NO_WORLDS: dict[str, object] = {"sensors": {}, "notes": []}
+
+
 def session(*, mocap: bool = True) -> CalibrationSession:
     return CalibrationSession(CHAIN, SETTINGS, mocap=mocap, calibration=None)
 
@@ -344,9 +347,22 @@ def test_version_is_unknown_until_the_calibration_is_stored() -> None:
     (job,) = only(feed(one, 0, 10), FitJob)
     outputs = done(one, job, calibration=PLAIN.to_dict(), quality={})
     assert only(outputs, CalibrationStatus)[-1].version is None
-    (status,) = only(one.set_stored_version(CalibrationStored(100 * SECOND, 4)), CalibrationStatus)
-    assert status.version == 4
+    stored = CalibrationStored(100 * SECOND, 4, "2026-11-23T09:30:00+00:00")
+    (status,) = only(one.set_stored_version(stored), CalibrationStatus)
+    assert (status.version, status.created_utc) == (4, stored.created_utc)
     assert status.quality == PLAIN.quality
+
+
+def test_status_names_the_phases_whose_results_the_movement_uses() -> None:
+    one = posed()
+    (status,) = only(ask(one, 11 * SECOND, "align"), CalibrationStatus)
+    assert status.done == ("static",)
+    outputs = feed(one, 11, 17)
+    assert only(outputs, CalibrationStatus)[-1].done == ("static",)  # the fit runs
+    (status,) = only(done(one, only(outputs, FitJob)[0], alignment=NO_WORLDS), CalibrationStatus)
+    assert status.done == ("align", "static")
+    (status,) = only(ask(one, 18 * SECOND, "static"), CalibrationStatus)
+    assert status.done == ("align",)
 
 
 def test_notes_of_the_alignment_are_published() -> None:

@@ -10,6 +10,7 @@ import contextlib
 import math
 import time
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import aiomqtt
@@ -23,6 +24,12 @@ PERIOD_S = 0.1
 THIGH_M, SHANK_M = 0.43, 0.39
 STEP_S = 1.2
 """Period of the simulated walk, s."""
+HOUR_US = 3_600_000_000
+
+
+def utc_text(t_us: int) -> str:
+    """Return the ISO 8601 text of a UNIX time, µs."""
+    return datetime.fromtimestamp(t_us // 1_000_000, UTC).isoformat()
 
 
 def about_x(angle: float) -> list[float]:
@@ -54,6 +61,10 @@ STORED = {
             "version": version, "created_utc": f"2026-11-2{version}T09:30:00Z", "usable": True,
             "method": "anchored", "functional": True, "flexion_deg": {"knee": 2.0 + 0.2 * version},
             "restored_from": None, "fault": None,
+            "online": {
+                "rounds": 1, "from_version": 2, "before_deg": {"thigh": 2.1, "knee": 2.6},
+                "after_deg": {"thigh": 1.7, "knee": 1.9},
+            } if version == 3 else None,
         }
         for version in (3, 2, 1)
     ],
@@ -86,6 +97,8 @@ class PublishedRig:
     """Their commands."""
     turned: dict[str, tuple[str, float]] = field(default_factory=dict)
     """Axis and angle, deg, by which a sensor was turned about its own axis."""
+    changes: dict[str, Any] = field(default_factory=dict)
+    """Keys of `calibration` with other values."""
     answer: dict[str, Any] = field(
         default_factory=lambda: {"status": "accepted", "data": {}, "error": None}
     )
@@ -162,6 +175,12 @@ class PublishedRig:
                 "length_sd_m": dict.fromkeys(self.sensors, 0.0215),
                 "length_sources": dict.fromkeys(self.sensors, "markers"),
             },
+            "online": {
+                "rounds": 1,
+                "before_deg": {"thigh": 2.1, "shank": 2.2, "knee": 2.6},
+                "after_deg": {"thigh": 1.7, "shank": 1.8, "knee": 1.9},
+                "known_after_deg": {"thigh": 2.0, "shank": 2.1, "knee": 2.4},
+            },
             "holdout": {
                 "method": "anchored",
                 "segments_deg": dict.fromkeys(self.sensors, errors),
@@ -174,8 +193,9 @@ class PublishedRig:
         }
         return {
             "v": 1, "t_us": self.now_us(), "phase": "calibrated", "text": "stored as version 3",
-            "version": 3, "kept": None, "quality": quality,
-        }  # fmt: skip
+            "version": 3, "kept": None, "done": [], "quality": quality,
+            "created_utc": utc_text(self.now_us() - 2 * HOUR_US),
+        } | self.changes  # fmt: skip
 
     def poses(self, seq: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return `pose/ui` and `optical/pose` of this instant: a walk."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -29,7 +29,7 @@ LIMB_PIXELS = """() => {
 async def test_the_limb_moves_and_the_angle_has_a_standard_deviation(broker: Broker) -> None:
     async with shown(broker, PublishedRig()) as page:
         assert await page.text("#rig-name") == "bench-1"
-        assert await page.text("#rig-state") == "Calibrated, version 3"
+        assert await page.text("#rig-state") == "Calibrated, version 3, 2 h ago"
         assert await page.text("#angle-title") == "Knee flexion"
         assert await page.text("#angle-sd") == "± 2.1°"
         await page.page.wait_for_selector("#chart canvas", state="attached")
@@ -124,11 +124,57 @@ async def test_a_request_is_sent_and_a_refusal_is_shown_in_words(broker: Broker)
         assert [request["phase"] for request in rig.requests] == ["static"]
 
 
+TICKS = "[...document.querySelectorAll('.rail .done .rail-title')].map((each) => each.textContent)"
+
+
+@pytest.mark.parametrize(
+    ("state", "ticks"),
+    [
+        ({"phase": "functional", "done": ["align", "static"]}, ["Align", "Stand still"]),
+        ({"phase": "fitting", "text": "fitting the static trial", "done": ["align"]}, ["Align"]),
+        (
+            {"phase": "static", "version": 3, "done": ["static"]},  # again, for one in force
+            ["Align", "Move"],
+        ),
+    ],
+    ids=["first movement", "fit of the pose", "pose again"],
+)
+async def test_finished_steps_have_ticks_in_a_page_that_is_opened_during_a_step(
+    broker: Broker, state: dict[str, Any], ticks: list[str]
+) -> None:
+    rig = PublishedRig()
+    in_force = state.get("version") is not None
+    rig.changes = {"version": None, "quality": {}} | state
+    if in_force:
+        del rig.changes["quality"]
+    async with shown(broker, rig) as page:
+        await page.show("calibrate")
+        await page.page.wait_for_selector(".step.running")
+        assert await page.page.evaluate(TICKS) == ticks
+
+
+async def test_tabs_and_devices_are_whole_on_a_phone(broker: Broker) -> None:
+    async with shown(broker, PublishedRig(), size="phone") as page:
+        await page.show("sensors")
+        await page.until_text("#view-sensors", "S4")
+        for selector in (".tabs", "#view-sensors .scroll"):
+            cut = f"document.querySelector('{selector}').scrollWidth - innerWidth"
+            assert await page.page.evaluate(cut) <= 0, selector
+        await page.show("history")
+        await page.until_text("#view-history", "Use version 2")
+        button = page.page.locator("text=Use version 2")
+        box = await button.bounding_box()
+        assert box is not None
+        assert box["height"] <= 44
+
+
 async def test_a_stored_calibration_is_chosen_in_the_history(broker: Broker) -> None:
     rig = PublishedRig()
     async with shown(broker, rig) as page:
         await page.show("history")
-        await page.until_text("#view-history", "in force")
+        await page.until_text("#view-history", "online learning, round 1, in force")
+        await page.until_text("#view-history", "Knee flexion 1.9° RMS, newest movement")
+        await page.until_text("#view-history", "Online learning, round 1: error on the newest")
         await page.page.click("text=Use version 2")
         async with asyncio.timeout(30):
             while len(rig.requests) < 2:

@@ -111,6 +111,7 @@ class SampleRig:
         done = phase == "calibrated"
         return {
             "v": 1, "t_us": self.t_us(0), "phase": phase, "kept": None,
+            "done": [], "created_utc": "2026-11-23T09:30:00+00:00" if done else None,
             "text": "stored as version 3" if done else "", "version": 3 if done else None,
             "quality": quality if done else {},
         } | changes  # fmt: skip
@@ -146,7 +147,8 @@ class SampleRig:
                 {
                     "version": version, "created_utc": f"2026-11-2{version}T09:30:00+00:00",
                     "software": "0.1.0", "method": "anchored", "procedure": "corrected",
-                    "restored_from": None, "functional": True, "usable": version != 1,
+                    "restored_from": None, "online": None, "functional": True,
+                    "usable": version != 1,
                     "segments_deg": {}, "flexion_deg": {"knee": 2.0 + 0.2 * version},
                     "fault": None,
                 }

@@ -11,7 +11,7 @@ const RESULT = "result";
 
 /** Show the calibration of a store; `request(command, content)` sends a request. */
 export function createCalibrateView(store, request) {
-  const view = { store, request, steps: [], builtFor: null, chosen: null, recorded: null, phase: null, done: new Set() };
+  const view = { store, request, steps: [], builtFor: null, chosen: null, recorded: null, phase: null };
   view.rail = createElement("ol", { class: "rail", "aria-label": "Steps of the calibration" });
   view.message = createElement("p", { class: "banner", role: "alert", dir: "auto", hidden: true });
   view.stage = createElement("div", { class: "stage" });
@@ -115,19 +115,19 @@ function updateRail(view, shown) {
   }
 }
 
-/** Return the steps that are done: in this calibration as far as it was seen, or in that in force. */
-function finishedSteps({ store, done }) {
-  const { phase, quality, version } = store.calibration ?? {};
-  if (phase === "align" || phase === "uncalibrated") done.clear();
-  if (phase === "aligned") done.add("align");
-  if (phase === "posed" || phase === "functional") done.add("static");
-  if (phase === "static") done.delete("static");
-  if (version == null && phase !== "calibrated") return done;
-  const inForce = new Set([RESULT]);
-  if (quality?.alignment) inForce.add("align");
-  if (quality?.static) inForce.add("static");
-  if (quality?.holdout || quality?.anatomy) inForce.add("functional");
-  return inForce;
+/** Return the steps that are done: those of this calibration, and those of the one in force. */
+function finishedSteps({ store, recorded }) {
+  const { phase, done = [], quality, version } = store.calibration ?? {};
+  const finished = new Set(done);
+  const running = isRunning(phase);
+  if (version != null || phase === "calibrated") {
+    if (quality?.alignment) finished.add("align");
+    if (quality?.static) finished.add("static");
+    if (quality?.holdout || quality?.anatomy) finished.add("functional");
+    if (!running) finished.add(RESULT);
+  }
+  if (running) finished.delete(recorded);
+  return finished;
 }
 
 function createStep(view, step, number, count) {

@@ -60,7 +60,7 @@ function updateMissing(list, entries) {
 }
 
 const COLUMNS = [
-  { name: "joint" }, { name: "centre" }, { name: "random part" }, { name: "arc" },
+  { name: "joint" }, { name: "centre" }, { name: "random error" }, { name: "arc" },
   { name: "determined by", text: true }, { name: "movement", text: true },
 ];
 

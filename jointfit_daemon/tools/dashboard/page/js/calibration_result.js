@@ -19,7 +19,7 @@ export function resultOf(calibration) {
   return [
     createElement("h2", {}, title),
     kept ? createElement("p", { class: "bad", dir: "auto" }, `The last result was rejected: ${kept}`) : createElement("p", { class: "good" }, summary(quality)),
-    createElement("div", { class: "pair" }, ...jointTable(quality), ...holdoutTable(quality), ...staticTable(quality), ...alignmentTable(quality)),
+    createElement("div", { class: "pair" }, ...jointTable(quality), ...holdoutTable(quality), ...onlineTable(quality), ...staticTable(quality), ...alignmentTable(quality)),
   ];
 }
 
@@ -52,6 +52,17 @@ function holdoutTable(quality) {
     ...Object.entries(holdout.flexion_deg ?? {}).map(([name, errors]) => [`${titleOf(name)} flexion`, errors]),
   ].map(([name, errors]) => [name, formatNumber(errors[holdout.method], 1, "°"), formatNumber(errors.mean, 1, "°"), formatNumber(errors.single, 1, "°")]);
   return [createTable("Held-out error against the cameras, RMS", [{ name: "part" }, { name: "in force" }, { name: "plain mean" }, { name: "one sensor" }], rows)];
+}
+
+function onlineTable(quality) {
+  const online = quality?.online;
+  if (!online?.rounds) return [];
+  const rows = Object.keys(online.after_deg ?? {}).map((name) => [
+    quality.holdout?.flexion_deg && name in quality.holdout.flexion_deg ? `${titleOf(name)} flexion` : titleOf(name),
+    ...[online.before_deg, online.after_deg, online.known_after_deg].map((errors) => formatNumber(errors?.[name], 1, "°")),
+  ]);
+  const columns = [{ name: "part" }, { name: "before" }, { name: "after" }, { name: "earlier movement" }];
+  return [createTable(`Online learning, round ${online.rounds}: error on the newest movement, RMS`, columns, rows)];
 }
 
 function staticTable(quality) {

@@ -1,5 +1,6 @@
 // Small functions that create and change elements. Text from MQTT is set as text, never as HTML.
 
+const MOST_COLUMNS = 8; // a table with more does not fit on a phone
 const SVG = "http://www.w3.org/2000/svg";
 
 /** Return an element with attributes and children; strings become text. */
@@ -36,22 +37,28 @@ export function setClass(element, name) {
 
 /** Return a table with a caption, a header row and rows of texts or elements. */
 export function createTable(caption, columns, rows) {
+  const wide = columns.length > MOST_COLUMNS;
+  // Rows of a wide table are blocks on a phone: the roles remain those of a table.
+  const role = (name) => (wide ? { role: name } : {});
   const cell = (value, column, index) =>
     createElement(
       index === 0 ? "th" : "td",
-      { scope: index === 0 ? "row" : null, class: column.text ? "text" : null, dir: "auto" },
+      {
+        scope: index === 0 ? "row" : null, class: column.text ? "text" : null, dir: "auto",
+        "data-column": wide ? column.name : null, ...role(index === 0 ? "rowheader" : "cell"),
+      },
       value instanceof Node ? value : String(value),
     );
   return createElement(
-    "div", { class: "scroll", tabindex: "0", role: "region", "aria-label": caption },
+    "div", { class: wide ? "scroll wide" : "scroll", tabindex: "0", role: "region", "aria-label": caption },
     createElement(
-      "table", {},
+      "table", role("table"),
       createElement("caption", {}, caption),
-      createElement("thead", {}, createElement("tr", {},
+      createElement("thead", role("rowgroup"), createElement("tr", role("row"),
         ...columns.map((column) =>
-          createElement("th", { scope: "col", class: column.text ? "text" : null }, column.name)))),
-      createElement("tbody", {},
-        ...rows.map((row) => createElement("tr", {},
+          createElement("th", { scope: "col", class: column.text ? "text" : null, ...role("columnheader") }, column.name)))),
+      createElement("tbody", role("rowgroup"),
+        ...rows.map((row) => createElement("tr", role("row"),
           ...row.map((value, index) => cell(value, columns[index], index))))),
     ),
   );

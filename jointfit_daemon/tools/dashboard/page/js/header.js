@@ -7,8 +7,11 @@ import { calibrationSentence, formatClock, isRunning } from "./words.js";
 const SILENT_MS = 5000; // poses come at 10 Hz, with or without sensors
 const RETAINED_MS = 1000; // retained messages arrive within this time after a connection
 
-/** Return the state of link, daemon and calibration: level, words, and the loss for the banner. */
-export function pageState(link, store) {
+/**
+ * Return the state of link, daemon and calibration: level, words, and the loss for the banner. With
+ * `now_us`, the words have the age of the calibration.
+ */
+export function pageState(link, store, now_us = null) {
   if (link.state === "lost") return { level: "error", words: "Connection lost", loss: link.reason };
   if (link.state === "refused") return { level: "error", words: "Not logged in", loss: link.reason };
   if (link.state === "connecting") return { level: "", words: "Connecting to the broker" };
@@ -29,7 +32,7 @@ export function pageState(link, store) {
   if (store.bridge !== "online" && store.pose === null) return { level: "", words: "Waiting for jointfitd" };
   if (store.calibration === null) return { level: "", words: "Running; the state of the calibration was not received" };
   const phase = store.calibration?.phase;
-  return { level: phase === "aborted" || store.calibration?.kept ? "warning" : "", words: calibrationSentence(store.calibration) };
+  return { level: phase === "aborted" || store.calibration?.kept ? "warning" : "", words: calibrationSentence(store.calibration, now_us) };
 }
 
 /** Show the header of a store; `actions` has reconnect, logIn, calibrate and stop. */
@@ -39,7 +42,7 @@ export function createHeader(link, store, configuration, actions) {
   button.addEventListener("click", () => action?.());
 
   const update = () => {
-    const state = pageState(link, store);
+    const state = pageState(link, store, gatewayNow(store));
     setText(byId("rig-name"), store.info?.rig ?? link.base ?? "jointfitd");
     document.title = store.info?.rig ? `${store.info.rig} – jointfitd` : "jointfitd";
     setText(byId("rig-state"), state.words);

@@ -68,16 +68,24 @@ function createEntry(view, entry, inForce, busy) {
   );
 }
 
-/** Return the error on held-out movement, and the method that it belongs to. */
+/** Return the error on held-out movement with its method, or that of the last online learning. */
 function errorsOf(entry) {
-  const errors = Object.entries(entry.flexion_deg ?? {}).map(([joint, error]) => `${titleOf(joint)} flexion ${formatNumber(error, 1)}° RMS`);
-  if (errors.length === 0) return entry.fault ? "" : "Made without cameras: error not measured";
-  return `${errors.join(", ")}, held out (${entry.method})`;
+  const words = (table) => Object.entries(table ?? {}).map(([joint, error]) => `${titleOf(joint)} flexion ${formatNumber(error, 1)}° RMS`).join(", ");
+  const learned = entry.online?.after_deg;
+  if (learned) return `${words(pick(learned, Object.keys(entry.flexion_deg ?? {})))}, newest movement (online learning)`;
+  const errors = words(entry.flexion_deg);
+  if (errors === "") return entry.fault ? "" : "Made without cameras: error not measured";
+  return `${errors}, held out (${entry.method})`;
 }
+
+const pick = (table, names) => Object.fromEntries(names.filter((name) => name in table).map((name) => [name, table[name]]));
 
 function stateOf(entry, inForce) {
   if (entry.fault) return createElement("span", { class: "status error" }, entry.fault);
-  const origin = entry.restored_from == null ? "" : `copy of version ${entry.restored_from}`;
+  const origin = [
+    entry.restored_from == null ? "" : `copy of version ${entry.restored_from}`,
+    entry.online ? `online learning, round ${entry.online.rounds}` : "",
+  ].filter(Boolean).join(", ");
   if (entry.version === inForce) return createElement("span", { class: "status ok" }, [origin, "in force"].filter(Boolean).join(", "));
   if (!entry.usable) return createElement("span", { class: "status unknown" }, "of another limb");
   return origin || "stored";

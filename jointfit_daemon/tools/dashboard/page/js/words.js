@@ -18,6 +18,12 @@ export function formatDuration(seconds) {
   return `${Math.round(seconds / 86400)} days`;
 }
 
+/** Return a time in the past in words, in whole minutes: it does not change every second. */
+export function ageInWords(seconds) {
+  if (seconds < 60) return "just now";
+  return seconds < 90 ? "1 min ago" : `${formatDuration(seconds)} ago`;
+}
+
 /** Return the time of day of a UNIX time in microseconds. */
 export function formatClock(microseconds) {
   if (!Number.isFinite(microseconds)) return UNKNOWN;
@@ -85,12 +91,14 @@ const RUNNING = new Set(["align", "static", "functional", "fitting"]);
 /** Return whether a calibration phase runs. */
 export const isRunning = (phase) => RUNNING.has(phase);
 
-/** Return the state of the calibration in words. */
-export function calibrationSentence(calibration) {
+/** Return the state of the calibration in words, at a UNIX time of the gateway, µs. */
+export function calibrationSentence(calibration, now_us = null) {
   if (!calibration) return "Waiting for the calibration state";
-  const { phase, version, text, kept } = calibration;
+  const { phase, version, text, kept, created_utc } = calibration;
   if (phase === "calibrated") {
-    const stored = version == null ? "not stored yet" : `version ${version}`;
+    const age_s = now_us === null ? NaN : (now_us / 1000 - Date.parse(created_utc ?? "")) / 1000;
+    const made = Number.isFinite(age_s) ? `, ${ageInWords(age_s)}` : "";
+    const stored = version == null ? "not stored yet" : `version ${version}${made}`;
     return kept ? `Calibrated, ${stored}; the last result was rejected` : `Calibrated, ${stored}`;
   }
   if (phase === "aborted" && version != null) return `Calibrated, version ${version}; last step stopped`;
