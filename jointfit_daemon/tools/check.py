@@ -9,6 +9,7 @@ import orjson
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_MISUSE
+from jointfit_daemon.tools.text_output import echo_wrapped
 
 if TYPE_CHECKING:
     from jointfit_daemon.config import Rig, Source
@@ -34,7 +35,7 @@ def check(
             faults = [each.as_dict() for each in fault.faults]
             typer.echo(orjson.dumps({"ok": False, "faults": faults}, default=str))
         else:
-            typer.echo(str(fault), err=True)
+            echo_wrapped(str(fault), err=True)
         raise typer.Exit(EXIT_MISUSE) from None
 
     heading = heading_warning(rig.sources)

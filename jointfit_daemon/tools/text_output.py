@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
+import textwrap
 from typing import TYPE_CHECKING, Any
 
 import orjson
@@ -18,6 +21,21 @@ _SHOWN = 8
 def echo_json(data: Any) -> None:
     """Print one JSON object in a line; NaN and infinity become null."""
     typer.echo(orjson.dumps(data, option=orjson.OPT_SERIALIZE_NUMPY))
+
+
+def echo_wrapped(text: str, *, err: bool = False) -> None:
+    """Print lines; on a terminal, long ones continue below their text, broken at blanks."""
+    if not (sys.stderr if err else sys.stdout).isatty():
+        typer.echo(text, err=err)
+        return
+    columns = shutil.get_terminal_size().columns
+    for line in text.split("\n"):
+        indent = line[: len(line) - len(line.lstrip())]
+        wrapped = textwrap.wrap(
+            line, columns, subsequent_indent=indent,
+            break_long_words=False, break_on_hyphens=False, drop_whitespace=True,
+        )  # fmt: skip
+        typer.echo("\n".join(wrapped), err=err)
 
 
 def align_columns(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> str:

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from jointfit_daemon.tools.discovery._sysfs import read_attribute, read_number
 
+_BUILT_IN = ("port", "serial8250")
+"""Drivers of the ports of a mainboard."""
 _USB_ID = 16
 """Base of vendor and product ids."""
 
@@ -41,11 +43,13 @@ class SerialPortInfo:
 
     @property
     def description(self) -> str:
-        """Maker, product, and USB ids."""
+        """Maker, product, and USB ids; of a port without them its driver."""
         words = [word for word in (self.manufacturer, self.product) if word]
         if self.vendor_id is not None and self.product_id is not None:
             words.append(f"({self.vendor_id:04x}:{self.product_id:04x})")
-        return " ".join(words) or self.driver or ""
+        # The kernel names the driver of the ports of a mainboard "port" or "serial8250".
+        driver = "built-in port" if self.driver in _BUILT_IN else self.driver
+        return " ".join(words) or driver or ""
 
 
 def find_serial_ports(root: Path = Path("/")) -> list[SerialPortInfo]:

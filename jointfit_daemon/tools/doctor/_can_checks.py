@@ -31,6 +31,7 @@ def check_can(host: Host, bitrates: Mapping[str, int] | None) -> Iterator[Findin
     found = {interface.name: interface for interface in find_can_interfaces(host.root, host.run)}
     if bitrates is None and not found:
         yield Finding(CHECK, "", "note", "no CAN interface", "plug one in, if the rig has any")
+
     for name in found if bitrates is None else bitrates:
         bitrate = None if bitrates is None else bitrates[name]
         if name not in found:

@@ -45,7 +45,7 @@ def doctor(
     from jointfit_daemon.config import load_rig
     from jointfit_daemon.tools.doctor._doctor_report import finding_lines, report_of
     from jointfit_daemon.tools.doctor._host import Host
-    from jointfit_daemon.tools.text_output import echo_json
+    from jointfit_daemon.tools.text_output import echo_json, echo_wrapped
 
     chosen = config or (_DEFAULT if _DEFAULT.exists() else None)
     rig = None if chosen is None else load_rig(chosen)
@@ -60,7 +60,7 @@ def doctor(
     else:
         for finding in findings:
             for line in finding_lines(finding):
-                typer.echo(line)
+                echo_wrapped(line)
     if report.level == "error":
         raise typer.Exit(EXIT_FAILED)
 

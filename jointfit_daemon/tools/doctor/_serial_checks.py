@@ -88,6 +88,7 @@ def _permission(host: Host, path: str, node: Path) -> Finding:
     if group in host.groups:
         text = f"group {group} may not read and write the port"
         return Finding(CHECK, path, "error", text, _RULES)
+
     if host.user in host.members(group):
         text = f"user {host.user} joined the group {group} after the login"
         return Finding(CHECK, path, "error", text, f"log out and in, or: newgrp {group}")

@@ -12,6 +12,7 @@ import typer
 
 from jointfit_daemon.tools.command_group import EXIT_INTERRUPTED, EXIT_MISUSE
 from jointfit_daemon.tools.output_files import check_output
+from jointfit_daemon.tools.text_output import echo_wrapped
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -63,7 +64,7 @@ def init(
         state.unlink(missing_ok=True)
 
     def show(text: str) -> None:
-        typer.echo(text, err=json)
+        echo_wrapped(text, err=json)
 
     ports = tuple(str(each) for each in port or ())
     dialogue = _new_dialogue(show, state, answers, ports, network=network)
@@ -83,18 +84,18 @@ def init(
 
 def _show_result(written: WrittenRig) -> None:
     if written.open_places:
-        typer.echo(f"\n{written.path} is written. These places are not filled in yet:")
+        echo_wrapped(f"\n{written.path} is written. These places are not filled in yet:")
         for place in written.open_places:
-            typer.echo(f"  {place}")
+            echo_wrapped(f"  {place}")
     else:
-        typer.echo(f"\n{written.path} is written and valid.")
+        echo_wrapped(f"\n{written.path} is written and valid.")
     for warning in written.warnings:
-        typer.echo(f"warning: {warning}")
+        echo_wrapped(f"warning: {warning}")
 
-    typer.echo("Next:")
+    echo_wrapped("Next:")
     width = max(map(len, written.next_commands))
     for command, use in written.next_commands.items():
-        typer.echo(f"  {command:{width}}  {use}")
+        echo_wrapped(f"  {command:{width}}  {use}")
 
 
 def _new_dialogue(
@@ -127,7 +128,7 @@ def _new_dialogue(
         show(f"Continuing with the answers in {state} (--restart begins again)")
         dialogue.resume(stored)
     elif answers is None:
-        show("Enter takes the proposal in brackets, '?' explains, '<' returns to the last question")
+        show("Enter takes the proposal in brackets, '?' explains, '<' goes back one question")
     return dialogue
 
 

@@ -172,6 +172,7 @@ class Dialogue:
         if asked.question.kind != "ids":
             for number, choice in enumerate(asked.choices, 1):
                 self.show(f"  {number}  {choice.address:{width}}  {choice.text}".rstrip())
+
         while True:
             line = self.read_line(self._prompt(asked)).strip()
             if line == HELP:
@@ -218,11 +219,13 @@ class Dialogue:
             if not self.found.markers:
                 raise AnswerError("no names of markers: type them, separated by commas")
             return
+
         if asked.question.finder == "identifiers":
             bus = self.answers["device", asked.subject]
             self.found = self.search.identifiers(self.found, bus)
             self.show(f"  {bus}: {len(self.found.ids[bus])} sensors were received")
             return
+
         self.found, address = self.search.moved_device(
             self.found, self.answers, asked.subject, asked.choices
         )

@@ -15,11 +15,12 @@ from jointfit_daemon.tools.init._answers import (
     marked_parts,
     sensors_of,
 )
+from jointfit_daemon.tools.init._found import FoundDevice
 
 if TYPE_CHECKING:
     from collections.abc import Container
 
-    from jointfit_daemon.tools.init._found import Found, FoundDevice
+    from jointfit_daemon.tools.init._found import Found
 
 Given = Mapping[Key, Any]
 
@@ -58,11 +59,13 @@ def sensors(answers: Given, _found: Found, segment: str) -> tuple[str, ...]:
 
 
 def devices(answers: Given, found: Found, _sensor: str) -> tuple[FoundDevice, ...]:
-    """Return all buses, and the serial ports that no other sensor uses."""
+    """Return all buses and CAN adapters, and the serial ports that no other sensor uses."""
     used = {value for (key, _), value in answers.items() if key == "device"}
     adapters = answers["can_adapters", ""]
     ports = [port for port in found.ports if port.address in adapters or port.address not in used]
-    return (*ports, *found.interfaces)
+    known = {port.address for port in found.ports}
+    typed = [FoundDevice(path, "CAN adapter") for path in adapters if path not in known]
+    return (*ports, *typed, *found.interfaces)
 
 
 def device(answers: Given, found: Found, sensor: str) -> str | None:

@@ -232,8 +232,8 @@ QUESTIONS: tuple[Question, ...] = (
     Question(
         "ids",
         "ids",
-        "CAN identifiers of the sensor {subject}",
-        "Identifiers of the messages of this sensor, as 0x105 0x106 0x121. 'find' receives on a"
+        "CAN identifiers of the sensor {subject}, as 0x105 0x106 0x121",
+        "Identifiers of the messages of this sensor. 'find' receives on a"
         " CAN interface and proposes the identifiers of its sensors. If they are unknown, return"
         " with '<' and leave the connection for 'later'.",
         group="sensor",

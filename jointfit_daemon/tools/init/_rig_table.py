@@ -42,11 +42,13 @@ def rig_table(answers: Given, found: Found) -> dict[str, Any]:
         "rig": {"name": answers["name", ""], "output_rate_hz": answers["output_rate_hz", ""]},
         "chain": _chain(answers),
     }
+
     if not limb_of(answers).is_planar:
         buses = _buses(answers)
         table["imu"] = [_imu(answers, found, buses, name) for name in sensors_of(answers)]
         if buses:
             table["can"] = {name: _bus(answers, device) for device, name in buses.items()}
+
     if has_cameras(answers):
         table["mocap"] = _mocap(answers, found)
     table["calibration"] = {"store": answers["subject", ""]}
@@ -65,6 +67,7 @@ def _chain(answers: Given) -> dict[str, Any]:
     table |= {end: part for end, part in limb.ends.items() if answers.get(("markers", part))}
     if limb.is_planar:
         table["motion"] = "planar"
+
     lengths = {name: answers["length_m", name] for name in lengths_asked(answers)}
     if known := {name: length for name, length in lengths.items() if length is not None}:
         table["lengths_m"] = known
@@ -102,6 +105,7 @@ def _imu(answers: Given, found: Found, buses: Mapping[str, str], name: str) -> d
         "segment": sensors_of(answers)[name],
         "driver": driver.name,
     }
+
     table |= {"port": device} if driver.wiring == "serial" else {"can": buses[device]}
     if driver.baud is not None and device != LATER:
         table["baud"] = answers["baud", name]

@@ -127,6 +127,7 @@ class DeviceSearch:
         except OSError as error:
             return found, f"{host}: {error.strerror or error}: the names of markers are unknown"
         named = [server for server in servers if server.markers or server.bodies]
+
         if not named:
             text = f"{host} {'sent no names' if servers else 'does not answer'}"
             return found, f"{text}: check the address, or type the names of the markers"
@@ -180,9 +181,11 @@ class DeviceSearch:
             raise AnswerError(
                 "nothing was found to listen to: connect the sensor, or name its port with --port"
             )
+
         self.show(f"  Opening {', '.join(tables)}; hold all sensors still …")
         rate_hz = answers["sensor_rate_hz", ""]
         _, table = asyncio.run(find_moved(sensor, tables, rate_hz, self.show))
+
         if "port" in table:
             port = str(table["port"])
             speed = {port: table["baud"]} if "baud" in table else {}

@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.init._found import Found
 
 
+_USUAL_BROKERS = ("mqtt://127.0.0.1:1883", "mqtt://localhost:1883")
+"""Broker that `jointfit dashboard` uses without an option."""
+
+
 def state_of(path: Path) -> Path:
     """Return the file with the answers of an interrupted dialogue."""
     return path.with_suffix(".answers.toml")
@@ -88,9 +92,10 @@ def _same_command(path: Path) -> str:
 def _next_commands(path: Path, rig: Rig) -> dict[str, str]:
     scheme = "mqtt" if rig.mqtt.tls is None else "mqtts"
     broker = f"{scheme}://{rig.mqtt.host}:{rig.mqtt.tcp_port}"
+    option = "" if broker in _USUAL_BROKERS else f" --broker {broker}"
     name = shlex.quote(str(path))
     return {
         f"jointfit check {name}": "check the file after changes",
         f"jointfitd --config {name}": "run the daemon",
-        f"jointfit dashboard --broker {broker}": "see the limb and calibrate in a browser",
+        f"jointfit dashboard{option}": "see the limb and calibrate in a browser",
     }

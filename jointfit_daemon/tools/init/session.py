@@ -9,6 +9,7 @@ import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.config import LATER
 from jointfit_daemon.tools.init._answer_file import read_answers, write_answers
 from jointfit_daemon.tools.init._dialogue import Dialogue, answer_text
 from jointfit_daemon.tools.init._engine import answered, complete, next_question
@@ -84,6 +85,7 @@ class SetUpSession:
         dialogue, action = self.dialogue, message.get("do")
         if self._written is not None:
             return
+
         asked = dialogue.next()
         if action == "back":
             dialogue.go_back()
@@ -127,6 +129,7 @@ class SetUpSession:
         dialogue = self.dialogue
         asked = dialogue.asked()
         found = dialogue.found
+
         secret = self._password_file() if asked is None else None
         return {
             "question": None if asked is None else _question(asked),
@@ -147,22 +150,24 @@ class SetUpSession:
 
 
 def _question(asked: Asked) -> dict[str, Any]:
+    question = asked.question
+    choices = (
+        [] if question.kind == "ids" else [(each.address, each.text) for each in asked.choices]
+    )
+    if question.kind == "yes_no":
+        choices = [("yes", ""), ("no", "")]
+    if question.postponable:
+        choices.append((LATER, "not connected yet: leave this place open"))
     return {
         "name": asked.name,
         "text": asked.text,
-        "help": asked.question.help,
+        "help": question.help,
         "default": answer_text(asked.proposal),
         "optional": asked.optional,
-        "finder": asked.question.finder,
-        "closed": asked.question.kind in ("choice", "yes_no"),
-        "choices": [
-            {"value": "yes", "text": ""}, {"value": "no", "text": ""}
-        ] if asked.question.kind == "yes_no" else [
-            {"value": choice.address, "text": choice.text}
-            for choice in asked.choices
-            if asked.question.kind != "ids"
-        ],
-    }  # fmt: skip
+        "finder": question.finder,
+        "closed": question.kind in ("choice", "yes_no"),
+        "choices": [{"value": value, "text": text} for value, text in choices],
+    }
 
 
 def _no_lines(_prompt: str) -> str:

@@ -108,13 +108,16 @@ def _caption(
 ) -> Line:
     if not imu:
         return Line.of(f"No known angle in the last {shown_s:g} s.", "muted")
+
     values = [value for _, value in imu]
     span = f"{format_number(min(values), 0, '°')} to {format_number(max(values), 0, '°')}"
     line = Line.of(f"{shown_s:g} s: {span}  ", "muted")
     if not optical:
         return line
+
     line = line.add("─ IMUs  " if unicode else "* IMUs  ", "imu")
     line = line.add("· cameras" if unicode else ". cameras", "optical")
+
     difference = _difference(imu, optical)
     if difference is None:
         return line

@@ -78,8 +78,10 @@ def _running(calibration: CalibrationState, progress: Progress | None, width: in
         cells = max(1, min(_BAR, width))
         done = round(share * cells)
         lines.append(Line.of("█" * done, "imu").add("░" * (cells - done), "muted"))
+
     instruction = next((text for phase, *_, text in _STEPS if phase == calibration.phase), "")
     lines += wrap(instruction, width)
+
     text = progress.text if progress is not None else calibration.text
     data: Mapping[str, Any] = {} if progress is None else progress.data
     missing = [str(each) for each in _list(data.get("missing"))]
@@ -87,6 +89,7 @@ def _running(calibration: CalibrationState, progress: Progress | None, width: in
         lines += wrap(text, width, "strong")
     for each in missing:
         lines += wrap(f"▲ {each}", width, "warning", indent=2)
+
     lines += _joint_lines(_table(data.get("joints")), width)
     seen = ", ".join(
         f"{name} {format_number(_number(_table(part).get('seen_pct')), 0, ' %')}"
@@ -99,10 +102,12 @@ def _joint_lines(joints: Mapping[str, Any], width: int) -> list[Line]:
     """Return the predicted error of every joint centre."""
     if not joints:
         return []
+
     wide = width >= _WIDE
     columns = [Column("joint centre"), Column("error", right=True)]
     if wide:
         columns += [Column("random error", right=True), Column("arc", right=True), Column("from")]
+
     rows = []
     for name, joint in joints.items():
         one = _table(joint)
@@ -154,15 +159,18 @@ def history_lines(state: MonitorState, width: int) -> list[Line]:
         return wrap("Reading the stored calibrations.", width, "muted")
     if not stored.versions:
         return wrap("No calibration is stored yet: key 2 shows how to make one.", width, "muted")
+
     wide = width >= _WIDE
     columns = [Column(""), Column("version", right=True), Column("made")]
     if wide:
         columns += [Column("method"), Column("held-out error")]
+
     chosen = state.chosen_version()
     rows = [
         _version_row(state, each, in_force=stored.in_force, chosen=each is chosen, wide=wide)
         for each in stored.versions
     ]
+
     lines = table([*columns, Column("state")], rows, width)
     if not wide and chosen is not None:
         lines += wrap(f"Version {chosen.version}: {_errors(chosen)}", width, "muted")

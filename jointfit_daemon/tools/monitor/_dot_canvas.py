@@ -84,6 +84,8 @@ def render(front: DotCanvas, style: Style, back: DotCanvas, back_style: Style) -
                 character = chr(_BRAILLE + mask) if mask else " "
             else:
                 character = "*" if above else "." if below else " "
+
+            # Cells of one style, and blank ones, are one span.
             chosen: Style = style if above else back_style if below else ""
             if spans and (spans[-1][1] == chosen or character == " "):
                 spans[-1] = (spans[-1][0] + character, spans[-1][1])

@@ -159,6 +159,7 @@ def _labelled(
         free = canvas.columns - width
         if row in taken or len(line.text.rstrip("⠀ ")) > free:
             continue
+
         taken.add(row)
         lines[row] = line.fit(free) if line.width <= free else _cut(line, free)
         lines[row] = lines[row].add(" " + fit_text(title_of(name), width - 1), "muted")

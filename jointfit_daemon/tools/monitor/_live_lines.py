@@ -124,6 +124,8 @@ def _reason(rig: RigView, value: float | None, sd: float | None, age_s: float) -
     """Return the most important limitation of the angle, and whether it is a warning."""
     if age_s > STALE_S:
         return f"No pose for {age_s:.0f} s.", True
+
+    # The most urgent flags, then what makes a value or its sd unknown.
     flags = serious_flags([] if rig.pose is None else rig.pose.flags)
     if flags:
         return "▲ " + " ".join(map(flag_sentence, flags[:2])), True

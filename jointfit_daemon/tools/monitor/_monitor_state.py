@@ -179,6 +179,8 @@ class MonitorState:
             if key == "enter" and bases:
                 return ChooseRig(bases[min(self.cursor, len(bases) - 1)])
             return None
+
+        # Keys of a rig: views first, then what moves in them, then requests.
         if key.isdecimal() and 1 <= int(key) <= len(VIEWS):
             self._show(VIEWS[int(key) - 1])
         elif key in {"tab", "shift+tab"}:
@@ -244,6 +246,7 @@ class MonitorState:
             return SendRequest("static")
         if key == "x" and self.is_running:
             return SendRequest("calibrate", {"phase": "abort"})
+
         if self.view != "calibrate" or self.is_running:
             return None
         phases: dict[str, Mapping[str, Any]] = {

@@ -106,6 +106,7 @@ def page_state(state: MonitorState, now: Moment) -> tuple[Level, str, str]:
         return "error", "jointfitd is not running", _STOPPED
     if rig.bridge != "online":
         return "muted", "Waiting for jointfitd", ""
+
     fault = next(iter(rig.faults.values()), "")
     calibration = rig.calibration
     age_s = pose_age_s(rig, now)
@@ -114,6 +115,7 @@ def page_state(state: MonitorState, now: Moment) -> tuple[Level, str, str]:
             f"No pose for {format_duration(age_s)}: jointfitd does not answer, or the network"
             " drops its messages"
         )
+
     poor = calibration is not None and (calibration.phase == "aborted" or calibration.kept)
     level: Level = "error" if fault else "warning" if poor else "good"
     if calibration is None or calibration.phase == "uncalibrated" or state.is_running:
@@ -127,11 +129,13 @@ def _header(state: MonitorState, level: Level, words: str, width: int, now: Mome
     name = rig.info.rig if rig.info is not None else (state.base or "jointfit monitor")
     style: Style = "" if level in ("good", "muted") else level
     words = f"{SYMBOLS[level]} {words}"
+
     clock = format_clock(rig.gateway_us(now), state.timezone)
     error_s = rig.clock_error_us / 1e6
     if abs(error_s) > _CLOCK_ERROR_S:
         direction = "ahead" if error_s > 0 else "behind"
         clock += f" ({format_duration(abs(error_s))} {direction})"
+
     if width < _WIDE:
         first = _spread(Line.of(name, "strong"), Line.of(clock, "muted"), width)
         return [first, *wrap(words, width, style)[:2]]
@@ -157,6 +161,7 @@ def _body(state: MonitorState, width: int, height: int, now: Moment) -> list[Lin
             style: Style = "chosen" if chosen else ""
             lines.append(Line.of(f"{'▶' if chosen else ' '} {name}  ({base})", style))
         return lines
+
     rig = state.rig
     if rig.bridge == "unknown" and rig.pose is None:
         return _waiting_lines(state, width)
@@ -201,6 +206,7 @@ def _log_lines(state: MonitorState, width: int) -> list[Line]:
     if not events:
         words = "warning or error" if state.only_problems else "event"
         return wrap(f"No {words} since the monitor was started.", width, "muted")
+
     lines = []
     for event in events:
         level = _EVENT_LEVELS[event.level]
@@ -225,6 +231,8 @@ def _keys(state: MonitorState) -> list[tuple[str, str]]:
     if state.base is None:
         choose = [("↑↓", "select"), ("Enter", "show")] if len(state.rigs) > 1 else []
         return [*choose, ("q", "quit")]
+
+    # What the keys of a view do depends on whether a phase runs.
     keys = {
         "live": [("j", "next angle"), ("←→", "turn")],
         "calibrate": [] if state.is_running else [("a", "align"), ("f", "move")],

@@ -54,6 +54,7 @@ class ScreenWidget(Widget):
         """Show lines of the width of the widget."""
         if lines == self._lines:
             return
+
         regions = []
         for row, line in enumerate(lines):
             if row < len(self._lines) and self._lines[row] == line:
@@ -62,6 +63,7 @@ class ScreenWidget(Widget):
             old = self._strips[row] if row < len(self._strips) else None
             regions.append(_changed(old, strip, row))
             self._strips[row : row + 1] = [strip]
+
         if len(lines) < len(self._strips):
             del self._strips[len(lines) :]
         self._lines = lines

@@ -58,6 +58,7 @@ class Line:
         excess = self.width - width
         if excess <= 0:
             return self if excess == 0 else self.add(" " * -excess)
+
         spans: list[tuple[str, Style]] = []
         free = max(0, width - 1)
         for text, style in self.spans:
@@ -105,6 +106,7 @@ def wrap(text: str, width: int, style: Style = "", *, indent: int = 0) -> list[L
                 lines.append(current)
                 current = " " * indent
             current += (" " if current.strip() else "") + piece
+
     if current.strip():
         lines.append(current)
     return [Line.of(line, style) for line in lines]
@@ -138,6 +140,7 @@ def table(
     titles: list[tuple[str, Style]] = [(column.title, "muted") for column in columns]
     every = [titles, *rows]
     widths = [max(cell_len(row[k][0]) for row in every) for k in range(len(columns))]
+
     lines = []
     for row in every:
         spans = tuple(

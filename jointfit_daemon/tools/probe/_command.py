@@ -190,6 +190,7 @@ def _faults(
                 f"{port.port}: {sum(port.received_bytes.values())} bytes, but no installed driver "
                 "decodes them: check the speed of the device, or write a driver"
             )
+
     for bus in can:
         if bus.fault is not None:
             faults.append(bus.fault)

@@ -114,6 +114,7 @@ def _device_lines(devices: tuple[DecodedDevice, ...]) -> Iterator[str]:
         rate = "no orientations" if device.rate_hz is None else f"{device.rate_hz:.1f} Hz"
         ids = device.settings.get("ids") or {}
         words = [f"{name} 0x{number:X}" for name, number in ids.items()]
+
         yield "  " + ", ".join(
             [
                 f"{device.driver}{f' ({model})' if model else ''}: {rate}",

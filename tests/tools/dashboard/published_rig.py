@@ -83,6 +83,8 @@ class PublishedRig:
     base: str = "jointfit/bench-1"
     clock_offset_s: float = 0.0
     """Clock of the gateway minus clock of this machine, s."""
+    lengths_known: bool = True
+    """Whether the lengths of the segments are known, and so the positions of knee and ankle."""
     offline: frozenset[str] = frozenset()
     """Devices without data."""
     version: int = 1
@@ -233,6 +235,7 @@ class PublishedRig:
         middle = below(p, hip, THIGH_M)
         end = below(middle, shank_angle, SHANK_M)
         flexion = math.degrees(knee)
+        unknown = None if self.lengths_known else {"p_m": None, "sd_m": None}
         return {
             "segments": {
                 thigh: {"q": about_x(hip), "sd_deg": 0.9, "used": self.sensors[thigh]},
@@ -246,8 +249,8 @@ class PublishedRig:
                     "inner_deg": round(180 - flexion, 2),
                     "sd_deg": 2.1, "flexion_deg_s": 61.2, "adduction_deg_s": 1.8,
                     "rotation_deg_s": -3.1,
-                },
-                "ankle": {"p_m": end, "sd_m": 0.027},
+                } | (unknown or {}),
+                "ankle": unknown or {"p_m": end, "sd_m": 0.027},
             },
         }  # fmt: skip
 

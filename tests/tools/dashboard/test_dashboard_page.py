@@ -40,7 +40,6 @@ async def test_the_limb_moves_and_the_angle_has_a_standard_deviation(broker: Bro
         assert len(pictures) >= 4
         await page.until_text("#chart-caption", "difference from the cameras")
         await page.page.wait_for_function("() => jointfit.store.poses.length > 195", timeout=60_000)
-        await page.picture("dashboard")  # the picture of the documentation
         assert await page.page.evaluate("document.documentElement.scrollHeight - innerHeight") <= 0
         assert page.foreign == []
         assert page.errors == []
@@ -151,6 +150,13 @@ async def test_finished_steps_have_ticks_in_a_page_that_is_opened_during_a_step(
         await page.show("calibrate")
         await page.page.wait_for_selector(".step.running")
         assert await page.page.evaluate(TICKS) == ticks
+
+
+async def test_a_limb_of_unknown_lengths_is_drawn_with_assumed_ones(broker: Broker) -> None:
+    async with shown(broker, PublishedRig(lengths_known=False)) as page:
+        await page.until_text("#limb-caption", "Unknown length of Thigh, Shank: drawn with 0.4 m")
+        drawn = "jointfit.limb.camera.length"
+        await page.page.wait_for_function(f"() => Math.abs({drawn} - 0.8) < 0.01")
 
 
 async def test_tabs_and_devices_are_whole_on_a_phone(broker: Broker) -> None:

@@ -282,6 +282,13 @@ def test_a_port_serves_one_sensor_and_leaves_the_list() -> None:
         accept(second, "/dev/ttyUSB0", answers, DEVICES)
 
 
+def test_a_can_adapter_that_was_typed_is_in_the_list() -> None:
+    asked, _ = until("device", NOTHING, can_adapters="/dev/ttyACM7")
+    assert [(each.address, each.text) for each in asked.choices] == [
+        ("/dev/ttyACM7", "CAN adapter")
+    ]
+
+
 def test_markers_of_the_stream_are_proposed_for_the_part_they_are_named_after() -> None:
     asked, answers = until("markers", STREAM, limb="knee", cameras=True)
     proposed = {}

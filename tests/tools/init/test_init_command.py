@@ -86,6 +86,7 @@ def test_a_typed_dialogue_writes_a_rig_that_check_accepts(tmp_path: Path, machin
         ("b", "/dev/ttyUSB1"),
     ]
     assert f"jointfitd --config {tmp_path / 'lab/rig.toml'}" in done.output
+    assert "jointfit dashboard  " in done.output  # the usual broker needs no option
     assert [path.name for path in (tmp_path / "lab").iterdir()] == ["rig.toml"]
     checked = CliRunner().invoke(app, ["check", str(tmp_path / "lab/rig.toml")])
     assert checked.exit_code == 0

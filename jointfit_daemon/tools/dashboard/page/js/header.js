@@ -133,9 +133,13 @@ function emptyContent(link, store, configuration, rigs, choose) {
     ] };
   }
   if (store.bridge === "online" && store.calibration?.phase === "uncalibrated") {
-    return { kind: "uncalibrated", children: [
+    const cameras = Object.values(store.info?.devices ?? {}).some((device) => device.kind === "mocap");
+    const steps = cameras
+      ? "A calibration takes about two minutes: turn the sensors on a plate, stand still, move every joint."
+      : "A calibration takes a few seconds: stand still.";
+    return { kind: `uncalibrated ${cameras}`, children: [
       createElement("h2", {}, "Not calibrated yet"),
-      createElement("p", {}, "The sensors send data, but their positions on the body are unknown. A calibration takes about two minutes: turn the sensors on a plate, stand still, move every joint."),
+      createElement("p", {}, `The sensors send data, but their positions on the body are unknown. ${steps}`),
       createElement("button", { class: "button primary", type: "button", onclick: () => { location.hash = "calibrate"; } }, "Show the steps"),
     ] };
   }

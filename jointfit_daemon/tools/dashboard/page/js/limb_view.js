@@ -15,6 +15,7 @@ const OPTICAL_MS = 600;
 const TURN_STEP = 0.15;
 const THICKNESS = [0.15, 0.105];
 const AXIS_SHARE = 0.15;
+const ASSUMED_M = 0.4; // length of a drawn segment whose length is unknown
 
 /** Draw the limb of a store; return the view, whose `frames` holds the time of each frame, ms. */
 export function createLimbView(store) {
@@ -138,9 +139,16 @@ function interpolate(view, store, now) {
     const [a, b] = [before, after].map((sample) => valueOf(sample.pose.segments, name));
     const q = b?.q ? (a?.q ? mixRotations(a.q, b.q, share) : b.q) : null;
     const [from, to] = endsOf(info, i).map((end) => joints[end] ?? NO_JOINT);
+    if (from.p && q && lacksLength(info, after.pose, i)) to.p = add(from.p, rotate(q, [0, 0, -ASSUMED_M]));
     return { name, q, from, to, used: b?.used ?? [] };
   });
   return { t_us, joints, segments };
+}
+
+/** Return whether the orientation of a segment is known, and the position of its end is not. */
+function lacksLength(info, pose, i) {
+  return !info.connections && i + 1 < info.joints.length
+    && Boolean(valueOf(pose.segments, info.segments[i])?.q) && !valueOf(pose.joints, info.joints[i + 1])?.p_m;
 }
 
 const NO_JOINT = { name: "", p: null, sd: null };
@@ -359,5 +367,7 @@ export function updateLimbCaption(store) {
     return `${isolate(titleOf(name))} ± ${formatNumber(segment.sd_deg, 1)}° from ${segment.used?.map(isolate).join(", ") || "no sensor"}`;
   });
   const mode = { imu: "First joint fixed (no cameras).", "imu+mocap": "First joint from the cameras." }[store.pose.mode] ?? "";
-  return setText(caption, `${parts.join(" · ")}. ${mode}`);
+  const assumed = store.info.segments.filter((_, i) => lacksLength(store.info, store.pose, i)).map((name) => isolate(titleOf(name)));
+  const lengths = assumed.length === 0 ? "" : ` Unknown length of ${assumed.join(", ")}: drawn with ${ASSUMED_M} m. Set lengths_m under [chain] in rig.toml.`;
+  return setText(caption, `${parts.join(" · ")}. ${mode}${lengths}`);
 }
