@@ -56,6 +56,7 @@ NOT_RUN = {
     r"^jointfit monitor": "needs a terminal: tests/system runs it in a pseudo-terminal",
     r"^jointfit doctor": "finds the faults of the test machine: tests/tools/doctor runs it",
     r"^jointfit center-study": "12 s of processor time",
+    r"^jointfit report ": "needs a recording: tests/tools/report makes one",
     r"/dev/|^candump |^ip link|^udevadm ": "needs hardware",
 }
 """Patterns of commands that a test cannot run, each with the reason."""

@@ -112,7 +112,8 @@ class SessionCollector:
                     self._add_state(output)
                 case OpticalState():
                     self._add_optical(output)
-                case Notice(t_ns, kind, name, text, _, data):
+                case Notice(t_ns, kind, name, text, level, data):
+                    data = {**data, "level": level.value}
                     self._events.append((t_ns, TimelineEvent(0.0, kind, name, text, data)))
                 case CalibrationStatus(t_ns, phase, text, version, quality, kept):
                     details = {"version": version, "quality": quality, "kept": kept}

@@ -28,6 +28,7 @@ from jointfit_daemon.tools.monitor import monitor
 from jointfit_daemon.tools.probe import probe
 from jointfit_daemon.tools.record import record
 from jointfit_daemon.tools.recover import recover
+from jointfit_daemon.tools.report import report
 from jointfit_daemon.tools.request import mark, request
 from jointfit_daemon.tools.sample import sample
 from jointfit_daemon.tools.schema import schema
@@ -43,6 +44,7 @@ app = typer.Typer(
 for command in (
     init, check, probe, doctor, demo, dashboard, monitor, calibrate, mark, record, request, recover,
     export, center, decode, ik, markers, center_study, sample, schema,
+    report,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(fuse.app)

@@ -6,6 +6,7 @@ import tempfile
 from pathlib import Path
 
 from tests.pictures import drift_event
+from tests.pictures.report_page import draw_report
 from tests.pictures.tutorial_run import run_tutorial
 
 PICTURES = Path(__file__).resolve().parents[2] / "docs" / "pictures"
@@ -15,6 +16,7 @@ def main() -> None:
     """Write all pictures."""
     with tempfile.TemporaryDirectory(prefix="jointfit-pictures-") as folder:
         run_tutorial(Path(folder), PICTURES)
+        draw_report(Path(folder), PICTURES / "report.webp")
     drift = drift_event.draw(drift_event.run())
     (PICTURES / "drift-event.svg").write_text(drift, encoding="utf-8")
 

@@ -1,0 +1,28 @@
+"""Command `jointfit report`: writes the page of a recorded session."""
+
+from __future__ import annotations
+
+from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
+from typing import Annotated
+
+import typer
+
+from jointfit_daemon.tools.output_files import check_output
+
+
+def report(
+    recording: Annotated[
+        Path, typer.Argument(help="Recording (.mcap), or another file of a session.")
+    ],
+    *,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Page to write; default: beside the recording.")
+    ] = None,
+) -> None:
+    """Write a session as one HTML page: angles, gait, range of motion, differences, faults."""
+    from jointfit_daemon.tools.report.writing import report_name, write_report
+
+    page = report_name(recording) if out is None else out
+    check_output("--out", page, (".html",))
+    write_report(recording, page)
+    typer.echo(f"wrote {page}", err=True)

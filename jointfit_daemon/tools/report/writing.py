@@ -1,0 +1,43 @@
+"""Report of a file on disk: `jointfit report` and `jointfit batch` share it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.tools.export import load_data
+from jointfit_daemon.tools.report.page import render_report
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.session_data import SessionData
+
+
+def report_name(recording: Path) -> Path:
+    """Return the default name of the page of a recording."""
+    return recording.with_name(f"{recording.name.split('.')[0]}-report.html")
+
+
+def write_report(recording: Path, page: Path) -> SessionData:
+    """Write the page of a recording, and return its session.
+
+    Raises
+    ------
+    ValueError
+        As `load_data`.
+    OSError
+        The recording cannot be read, or the page not written.
+    """
+    session = load_data(recording)
+    write_page(session, page)
+    return session
+
+
+def write_page(session: SessionData, page: Path) -> None:
+    """Write the page of a session; a page that exists stays until the new one is complete."""
+    partial = page.with_name(f"{page.name}.part")
+    try:
+        partial.write_text(render_report(session), encoding="utf-8")
+        partial.replace(page)
+    finally:
+        partial.unlink(missing_ok=True)
