@@ -120,11 +120,8 @@ class Host:
         for number, name, folder in self.processes():
             try:
                 links = list((folder / "fd").iterdir())
-                if any(self._target(link) == wanted for link in links):
+                if any(self.at(str(link.readlink())) == wanted for link in links):
                     found.append((number, name))
             except OSError:  # of another user, or ended
                 continue
         return found
-
-    def _target(self, link: Path) -> Path:
-        return self.at(str(link.readlink()))

@@ -95,10 +95,6 @@ def _is_remote(answers: Given) -> bool:
     return not is_this_host(split_address(answers["broker", ""])[0])
 
 
-def _has_account(answers: Given) -> bool:
-    return answers["username", ""] is not None
-
-
 def _always(value: Any) -> Propose:
     return lambda _answers, _found, _subject: value
 
@@ -362,7 +358,7 @@ QUESTIONS: tuple[Question, ...] = (
         "text",
         "File for the password",
         "The password is in a file of its own, readable by its owner only, never in the rig.",
-        subjects=_if(_has_account),
+        subjects=_if(lambda answers: answers["username", ""] is not None),
         default=_always("mqtt-password"),
     ),
 )

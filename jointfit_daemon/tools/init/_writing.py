@@ -78,15 +78,11 @@ def write_rig(path: Path, given: Answers, found: Found) -> WrittenRig:
     warnings = (*missing_files(rig.mqtt), *(() if heading is None else (heading,)))
     following = _next_commands(path, rig)
     if open_places:
-        following = {_same_command(path): "fill in these places later"} | following
+        command = f"jointfit init --config {shlex.quote(str(path))} --force"
+        if path.name == "rig.toml":
+            command = f"jointfit init {shlex.quote(str(path.parent))} --force"
+        following = {command: "fill in these places later"} | following
     return WrittenRig(path, table, tuple(open_places), warnings, following)
-
-
-def _same_command(path: Path) -> str:
-    """Return the command that asks for the open places of a rig.toml."""
-    if path.name == "rig.toml":
-        return f"jointfit init {shlex.quote(str(path.parent))} --force"
-    return f"jointfit init --config {shlex.quote(str(path))} --force"
 
 
 def _next_commands(path: Path, rig: Rig) -> dict[str, str]:

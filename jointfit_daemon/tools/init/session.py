@@ -68,7 +68,7 @@ class SetUpSession:
             self._dialogue = Dialogue(
                 self.search,
                 self._note,
-                _no_lines,
+                lambda _prompt: "",  # a page sends messages instead of lines
                 lambda given: write_answers(state, given),
                 self.search.start(),
             )
@@ -168,7 +168,3 @@ def _question(asked: Asked) -> dict[str, Any]:
         "closed": question.kind in ("choice", "yes_no"),
         "choices": [{"value": value, "text": text} for value, text in choices],
     }
-
-
-def _no_lines(_prompt: str) -> str:
-    raise EOFError

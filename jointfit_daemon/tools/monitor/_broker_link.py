@@ -58,7 +58,10 @@ class BrokerLink:
             self.choose(self._settings.base)
         while True:
             try:
-                await (self._follow() if self._chosen.is_set() else self._search())
+                if self._chosen.is_set():
+                    await self._follow()
+                elif only := self._state.found_rigs(await find_rigs(self._settings, SEARCH_S)):
+                    self.choose(only)
             except BrokerLostError as lost:
                 self._state.lost(str(lost))
                 await asyncio.sleep(RECONNECT_S)
@@ -77,12 +80,6 @@ class BrokerLink:
             return await self._client.request(command, arguments)
         except BrokerLostError as lost:
             raise NoAnswerError(str(lost)) from lost
-
-    async def _search(self) -> None:
-        """Look for rigs once; the only one is chosen."""
-        only = self._state.found_rigs(await find_rigs(self._settings, SEARCH_S))
-        if only is not None:
-            self.choose(only)
 
     async def _follow(self) -> None:
         """Pass on the messages of the rig until the broker is lost."""

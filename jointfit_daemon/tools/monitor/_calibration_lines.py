@@ -84,7 +84,8 @@ def _running(calibration: CalibrationState, progress: Progress | None, width: in
 
     text = progress.text if progress is not None else calibration.text
     data: Mapping[str, Any] = {} if progress is None else progress.data
-    missing = [str(each) for each in _list(data.get("missing"))]
+    found = data.get("missing")
+    missing = [str(each) for each in found] if isinstance(found, list) else []
     if text and text not in missing:
         lines += wrap(text, width, "strong")
     for each in missing:
@@ -221,10 +222,6 @@ def _spread(value: Any, decimals: int) -> str:
 
 def _table(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, dict) else {}
-
-
-def _list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else []
 
 
 def _number(value: Any) -> float | None:

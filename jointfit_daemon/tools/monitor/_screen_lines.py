@@ -86,11 +86,15 @@ def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> l
         shown[-1] = Line.of(f"↓ {more} more lines: key ↓", "muted")
     shown += [Line()] * (free - len(shown))
     lines = [*top, *shown, *bottom][:height]
-    if not state.unicode:
-        lines = [line.to_ascii() for line in lines]
-    return [line.fit(width) for line in lines] if state.unicode else [
-        _fit_ascii(line, width) for line in lines
-    ]  # fmt: skip
+    if state.unicode:
+        return [line.fit(width) for line in lines]
+
+    # The ellipsis of a line that is cropped is a point.
+    fitted = [line.to_ascii().fit(width) for line in lines]
+    return [
+        Line(tuple((text.replace("…", "."), style) for text, style in line.spans))
+        for line in fitted
+    ]
 
 
 def page_state(state: MonitorState, now: Moment) -> tuple[Level, str, str]:
@@ -242,9 +246,3 @@ def _keys(state: MonitorState) -> list[tuple[str, str]]:
     }[state.view]
     phase = ("x", "stop phase") if state.is_running else ("s", "static pose")
     return [("1–5", "views"), *keys, phase, ("m", "mark"), ("q", "quit")]
-
-
-def _fit_ascii(line: Line, width: int) -> Line:
-    """Return an ASCII line with exactly `width` cells; its ellipsis is a point."""
-    fitted = line.fit(width)
-    return Line(tuple((text.replace("…", "."), style) for text, style in fitted.spans))

@@ -55,8 +55,12 @@ def report_lines(report: ProbeReport) -> Iterator[str]:
     yield _table(rows, "none: plug an adapter in, and look at `dmesg`")
 
     yield "\nCAN interfaces"
-    rows = [(each.name, each.kind, _can_state(each)) for each in report.can_interfaces]
-    rows += [(each.channel, each.interface, each.file) for each in report.can_channels]
+    rows = []
+    for each in report.can_interfaces:
+        bitrate = f"{each.bitrate} bit/s" if each.bitrate else None
+        words = ("up" if each.up else "down", bitrate, each.state, each.driver)
+        rows.append((each.name, each.kind, ", ".join(filter(None, words))))
+    rows += [(channel.channel, channel.interface, channel.file) for channel in report.can_channels]
     yield _table(rows, "none: plug an adapter in, or load its module (virtual: vcan)")
 
     for serial in report.serial:
@@ -87,14 +91,6 @@ def report_lines(report: ProbeReport) -> Iterator[str]:
 def _table(rows: list[tuple[str, str, str]], empty: str) -> str:
     text = align_columns(rows) if rows else empty
     return "\n".join(f"  {line}" for line in text.splitlines())
-
-
-def _can_state(interface: CanInterface) -> str:
-    words = ["up" if interface.up else "down"]
-    words += [f"{interface.bitrate} bit/s"] if interface.bitrate else []
-    words += [interface.state] if interface.state else []
-    words += [interface.driver] if interface.driver else []
-    return ", ".join(words)
 
 
 def _serial_result(serial: SerialTraffic) -> str:

@@ -48,6 +48,8 @@ def _buses(can: Sequence[CanTraffic]) -> Iterator[str]:
 def _sensors(
     ports: Sequence[SerialPortInfo], serial: Sequence[SerialTraffic], can: Sequence[CanTraffic]
 ) -> Iterator[str]:
+    from jointfit_daemon.driver import find_driver
+
     number = 0
     for traffic in serial:
         for device in traffic.devices[:1]:
@@ -57,19 +59,14 @@ def _sensors(
             info = next((port for port in ports if Path(port.device).name == name), None)
             keys: dict[str, Any] = {"port": traffic.port if info is None else info.path}
             keys |= device.settings
-            if info is not None and info.driver == _USB_SERIAL and _has_transport(device.driver):
+            fields = find_driver(device.driver).Settings.model_fields
+            if info is not None and info.driver == _USB_SERIAL and "transport" in fields:
                 keys["transport"] = "usb"
             yield _imu(number, device, keys)
     for bus in can:
         for device in bus.devices:
             number += 1
             yield _imu(number, device, {"can": bus.interface, **device.settings})
-
-
-def _has_transport(driver: str) -> bool:
-    from jointfit_daemon.driver import find_driver
-
-    return "transport" in find_driver(driver).Settings.model_fields
 
 
 def _imu(number: int, device: DecodedDevice, connection: dict[str, Any]) -> str:
