@@ -17,6 +17,7 @@ import numpy as np
 
 from jointfit_daemon.kinematics.exchanged_labels import find_exchanged_labels
 from jointfit_daemon.model import MarkerFlag
+from jointfit_daemon.pipeline.chain_tracking._segment_labels import SegmentLabels
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -92,8 +93,12 @@ class MarkerMonitor:
     """Markers of each flag in force."""
     _observed: dict[int, _Observation] = field(default_factory=dict)
     _began_ns: int | None = None
+    _labels: SegmentLabels = field(init=False)
+    _by_shape: set[str] = field(default_factory=set)
+    """Flags of exchanges in force that the shapes of the segments showed."""
 
     def __post_init__(self) -> None:
+        self._labels = SegmentLabels(self.model)
         count = len(self.model.markers)
         self.excluded = np.zeros(count, dtype=np.bool_)
         self._seen_ns = [None] * count
@@ -163,11 +168,17 @@ class MarkerMonitor:
         distances = np.sqrt(((places - measured) ** 2).sum(axis=1))
 
         far = distances > FAR_M  # False where NaN
-        exchanged = find_exchanged_labels(places, measured, far) if far.any() else []
+        exchanged: list[tuple[int, ...]] = []
+        if far.any() or self._by_shape:
+            # By the shapes of the segments, which exchanged markers turn; then by the places.
+            exchanged = [*self._labels.search(measured)]
+            turned = {segments[m] for group in exchanged for m in group}
+            far &= ~np.isin(segments, list(turned))
+            exchanged += find_exchanged_labels(places, measured, far)
         grouped = {m for group in exchanged for m in group}
         suspects = {self._flag(MarkerFlag.EXCHANGED, *group): group for group in exchanged}
         for m in np.flatnonzero(far).tolist():
-            if m not in grouped:
+            if m not in grouped and not self.excluded[m]:
                 suspects[self._flag(MarkerFlag.MISPLACED, m)] = (m,)
 
         reports = self._recover(t_ns, distances)
@@ -209,6 +220,8 @@ class MarkerMonitor:
         reports = []
         for flag, markers in new.items():
             self._faults[flag] = markers
+            if len(markers) > 1 and not self._labels.fit(markers):
+                self._by_shape.add(flag)
             self.excluded[list(markers)] = True
             reports.append(self._report(markers, distances))
         return reports
@@ -244,10 +257,20 @@ class MarkerMonitor:
 
     def _recover(self, t_ns: int, distances: Array) -> list[MarkerReport]:
         """Use the markers of faults again that are near their places."""
-        near = [flag for flag, m in self._faults.items() if (distances[list(m)] < NEAR_M).all()]
+        # Excluded markers may have left their segment without a pose: its shape decides then.
+        near = [
+            flag
+            for flag, m in self._faults.items()
+            if (
+                self._labels.fit(m)
+                if flag in self._by_shape
+                else (distances[list(m)] < NEAR_M).all()
+            )
+        ]
         reports = []
         for flag in sorted(self._lasting(t_ns, "near", near, RECOVERY_NS)):
             markers = self._faults.pop(flag)
+            self._by_shape.discard(flag)
             self.excluded[list(markers)] = False
             names = [self.model.markers[m].name for m in markers]
             text = f"{_joined(names)}: at the expected place again, and in use"

@@ -173,6 +173,33 @@ def test_three_exchanged_labels_are_named_together_each_with_its_place(
     assert np.abs(flexion_errors_deg(states[15:])).max() < 2.0
 
 
+@pytest.mark.parametrize(
+    "labels",
+    [
+        ("foot0", "foot1", "foot2"),
+        ("foot0", "foot3", "foot1"),
+        ("pelvis0", "pelvis1", "pelvis2"),
+        ("foot0", "foot1", "foot2", "foot3"),
+    ],
+    ids="-".join,
+)
+def test_cycled_labels_at_the_ends_of_the_chain_are_named_by_their_shape_until_correct(
+    labels: tuple[str, ...],
+) -> None:
+    rows = [NAMES.index(name) for name in labels]
+
+    def rotate(t_s: float, points: Array) -> Array:
+        if t_s < 4.0:
+            points[rows] = points[rows[1:] + rows[:1]]
+        return points
+
+    states, notices = track(9.0, rotate)
+    assert [(n.data["state"], n.data["markers"]) for n in notices] == [
+        ("exchanged", list(labels)), ("ok", list(labels)),
+    ]  # fmt: skip
+    assert states[-1].flags == ()
+
+
 def test_a_marker_on_the_wrong_segment_is_excluded_and_its_segment_is_named() -> None:
     # the marker of the shank is fixed to the thigh, 3 cm from two of its markers
     wrong = replaced("shank1", lambda _, p: 0.5 * (p[4] + p[5]) + (p[6] - p[7]) * 0.2)
