@@ -282,6 +282,7 @@ def test_broken_driver_is_a_fault_of_its_users_only(
     [
         (b"[rig\nname = 1", "line 1"),
         (b"\xff\xfe", "is not UTF-8"),
+        ("[rig]".encode("utf-16"), "iconv -f UTF-16 -t UTF-8 rig.toml > converted-rig.toml"),
         (None, "no such file: check the path, or write one: `jointfit init`"),
     ],
 )

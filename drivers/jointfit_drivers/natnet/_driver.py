@@ -83,7 +83,8 @@ class NatNetMocap:
                     "address of the network card, and server"
                 ) from error
             raise DeviceMisconfiguredError(
-                f"mocap.interface = {interface!r}: no network card with this name or IPv4 address"
+                f"mocap.interface = {interface!r}: no network card with this name or IPv4 address: "
+                "correct it (`ip address` lists them), or remove it"
             ) from error
         session = NatNetSession(self._settings, host, local, emit, after_silence=self._silent)
         try:

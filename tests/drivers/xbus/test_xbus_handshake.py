@@ -248,6 +248,20 @@ async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_pat
         assert "too late" in await refusal(make(tmp_path), DeviceLostError)
 
 
+async def test_noise_before_silence_is_reported_without_figures(tmp_path: Path) -> None:
+    line = PtyLine(tmp_path / "imu")
+    running = asyncio.create_task(make(tmp_path).run(lambda _: None))
+    await asyncio.sleep(0.2)
+    line.write(b"\x01\x02\x03")
+    with pytest.raises(DeviceLostError) as caught:
+        await running
+    # A figure would differ at every attempt, and every different text is a new line of the log.
+    assert str(caught.value) == (
+        f"{tmp_path}/imu: some bytes of noise, then silence: check its power and cable, and `port`"
+    )
+    line.unplug()
+
+
 async def test_a_silent_port_may_come_to_life(tmp_path: Path) -> None:
     line = PtyLine(tmp_path / "imu")
     driver = make(tmp_path)

@@ -1,10 +1,11 @@
-"""`jointfit calibrate` names the missing password before the broker refuses the connection."""
+"""`jointfit calibrate` refuses wrong options, and names the missing password of the broker."""
 
 from __future__ import annotations
 
 import socket
 from typing import TYPE_CHECKING
 
+import pytest
 from typer.testing import CliRunner
 
 from jointfit_daemon.tools.__main__ import app
@@ -13,7 +14,12 @@ from tests import fake_drivers
 if TYPE_CHECKING:
     from pathlib import Path
 
-    import pytest
+
+@pytest.mark.parametrize("seconds", ["601", "0", "nan"])
+def test_a_duration_outside_of_its_range_is_refused_with_the_range(seconds: str) -> None:
+    result = CliRunner().invoke(app, ["calibrate", "--phase", "static", "--seconds", seconds])
+    assert result.exit_code == 2
+    assert "expected 0 < seconds <= 600" in result.output + str(result.exception)
 
 
 def test_a_missing_password_file_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
