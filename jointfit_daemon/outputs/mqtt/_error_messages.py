@@ -16,7 +16,9 @@ CONNECTION_CLOSED = (
     " as configured in [mqtt]"
 )
 CONNECTION_LOST = "the connection was lost: check that the broker runs, and the network"
-NO_ANSWER = "the broker does not answer in time: check its log, and the network"
+NO_ANSWER = (
+    "the broker does not answer in time: check its log, the network, and the load of this machine"
+)
 
 _SYSTEM_ERRORS = {
     errno.ECONNREFUSED: (

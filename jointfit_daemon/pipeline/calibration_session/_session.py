@@ -203,8 +203,8 @@ class CalibrationSession:
         posed, self._static = self._static is not None, None
         if posed or self._alignment is not None or self.calibration is not None:
             text = (
-                f"{sensor} restarted, so its heading may have changed (without a magnetometer it "
-                "always does). Repeat the align phase, if you used it, and then the static pose"
+                "restarted, so its heading may have changed (without a magnetometer it always "
+                "does). Repeat the align phase, if you used it, and then the static pose"
             )
             outputs.append(Notice(t_ns, NoticeKind.CALIBRATION, sensor, text, NoticeLevel.WARNING))
         return outputs

@@ -44,11 +44,16 @@ MIN_FRAMES = 600
 """Number of frames that trigger a refit: one minute of movement."""
 REFIT_NS = 180_000_000_000
 """Time between two refits, and before the first one once there are enough frames, ns."""
-_FAULTS = (
-    FrameFlag.STUCK, FrameFlag.SLIPPED, FrameFlag.PAIR_DISAGREES, FrameFlag.HEADING_DISAGREES,
-    FrameFlag.ONE_SENSOR, FrameFlag.HELD, FrameFlag.LOST,
-)  # fmt: skip
-"""Flags of a frame that is not used for training."""
+_FAULTS = {
+    FrameFlag.STUCK: "sensor repeats its value",
+    FrameFlag.SLIPPED: "sensor slipped",
+    FrameFlag.PAIR_DISAGREES: "sensors contradict each other",
+    FrameFlag.HEADING_DISAGREES: "headings contradict each other",
+    FrameFlag.ONE_SENSOR: "one working sensor only",
+    FrameFlag.HELD: "no data of the sensors",
+    FrameFlag.LOST: "no data of the sensors",
+}
+"""Flags of a frame that is not used for training, and their texts."""
 _RECENT, _WAITING = 64, 16
 
 
@@ -172,11 +177,16 @@ class OnlineFrameCollector:
         waiting = self._waiting
         while waiting and waiting[0][0] <= frame.t_ns:
             t_ns, mocap = waiting.popleft()
-            faults = [flag for flag in flags if flag.partition(":")[0] in _FAULTS]
-            if not faults:
+            places: dict[str, list[str]] = {}
+            for flag in flags:
+                kind, _, place = flag.partition(":")
+                if kind in _FAULTS:
+                    places.setdefault(_FAULTS[FrameFlag(kind)], []).append(place)
+            if not places:
                 self._pair(t_ns, mocap)
             else:
-                self._monitor.add_obstacle(t_ns, f"sensor fault: {', '.join(faults)}")
+                listed = (f"{text} ({', '.join(names)})" for text, names in places.items())
+                self._monitor.add_obstacle(t_ns, "; ".join(listed))
 
     def take_due(self, now_ns: int) -> OnlineFrames | None:
         """Return and remove the collected frames if a refit is due; otherwise None."""

@@ -300,7 +300,7 @@ def test_sensor_restart_discards_the_pose_with_a_notice() -> None:
     (notice,) = one.restart_sensor(11 * SECOND, "S2")
     assert isinstance(notice, Notice)
     assert notice.level == "warning"
-    assert notice.text.startswith("S2 restarted, so its heading may have changed")
+    assert notice.text.startswith("restarted, so its heading may have changed")
     assert notice.text.endswith("Repeat the align phase, if you used it, and then the static pose")
     (reply,) = only(ask(one, 12 * SECOND, "functional"), Reply)
     assert "static" in str(reply.error)

@@ -105,8 +105,12 @@ def test_mocap_that_is_off_is_no_obstacle() -> None:
     ("how", "why"),
     [
         ({"missing": "S2"}, "no data from S2"),
-        ({"flags": ("slipped:S1",)}, "sensor fault: slipped:S1"),
-        ({"flags": ("heading_disagrees:knee",)}, "fault: heading_disagrees:knee"),
+        ({"flags": ("slipped:S1",)}, "sensor slipped (S1)"),
+        ({"flags": ("heading_disagrees:knee",)}, "headings contradict each other (knee)"),
+        (
+            {"flags": ("one_sensor:thigh", "one_sensor:shank", "imu_only")},
+            "one working sensor only (thigh, shank)",
+        ),
         ({"layout": MocapLayout(("A", "B", "C", "X"), ())}, "missing in the mocap stream: D"),
     ],
 )
