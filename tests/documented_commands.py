@@ -57,6 +57,8 @@ NOT_RUN = {
     r"^jointfit doctor": "finds the faults of the test machine: tests/tools/doctor runs it",
     r"^jointfit center-study": "12 s of processor time",
     r"^jointfit report ": "needs a recording: tests/tools/report makes one",
+    r"^jointfit batch ": "needs recordings: tests/tools/batch makes some",
+    r"^dask ": "runs until it is stopped: tests/tools/batch starts a cluster",
     r"/dev/|^candump |^ip link|^udevadm ": "needs hardware",
 }
 """Patterns of commands that a test cannot run, each with the reason."""

@@ -11,6 +11,7 @@ import os
 import typer
 
 from jointfit_daemon.tools import fuse
+from jointfit_daemon.tools.batch import batch
 from jointfit_daemon.tools.calibrate import calibrate
 from jointfit_daemon.tools.center import center
 from jointfit_daemon.tools.center_study import center_study
@@ -44,7 +45,7 @@ app = typer.Typer(
 for command in (
     init, check, probe, doctor, demo, dashboard, monitor, calibrate, mark, record, request, recover,
     export, center, decode, ik, markers, center_study, sample, schema,
-    report,
+    report, batch,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(fuse.app)

@@ -1,0 +1,87 @@
+"""Command `jointfit batch`: the same steps for every recording of a folder."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.text_output import check_choice
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from jointfit_daemon.tools.batch.recording_task import RecordingResult
+
+
+def batch(
+    folder: Annotated[Path, typer.Argument(help="Folder with recordings, searched recursively.")],
+    *,
+    do: Annotated[
+        str, typer.Option("--do", help="Steps, separated by commas: export, report.")
+    ] = "report",
+    to: Annotated[str, typer.Option("--to", help="Formats of the step export.")] = "csv",
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Output folder; default: FOLDER/batch.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", min=1, help="Processes; default: one per processor.")
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", help="Dask cluster instead: tcp://HOST:8786."),
+    ] = None,
+) -> None:
+    """Process every recording of a folder, and summarize them in a table.
+
+    A batch that was stopped continues where it was: recordings whose bytes and steps are unchanged
+    are not processed again. Exit codes: 0 all recordings are processed; 1 at least one failed.
+    """
+    from jointfit_daemon.files.sessions import SESSION_FORMATS
+    from jointfit_daemon.tools.batch.executors import run_in_pool, run_on_cluster
+    from jointfit_daemon.tools.batch.find_recordings import find_recordings
+    from jointfit_daemon.tools.batch.recording_task import STEPS
+    from jointfit_daemon.tools.batch.summary import write_summary
+
+    steps = _words("--do", do, STEPS)
+    formats = _words("--to", to, [*SESSION_FORMATS]) if "export" in steps else ()
+    if scheduler is not None and jobs is not None:
+        raise ValueError("--jobs: the cluster of --scheduler has its own workers: omit one of both")
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: expected a folder with recordings")
+    output = (folder / "batch" if out is None else out).resolve()
+    tasks = find_recordings(folder.resolve(), output, steps, formats)
+    if not tasks:
+        raise ValueError(f"{folder}: found no recording (.mcap): name the folder that holds them")
+    output.mkdir(parents=True, exist_ok=True)
+
+    if scheduler is not None:
+        running = run_on_cluster(tasks, scheduler)
+    else:
+        running = run_in_pool(tasks, jobs or os.cpu_count() or 1)
+    results = _collect(running, len(tasks))
+    for path in write_summary(results, output):
+        typer.echo(f"wrote {path}", err=True)
+    if any(result.status != "done" for result in results):
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _words(option: str, text: str, choices: Sequence[str]) -> tuple[str, ...]:
+    """Return the words of a list in the order of `choices`."""
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    for word in words or [""]:
+        check_choice(option, word, choices)
+    return tuple(choice for choice in choices if choice in words)
+
+
+def _collect(running: Iterable[RecordingResult], total: int) -> list[RecordingResult]:
+    """Print one line for every finished recording, and return all."""
+    results = []
+    for number, result in enumerate(running, start=1):
+        text = f": {result.error}" if result.error else ""
+        typer.echo(f"[{number}/{total}] {result.recording}: {result.status}{text}", err=True)
+        results.append(result)
+    return results

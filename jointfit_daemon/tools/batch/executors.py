@@ -1,0 +1,115 @@
+"""Execution of tasks: in a pool of processes, or on an existing Dask cluster.
+
+Invariant: every task yields exactly one result; a process that dies fails only the task that ended
+it.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from importlib import import_module
+from itertools import islice
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.tools.batch.recording_task import (
+    RecordingResult,
+    RecordingTask,
+    process_recording,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Generator, Iterator, Sequence
+    from concurrent.futures import Future
+
+_AHEAD = 2
+"""Tasks submitted per process, so that none of them waits."""
+_DIED = (
+    "the process that read this recording was ended, probably by the system for lack of memory:"
+    " process it on a computer with more memory"
+)
+
+
+class SchedulerUnavailableError(ImportError):
+    """The package for Dask clusters is not installed."""
+
+    def __init__(self) -> None:
+        super().__init__("--scheduler needs distributed: pip install 'jointfitd[batch]'")
+
+
+def run_in_pool(tasks: Sequence[RecordingTask], jobs: int) -> Iterator[RecordingResult]:
+    """Yield results in the order of their completion; a single job runs in this process.
+
+    A pool whose process dies loses all of its tasks. They run again one at a time, which names the
+    task that ends its process.
+    """
+    if jobs == 1:
+        yield from map(process_recording, tasks)
+        return
+    lost = yield from _run_pool(tasks, jobs)
+    while lost:
+        rest = yield from _run_pool(lost[:1], 1)
+        if rest:
+            yield RecordingResult(rest[0].name, "failed", error=_DIED)
+        lost = lost[1:]
+
+
+def _run_pool(
+    tasks: Sequence[RecordingTask], jobs: int
+) -> Generator[RecordingResult, None, list[RecordingTask]]:
+    """Yield results; return the tasks without one, because a process died."""
+    context = multiprocessing.get_context("spawn")  # a fork would copy threads of numpy
+    waiting = iter(tasks)
+    running: dict[Future[RecordingResult], RecordingTask] = {}
+    with ProcessPoolExecutor(jobs, context) as pool:
+        try:
+            for task in islice(waiting, _AHEAD * jobs):
+                running[pool.submit(process_recording, task)] = task
+            while running:
+                finished, _ = wait(running, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    result = future.result()
+                    del running[future]
+                    for task in islice(waiting, 1):
+                        running[pool.submit(process_recording, task)] = task
+                    yield result
+        except BrokenProcessPool:
+            return [*running.values(), *waiting]
+        except GeneratorExit:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return []
+
+
+def run_on_cluster(tasks: Sequence[RecordingTask], address: str) -> Iterator[RecordingResult]:
+    """Yield results of the workers of a Dask scheduler, in the order of their completion.
+
+    Tasks of a worker that dies run on another one. The workers must see the recordings and the
+    output folder under the same paths.
+
+    Raises
+    ------
+    SchedulerUnavailableError
+        The extra ``batch`` is not installed.
+    OSError
+        There is no scheduler at `address`.
+    """
+    try:
+        dask: Any = import_module("distributed")  # some of its functions have no types
+    except ModuleNotFoundError as missing:
+        raise SchedulerUnavailableError from missing
+
+    with dask.Client(address, timeout="10s", set_as_default=False) as client:
+        names: dict[Any, str] = {}
+        for task in tasks:
+            future = client.submit(process_recording, task, pure=False)
+            names[future] = task.name
+        for future in dask.as_completed(list(names)):
+            name = names.pop(future)
+            error = future.exception()
+            if error is None:
+                yield future.result()
+            else:
+                yield RecordingResult(name, "failed", error=f"{type(error).__name__}: {error}")
+            future.release()

@@ -1,0 +1,178 @@
+"""Processing of one recording of a batch, in whatever process runs it.
+
+Invariant: the files of a recording depend on its bytes, the steps and the software version alone;
+they become visible together, and only when all steps succeeded.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import shutil
+import tempfile
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon import __version__
+
+if TYPE_CHECKING:
+    from jointfit_daemon.session_data import SessionData
+
+STEPS = ("export", "report")
+"""Steps in the order in which they run."""
+REPORT_FILE = "report.html"
+MARKS = ".done"
+"""Folder of the marks of processed recordings, in the output folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingTask:
+    """One recording, and what to do with it. Paths are the same on all computers of a cluster."""
+
+    name: str
+    """Name of the recording in the summary, and of its output folder."""
+    parts: tuple[str, ...]
+    """Files of the recording in order."""
+    out: str
+    """Output folder of the batch."""
+    steps: tuple[str, ...]
+    formats: tuple[str, ...]
+    """Formats of the step ``export``."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingResult:
+    """Row of the summary."""
+
+    recording: str
+    status: str
+    """``done`` or ``failed``."""
+    duration_s: float | None = None
+    angle: str = ""
+    """Joint angle of `rms_deg`."""
+    rms_deg: float | None = None
+    """RMS difference of the sensors from the cameras, degrees."""
+    range_deg: float | None = None
+    """Largest range of an angle, degrees."""
+    gait_cycles: int | None = None
+    lost_percent: float | None = None
+    """Largest loss of a source, percent."""
+    faults: int | None = None
+    notes: str = ""
+    error: str = ""
+
+
+def task_digest(task: RecordingTask) -> str:
+    """Return the SHA-256 of the bytes of a recording, of the settings and of the version.
+
+    Raises
+    ------
+    OSError
+        A part cannot be read.
+    """
+    settings = [__version__, task.name, task.steps, task.formats]
+    found = hashlib.sha256(json.dumps(settings).encode())
+    for part in task.parts:
+        with Path(part).open("rb") as file:
+            found.update(hashlib.file_digest(file, "sha256").digest())
+    return found.hexdigest()
+
+
+def finished_result(task: RecordingTask, digest: str) -> RecordingResult | None:
+    """Return the stored result of a task; None if it must run."""
+    mark = _mark(task)
+    try:
+        stored: dict[str, Any] = json.loads(mark.read_bytes())
+        if stored.pop("digest") != digest or not (Path(task.out) / task.name).is_dir():
+            return None
+        return RecordingResult(**stored)
+    except (OSError, ValueError, TypeError, KeyError):
+        return None  # no mark, or one of another version
+
+
+def process_recording(task: RecordingTask) -> RecordingResult:
+    """Run the steps of a task unless their result exists; errors are in the result."""
+    try:
+        digest = task_digest(task)
+        known = finished_result(task, digest)
+        if known is not None:
+            return known
+        return _process(task, digest)
+    except (ValueError, OSError, ImportError, LookupError) as error:
+        return RecordingResult(task.name, "failed", error=f"{error}")
+    except Exception as error:  # noqa: BLE001 - a fault in one recording stops only this recording
+        return RecordingResult(task.name, "failed", error=f"{type(error).__name__}: {error}")
+
+
+def _process(task: RecordingTask, digest: str) -> RecordingResult:
+    out = Path(task.out)
+    target = out / task.name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _mark(task).unlink(missing_ok=True)
+
+    # Outputs of a stopped run stay in a hidden folder, which is never counted.
+    staging = Path(tempfile.mkdtemp(prefix=f".partial-{target.name}-", dir=target.parent))
+    try:
+        result = _run_steps(task, staging)
+        shutil.rmtree(target, ignore_errors=True)
+        staging.chmod(0o755)
+        staging.replace(target)
+    finally:
+        shutil.rmtree(staging, ignore_errors=True)
+
+    mark = _mark(task)
+    mark.parent.mkdir(parents=True, exist_ok=True)
+    partial = mark.with_suffix(f".{staging.name[-8:]}.part")
+    partial.write_text(json.dumps({"digest": digest, **asdict(result)}), encoding="utf-8")
+    partial.replace(mark)
+    return result
+
+
+def _run_steps(task: RecordingTask, folder: Path) -> RecordingResult:
+    from jointfit_daemon.tools.export import load_data
+
+    recording, notes = Path(task.parts[0]), list[str]()
+    session = load_data(recording)
+    if "export" in task.steps:
+        from jointfit_daemon.files.sessions import NothingToWriteError, write_session
+
+        for name in task.formats:
+            try:
+                notes += write_session(session, folder, name).notes
+            except NothingToWriteError as nothing:  # a recording without cameras has no markers
+                notes.append(f"{name}: {nothing}")
+
+    if "report" in task.steps:
+        from jointfit_daemon.tools.report.page import render_report
+
+        (folder / REPORT_FILE).write_text(render_report(session), encoding="utf-8")
+    return _measured(task, session, "; ".join(notes))
+
+
+def _measured(task: RecordingTask, session: SessionData, notes: str) -> RecordingResult:
+    """Return the row of a session."""
+    from jointfit_daemon.tools.report.session_results import analyze_session
+
+    results = analyze_session(session)
+    main = results.differences[0] if results.differences else None
+    losses = [found.lost_share for found in results.sources.values()]
+    known = [share for share in losses if math.isfinite(share)]
+    extents = [found.extent for found in results.ranges]
+    return RecordingResult(
+        task.name,
+        "done",
+        duration_s=round(session.duration_s, 3),
+        angle="" if main is None else f"{main.joint} {main.angle}",
+        rms_deg=None if main is None else round(math.degrees(main.rms), 3),
+        range_deg=round(math.degrees(max(extents)), 2) if extents else None,
+        gait_cycles=sum(len(gait.cycles_s) for gait in results.gait.values()),
+        lost_percent=round(100.0 * max(known), 3) if known else None,
+        faults=results.faults,
+        notes=notes,
+    )
+
+
+def _mark(task: RecordingTask) -> Path:
+    return Path(task.out) / MARKS / f"{task.name.replace('/', '__')}.json"

@@ -1,0 +1,73 @@
+"""Summary of a batch: one row a recording, as CSV and as HTML page."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import asdict, fields
+from typing import TYPE_CHECKING
+from urllib.parse import quote
+
+from jointfit_daemon.tools.batch.recording_task import REPORT_FILE, RecordingResult
+from jointfit_daemon.tools.report.html_document import Link, document, facts, section, table
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+_UNKNOWN = "–"
+_HEAD = (
+    "Recording", "Status", "Duration, s", "RMS against cameras", "Largest range", "Gait cycles",
+    "Lost, %", "Faults", "Notes",
+)  # fmt: skip
+
+
+def write_summary(results: Sequence[RecordingResult], out: Path) -> list[Path]:
+    """Write ``summary.csv`` and ``summary.html`` in the order of the recordings."""
+    ordered = sorted(results, key=lambda result: result.recording)
+    texts = {"summary.csv": _csv(ordered), "summary.html": _page(ordered, out)}
+    for name, text in texts.items():
+        partial = out / f"{name}.part"
+        partial.write_text(text, encoding="utf-8", newline="")
+        partial.replace(out / name)
+    return [out / name for name in texts]
+
+
+def _csv(results: Sequence[RecordingResult]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [field.name for field in fields(RecordingResult)])
+    writer.writeheader()
+    writer.writerows(asdict(result) for result in results)  # None becomes an empty cell
+    return text.getvalue()
+
+
+def _page(results: Sequence[RecordingResult], out: Path) -> str:
+    counts = [(status, sum(r.status == status for r in results)) for status in ("done", "failed")]
+    pairs = [("Recordings", f"{len(results)}"), *((s.title(), f"{n}") for s, n in counts)]
+    rows = [_row(result, out) for result in results]
+    body = section("recordings", "Recordings", [table("One row a recording", _HEAD, rows, text=2)])
+    header = f"<header><h1>Batch summary</h1>{facts(pairs, 'facts head')}</header>"
+    return document("Batch summary", f"{header}<main>{body}</main>")
+
+
+def _row(result: RecordingResult, out: Path) -> tuple[str, ...]:
+    page = out / result.recording / REPORT_FILE
+    address = f"{quote(result.recording)}/{REPORT_FILE}"
+    name = Link(result.recording, address) if page.is_file() else result.recording
+    rms = _UNKNOWN if result.rms_deg is None else f"{result.rms_deg:.1f}° {result.angle}"
+    extent = _UNKNOWN if result.range_deg is None else f"{result.range_deg:.0f}°"
+    return (
+        name,
+        "▲ failed" if result.status == "failed" else result.status,
+        _text(result.duration_s, 1),
+        rms,
+        extent,
+        _text(result.gait_cycles, 0),
+        _text(result.lost_percent, 2),
+        _text(result.faults, 0),
+        result.error or result.notes or _UNKNOWN,
+    )
+
+
+def _text(value: float | None, places: int) -> str:
+    return _UNKNOWN if value is None else f"{value:.{places}f}"

@@ -1,0 +1,41 @@
+"""Folders of recordings for the tests of the batch."""
+
+from __future__ import annotations
+
+import shutil
+from multiprocessing import resource_tracker
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.reprocessing.recorded_run import record_run
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+
+@pytest.fixture(scope="session", autouse=True)
+def process_tracker() -> None:
+    """Start the tracker of processes, whose pipe stays open for as long as this process."""
+    resource_tracker.ensure_running()
+
+
+@pytest.fixture(scope="session")
+def recorded_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record_run(tmp_path_factory.mktemp("recorded")).path
+
+
+@pytest.fixture
+def recordings(recorded_file: Path, tmp_path: Path) -> Callable[[int], Path]:
+    """Return a function that makes a folder of so many recordings of one subject."""
+
+    def make(count: int) -> Path:
+        folder = tmp_path / "trials"
+        folder.mkdir()
+        ending = "".join(recorded_file.suffixes[-1:])
+        for number in range(count):
+            shutil.copy(recorded_file, folder / f"trial-{number:04d}{ending}")
+        return folder
+
+    return make

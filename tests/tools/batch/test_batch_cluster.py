@@ -1,0 +1,87 @@
+"""`jointfit batch` at scale: a Dask cluster that loses a worker, speed of two processes, memory."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+import signal
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+from jointfit_daemon.tools.batch import executors
+from jointfit_daemon.tools.batch.executors import run_in_pool, run_on_cluster
+from jointfit_daemon.tools.batch.find_recordings import find_recordings
+from jointfit_daemon.tools.batch.recording_task import RecordingTask
+from tests.tools.batch.deadly_task import process_or_die
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    Recordings = Callable[[int], Path]
+
+pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(600)]
+
+
+@pytest.mark.filterwarnings("ignore")  # of distributed
+def test_every_recording_is_processed_once_though_a_worker_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    distributed = pytest.importorskip("distributed", reason="distributed is not installed")
+    monkeypatch.setattr(executors, "process_recording", process_or_die)
+    tasks = [RecordingTask(f"t{k}", (), str(tmp_path), ("report",), ()) for k in range(24)]
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
+    ) as cluster:
+        names = []
+        for result in run_on_cluster(tasks, cluster.scheduler_address):
+            names.append(result.recording)
+            assert result.status == "done", result.error
+            if len(names) == 4:
+                victim = next(iter(cluster.workers.values()))
+                os.kill(victim.pid, signal.SIGKILL)
+    assert sorted(names) == sorted(task.name for task in tasks)
+
+
+def test_two_processes_are_almost_twice_as_fast_as_one(
+    recordings: Recordings, tmp_path: Path
+) -> None:
+    if (os.cpu_count() or 1) < 2 or os.getloadavg()[0] > 0.5:
+        pytest.skip("needs two idle processors")
+    folder = recordings(16)
+    seconds = []
+    for jobs in (1, 2):
+        tasks = find_recordings(folder, tmp_path / f"out{jobs}", ("export", "report"), ("csv",))
+        began = time.monotonic()
+        assert all(result.status == "done" for result in run_in_pool(tasks, jobs))
+        seconds.append(time.monotonic() - began)
+    assert seconds[0] / seconds[1] >= 1.8, seconds
+
+
+def test_memory_stays_flat_over_a_thousand_recordings(
+    recordings: Recordings, tmp_path: Path
+) -> None:
+    tasks = find_recordings(recordings(1000), tmp_path / "out", ("report",), ())
+    peaks_kb = []
+    for number, result in enumerate(run_in_pool(tasks, 2)):
+        assert result.status == "done", result.error
+        if number in (99, 999):
+            peaks_kb.append(worker_kb() + own_kb())
+    assert peaks_kb[1] < 1.1 * peaks_kb[0] + 10_000, peaks_kb
+
+
+def own_kb() -> int:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+
+
+def worker_kb() -> int:
+    """Return the largest resident memory of a child process so far, kB."""
+    children = [child.pid for child in multiprocessing.active_children()]
+    found = []
+    for pid in children:
+        status = Path(f"/proc/{pid}/status").read_text(encoding="utf-8")
+        found.append(int(status.partition("VmHWM:")[2].split()[0]))
+    return max(found)
