@@ -6,6 +6,8 @@ import asyncio
 import contextlib
 import json
 import os
+import random
+import resource
 import signal
 import subprocess
 import sys
@@ -21,7 +23,12 @@ from jointfit_daemon.__main__ import main
 from jointfit_daemon.calibration.record._store import checksum
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.outputs.mqtt import MqttClient
-from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
+from jointfit_daemon.outputs.recording import (
+    encode_state,
+    open_recording,
+    read_events,
+    read_states,
+)
 from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import Configured
 from tests import fake_drivers
@@ -148,6 +155,29 @@ def test_unexpected_error_ends_the_daemon_with_a_traceback_and_exit_code_1(
         _, said = daemon.communicate(timeout=PATIENCE_S)
     assert daemon.returncode == 1
     assert "ZeroDivisionError: a bug" in said
+
+
+async def test_a_disk_without_room_stops_neither_poses_nor_later_recording(
+    process: Process, broker: Broker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process.write(broker.port)
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with running(process) as daemon:
+        assert len(await states(broker.port, 20)) == 20
+        for room_bytes in (0, *random.Random(4).sample(range(20_000), 3)):
+            resource.prlimit(daemon.pid, resource.RLIMIT_FSIZE, (room_bytes, hard))
+            assert len(await states(broker.port, 60)) == 60
+        resource.prlimit(daemon.pid, resource.RLIMIT_FSIZE, (hard, hard))
+        assert len(await states(broker.port, 150)) == 150
+        daemon.send_signal(signal.SIGTERM)
+        _, said = await asyncio.to_thread(daemon.communicate)
+        assert daemon.returncode == 0, said
+    assert "recording is interrupted" in said
+    assert "recording resumed" in said
+    monkeypatch.setattr("jointfit_daemon.driver.entry_points", fake_drivers.entry_points)
+    recording = open_recording(process.state / "recordings")
+    assert recording.gaps()
+    assert len(list(recording.states())) > 100
 
 
 def read_log(daemon: subprocess.Popen[str], part: str) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import time
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import orjson
@@ -16,6 +17,7 @@ import pytest
 from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.outputs.mqtt import Incoming, signed
 from jointfit_daemon.outputs.payload_models import ANSWERS
+from jointfit_daemon.outputs.recording import open_recording
 from jointfit_daemon.pipeline.events import (
     CalibrationSelected,
     Configured,
@@ -211,6 +213,27 @@ async def test_a_repetition_during_the_request_is_answered_at_its_end(gateway: R
 
 
 # --- effects ------------------------------------------------------------------------------------
+
+
+async def test_a_recording_is_started_and_stopped_once(gateway: Running) -> None:
+    async with gateway.run():
+        first_start = await gateway.ask("record", {"action": "start"})
+        started = await gateway.ask("record", {"action": "start"})
+        file = started.data["file"]
+        assert first_start.data["file"] == file
+        assert gateway.daemon.health().recording is not None
+        await gateway.ask("mark", {"text": "start"})
+        stopped = await gateway.ask("record", {"action": "stop"})
+        again = await gateway.ask("record", {"action": "stop"})
+        assert (stopped.data["file"], stopped.data["active"]) == (file, False)
+        assert (again.status, again.data["file"]) == ("ok", "")
+        assert gateway.daemon.health().recording is None
+
+    recording = open_recording(Path(str(started.data["directory"])) / str(file))
+    first, *rest = recording.events()
+    assert isinstance(first, Configured)
+    assert not recording.began_with_daemon
+    assert any(isinstance(event, Request) and event.command == "mark" for event in rest)
 
 
 async def test_a_mark_is_an_event_with_its_number(gateway: Running) -> None:

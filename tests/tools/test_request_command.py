@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import orjson
 import pytest
 from typer.testing import CliRunner
 
+from jointfit_daemon.outputs.recording import RecordedMessage, open_recording
 from jointfit_daemon.tools.__main__ import app
 from tests.supervisor.request_gateway import gateway_fixture  # noqa: F401 - a fixture
 
@@ -41,6 +43,18 @@ async def test_requests_of_a_user_are_printed_as_text_and_as_json(
         (mark,) = [notice for notice in gateway.notices if notice.kind == "mark"]
         assert mark.text == "heel strike"
 
+        idle = await jointfit("record", "status", "--rig", rig)
+        assert idle.stdout == "not recording\n"
+        started = await jointfit("record", "start", "--rig", rig)
+        assert started.stdout.startswith("recording "), started.output
+        assert (await jointfit("record", "mark", "toe off", "--rig", rig)).exit_code == 0
+        active = await jointfit("record", "status", "--rig", rig, "--json")
+        assert orjson.loads(active.stdout)["data"]["active"] is True
+        stopped = await jointfit("record", "stop", "--rig", rig)
+        file = Path(stopped.stdout.removeprefix("recorded ").partition(".mcap")[0] + ".mcap")
+        texts = [m.data for m in open_recording(file).messages() if isinstance(m, RecordedMessage)]
+        assert any(b"toe off" in text for text in texts)
+
         listed = await jointfit("calibrate", rig, "--list")
         rows = [line.split()[:2] for line in listed.stdout.splitlines()]
         assert rows[1:] == [["*", "2"], ["1", listed.stdout.splitlines()[2].split()[1]]]
@@ -67,6 +81,8 @@ async def test_requests_of_a_user_are_printed_as_text_and_as_json(
         (("request", "rate", "{hz:5}"), "expected an object in quotes"),
         (("request", "rate", "[5]"), "expected a JSON object"),
         (("request", "a/b"), "expected one word"),
+        (("record", "begin"), "expected start, stop, status or mark"),
+        (("record", "mark"), "expected a text after mark"),
         (("calibrate", "--list", "--revert"), "expected one of --phase"),
     ],
 )

@@ -172,6 +172,11 @@ class PartFile:
         finally:
             self.close()
 
+    def discard(self) -> None:
+        """Close and delete the file."""
+        self.close()
+        self.open_path.unlink(missing_ok=True)
+
     def close(self) -> None:
         """Close the file as it is."""
         if self._fd >= 0:

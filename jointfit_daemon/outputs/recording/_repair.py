@@ -97,8 +97,7 @@ def repair_recording(
         try:
             result = _copy(Recording((part,)), clean, pause=pause, stopped=stopped)
         except BaseException:
-            clean.close()
-            clean.open_path.unlink(missing_ok=True)
+            clean.discard()
             raise
     return result
 

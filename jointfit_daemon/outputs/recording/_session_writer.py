@@ -209,8 +209,8 @@ class SessionWriter:
         )
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            part = self._create(info, (before if before.configured else batch.after).attachments())
-            part.flush()
+            documents = (before if before.configured else batch.after).attachments()
+            part = self._create(info, documents)
         except OSError as error:
             self._report_fault(error)
             return None
@@ -244,11 +244,18 @@ class SessionWriter:
                 self._stem = f"{self.rig}-{started:%Y%m%dT%H%M%S}"
             try:
                 path = self.directory / f"{self._stem}-{info.part:04d}.mcap"
-                return PartFile(path, info, attachments)
+                part = PartFile(path, info, attachments)
             except FileExistsError:  # another session of the same second
                 if info.part > 1:
                     raise
                 self._stem, unix_s = "", unix_s + 1
+                continue
+            try:
+                part.flush()
+            except OSError:  # leave no file without a message behind
+                part.discard()
+                raise
+            return part
 
     def _flush(self, part: PartFile) -> bool:
         """Write everything; return whether the disk took it."""

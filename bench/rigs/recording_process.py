@@ -1,0 +1,92 @@
+"""A process that records four sensors of 400 Hz and the limb states of 100 Hz, until it is killed.
+
+    python -m bench.rigs.recording_process FOLDER [--seconds S] [--without-recorder]
+
+It writes ``ready`` when it starts to feed, and its cost as JSON at its end.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import resource
+import time
+from contextlib import suppress
+from pathlib import Path
+
+from jointfit_daemon.model import Chunk, LimbState
+from jointfit_daemon.outputs.recording import Recorder
+from jointfit_daemon.pipeline import Core
+from jointfit_daemon.pipeline.events import ChunkArrived
+from tests.pipeline.core_feed import SENSORS, chunk, opening
+
+RATE_HZ, STATES_HZ = 400, 100
+PERIOD_S = 0.01
+"""Interval between feeds, s: four samples of each sensor, and one state."""
+PREPARED = 400
+"""Samples of each sensor that are prepared; they are repeated."""
+
+
+def prepared_chunks() -> list[list[tuple[str, bytes]]]:
+    """Return source and bytes of the chunks of every sample number."""
+    samples = [[chunk(name, number) for name in SENSORS] for number in range(PREPARED)]
+    return [[(event.source, event.chunk.data) for event in row] for row in samples]
+
+
+def prepared_states() -> list[LimbState]:
+    """Return limb states of a core that is fed with these samples."""
+    core, states = Core(), []
+    for event in opening(mocap=False):
+        core.feed(event)
+    for number in range(100):
+        for name in SENSORS:
+            states += core.feed(chunk(name, number))
+    return [state for state in states if isinstance(state, LimbState)]
+
+
+async def record(folder: Path, seconds: float, *, recording: bool) -> None:
+    """Feed the recorder in real time, and print the cost."""
+    samples, states = prepared_chunks(), prepared_states()
+    recorder = Recorder(folder, "rig", autostart=False)
+    for event in opening(mocap=False):
+        recorder.event(event)
+    task = asyncio.create_task(recorder.run(), name="recorder")
+    await asyncio.sleep(0.1)
+    if recording:
+        await recorder.start()
+
+    print("ready", flush=True)
+    began_s, cpu_s, raw_bytes = time.monotonic(), time.process_time(), 0
+    per_feed = round(RATE_HZ * PERIOD_S)
+    for feed in range(round(seconds / PERIOD_S)):
+        await asyncio.sleep(max(0.0, began_s + feed * PERIOD_S - time.monotonic()))
+        for number in range(feed * per_feed, (feed + 1) * per_feed):
+            for source, data in samples[number % PREPARED]:
+                recorder.event(ChunkArrived(source, Chunk(time.monotonic_ns(), data)))
+                raw_bytes += len(data)
+        recorder.output(states[feed % len(states)]._replace(completed_ns=time.monotonic_ns()))
+
+    cost = {
+        "cpu_s": time.process_time() - cpu_s,
+        "elapsed_s": time.monotonic() - began_s,
+        "raw_bytes": raw_bytes,
+        "memory_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+    }
+    task.cancel()
+    with suppress(asyncio.CancelledError):
+        await task
+    print(json.dumps(cost), flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--without-recorder", action="store_true")
+    options = parser.parse_args()
+    asyncio.run(record(options.folder, options.seconds, recording=not options.without_recorder))
+
+
+if __name__ == "__main__":
+    main()
