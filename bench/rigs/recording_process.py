@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import resource
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -45,6 +44,12 @@ def prepared_states() -> list[LimbState]:
     return [state for state in states if isinstance(state, LimbState)]
 
 
+def peak_memory_kib() -> int:
+    """Return the peak of the resident memory, KiB; getrusage includes that of the parent."""
+    status = Path("/proc/self/status").read_text(encoding="ascii")
+    return int(status.partition("VmHWM:")[2].split()[0])
+
+
 async def record(folder: Path, seconds: float, *, recording: bool) -> None:
     """Feed the recorder in real time, and print the cost."""
     samples, states = prepared_chunks(), prepared_states()
@@ -71,7 +76,7 @@ async def record(folder: Path, seconds: float, *, recording: bool) -> None:
         "cpu_s": time.process_time() - cpu_s,
         "elapsed_s": time.monotonic() - began_s,
         "raw_bytes": raw_bytes,
-        "memory_kib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        "memory_kib": peak_memory_kib(),
     }
     task.cancel()
     with suppress(asyncio.CancelledError):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from bench.framework.experiment import Result
 
 ROOT = Path(__file__).resolve().parents[3]
-ROUNDS, SECONDS, QUICK_S = 3, 60.0, 10.0
+ROUNDS, SECONDS, QUICK_S = 3, 20.0, 10.0
 HOUR_S = 3600.0
 MOST_SHARE_PCT, MOST_MEMORY_MB = 3.0, 40.0
 """Targets: share of a core, percent, and memory, MB."""

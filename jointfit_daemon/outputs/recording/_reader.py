@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import struct
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
@@ -219,8 +220,10 @@ class Recording:
     @cached_property
     def rig_table(self) -> dict[str, Any] | None:
         """The parsed rig.toml at the beginning; None if the recording contains none."""
-        document = self.parts[0].documents.get("rig.json")
-        return None if document is None else orjson.loads(document)
+        with suppress(ValueError, KeyError):
+            table = orjson.loads(self.parts[0].documents["rig.json"])
+            return table if isinstance(table, dict) else None
+        return None
 
     def messages(self) -> Iterator[RecordedMessage | RecordingGap]:
         """Yield all messages in the order of processing, and the gaps between them.
@@ -281,7 +284,7 @@ class _Sequencer:
             if item.sequence > self._expected:
                 reason = self.damage
                 if item.channel == GAP:
-                    reason = str(orjson.loads(item.data).get("reason", ""))
+                    reason = _reason_of(item.data)
                 yield self._gap(item.sequence, item.t_ns, reason)
             if item.channel != GAP and self._restoring:
                 yield item
@@ -297,6 +300,13 @@ class _Sequencer:
         self._expected, self._restoring, self.damage = following, True, ""
         reason = reason or "a file of the session is missing"
         return RecordingGap(first, count, self._t_ns, t_ns, reason)
+
+
+def _reason_of(gap: bytes) -> str:
+    """Return the reason of a recorded gap; empty if the file was made by hand."""
+    with suppress(ValueError, KeyError, TypeError):
+        return str(orjson.loads(gap)["reason"])
+    return ""
 
 
 def open_recording(path: Path) -> Recording:

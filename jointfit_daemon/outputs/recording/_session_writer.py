@@ -53,6 +53,9 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 _YIELD_MESSAGES, _YIELD_S = 32, 0.0005
 """Messages encoded at once, and the pause after them, s: the event loop waits for the interpreter
 lock for less than half a millisecond."""
+_LONGEST_PAUSED_S = 0.05
+"""Time after which a batch is encoded without pauses, s: on a busy machine they take long, and
+messages that are not written are lost at a kill."""
 
 SOFTWARE = f"jointfitd {__version__}, {LIBRARY_IDENTIFIER}, Python {sys.version.split()[0]}"
 """Programs that write a recording."""
@@ -169,9 +172,14 @@ class SessionWriter:
             return
 
         self._add_gap(part, batch)
+        paused_until_s = time.monotonic() + _LONGEST_PAUSED_S
         for index, message in enumerate(batch.messages):
             self._add(part, batch.first_sequence + index, message)
-            if index % _YIELD_MESSAGES == _YIELD_MESSAGES - 1 and self.pause_s:
+            if (
+                index % _YIELD_MESSAGES == _YIELD_MESSAGES - 1
+                and self.pause_s
+                and time.monotonic() < paused_until_s
+            ):
                 time.sleep(self.pause_s)
 
         self._added_sequence = batch.next_sequence
