@@ -35,6 +35,10 @@ class UnixClock:
         self._reading: _OffsetReading | None = None
         self._until_ns = -1
 
+    def now_ns(self) -> int:
+        """Return the present instant, CLOCK_MONOTONIC ns."""
+        return time.monotonic_ns()
+
     def offset_ns(self) -> int:
         """Return UNIX time minus CLOCK_MONOTONIC, ns."""
         now_ns, before = time.monotonic_ns(), self._reading

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon import __version__
-from jointfit_daemon.outputs.recording import read_events
+from jointfit_daemon.calibration.record import MOST_BYTES, calibration_of
+from jointfit_daemon.files.text import parse_json, read_bounded
+from jointfit_daemon.outputs.recording import RecordingGap, open_recording, read_events
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     CalibrationPhase,
@@ -18,10 +20,13 @@ from jointfit_daemon.reprocessing._processing import Changes, process_events
 from jointfit_daemon.reprocessing._session_collector import SessionCollector
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration
+    from jointfit_daemon.outputs.recording import Recording
+    from jointfit_daemon.pipeline.events import Event
     from jointfit_daemon.session_data import SessionData
 
 
@@ -55,7 +60,8 @@ def load_session(
     last_rig: Rig | None = None
     in_force, now_ns = "none", 0
     changes = Changes(rig, calibration)
-    for event, outputs in process_events(read_events(path), changes, core):
+    events = _note_gaps(open_recording(path), collector)
+    for event, outputs in process_events(events, changes, core):
         collector.add_event(event, outputs)
         if not isinstance(event, ChunkArrived):
             now_ns = event.t_ns
@@ -80,6 +86,52 @@ def load_session(
         "source": "processed again" if changes.any else "as recorded",
     }
     return collector.session(last_rig, core.lags_ns, description)
+
+
+def _note_gaps(recording: Recording, collector: SessionCollector) -> Iterator[Event]:
+    """Yield the events of a recording; pass its gaps to the time line."""
+    for item in recording.messages():
+        if isinstance(item, RecordingGap):
+            collector.add_gap(item)
+        elif (event := item.event()) is not None:
+            yield event
+
+
+def recorded_rig(path: Path) -> Rig:
+    """Return the first rig of a recording.
+
+    Raises
+    ------
+    ReprocessingError
+        The recording contains no configuration.
+    ConfigError
+        The recorded rig cannot be loaded, because a driver is not installed.
+    ValueError, OSError
+        The file is no recording, or cannot be read.
+    """
+    for event in read_events(path):
+        if isinstance(event, Configured):
+            return event.rig
+    raise ReprocessingError(f"{path}: the recording contains no configuration")
+
+
+def load_calibration(path: Path) -> Calibration:
+    """Return the calibration in a file: a stored version, or the output of `jointfit fuse fit`.
+
+    Raises
+    ------
+    ReprocessingError
+        The content cannot be used.
+    OSError
+        The file cannot be read.
+    """
+    try:
+        return calibration_of(parse_json(read_bounded(path, MOST_BYTES).decode("utf-8-sig")))
+    except (ValueError, RecursionError) as error:
+        raise ReprocessingError(
+            f"{path}: cannot be used as a calibration ({str(error) or type(error).__name__:.300}): "
+            "choose a file of a calibration store"
+        ) from error
 
 
 def _calibration_text(status: CalibrationStatus) -> str:

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.config import Rig
     from jointfit_daemon.model import AngleConvention, JointState, OpticalJoint
+    from jointfit_daemon.outputs.recording import RecordingGap
     from jointfit_daemon.pipeline import StampedMeasurement
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.pipeline.health import ClockHealth, CoreHealth
@@ -141,6 +142,12 @@ class SessionCollector:
         for joint in state.joints:
             _, rows = self._optical_joints.setdefault(joint.name, (joint.convention, _Rows(6)))
             rows.add(state.t_ns, *_angles_and_position(joint))
+
+    def add_gap(self, gap: RecordingGap) -> None:
+        """Add a gap of the recording to the time line."""
+        data = {"seconds": gap.seconds, "messages": gap.count}
+        event = TimelineEvent(0.0, "gap", text=gap.text(), data=data)
+        self._events.append((gap.from_t_ns, event))
 
     def add_health(self, t_ns: int, rig: Rig, health: CoreHealth) -> None:
         """Add clocks, sample counts and latency of the run as events at its end."""

@@ -29,6 +29,7 @@ from jointfit_daemon.tools.monitor import monitor
 from jointfit_daemon.tools.probe import probe
 from jointfit_daemon.tools.record import record
 from jointfit_daemon.tools.recover import recover
+from jointfit_daemon.tools.replay import replay
 from jointfit_daemon.tools.report import report
 from jointfit_daemon.tools.request import mark, request
 from jointfit_daemon.tools.sample import sample
@@ -45,7 +46,7 @@ app = typer.Typer(
 for command in (
     init, check, probe, doctor, demo, dashboard, monitor, calibrate, mark, record, request, recover,
     export, center, decode, ik, markers, center_study, sample, schema,
-    report, batch,
+    report, batch, replay,
 ):  # fmt: skip
     app.command()(command)
 app.add_typer(fuse.app)

@@ -56,20 +56,26 @@ def rig_table(**head: Any) -> dict[str, Any]:
 class RecordingBench(Bench):
     """A core whose events and outputs are recorded."""
 
-    writer: Recorder = field(kw_only=True)
+    recorder: Recorder = field(kw_only=True)
 
     @override
     def give(self, event: Event, now_ns: int) -> None:
         before = len(self.out)
-        self.writer.event(event)
+        self.recorder.event(event)
         super().give(event, now_ns)
         for output in self.out[before:]:
-            self.writer.output(output)
+            self.recorder.output(output)
+
+    def flush(self) -> None:
+        """Write what waits, as the thread of the recorder does twice per second."""
+        writer = self.recorder._writer
+        assert writer is not None
+        writer.write(self.recorder._take())
 
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """The file of the run and what the live run produced."""
+    """The files of the run and what the live run produced."""
 
     path: Path
     calibration: Calibration
@@ -92,7 +98,7 @@ def samples(first: int, end: int, *, still: bool = False) -> list[Event]:
 
 def record_run(folder: Path) -> RecordedRun:
     """Run a core on simulated bytes and record it in `folder`."""
-    bench = RecordingBench(writer=Recorder(folder, "r"))
+    bench = RecordingBench(recorder=Recorder(folder, "r"))
     rig = parse_rig(rig_table())
     bench.feed([Configured(BEGIN_NS, rig, None), UnixOffset(BEGIN_NS, UNIX_NS)])
     bench.feed([SourceOpened(BEGIN_NS, source.id) for source in rig.sources])
@@ -105,6 +111,7 @@ def record_run(folder: Path) -> RecordedRun:
     bench.feed([CalibrationStored(at(FITTED + 1), 1)])
     (ready,) = [output for output in bench.out if isinstance(output, CalibrationReady)]
 
+    bench.flush()
     bench.feed(samples(FITTED + 2, 300))
     bench.feed([Request(at(300), "mark", "t2", {"text": "first step"})])
     bench.feed([SourceClosed(at(301), "S1", "lost", "unplugged"), SourceOpened(at(302), "S1")])
@@ -112,6 +119,6 @@ def record_run(folder: Path) -> RecordedRun:
     slower = parse_rig(rig_table(output_rate_hz=80))
     bench.feed([Configured(at(400), slower, ready.calibration, 1, 2.4)])
     bench.feed(samples(401, END))
-    bench.writer.close()
-    (path,) = folder.glob("r-*.mcap")
-    return RecordedRun(path, ready.calibration, len(bench.states))
+    bench.recorder.close()
+    (_path,) = folder.glob("r-*.mcap")
+    return RecordedRun(folder, ready.calibration, len(bench.states))

@@ -5,6 +5,7 @@ from jointfit_daemon.calibration.record._store import (
     CalibrationFileError,
     CalibrationStore,
     calibration_of,
+    calibration_text,
 )
 from jointfit_daemon.calibration.record._trial_digest import trials_digest
 
@@ -13,5 +14,6 @@ __all__ = [
     "CalibrationFileError",
     "CalibrationStore",
     "calibration_of",
+    "calibration_text",
     "trials_digest",
 ]

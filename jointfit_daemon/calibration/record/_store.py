@@ -105,9 +105,7 @@ class CalibrationStore:
             The medium is full, read-only or missing, or `LAST_VERSION` is used; nothing changed.
         """
         self._directory.mkdir(parents=True, exist_ok=True)
-        content = calibration.to_dict()
-        table = {"sha256": checksum(content), "calibration": content}
-        text = json.dumps(table, allow_nan=False, indent=1) + "\n"
+        text = calibration_text(calibration)
         aside = self._directory / f".writing-{os.getpid()}"
         try:
             with aside.open("w", encoding="utf-8") as file:
@@ -208,6 +206,13 @@ class CalibrationStore:
                     return f"it cannot be renamed: {error.strerror}"
                 return f"renamed to {aside.name}"
         return "it was not renamed: too many damaged files of this name"
+
+
+def calibration_text(calibration: Calibration) -> str:
+    """Return the content of the file of a stored calibration; `calibration_of` reads it."""
+    content = calibration.to_dict()
+    table = {"sha256": checksum(content), "calibration": content}
+    return json.dumps(table, allow_nan=False, indent=1) + "\n"
 
 
 def checksum(content: Mapping[str, object]) -> str:

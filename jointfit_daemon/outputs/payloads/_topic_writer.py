@@ -6,7 +6,6 @@ Invariant: no method waits for a broker. docs/mqtt.md documents topics, rates an
 from __future__ import annotations
 
 import hashlib
-import time
 from typing import TYPE_CHECKING, Any
 
 import orjson
@@ -180,7 +179,7 @@ class TopicWriter:
             self._outbox.stream(name, payload)
 
     def _publish_limb_state(self, state: LimbState) -> None:
-        offset_ns, now_ns = self._clock.offset_ns(), time.monotonic_ns()
+        offset_ns, now_ns = self._clock.offset_ns(), self._clock.now_ns()
         pose = encode_pose(state, offset_ns, now_ns)
         self._outbox.stream(self._pose_topic, pose)
 
@@ -237,12 +236,12 @@ class TopicWriter:
     def publish_health(self, health: BridgeHealth) -> None:
         """Publish ``bridge/health``."""
         payload = health_payload(health)
-        self._publish(topics.BRIDGE_HEALTH, self._stamped(payload, time.monotonic_ns()))
+        self._publish(topics.BRIDGE_HEALTH, self._stamped(payload, self._clock.now_ns()))
 
     def publish_log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
         """Publish one log line on ``bridge/log``."""
         line = {"level": level, "logger": name, "text": text, "suppressed": suppressed}
-        self._publish(topics.BRIDGE_LOG, self._stamped(line, time.monotonic_ns()))
+        self._publish(topics.BRIDGE_LOG, self._stamped(line, self._clock.now_ns()))
 
     def _stamped(self, data: Mapping[str, object], t_ns: int | None) -> bytes:
         stamp = {} if t_ns is None else {"t_us": (t_ns + self._clock.offset_ns()) // 1000}

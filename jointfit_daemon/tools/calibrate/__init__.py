@@ -1,6 +1,7 @@
 """`jointfit calibrate`: guides a functional calibration of a running daemon over MQTT."""
 
 from jointfit_daemon.tools.calibrate._command import calibrate
+from jointfit_daemon.tools.calibrate._offline import store_offline_calibration
 from jointfit_daemon.tools.calibrate._phase_tracker import (
     PhaseAbortedError,
     PhaseTracker,
@@ -15,4 +16,5 @@ __all__ = [
     "calibrate",
     "movement_lines",
     "report",
+    "store_offline_calibration",
 ]

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import orjson
 import typer
 
+from jointfit_daemon.tools.calibrate._offline import calibrate_offline
 from jointfit_daemon.tools.calibrate._phase_tracker import (
     PhaseTracker,
     RequestRefusedError,
@@ -58,6 +59,17 @@ _List = Annotated[
     bool, typer.Option("--list", help="List the stored calibrations with their quality.")
 ]
 _Use = Annotated[int | None, typer.Option("--use", help="Use this stored version again.", min=1)]
+_Recording = Annotated[
+    Path | None,
+    typer.Option(help="Repeat the calibration of a recorded session instead, without a daemon."),
+]
+_OtherRig = Annotated[
+    Path | None, typer.Option("--rig", help="With --recording: use this rig.toml instead.")
+]
+_Out = Annotated[
+    Path | None,
+    typer.Option(help="With --recording: write to this .json file instead of the store."),
+]
 _Revert = Annotated[
     bool, typer.Option("--revert", help="Use the newest version before the one in force again.")
 ]
@@ -78,33 +90,42 @@ def _complete_phase(incomplete: str) -> list[str]:
     return [name for name in _PHASES if name.startswith(incomplete)]
 
 
+_Phases = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="align, static, functional, abort or revert; repeatable. Default: static, and"
+        " functional if rig.toml has a motion-capture source.",
+        autocompletion=_complete_phase,
+    ),
+]
+_Seconds = Annotated[
+    float | None,
+    typer.Option(help="Duration of each phase, s, up to 600. Default: from rig.toml."),
+]
+_Force = Annotated[
+    bool, typer.Option("--force", help="Accept a calibration that is worse than the stored one.")
+]
+
+
 def calibrate(
     config: Annotated[Path, typer.Argument(help="The rig.toml of the daemon.")] = Path("rig.toml"),
     *,
-    phase: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="align, static, functional, abort or revert; repeatable. Default: static, and"
-            " functional if rig.toml has a motion-capture source.",
-            autocompletion=_complete_phase,
-        ),
-    ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option(help="Duration of each phase, s, up to 600. Default: from rig.toml."),
-    ] = None,
+    phase: _Phases = None,
+    seconds: _Seconds = None,
     abort: Annotated[bool, typer.Option("--abort", help="Abort the running phase.")] = False,
     listed: _List = False,
     use: _Use = None,
     revert: _Revert = False,
-    force: Annotated[
-        bool,
-        typer.Option("--force", help="Accept a calibration that is worse than the stored one."),
-    ] = False,
+    recording: _Recording = None,
+    rig: _OtherRig = None,
+    out: _Out = None,
+    force: _Force = False,
     yes: Annotated[bool, typer.Option("--yes", help="Start each phase without a prompt.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print the final status as JSON.")] = False,
 ) -> None:
     """Calibrate the rig of a running daemon; Ctrl-C or SIGTERM aborts the phase.
+
+    With --recording, the requests in a recording start the same phases, and the result is stored.
 
     Exit codes: 0 success; 1 no broker, no daemon, a phase was refused or aborted, or its result
     could not be stored; 2 invalid options or rig.toml; 3 the result is worse than the stored
@@ -118,8 +139,16 @@ def calibrate(
         raise ValueError(f"--phase {wrong[0]}: expected one of {', '.join(_PHASES)}")
     if seconds is not None and not 0.0 < seconds <= LONGEST_S:
         raise ValueError(f"--seconds {seconds:g}: expected 0 < seconds <= {LONGEST_S:g}")
-    if sum((abort, listed, use is not None, revert, bool(phase))) > 1:
-        raise ValueError("expected one of --phase, --abort, --list, --use and --revert")
+    if sum((abort, listed, use is not None, revert, bool(phase), recording is not None)) > 1:
+        raise ValueError(
+            "expected one of --phase, --abort, --list, --use, --revert and --recording"
+        )
+    if recording is not None:
+        status = calibrate_offline(recording, rig, out)
+        _print_status(status, json=json)
+        return
+    if rig is not None or out is not None:
+        raise ValueError(f"{'--rig' if rig else '--out'}: expected --recording with it")
     if listed:
         list_versions(config, json=json)
         return
@@ -127,11 +156,11 @@ def calibrate(
         use_version(config, use, json=json)
         return
 
-    rig = load_rig(config)
-    default = ORDER[1:] if any(s.kind == "mocap" for s in rig.sources) else ("static",)
+    own = load_rig(config)
+    default = ORDER[1:] if any(s.kind == "mocap" for s in own.sources) else ("static",)
     phases = ("abort",) if abort else phase or default
     try:
-        status = asyncio.run(_guide_phases(rig, phases, seconds, config, force=force, ask=not yes))
+        status = asyncio.run(_guide_phases(own, phases, seconds, config, force=force, ask=not yes))
     except OutputLostError:
         raise typer.Exit(EXIT_FAILED) from None
     _print_status(status, json=json)

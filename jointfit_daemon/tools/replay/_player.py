@@ -1,0 +1,164 @@
+"""Plays a recording at a speed: time line on the terminal, and payloads to a broker."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import typer
+
+from jointfit_daemon.model import LimbState
+from jointfit_daemon.pipeline.events import CalibrationStatus, ChunkArrived, Configured, Notice
+from jointfit_daemon.tools.replay._publication import Publication
+from jointfit_daemon.tools.stop_signals import cancel_on_signal
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.pipeline.events import Output
+    from jointfit_daemon.reprocessing import Changes
+
+_NS_PER_S = 1e9
+_YIELD_EVENTS = 200
+"""Events between two pauses for other tasks at the highest speed."""
+
+
+@dataclass(slots=True)
+class PlaySummary:
+    """What was played."""
+
+    rig: str = ""
+    events: int = 0
+    states: int = 0
+    """Number of limb states."""
+    seconds: float = 0.0
+    """Recorded time, s."""
+    took_s: float = 0.0
+    settings: str = "as recorded"
+    """Whether rig and calibration are the recorded ones."""
+
+    def add(self, seconds: float, outputs: list[Output]) -> None:
+        """Add an event at `seconds` with its outputs."""
+        self.events += 1
+        self.states += sum(isinstance(output, LimbState) for output in outputs)
+        self.seconds = max(self.seconds, seconds)
+
+    def table(self) -> dict[str, object]:
+        """Return the summary with its names."""
+        return {
+            "rig": self.rig, "events": self.events, "states": self.states, "seconds": self.seconds,
+            "took_s": self.took_s, "settings": self.settings,
+        }  # fmt: skip
+
+    def text(self) -> str:
+        """Return the summary as a sentence."""
+        factor = self.seconds / self.took_s if self.took_s else math.inf
+        return (
+            f"{self.rig}: {self.states} limb states from {self.events} events, "
+            f"{self.settings}: {self.seconds:.1f} s in {self.took_s:.1f} s ({factor:.0f} × real "
+            "time)"
+        )
+
+
+async def play_recording(
+    file: Path,
+    changes: Changes,
+    speed: float,
+    destination: tuple[str | None, str | None] | None = None,
+    *,
+    quiet: bool = False,
+) -> PlaySummary:
+    """Run a recording through a new core at a speed, and return a summary.
+
+    Parameters
+    ----------
+    file
+        The recording.
+    changes
+        Differences from the recorded run.
+    speed
+        Multiple of the recorded speed; infinity: as fast as possible.
+    destination
+        Base topic and broker to publish to, each None for its default; None: no publication.
+    quiet
+        Whether to print no time line.
+
+    Raises
+    ------
+    ValueError
+        The recording or the destination is invalid.
+    BrokerLostError
+        The broker does not answer.
+    """
+    from jointfit_daemon.outputs.recording import read_events
+    from jointfit_daemon.reprocessing import process_events
+
+    summary = PlaySummary(settings="processed again" if changes.any else "as recorded")
+    pace = _Pace(speed)
+    publication: Publication | None = None
+    with cancel_on_signal() as stop:
+        try:
+            for event, outputs in process_events(read_events(file), changes):
+                if isinstance(event, Configured):
+                    summary.rig = event.rig.name
+                    if destination is not None and publication is None:
+                        publication = Publication(event.rig, *destination)
+                        await publication.start()
+
+                t_ns = event.chunk.t_ns if isinstance(event, ChunkArrived) else event.t_ns
+                await pace.wait(t_ns)
+                if publication is not None:
+                    await publication.publish(t_ns, event, outputs)
+                summary.add(pace.seconds(t_ns), outputs)
+                if not quiet:
+                    _print_time_line(pace.seconds(t_ns), outputs)
+        except asyncio.CancelledError:
+            if stop.number is None:
+                raise
+            raise typer.Exit(stop.exit_code) from None
+        finally:
+            if publication is not None:
+                await publication.stop()
+    summary.took_s = pace.took_s
+    return summary
+
+
+class _Pace:
+    """Waits until an instant of the recording is due."""
+
+    def __init__(self, speed: float) -> None:
+        self._speed, self._began_s = speed, time.monotonic()
+        self._first_ns: int | None = None
+        self._events = 0
+
+    async def wait(self, t_ns: int) -> None:
+        """Return when `t_ns` is due; let other tasks run now and then."""
+        if self._first_ns is None:
+            self._first_ns, self._began_s = t_ns, time.monotonic()
+        self._events += 1
+        ahead_s = 0.0
+        if self._speed < math.inf:
+            due_s = self._began_s + self.seconds(t_ns) / self._speed
+            ahead_s = due_s - time.monotonic()
+        if ahead_s > 0.0 or self._events % _YIELD_EVENTS == 0:
+            await asyncio.sleep(max(0.0, ahead_s))
+
+    def seconds(self, t_ns: int) -> float:
+        """Return the time since the first event, s."""
+        return (t_ns - (self._first_ns or t_ns)) / _NS_PER_S
+
+    @property
+    def took_s(self) -> float:
+        """Time since the first event was processed, s."""
+        return time.monotonic() - self._began_s
+
+
+def _print_time_line(seconds: float, outputs: list[Output]) -> None:
+    for output in outputs:
+        if isinstance(output, Notice):
+            typer.echo(f"{seconds:9.3f} s  {output.kind} {output.id}: {output.text}")
+        elif isinstance(output, CalibrationStatus):
+            typer.echo(f"{seconds:9.3f} s  calibration {output.phase}: {output.text}")
