@@ -38,6 +38,7 @@ from jointfit_simulators.body import (
     read_recorded_trial,
 )
 from jointfit_simulators.devices import ClockFault
+from jointfit_simulators.recorded import RecordedScene, read_session_chunks
 from jointfit_simulators.sample import write_sample
 from jointfit_simulators.scene import (
     InvalidCommandError,
@@ -144,6 +145,11 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--trial", type=Path, nargs="+", metavar="FILE",
                       help="replay a trial: .npz or .sto, with .trc and .json")  # fmt: skip
 
+    play.add_argument("--recording", type=Path, metavar="FILE",
+                      help="send a recording of the daemon by virtual devices, once, at its "
+                      "intervals, and write its rig.toml for them; all other options except "
+                      "--mqtt-host and --mqtt-port have no effect")  # fmt: skip
+
     for field in dataclasses.fields(RigOptions):
         play.add_argument(
             f"--{field.name.replace('_', '-')}",
@@ -245,7 +251,20 @@ async def _run_commands(scene: Scene) -> None:
         transport.close()
 
 
+async def _play_recording(options: argparse.Namespace) -> None:
+    session = read_session_chunks(options.recording)
+    with play_directory(options.directory.absolute()):
+        broker = (options.mqtt_host, options.mqtt_port)
+        scene = RecordedScene(session, options.directory.absolute(), broker)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            asyncio.get_running_loop().add_signal_handler(number, scene.stop)
+        await scene.run(_print_json)
+
+
 async def _play(options: argparse.Namespace) -> None:
+    if options.recording is not None:
+        await _play_recording(options)
+        return
     knobs = _knobs(options)
     rig = RigOptions(
         **{field.name: getattr(options, field.name) for field in dataclasses.fields(RigOptions)}

@@ -19,7 +19,7 @@ from jointfit_simulators.devices._natnet_frames import (
     model_definition,
 )
 from jointfit_simulators.devices._natnet_options import NatNetServerOptions
-from jointfit_simulators.devices._natnet_port import LOOPBACK
+from jointfit_simulators.devices._natnet_port import LOOPBACK, Address, NatNetPort
 from jointfit_simulators.devices._natnet_server import NatNetServer
 from jointfit_simulators.devices._orientation_sensor import OrientationSensor
 from jointfit_simulators.devices._sensor_faults import SensorFaults
@@ -29,6 +29,7 @@ from jointfit_simulators.devices._xcdi_device import XcdiDevice, XcdiDeviceOptio
 __all__ = [
     "LOOPBACK",
     "NS",
+    "Address",
     "Bodies",
     "CameraFrames",
     "Cameras",
@@ -36,6 +37,7 @@ __all__ = [
     "FrameStamps",
     "Markers",
     "NatNetFrameBuilder",
+    "NatNetPort",
     "NatNetServer",
     "NatNetServerOptions",
     "OrientationSensor",

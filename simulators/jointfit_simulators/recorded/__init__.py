@@ -1,0 +1,10 @@
+"""Recordings of the daemon as virtual devices: their bytes again, at the recorded intervals."""
+
+from jointfit_simulators.recorded._recorded_scene import RecordedScene
+from jointfit_simulators.recorded._session_file import (
+    RecordedSession,
+    UnplayableRecordingError,
+    read_session_chunks,
+)
+
+__all__ = ["RecordedScene", "RecordedSession", "UnplayableRecordingError", "read_session_chunks"]

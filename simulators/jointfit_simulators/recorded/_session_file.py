@@ -1,0 +1,90 @@
+"""Chunks of the sources and the rig of a recording, read with the library of the container."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import orjson
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_SOURCE = "source/"
+"""Beginning of the channels with chunks."""
+_RIG = "rig.json"
+"""Name of the attachment with the parsed rig.toml."""
+_PART_NAME = re.compile(r"(.+-\d{8}T\d{6})-\d{4,}\.mcap")
+
+
+class UnplayableRecordingError(ValueError):
+    """The file is no recording, is damaged, or has devices that cannot be simulated."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedSession:
+    """What the devices of a session sent."""
+
+    rig: dict[str, Any]
+    """The parsed rig.toml."""
+    chunks: dict[str, list[tuple[int, bytes]]]
+    """Arrival since the first chunk of all sources, ns, and bytes, by source."""
+
+
+def read_session_chunks(path: Path) -> RecordedSession:
+    """Return rig and chunks of the recording at `path`, any file of a session or their folder.
+
+    Raises
+    ------
+    UnplayableRecordingError
+        The file is no recording, or damaged.
+    OSError
+        It cannot be read.
+    """
+    rig: dict[str, Any] | None = None
+    found: dict[str, list[tuple[int, bytes]]] = {}
+    for file in _files_of(path):
+        try:
+            with file.open("rb") as stream:
+                reader = make_reader(stream, validate_crcs=True)
+                for attachment in reader.iter_attachments():
+                    if attachment.name == _RIG and rig is None:
+                        rig = orjson.loads(attachment.data)
+                for _, channel, message in reader.iter_messages():
+                    if channel.topic.startswith(_SOURCE):
+                        source = channel.topic.removeprefix(_SOURCE)
+                        found.setdefault(source, []).append((message.log_time, message.data))
+        except (McapError, ValueError, EOFError) as error:
+            raise UnplayableRecordingError(
+                f"{file}: cannot be read ({str(error) or type(error).__name__:.200}): expected a "
+                "complete recording. `jointfit recover` writes one from a damaged file"
+            ) from error
+
+    if rig is None or not found:
+        what = "rig" if rig is None else "bytes of devices"
+        raise UnplayableRecordingError(f"{path}: the recording contains no {what}: choose another")
+    begin_ns = min(chunks[0][0] for chunks in found.values())
+    return RecordedSession(
+        rig,
+        {source: [(t_ns - begin_ns, data) for t_ns, data in found[source]] for source in found},
+    )
+
+
+def _files_of(path: Path) -> list[Path]:
+    """Return the files of the session of `path`, in order."""
+    match = None if path.is_dir() else _PART_NAME.fullmatch(path.name)
+    if match is None and not path.is_dir():
+        return [path]
+    folder = path if path.is_dir() else path.parent
+    files = sorted(file for file in folder.iterdir() if _PART_NAME.fullmatch(file.name))
+    if match is not None:
+        return [file for file in files if file.name.startswith(f"{match[1]}-")]
+    if not files:
+        raise UnplayableRecordingError(
+            f"{path}: the folder contains no complete recording (NAME.mcap): stop the recording, or"
+            " name its file"
+        )
+    return files
