@@ -10,6 +10,7 @@ from jointfit_daemon.config._open_places import LATER
 from jointfit_daemon.config._rig import Rig, Source
 from jointfit_daemon.config._schema import rig_schema
 from jointfit_daemon.config._tables import (
+    LslSettings,
     MetricsSettings,
     MqttSettings,
     RecordingSettings,
@@ -21,6 +22,7 @@ __all__ = [
     "LATER",
     "ConfigError",
     "Fault",
+    "LslSettings",
     "MetricsSettings",
     "MqttSettings",
     "RecordingSettings",

@@ -25,6 +25,7 @@ from jointfit_daemon.config._syntax import read_table, without_unreadable
 from jointfit_daemon.config._tables import (
     CalibrationTable,
     ChainTable,
+    LslSettings,
     MetricsSettings,
     MqttSettings,
     RecordingSettings,
@@ -52,7 +53,9 @@ if TYPE_CHECKING:
 
 Model = TypeVar("Model", bound=BaseModel)
 
-SECTIONS = ("rig", "chain", "imu", "can", "mocap", "calibration", "mqtt", "recording", "metrics")
+SECTIONS = (
+    "rig", "chain", "imu", "can", "mocap", "calibration", "mqtt", "recording", "metrics", "lsl",
+)  # fmt: skip
 
 
 def load_rig(path: Path) -> Rig:
@@ -140,10 +143,9 @@ class _RigReader:
         chain = self._section("chain", ChainTable, needed=True)
         calibration = self._section("calibration", CalibrationTable)
         mqtt = self._section("mqtt", MqttSettings)
-        recording = None
-        if "recording" in self.table:
-            recording = self._section("recording", RecordingSettings)
-        metrics = self._section("metrics", MetricsSettings) if "metrics" in self.table else None
+        recording = self._optional_section("recording", RecordingSettings)
+        metrics = self._optional_section("metrics", MetricsSettings)
+        lsl = self._optional_section("lsl", LslSettings)
 
         buses = self._buses()
         limb = chain or self.partial.get("chain")
@@ -187,6 +189,7 @@ class _RigReader:
             mqtt=mqtt.model_copy(update={"base": base}),
             recording=recording,
             metrics=metrics,
+            lsl=lsl,
             table=self.table,
         )
 
@@ -271,6 +274,10 @@ class _RigReader:
             self.faults.append(Fault(f"[{key}]", "this table is missing"))
             return None
         return self._validate(key, self.table.get(key, {}), model)
+
+    def _optional_section(self, key: str, model: type[Model]) -> Model | None:
+        """Return a table; None if it is absent, which switches its feature off."""
+        return self._section(key, model) if key in self.table else None
 
     def _validate(self, key: str, table: object, model: type[Model]) -> Model | None:
         if not isinstance(table, dict):

@@ -9,7 +9,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from jointfit_daemon.calibration import CalibrationSettings
-    from jointfit_daemon.config._tables import MetricsSettings, MqttSettings, RecordingSettings
+    from jointfit_daemon.config._tables import (
+        LslSettings,
+        MetricsSettings,
+        MqttSettings,
+        RecordingSettings,
+    )
     from jointfit_daemon.driver import Driver
     from jointfit_daemon.files.models import LoadedModel
     from jointfit_daemon.model import Chain
@@ -49,6 +54,7 @@ class Rig:
     mqtt: MqttSettings
     recording: RecordingSettings | None
     metrics: MetricsSettings | None
+    lsl: LslSettings | None
     chain_model: LoadedModel | None
     """Chain model for inverse kinematics from the markers; None without one."""
     table: Mapping[str, Any]

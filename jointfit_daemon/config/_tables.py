@@ -397,6 +397,15 @@ class RecordingSettings(Settings):
     )
 
 
+class LslSettings(Settings):
+    """``[lsl]``: if present, the daemon offers streams of the Lab Streaming Layer."""
+
+    name: str = Field(
+        "",
+        description="begins the names of both streams; default: [rig] name",
+    )
+
+
 class MetricsSettings(Settings):
     """``[metrics]``: if present, the daemon offers metrics for Prometheus."""
 

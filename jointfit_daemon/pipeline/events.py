@@ -201,6 +201,8 @@ class NoticeKind(StrEnum):
     RELOAD = "reload"
     RECORDING = "recording"
     METRICS = "metrics"
+    LSL = "lsl"
+    """The streams of the Lab Streaming Layer."""
     STATE = "state"
     """The state directory."""
     MARK = "mark"

@@ -1,4 +1,4 @@
-"""Sinks that rig.toml or a request switches on: the recording and the metrics.
+"""Sinks that rig.toml or a request switches on: the recording, the metrics, streams of LSL.
 
 Invariant: one that cannot start is reported, and the daemon runs without it.
 """
@@ -79,3 +79,19 @@ def start_metrics(
         log.info("metrics at %s", server.url)
         core.subscribe(frames)
         tasks.create_task(server.run(), name="metrics")
+
+
+def start_lsl(rig: Rig, core: CoreRunner, report: Report) -> None:
+    """Offer streams of the Lab Streaming Layer, if rig.toml has the table ``[lsl]``."""
+    if rig.lsl is None:
+        return
+    from jointfit_daemon.outputs.lsl import LslError, LslOutlet  # noqa: PLC0415 - rarely used
+
+    outlet = LslOutlet(rig.lsl, rig.name, rig.output_rate_hz)
+    try:
+        outlet.start()
+    except LslError as fault:
+        report(NoticeKind.LSL, f"LSL is off: {fault}", NoticeLevel.ERROR)
+    else:
+        log.info("streams of LSL: %s segments, %s joints", *[rig.lsl.name or rig.name] * 2)
+        core.subscribe(outlet)

@@ -63,7 +63,7 @@ from jointfit_daemon.supervisor._calibration_store import (
 from jointfit_daemon.supervisor._core_runner import CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_daemon.supervisor._notice_log import LEVELS, NoticeLog
-from jointfit_daemon.supervisor._optional_sinks import create_recorder, start_metrics
+from jointfit_daemon.supervisor._optional_sinks import create_recorder, start_lsl, start_metrics
 from jointfit_daemon.supervisor._overload_monitor import STALL_S, OverloadMonitor
 from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
@@ -217,6 +217,7 @@ class Daemon:
         rig, core, report = self._rig, self._core, self._report
         self._recorder = create_recorder(rig, core, tasks, report)
         start_metrics(rig, self.health, core, tasks, report)
+        start_lsl(rig, core, report)
         self._state_check = tasks.create_task(self._check_state(), name="state check")
         self._mqtt = tasks.create_task(self._link.run(), name="mqtt")
 
@@ -466,7 +467,7 @@ class Daemon:
     async def _change_to(self, rig: Rig) -> None:
         """Apply `rig`; sources and connections without changes continue."""
         before, self._rig = self._rig, rig
-        for key in ("recording", "metrics"):
+        for key in ("recording", "metrics", "lsl"):
             if getattr(before, key) != getattr(rig, key):
                 text = f"a change of [{key}] requires a restart"
                 self._report(NoticeKind.RELOAD, text, NoticeLevel.WARNING)
