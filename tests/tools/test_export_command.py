@@ -57,7 +57,12 @@ def test_a_file_is_converted_and_the_files_are_printed(trial: Path, tmp_path: Pa
     printed = result.stdout.splitlines()
     assert printed == [str(out / "walk_sensors.sto"), str(out / "walk_segments.sto")]
     assert "resampled to 100 Hz by interpolation: S2" in result.stderr
-    second = read_session(out / "walk_sensors.sto").sensors[1]
+    first, second = read_session(out / "walk_sensors.sto").sensors
+    # The file begins when the second sensor starts, 2 ms after the first: IMUPlacer needs both.
+    assert first.t_s[0] == pytest.approx(3.01)
+    assert np.isfinite(first.orientation[0]).all()
+    assert np.isfinite(second.orientation[0]).all()
+    assert "IMUPlacer" not in result.stderr
     gap = (second.t_s > 3.495) & (second.t_s < 3.525)
     assert np.isnan(second.orientation[gap]).all()
     assert np.isfinite(second.orientation[second.t_s > 3.525]).all()

@@ -39,6 +39,9 @@ if TYPE_CHECKING:
 _POSITION_PARTS = (("_x", "_y", "_z"), ("_tx", "_ty", "_tz"))
 """Endings of position columns: ours, and those of OpenSim's coordinates."""
 _TRANSLATION = re.compile(r"_t?[xyz]$")
+_LATE_START_S = 1.0
+"""Longest time before the last series starts that is left out of orientations, s."""
+_SAME_INSTANT_S = 1e-6
 _GROUPS = ("sensors", "segments", "optical_segments")
 
 
@@ -50,7 +53,7 @@ def write_sto_session(
     Parameters
     ----------
     session, folder
-        Groups without series are left out.
+        Groups without series are left out, and up to 1 s before the last series of a group starts.
     names
         Column names of sensors and segments, ``{"S1": "femur_r_imu"}`` for example. OpenSense finds
         the body of a column by its name.
@@ -72,7 +75,11 @@ def write_sto_session(
             else None,
         )
         quaternions = np.stack(columns, axis=1)
+        # Sensors rarely start in the same instant. IMUPlacer needs all of them in the first frame.
+        starts = [t_s[0] for _, t_s, _ in series]
+        late_s = max(starts) if max(starts) - min(starts) <= _LATE_START_S else min(starts)
         rows = ~np.isnan(quaternions).all(axis=(1, 2))
+        rows &= axis.t_s >= late_s - _SAME_INSTANT_S
         if not rows.any():
             continue
         path = folder / f"{session.name}_{group}.sto"

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.files.sessions._tidy_tables import Table
     from jointfit_daemon.session_data import SessionData
 
+_BLOCK_ROWS = 1 << 15
+"""Rows that are converted to text at a time, which bounds the memory."""
 _NEEDS_QUOTES = frozenset(',"\n\r')
 
 
@@ -39,10 +41,13 @@ def write_csv_session(session: SessionData, folder: Path) -> WrittenSession:
     files = []
     for name, table in tables_of(session).items():
         path = folder / f"{session.name}_{name}.csv"
-        cells = [_texts_of(column, values) for column, values in table.items()]
+        count = len(next(iter(table.values())))
         with path.open("w", encoding="utf-8", newline="") as file:
             file.write(",".join(table) + "\n")
-            file.writelines(f"{','.join(row)}\n" for row in zip(*cells, strict=True))
+            for k in range(0, count, _BLOCK_ROWS):
+                rows = slice(k, k + _BLOCK_ROWS)
+                cells = [_texts_of(column, values[rows]) for column, values in table.items()]
+                file.writelines(f"{','.join(row)}\n" for row in zip(*cells, strict=True))
         files.append(path)
     return WrittenSession(tuple(files))
 
