@@ -100,7 +100,7 @@ def run_on_cluster(tasks: Sequence[RecordingTask], address: str) -> Iterator[Rec
     except ModuleNotFoundError as missing:
         raise SchedulerUnavailableError from missing
 
-    with dask.Client(address, timeout="10s", set_as_default=False) as client:
+    with dask.Client(address, timeout="10s") as client:
         names: dict[Any, str] = {}
         for task in tasks:
             future = client.submit(process_recording, task, pure=False)
