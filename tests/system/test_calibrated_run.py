@@ -18,6 +18,7 @@ import pytest
 from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
 from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import Configured, JobFinished, SourceClosed, SourceOpened
+from jointfit_daemon.reprocessing import verify_recording
 from tests.payload_check import payload_fault
 from tests.system.station import SENSORS, Listener, Station, hang_up, running, stopped
 
@@ -270,3 +271,8 @@ def replay_the_recording(run: CalibratedRun) -> None:
     live = list(read_states(run.recording))
     assert len(live) > 2000
     assert [encode_state(state) for state in replay_states(events)] == live
+
+    verified = verify_recording(run.recording)
+    assert verified.passed, verified.lines()
+    assert verified.compared["output/state"] == len(live)
+    assert {"output/optical", "output/coordinates", "output/notice"} <= verified.compared.keys()
