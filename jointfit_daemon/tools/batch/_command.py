@@ -21,7 +21,8 @@ def batch(
     folder: Annotated[Path, typer.Argument(help="Folder with recordings, searched recursively.")],
     *,
     do: Annotated[
-        str, typer.Option("--do", help="Steps, separated by commas: export, report.")
+        str,
+        typer.Option("--do", help="Steps, separated by commas: calibrate, replay, export, report."),
     ] = "report",
     to: Annotated[str, typer.Option("--to", help="Formats of the step export.")] = "csv",
     out: Annotated[

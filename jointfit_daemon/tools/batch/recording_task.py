@@ -11,18 +11,19 @@ import json
 import math
 import shutil
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon import __version__
 
 if TYPE_CHECKING:
+    from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.session_data import SessionData
 
-STEPS = ("export", "report")
+STEPS = ("calibrate", "replay", "export", "report")
 """Steps in the order in which they run."""
-REPORT_FILE = "report.html"
+REPORT_FILE, CALIBRATION_FILE = "report.html", "calibration.json"
 MARKS = ".done"
 """Folder of the marks of processed recordings, in the output folder."""
 
@@ -48,7 +49,7 @@ class RecordingResult:
 
     recording: str
     status: str
-    """``done`` or ``failed``."""
+    """``done``, ``differs`` (the replay is not the recorded run) or ``failed``."""
     duration_s: float | None = None
     angle: str = ""
     """Joint angle of `rms_deg`."""
@@ -60,6 +61,8 @@ class RecordingResult:
     lost_percent: float | None = None
     """Largest loss of a source, percent."""
     faults: int | None = None
+    verified: str = ""
+    """Result of the step ``replay``."""
     notes: str = ""
     error: str = ""
 
@@ -131,10 +134,16 @@ def _process(task: RecordingTask, digest: str) -> RecordingResult:
 
 
 def _run_steps(task: RecordingTask, folder: Path) -> RecordingResult:
+    from jointfit_daemon.reprocessing import load_session, verify_recording
     from jointfit_daemon.tools.export import load_data
 
     recording, notes = Path(task.parts[0]), list[str]()
-    session = load_data(recording)
+    calibration = _calibrate(recording, folder, notes) if "calibrate" in task.steps else None
+    verification = verify_recording(recording) if "replay" in task.steps else None
+    if calibration is None:
+        session = load_data(recording)
+    else:
+        session = load_session(recording, calibration=calibration)
     if "export" in task.steps:
         from jointfit_daemon.files.sessions import NothingToWriteError, write_session
 
@@ -148,7 +157,28 @@ def _run_steps(task: RecordingTask, folder: Path) -> RecordingResult:
         from jointfit_daemon.tools.report.page import render_report
 
         (folder / REPORT_FILE).write_text(render_report(session), encoding="utf-8")
-    return _measured(task, session, "; ".join(notes))
+    result = _measured(task, session, "; ".join(notes))
+    if verification is None:
+        return result
+    status = "done" if verification.passed else "differs"
+    return replace(result, status=status, verified=verification.lines()[-1])
+
+
+def _calibrate(recording: Path, folder: Path, notes: list[str]) -> Calibration | None:
+    """Calibrate from a recording; return None, with a note, if it gives no calibration."""
+    from jointfit_daemon.reprocessing import ReprocessingError, calibrate_recording
+    from jointfit_daemon.tools.calibrate import store_offline_calibration
+
+    try:
+        found = calibrate_recording(recording)
+    except ReprocessingError as error:  # most recordings of a day contain no calibration
+        notes.append(f"calibrate: {error}")
+        return None
+    if found.calibration is None:
+        notes.append(f"calibrate: {found.rejected or 'no phase ended with a calibration'}")
+        return None
+    store_offline_calibration(found, folder / CALIBRATION_FILE)
+    return found.calibration
 
 
 def _measured(task: RecordingTask, session: SessionData, notes: str) -> RecordingResult:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 _UNKNOWN = "–"
 _HEAD = (
     "Recording", "Status", "Duration, s", "RMS against cameras", "Largest range", "Gait cycles",
-    "Lost, %", "Faults", "Notes",
+    "Lost, %", "Faults", "Replay", "Notes",
 )  # fmt: skip
 
 
@@ -42,7 +42,10 @@ def _csv(results: Sequence[RecordingResult]) -> str:
 
 
 def _page(results: Sequence[RecordingResult], out: Path) -> str:
-    counts = [(status, sum(r.status == status for r in results)) for status in ("done", "failed")]
+    counts = [
+        (status, sum(r.status == status for r in results))
+        for status in ("done", "differs", "failed")
+    ]
     pairs = [("Recordings", f"{len(results)}"), *((s.title(), f"{n}") for s, n in counts)]
     rows = [_row(result, out) for result in results]
     body = section("recordings", "Recordings", [table("One row a recording", _HEAD, rows, text=2)])
@@ -58,13 +61,14 @@ def _row(result: RecordingResult, out: Path) -> tuple[str, ...]:
     extent = _UNKNOWN if result.range_deg is None else f"{result.range_deg:.0f}°"
     return (
         name,
-        "▲ failed" if result.status == "failed" else result.status,
+        result.status if result.status == "done" else f"▲ {result.status}",
         _text(result.duration_s, 1),
         rms,
         extent,
         _text(result.gait_cycles, 0),
         _text(result.lost_percent, 2),
         _text(result.faults, 0),
+        result.verified or _UNKNOWN,
         result.error or result.notes or _UNKNOWN,
     )
 

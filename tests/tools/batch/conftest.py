@@ -23,7 +23,10 @@ def process_tracker() -> None:
 
 @pytest.fixture(scope="session")
 def recorded_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return record_run(tmp_path_factory.mktemp("recorded")).path
+    folder = tmp_path_factory.mktemp("recorded")
+    record_run(folder)
+    (file,) = folder.iterdir()
+    return file
 
 
 @pytest.fixture

@@ -67,6 +67,20 @@ def test_batch_equals_single_commands_byte_for_byte(recordings: Recordings, tmp_
         assert files_of(tmp_path / "out" / own.name) == files_of(own)
 
 
+def test_calibration_and_replay_equal_the_single_commands(
+    recordings: Recordings, tmp_path: Path
+) -> None:
+    (path,), out = recordings(1).iterdir(), tmp_path / "out"
+    arguments = ["batch", str(path.parent), "--do", "replay,calibrate,report", "--jobs", "1"]
+    assert run(app, [*arguments, "--out", str(out)]).exit_code == 0
+    (row,) = rows_of(out)
+    assert "equal, byte for byte" in row["verified"]
+
+    own = tmp_path / "own.json"
+    assert run(app, ["calibrate", "--recording", str(path), "--out", str(own)]).exit_code == 0
+    assert (out / "trial-0000" / "calibration.json").read_bytes() == own.read_bytes()
+
+
 def test_one_bad_file_stops_only_itself(recordings: Recordings, tmp_path: Path) -> None:
     folder, out = recordings(2), tmp_path / "out"
     (folder / "trial-0000a.mcap").write_bytes(b"not a recording")

@@ -9,9 +9,13 @@ import pytest
 from tests.reprocessing.recorded_run import record_run
 
 if TYPE_CHECKING:
-    from tests.reprocessing.recorded_run import RecordedRun
+    from pathlib import Path
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> RecordedRun:
-    return record_run(tmp_path_factory.mktemp("recorded"))
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of a recorded run."""
+    folder = tmp_path_factory.mktemp("recorded")
+    record_run(folder)
+    (file,) = folder.iterdir()
+    return file

@@ -11,14 +11,12 @@ from jointfit_daemon.tools.__main__ import app
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.reprocessing.recorded_run import RecordedRun
-
 run = CliRunner().invoke
 
 
-def test_page_of_a_recording_is_written(recorded: RecordedRun, tmp_path: Path) -> None:
+def test_page_of_a_recording_is_written(recorded: Path, tmp_path: Path) -> None:
     page = tmp_path / "report.html"
-    result = run(app, ["report", str(recorded.path), "--out", str(page)])
+    result = run(app, ["report", str(recorded), "--out", str(page)])
     assert result.exit_code == 0, result.output
     assert f"wrote {page}" in result.stderr
     text = page.read_text("utf-8")
@@ -36,16 +34,16 @@ def test_a_file_that_is_no_recording_leaves_no_page(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["broken.mcap"]
 
 
-def test_an_older_page_survives_a_failure(recorded: RecordedRun, tmp_path: Path) -> None:
+def test_an_older_page_survives_a_failure(recorded: Path, tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     page.write_text("older", "utf-8")
     assert run(app, ["report", str(tmp_path / "absent.mcap"), "--out", str(page)]).exit_code == 2
     assert page.read_text("utf-8") == "older"
-    assert run(app, ["report", str(recorded.path), "--out", str(page)]).exit_code == 0
+    assert run(app, ["report", str(recorded), "--out", str(page)]).exit_code == 0
     assert page.read_text("utf-8") != "older"
 
 
-def test_another_ending_is_refused(recorded: RecordedRun) -> None:
-    result = run(app, ["report", str(recorded.path), "--out", "report.pdf"])
+def test_another_ending_is_refused(recorded: Path) -> None:
+    result = run(app, ["report", str(recorded), "--out", "report.pdf"])
     assert result.exit_code == 2
     assert ".html" in result.stderr
