@@ -35,7 +35,7 @@ test: $(STAMP)  ## all tests that this machine can run, on all cores; what is sk
 test-experiments: $(STAMP)  ## the short experiments of bench against their targets
 	@$(BIN)/python .ci/suite.py --experiments $(ARGS)
 
-test-cpu: $(STAMP)  ## the numerical tests four times, as on other processors
+test-cpu: $(STAMP)  ## the numerical tests six times, as on other processors
 	@$(BIN)/python .ci/cpu_features.py $(ARGS)
 
 test-root:  ## the tests and the demo on a fresh minimal Debian, as a user without root (mmdebstrap; root or sudo)

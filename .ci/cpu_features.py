@@ -4,8 +4,9 @@
 
 Kernels of OpenBLAS and loops of numpy round differently on each processor. A decision that
 depends on last bits shows itself by a test that passes in one of these runs and fails in another.
-Each run has the kernels (``OPENBLAS_CORETYPE``) and the loops (``NPY_DISABLE_CPU_FEATURES``) of one
-processor. A run that this processor cannot execute is skipped with its reason.
+Four runs have the kernels (``OPENBLAS_CORETYPE``) and the loops (``NPY_DISABLE_CPU_FEATURES``) of
+one processor, two combine the oldest with the newest. A run that this processor cannot execute is
+skipped with its reason.
 
 Exit status: 0 if every run passed, 1 otherwise.
 """
@@ -35,7 +36,7 @@ of the core, rounds alike on all processors."""
 
 @dataclass(frozen=True)
 class Processor:
-    """A processor as OpenBLAS and numpy distinguish them."""
+    """A processor as OpenBLAS and numpy distinguish them, or a combination of two."""
 
     core_type: str
     """Name of its kernels in OpenBLAS."""
@@ -50,8 +51,11 @@ PROCESSORS = (
     Processor("Haswell", "avx2", 1),
     Processor("Zen", "avx2", 1),
     Processor("SkylakeX", "avx512f", None),
+    Processor("Nehalem", "sse4_2", None),
+    Processor("SkylakeX", "avx512f", 0),
 )
-"""Each kernel and each kind of loop occurs in one of them."""
+"""Each kernel and each kind of loop occurs in one of them; the last two are no real processors, but
+show whether kernels or loops cause a difference."""
 
 
 def main(arguments: list[str]) -> int:
