@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -16,6 +17,7 @@ from jointfit_daemon.tools.batch import executors
 from jointfit_daemon.tools.batch.executors import run_in_pool, run_on_cluster
 from jointfit_daemon.tools.batch.find_recordings import find_recordings
 from jointfit_daemon.tools.batch.recording_task import RecordingTask
+from tests.reprocessing import recorded_run
 from tests.tools.batch.deadly_task import process_or_die
 
 if TYPE_CHECKING:
@@ -47,14 +49,20 @@ def test_every_recording_is_processed_once_though_a_worker_is_killed(
 
 
 def test_two_processes_are_almost_twice_as_fast_as_one(
-    recordings: Recordings, tmp_path: Path
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if (os.cpu_count() or 1) < 2 or os.getloadavg()[0] > 0.5:
         pytest.skip("needs two idle processors")
-    folder = recordings(16)
+    monkeypatch.setattr(recorded_run, "END", 5000)  # 50 s, so that the start of processes is short
+    recorded_run.record_run(tmp_path / "recorded")
+    (file,) = (tmp_path / "recorded").iterdir()
+    (tmp_path / "trials").mkdir()
+    for number in range(16):
+        shutil.copy(file, tmp_path / "trials" / f"trial-{number:02d}.mcap")
     seconds = []
     for jobs in (1, 2):
-        tasks = find_recordings(folder, tmp_path / f"out{jobs}", ("export", "report"), ("csv",))
+        out = tmp_path / f"out{jobs}"
+        tasks = find_recordings(tmp_path / "trials", out, ("replay", "export", "report"), ("csv",))
         began = time.monotonic()
         assert all(result.status == "done" for result in run_in_pool(tasks, jobs))
         seconds.append(time.monotonic() - began)
