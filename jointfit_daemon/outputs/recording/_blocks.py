@@ -219,15 +219,13 @@ def _read_chunk(start: int, end: int, content: bytes) -> Block:
         # A frame that claims another size could expand to any number of bytes.
         if zstandard.get_frame_parameters(data).content_size != chunk.uncompressed_size:
             raise _DamageError("the compressed size of a chunk contradicts its content")
-        data = _DECOMPRESSOR.decompress(data)
+        # A decompressor of its own: a shared one is not safe in several threads.
+        data = zstandard.ZstdDecompressor(max_window_size=MOST_RECORD_BYTES).decompress(data)
     elif chunk.compression:
         raise _DamageError(f"unknown compression {chunk.compression[:20]!r}")
     if zlib.crc32(data) != chunk.uncompressed_crc:
         raise _DamageError("the checksum of a chunk is wrong")
     return ChunkBlock(start, end, data)
-
-
-_DECOMPRESSOR = zstandard.ZstdDecompressor(max_window_size=MOST_RECORD_BYTES)
 
 
 def _read_metadata(start: int, end: int, content: bytes) -> Block:

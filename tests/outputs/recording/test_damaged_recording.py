@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -168,6 +169,14 @@ def test_hostile_records_are_skipped_in_bounded_memory(tmp_path: Path, record: s
     assert list(read_events(path)) == EVENTS
     sizes = [len(block.content) for block in read_blocks(path) if isinstance(block, ChunkBlock)]
     assert max(sizes) < MOST_RECORD_BYTES / 100
+
+
+def test_recordings_are_read_in_several_threads(tmp_path: Path) -> None:
+    path = tmp_path / "recording.mcap"
+    path.write_bytes(recorded()[0])
+    with ThreadPoolExecutor(4) as pool:
+        read = list(pool.map(lambda _: list(read_events(path)), range(60)))
+    assert all(events == EVENTS for events in read)
 
 
 def test_a_recording_of_a_later_version_is_refused(
