@@ -58,6 +58,9 @@ if TYPE_CHECKING:
 
 _DETAIL_S = 10.0
 """Duration of the detail of a long session, s."""
+_UNSHOWN = 0.1
+"""Share of a session without angles at its beginning, such as a calibration, above which the curves
+begin later."""
 _PANEL, _HALF = 320.0, 450.0
 """Widths of a panel, one of three or of two in a row, px."""
 _MOST_POINTS = 800
@@ -72,8 +75,15 @@ def angles_section(results: SessionResults) -> str:
         text = "No joint angle is known: the session has no calibration or no limb states."
         return section("angles", "Joint angles", [paragraph(text)])
 
-    whole = results.start_s, results.end_s
     parts = []
+    known_s, end_s = _first_angle(results), results.end_s
+    if known_s - results.start_s > _UNSHOWN * (end_s - results.start_s):
+        after = decimal(known_s - results.start_s, 0)
+        parts.append(paragraph(f"No angle is known before {after} s, so the curves begin there."))
+        whole = known_s, end_s
+    else:
+        whole = results.start_s, end_s
+
     for joint in results.session.joints:
         names = [angle for owner, angle in results.angles if owner is joint]
         drawings = "".join(_angle_figure(results, joint, angle, whole) for angle in names)
@@ -95,6 +105,12 @@ def angles_section(results: SessionResults) -> str:
     return section("angles", "Joint angles", parts)
 
 
+def _first_angle(results: SessionResults) -> float:
+    """Return the time of the first known value of any angle, s."""
+    known = (joint.t_s[np.isfinite(joint.angles[angle])] for joint, angle in results.angles)
+    return min((float(t_s[0]) for t_s in known if len(t_s)), default=results.start_s)
+
+
 def _detail_start(results: SessionResults) -> float | None:
     """Return the start of the detail: the first walking, or the largest movement, s."""
     if results.end_s - results.start_s < 3.0 * _DETAIL_S:
@@ -106,9 +122,9 @@ def _detail_start(results: SessionResults) -> float | None:
     joint, angle = results.angles[0]
     starts = np.arange(results.start_s, results.end_s - _DETAIL_S, _DETAIL_S / 2.0)
     edges = np.searchsorted(joint.t_s, np.column_stack([starts, starts + _DETAIL_S]))
-    spreads = [
-        np.nan_to_num(np.nanstd(joint.angles[angle][a:b])) if b > a else 0.0 for a, b in edges
-    ]
+    windows = [joint.angles[angle][a:b] for a, b in edges]
+    known = [window[np.isfinite(window)] for window in windows]
+    spreads = [np.std(window) if len(window) else 0.0 for window in known]
     return float(starts[int(np.argmax(spreads))])
 
 

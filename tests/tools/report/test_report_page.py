@@ -156,6 +156,18 @@ def test_long_session_stays_small_and_shows_its_peak() -> None:
     assert "−57.3° to 80.0°" in text
 
 
+def test_curves_begin_at_the_end_of_a_calibration() -> None:
+    t_s = np.arange(0.0, 100.0, 0.01)
+    angle = np.where(t_s < 60.0, np.nan, np.sin(t_s))
+    joint = JointSeries("knee", t_s, {"flexion": angle}, {})
+    text = render_report(SessionData("calibrated", joints=(joint,)))
+    curves = text[text.index("Joint angles</h2>") : text.index("Detail of 10 s")]
+    assert "No angle is known before 60 s" in curves
+    ticks = [int(tick) for tick in re.findall(r">(\d+)(?: s)?</text>", curves)]
+    assert 70 in ticks
+    assert 15 not in ticks
+
+
 @pytest.mark.system
 @pytest.mark.experiment
 @pytest.mark.timeout(150)
