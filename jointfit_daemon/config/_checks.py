@@ -235,22 +235,26 @@ def body_parts_of(table: ChainTable) -> list[str]:
 
 def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator[Fault]:
     """Check the markers and rigid bodies of ``[mocap]``; keys that had faults are None."""
-    for kind in ("markers", "rigid_body"):
-        for part in getattr(settings, kind) or ():
+    # A value of another type than a table has its fault already.
+    given: dict[str, dict[str, Any]] = {
+        kind: value if isinstance(value := getattr(settings, kind), dict) else {}
+        for kind in ("markers", "rigid_body")
+    }
+    taken = {part for parts in given.values() for part in parts}
+    for kind, bodies in given.items():
+        for part in bodies:
             if table is not None and table.segments:
                 parts = body_parts_of(table)
-                taken = {*(settings.markers or ()), *(settings.rigid_body or ())}
                 yield from check_known_name(f"mocap.{kind}.{part}", part, parts, "segment", taken)
 
-    given: Any = settings.markers or {}
-    readable = {part: names for part, names in given.items() if names is not None}
+    readable = {part: names for part, names in given["markers"].items() if names is not None}
     for part, names in readable.items():
         key = f"mocap.markers.{part}"
         yield from _repeated(key, names)
         planar = table is not None and table.motion == "planar"
         if not planar and len(set(names)) < _LEAST_MARKERS:
             yield Fault(key, "expected at least three different markers", list(names))
-        if part in (settings.rigid_body or {}):
+        if part in given["rigid_body"]:
             yield Fault(f"mocap.rigid_body.{part}", "has markers already; give one of the two")
 
     # A marker belongs to one body part.

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 File = Annotated[
     Path,
     typer.Argument(
-        help="Recording (.mcap), or a file to convert: .trc, .c3d, .sto, .mot, .npz, .csv,"
-        " .parquet, .xdf, .txt of an Xsens program, or a folder: Motion-BIDS, Xsens text."
+        help="Recording (.mcap, or its folder), or a file to convert: .trc, .c3d, .sto, .mot,"
+        " .npz, .csv, .parquet, .xdf, .txt of an Xsens program, or a folder: Motion-BIDS, Xsens text."
     ),
 ]
 To = Annotated[
@@ -75,14 +75,15 @@ def export(
 
 
 def load_data(file: Path) -> SessionData:
-    """Return the session of a recording, or of any other file or folder that can be imported.
+    """Return the session of a recording or its folder, or of a file or folder to import.
 
     Raises
     ------
     ValueError
         Not a file of a known kind, or damaged.
     """
-    if {".mcap", ".jsonl"} & {suffix.lower() for suffix in file.suffixes}:
+    recorded = any(file.glob("*.mcap*")) if file.is_dir() else ".mcap" in file.suffixes
+    if recorded:
         from jointfit_daemon.reprocessing import load_session
 
         return load_session(file)

@@ -341,7 +341,7 @@ def test_check_of_a_missing_file_is_a_usage_error(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["--config", str(tmp_path / "none.toml"), "--check"]) == 2
-    assert "No such file" in capsys.readouterr().err
+    assert "no such file: check the path" in capsys.readouterr().err
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

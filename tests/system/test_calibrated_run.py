@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
-from jointfit_daemon.pipeline import replay_states
+from jointfit_daemon.outputs.recording import read_events
 from jointfit_daemon.pipeline.events import Configured, JobFinished, SourceClosed, SourceOpened
 from jointfit_daemon.reprocessing import verify_recording
 from tests.payload_check import payload_fault
@@ -268,11 +267,7 @@ def replay_the_recording(run: CalibratedRun) -> None:
     assert (opened.count("S1"), opened.count("S2"), opened.count("S3")) == (2, 1, 2)
     assert {e.reason for e in events if isinstance(e, SourceClosed)} == {"lost", "removed"}
 
-    live = list(read_states(run.recording))
-    assert len(live) > 2000
-    assert [encode_state(state) for state in replay_states(events)] == live
-
     verified = verify_recording(run.recording)
     assert verified.passed, verified.lines()
-    assert verified.compared["output/state"] == len(live)
+    assert verified.compared["output/state"] > 2000
     assert {"output/optical", "output/coordinates", "output/notice"} <= verified.compared.keys()

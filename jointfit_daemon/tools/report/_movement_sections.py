@@ -124,7 +124,7 @@ def _detail_start(results: SessionResults) -> float | None:
     edges = np.searchsorted(joint.t_s, np.column_stack([starts, starts + _DETAIL_S]))
     windows = [joint.angles[angle][a:b] for a, b in edges]
     known = [window[np.isfinite(window)] for window in windows]
-    spreads = [np.std(window) if len(window) else 0.0 for window in known]
+    spreads = [float(np.std(window)) if len(window) else 0.0 for window in known]
     return float(starts[int(np.argmax(spreads))])
 
 

@@ -249,9 +249,10 @@ async def test_a_late_answer_of_a_port_without_a_speed_is_no_other_speed(tmp_pat
 
 
 async def test_noise_before_silence_is_reported_without_figures(tmp_path: Path) -> None:
-    line = PtyLine(tmp_path / "imu")
+    line, asked = PtyLine(tmp_path / "imu"), asyncio.Event()
+    serving_line = asyncio.create_task(line.serve(lambda _: asked.set()))
     running = asyncio.create_task(make(tmp_path).run(lambda _: None))
-    await asyncio.sleep(0.2)
+    await asked.wait()  # bytes that arrive before the port is open are discarded
     line.write(b"\x01\x02\x03")
     with pytest.raises(DeviceLostError) as caught:
         await running
@@ -259,6 +260,8 @@ async def test_noise_before_silence_is_reported_without_figures(tmp_path: Path) 
     assert str(caught.value) == (
         f"{tmp_path}/imu: some bytes of noise, then silence: check its power and cable, and `port`"
     )
+    serving_line.cancel()
+    await asyncio.wait([serving_line])
     line.unplug()
 
 

@@ -305,6 +305,8 @@ async def test_the_command_prints_its_url_and_the_missing_broker_and_stops_with_
         *shell, sys.executable, "-m", "jointfit_daemon.tools.__main__", "dashboard",
         "--listen", f"{HOST}:0", "--broker", f"mqtt://{HOST}:{free_port()}",
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+        # The tests themselves may run in the background of a shell that ignores SIGINT.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert process.stdout is not None
     assert process.stderr is not None
