@@ -19,7 +19,8 @@ File = Annotated[
     Path,
     typer.Argument(
         help="Recording (.mcap, or its folder), or a file to convert: .trc, .c3d, .sto, .mot,"
-        " .npz, .csv, .parquet, .xdf, .txt of an Xsens program, or a folder: Motion-BIDS, Xsens text."
+        " .npz, .csv, .parquet, .xdf, .txt of an Xsens program, or a folder: Motion-BIDS, Xsens"
+        " text."
     ),
 ]
 To = Annotated[

@@ -197,6 +197,7 @@ def test_a_process_that_dies_fails_only_its_recording(
 
 
 @pytest.mark.system
+@pytest.mark.experiment
 def test_a_killed_batch_continues_and_gives_the_same_files(
     recordings: Recordings, tmp_path: Path
 ) -> None:
