@@ -166,7 +166,7 @@ def repair_unfinished(
     """Repair the files that earlier runs of `rig` left unfinished.
 
     A repaired file gets its final name. The unfinished one is deleted; if it was damaged before its
-    end, it is renamed to ``….bad`` instead.
+    end, or a file with the final name exists, it is renamed to ``….bad`` instead.
 
     Returns
     -------
@@ -182,10 +182,15 @@ def repair_unfinished(
         if recorded_rig_name(source.name) != rig:
             continue
         target = source.with_name(source.name.removesuffix(UNFINISHED))
+        damaged = source.with_name(source.name + DAMAGED)
         try:
+            if target.exists():  # a person has repaired it
+                source.rename(damaged)
+                found.append(f"{source.name}: {target.name} exists already; renamed {damaged.name}")
+                continue
             result = repair_recording(source, target, pause=True, stopped=stopped)
             if result.gaps:
-                source.rename(source.with_name(source.name + DAMAGED))
+                source.rename(damaged)
             else:
                 source.unlink()
             found.append(result)

@@ -264,3 +264,21 @@ async def test_files_of_earlier_runs_are_repaired_at_the_start(tmp_path: Path) -
     assert not torn.exists()
     assert other.exists()
     assert list(read_events(torn.with_suffix(""))) == some
+
+
+async def test_an_unfinished_file_that_a_person_repaired_is_renamed(tmp_path: Path) -> None:
+    path = write_recording(tmp_path, [Tick(number) for number in range(100)])
+    repaired = path.rename(tmp_path / "rig-20200101T000000-0001.mcap")
+    content = repaired.read_bytes()
+    unfinished = tmp_path / f"{repaired.name}.part"
+    unfinished.write_bytes(content[:-300])
+    reports: list[RecordingReport] = []
+    recorder = Recorder(tmp_path, "rig", report=reports.append)
+    running = asyncio.create_task(recorder.run(), name="recorder")
+    await until(lambda: bool(reports))
+    running.cancel()
+    await asyncio.wait([running])
+    assert f"{repaired.name} exists already" in reports[0].text
+    assert repaired.read_bytes() == content
+    assert (tmp_path / f"{unfinished.name}.bad").read_bytes() == content[:-300]
+    assert not unfinished.exists()
