@@ -1,13 +1,11 @@
-"""`jointfit batch` at scale: a Dask cluster that loses a worker, speed of two processes, memory."""
+"""`jointfit batch` at scale: a Dask cluster that loses a worker, and memory."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
 import resource
-import shutil
 import signal
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +15,6 @@ from jointfit_daemon.tools.batch import executors
 from jointfit_daemon.tools.batch.executors import run_in_pool, run_on_cluster
 from jointfit_daemon.tools.batch.find_recordings import find_recordings
 from jointfit_daemon.tools.batch.recording_task import RecordingTask
-from tests.reprocessing import recorded_run
 from tests.tools.batch.deadly_task import process_or_die
 
 if TYPE_CHECKING:
@@ -48,35 +45,12 @@ def test_every_recording_is_processed_once_though_a_worker_is_killed(
     assert sorted(names) == sorted(task.name for task in tasks)
 
 
-def test_two_processes_are_almost_twice_as_fast_as_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if (os.cpu_count() or 1) < 2 or os.getloadavg()[0] > 0.5:
-        pytest.skip("needs two idle processors")
-    monkeypatch.setattr(recorded_run, "END", 5000)  # 50 s, so that the start of processes is short
-    recorded_run.record_run(tmp_path / "recorded")
-    (file,) = (tmp_path / "recorded").iterdir()
-    (tmp_path / "trials").mkdir()
-    for number in range(16):
-        shutil.copy(file, tmp_path / "trials" / f"trial-{number:02d}.mcap")
-    seconds = []
-    for jobs in (1, 2):
-        out = tmp_path / f"out{jobs}"
-        tasks = find_recordings(tmp_path / "trials", out, ("replay", "export", "report"), ("csv",))
-        began = time.monotonic()
-        assert all(result.status == "done" for result in run_in_pool(tasks, jobs))
-        seconds.append(time.monotonic() - began)
-    assert seconds[0] / seconds[1] >= 1.8, seconds
-
-
-def test_memory_stays_flat_over_a_thousand_recordings(
-    recordings: Recordings, tmp_path: Path
-) -> None:
-    tasks = find_recordings(recordings(1000), tmp_path / "out", ("report",), ())
+def test_memory_stays_flat_over_many_recordings(recordings: Recordings, tmp_path: Path) -> None:
+    tasks = find_recordings(recordings(150), tmp_path / "out", ("report",), ())
     peaks_kb = []
     for number, result in enumerate(run_in_pool(tasks, 2)):
         assert result.status == "done", result.error
-        if number in (99, 999):
+        if number in (29, 149):
             peaks_kb.append(worker_kb() + own_kb())
     assert peaks_kb[1] < 1.1 * peaks_kb[0] + 10_000, peaks_kb
 
