@@ -57,9 +57,14 @@ async def lose_and_exchange_markers(
     await listener.until(lambda: {"lost:F2", "exchanged:T1~T3"} <= set(flags()))
     await listener.event("T1", "T1 and T3 look exchanged")
 
-    # the next frame is fitted without the two markers
+    # the next frame in which the cameras see both is fitted without them
     excluded_us = listener.latest["optical/chain"]["t_us"]
-    await listener.until(lambda: listener.latest["optical/chain"]["t_us"] > excluded_us)
+
+    def is_later_with_both(payload: dict[str, Any]) -> bool:
+        both = payload["error_m"]["T1"], payload["error_m"]["T3"]
+        return bool(payload["t_us"] > excluded_us and None not in both)
+
+    await listener.until(lambda: is_later_with_both(listener.latest["optical/chain"]))
     faulty = listener.latest["optical/chain"]
 
     await simulator.say("show F2")

@@ -83,7 +83,7 @@ async def errors_deg(scene: Scene, listener: Listener, folder: Path) -> dict[str
     return {n: math.degrees(np.sqrt(np.mean(np.square(angles)))) for n, angles in off.items()}
 
 
-@pytest.mark.timeout(180)
+@pytest.mark.timeout(300)
 async def test_chain_of_three_segments_with_six_sensors_is_calibrated_tracked_and_redonned(
     tmp_path: Path, broker: Broker
 ) -> None:
