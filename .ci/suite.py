@@ -6,9 +6,10 @@ With ``--experiments`` the tests with the marker ``experiment`` run, otherwise a
 leaves a JUnit report in ``build/tests`` or ``build/experiments``; the last line counts the tests of
 both parts and the seconds.
 
-System tests start daemons in real time, which other tests on the same cores can starve. One that
-fails beside others is repeated once, alone: it passes only if it passes then, and the summary names
-it. All other tests get no second chance.
+System tests start daemons in real time, and tests with the marker `real_time` simulate devices that
+send in real time. Other tests on the same cores can starve both. One that fails beside others is
+repeated once, alone: it passes only if it passes then, and the summary names it. All other tests
+get no second chance.
 
 Invariant: the exit status is 0 only if both parts passed.
 """
@@ -51,7 +52,7 @@ def main(arguments: list[str]) -> int:
     parallel = _run(parts[0], reports, ["-n", str(workers), "--dist", "worksteal", *arguments])
     disturbed: list[str] = []
     if parallel == TESTS_FAILED:
-        disturbed = _repeat_system_tests(parts[0], reports)
+        disturbed = _repeat_tests_in_real_time(parts[0], reports)
         parallel = 0 if disturbed else parallel
     alone = _run(parts[1], reports, arguments or _files_of_tests_alone())
 
@@ -79,9 +80,10 @@ def _files_of_tests_alone() -> list[str]:
     return [str(path) for path in files if "mark.alone" in path.read_text(encoding="utf-8")]
 
 
-def _repeat_system_tests(part: str, reports: Path) -> list[str]:
-    """Repeat the failed system tests alone; return their names if this cleared all failures."""
-    selection = ["--last-failed", "--last-failed-no-failures=none", "-m", "system"]
+def _repeat_tests_in_real_time(part: str, reports: Path) -> list[str]:
+    """Repeat failed tests in real time alone; return their names if this cleared all failures."""
+    chosen = "system or real_time"
+    selection = ["--last-failed", "--last-failed-no-failures=none", "-m", chosen]
     if _run(part, reports, selection, report="repeated") != 0:
         return []
     failed = {

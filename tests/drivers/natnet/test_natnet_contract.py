@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Driver
     from jointfit_simulators.imu_device import WireNoise
 
+pytestmark = pytest.mark.real_time
+
 THIGH = RigidBodyAsset("Thigh", ("T1", "T2", "T3"), 1)
 
 

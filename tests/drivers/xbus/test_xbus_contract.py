@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import WireNoise
 
 
+pytestmark = pytest.mark.real_time
+
+
 def settings(folder: Path, **more: Any) -> XbusSettings:
     return XbusSettings(
         id="S1", segment="thigh", driver="xbus", port=str(folder / "imu"), baud=115_200,

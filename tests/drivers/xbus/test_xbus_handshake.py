@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
+pytestmark = pytest.mark.real_time
+
+
 def make(folder: Path, **more: Any) -> XbusImu:
     table: dict[str, Any] = {"baud": 115_200, "silence_s": 0.5} | more
     return XbusImu(

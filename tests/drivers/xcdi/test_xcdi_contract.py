@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import pytest
 from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.driver import Driver
     from jointfit_simulators.imu_device import WireNoise
+
+pytestmark = pytest.mark.real_time
 
 
 def settings(interface: str, channel: str, **more: Any) -> XcdiSettings:

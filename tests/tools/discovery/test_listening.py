@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
     from jointfit_protocols.can import CanFrame
 
+pytestmark = pytest.mark.real_time
+
 Q = (1.0, 0.0, 0.0, 0.0)
 PERIOD_NS = 10_000_000
 LISTEN_S = 0.4
