@@ -7,7 +7,7 @@ leaves a JUnit report in ``build/tests`` or ``build/experiments``; the last line
 both parts and the seconds.
 
 System tests start daemons in real time, and tests with the marker `real_time` simulate devices that
-send in real time. Other tests on the same cores can starve both. One that fails beside others is
+send in real time. Other tests on the same cores can starve both. One that fails while others run is
 repeated once, alone: it passes only if it passes then, and the summary names it. All other tests
 get no second chance.
 

@@ -3,7 +3,7 @@
 Invariant: each gateway has a connection of its own and sends the recorded messages of one real
 daemon, at their recorded times, shifted against the other gateways. After a loss of the connection
 it connects again as the daemon does, and sends its retained messages first. The process prints a
-line when all are connected, ends when its input is closed, and prints what it sent as JSON.
+line when all are connected, ends when its input is closed, and prints its counts as JSON.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class SimulatedGateway:
 
 
 async def run(port: int, traffic: Path, count: int) -> Sent:
-    """Run gateways until the input is closed; return what they sent."""
+    """Run gateways until the input is closed; return the counts of all."""
     sent = Sent()
     period_s, messages = load_traffic(traffic)
     gateways = [SimulatedGateway(port, number, sent) for number in range(count)]

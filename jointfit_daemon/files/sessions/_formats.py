@@ -57,7 +57,7 @@ class SessionFormat:
     """A format that sessions are written to."""
 
     contents: str
-    """What its files hold."""
+    """Content of its files."""
     write: Writer
 
 

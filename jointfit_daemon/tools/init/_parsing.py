@@ -21,7 +21,7 @@ _YES, _NO = ("y", "yes", "true", "1"), ("n", "no", "false", "0")
 
 
 class AnswerError(ValueError):
-    """An answer cannot be used; the message contains what was found and what is expected."""
+    """An answer cannot be used; the message contains the answer and the expected form."""
 
 
 def parse_answer(

@@ -24,7 +24,7 @@ _BRANCHED_TURN_DEG = 35.0
 _LEAST_HORIZONTAL = 0.1
 """Least horizontal part of the direction ahead."""
 _LONGEST_LABEL = 12
-"""Most cells for the name of a joint beside the figure."""
+"""Most cells for the name of a joint next to the figure."""
 
 
 def limb_lines(

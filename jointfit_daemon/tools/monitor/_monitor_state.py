@@ -1,4 +1,4 @@
-"""State of the monitor beside the rig: connection, views, keys, and answers of the daemon.
+"""State of the monitor apart from the rig: connection, views, keys, and answers of the daemon.
 
 Invariants: no clock, no I/O, no terminal. A key changes the state, or returns an action for the
 program.
@@ -180,7 +180,7 @@ class MonitorState:
                 return ChooseRig(bases[min(self.cursor, len(bases) - 1)])
             return None
 
-        # Keys of a rig: views first, then what moves in them, then requests.
+        # Keys of a rig: views first, then selections in them, then requests.
         if key.isdecimal() and 1 <= int(key) <= len(VIEWS):
             self._show(VIEWS[int(key) - 1])
         elif key in {"tab", "shift+tab"}:
@@ -274,7 +274,7 @@ def _fault_text(answer: Mapping[str, Any]) -> str:
 
 
 def _words_of(command: str, answer: Mapping[str, Any]) -> str:
-    """Return what a request did, in words."""
+    """Return the effect of a request, in words."""
     data = answer.get("data")
     data = data if isinstance(data, dict) else {}
     if command == "mark":

@@ -28,7 +28,7 @@ _YIELD_EVENTS = 200
 
 @dataclass(slots=True)
 class PlaySummary:
-    """What was played."""
+    """Counts and duration of a replay."""
 
     rig: str = ""
     events: int = 0
