@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.outputs.payloads import BridgeHealth
-    from jointfit_daemon.outputs.recording import Recorder, RecordingHealth
+    from jointfit_daemon.outputs.recording import Recorder
     from jointfit_daemon.pipeline.events import Event, Reply, Request
     from jointfit_daemon.supervisor.requests import Handler
 
@@ -169,7 +169,6 @@ class RequestHandlers:
         """Start or stop to record, or return the state; repetitions change nothing."""
         recorder, action = self._daemon.recorder, request.arguments["action"]
         try:
-            health: RecordingHealth | None
             if action == "start":
                 health = await recorder.start()
             elif action == "stop":
@@ -180,13 +179,9 @@ class RequestHandlers:
             text = f"the file cannot be created: {error}: correct the folder of [recording]"
             return request.refusal("record.action", text)
 
-        state = {"directory": str(recorder.directory)}
-        if health is None:
-            nothing = {"file": "", "written_bytes": 0, "lost": 0, "failure": None, "active": False}
-            return request.reply("ok", state | nothing)
         found = asdict(health)
         del found["backlog_bytes"]
-        return request.reply("ok", state | found)
+        return request.reply("ok", {"directory": str(recorder.directory), **found})
 
     async def selftest(self, request: Request) -> Reply:
         """Check devices, clocks, store, broker and host."""

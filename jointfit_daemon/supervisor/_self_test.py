@@ -189,10 +189,10 @@ def _store(host: HostState, health: BridgeHealth) -> Iterator[Finding]:
         yield Finding("disk", "", level, text, "" if level == "ok" else remedy)
 
     recording = health.recording
-    if recording is not None and recording.failure is not None:
+    if recording is not None and recording.active and recording.failure is not None:
         text = f"interrupted, {recording.lost} messages lost: {recording.failure}"
         yield Finding("recording", "", "error", text, f"{remedy}; the recording resumes by itself")
-    elif recording is not None:
+    elif recording is not None and recording.active:
         yield Finding("recording", "", "ok", f"{recording.file}, {recording.written_bytes} bytes")
 
 

@@ -100,7 +100,7 @@ log = logging.getLogger(__name__)
 CHECK_S = 0.1
 """Interval between checks of the event loop's delay and of due health messages, s."""
 HEALTH_SOON_S = 0.5
-"""Delay of the health message after a device was lost or found, s."""
+"""Delay of the health message after a device was lost or found or a recording began, s."""
 KNOWN_S = 2.0
 """Time after the start for which a silent source is awaited, s."""
 FAREWELL_S = 0.5
@@ -278,6 +278,8 @@ class Daemon:
         self._topics.publish_notice(notice)
         if self._recorder is not None:
             self._recorder.daemon_message(DAEMON_NOTICE, notice)
+        if kind is NoticeKind.RECORDING:
+            self._publish_health_soon()
 
     # --- outputs of the core -----------------------------------------------------------------
 
@@ -298,7 +300,7 @@ class Daemon:
             case CalibrationStatus():
                 self._calibration = output
             case DeviceStatus():
-                self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
+                self._publish_health_soon()
 
     # --- requests ----------------------------------------------------------------------------
 
@@ -383,6 +385,9 @@ class Daemon:
         state = StateHealth(self._state_fault, self._calibrations.fault)
         recording = None if self._recorder is None else self._recorder.health()
         return BridgeHealth(core, self._process_health, link, state, recording)
+
+    def _publish_health_soon(self) -> None:
+        self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
 
     def _publish_health(self) -> None:
         self._process_health = self._process.health()

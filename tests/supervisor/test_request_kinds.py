@@ -221,13 +221,17 @@ async def test_a_recording_is_started_and_stopped_once(gateway: Running) -> None
         started = await gateway.ask("record", {"action": "start"})
         file = started.data["file"]
         assert first_start.data["file"] == file
-        assert gateway.daemon.health().recording is not None
+        recording_health = gateway.daemon.health().recording
+        assert recording_health is not None
+        assert recording_health.active
         await gateway.ask("mark", {"text": "start"})
         stopped = await gateway.ask("record", {"action": "stop"})
         again = await gateway.ask("record", {"action": "stop"})
         assert (stopped.data["file"], stopped.data["active"]) == (file, False)
-        assert (again.status, again.data["file"]) == ("ok", "")
-        assert gateway.daemon.health().recording is None
+        assert (again.status, again.data) == ("ok", stopped.data)
+        recording_health = gateway.daemon.health().recording
+        assert recording_health is not None
+        assert (recording_health.active, recording_health.file) == (False, file)
 
     recording = open_recording(Path(str(started.data["directory"])) / str(file))
     first, *rest = recording.events()

@@ -224,7 +224,7 @@ def _process(health: BridgeHealth) -> Iterator[Metric]:
         ),
         (
             "jointfit_recording_backlog_bytes",
-            None if recording is None else recording.backlog_bytes,
+            None if recording is None or not recording.active else recording.backlog_bytes,
             "Recorded data not yet written.",
         ),
         ("process_resident_memory_bytes", _resident_bytes(), "Resident memory."),

@@ -107,10 +107,12 @@ class RecordAnswer(Table):
     """Answer to ``record``."""
 
     directory: str
-    file: str = Field(description="name of the open file, after `stop` of the last one; or empty")
+    file: str = Field(description="name of the open file, else of the last one; or empty")
+    duration_s: float = Field(description="from the start of the recording to now, or to its end")
     written_bytes: int
     lost: int = Field(description="messages that the disk did not take")
     failure: str | None = Field(description="why the recording is interrupted")
+    free_bytes: int | None = Field(description="free space for recordings")
     active: bool
 
 

@@ -153,13 +153,15 @@ class StateFaults(Table):
 
 
 class Recording(Table):
-    """State of the recording."""
+    """State of the present recording, or of the last one."""
 
     file: str
+    duration_s: float
     written_bytes: int
     backlog_bytes: int
     lost: int
     failure: str | None
+    free_bytes: int | None
     active: bool
 
 

@@ -7,6 +7,7 @@ the limit are counted, and the recording contains a gap in their place.
 from __future__ import annotations
 
 import asyncio
+import shutil
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -44,22 +45,28 @@ _MESSAGE_BYTES: dict[type, int] = {LimbState: 6000}
 """Memory of messages by their type, bytes."""
 _OTHER_BYTES = 500
 """Memory of any other message, bytes; the data of a chunk are added."""
+_FREE_S = 5.0
+"""Interval between measurements of the free space, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingHealth:
-    """State of a recording."""
+    """State of the present recording, or of the last one."""
 
-    file: str
-    """Name of the open file; empty without one."""
-    written_bytes: int
-    backlog_bytes: int
+    file: str = ""
+    """Name of the open file, or of the last one; empty without one."""
+    duration_s: float = 0.0
+    """Time from the start of the recording to now, or to its end."""
+    written_bytes: int = 0
+    backlog_bytes: int = 0
     """Memory of messages that are not yet written."""
-    lost: int
+    lost: int = 0
     """Messages that the disk did not take."""
-    failure: str | None
+    failure: str | None = None
     """Reason for which messages are not written at present; None while they are."""
-    active: bool = True
+    free_bytes: int | None = None
+    """Free space for recordings; None while it is unknown."""
+    active: bool = False
     """Whether the recorder is started."""
 
 
@@ -97,6 +104,9 @@ class Recorder:
         self._writer: SessionWriter | None = None
         self._snapshot = self._before = Snapshot()
         self._t_ns = time.monotonic_ns()
+        self._began_s = 0.0
+        self._free_bytes: int | None = None
+        self._last = RecordingHealth()
         self._clear()
         if autostart:
             self.begin(with_daemon=True)
@@ -112,6 +122,7 @@ class Recorder:
         """Record from now on; the file is created by the next write."""
         self._clear()
         self._before = self._snapshot
+        self._began_s = time.monotonic()
         writer = SessionWriter(self._directory, self._name, with_daemon, self._limits)
         self._writer = writer
         return writer
@@ -152,17 +163,22 @@ class Recorder:
 
     # --- state -------------------------------------------------------------------------------
 
-    def health(self) -> RecordingHealth | None:
-        """Return the state of the recording; None while nothing is recorded."""
-        return None if self._writer is None else self._health(self._writer)
+    def health(self) -> RecordingHealth:
+        """Return the state of the recording; while nothing is recorded, that of the last one."""
+        if self._writer is None:
+            return replace(self._last, free_bytes=self._free_bytes)
+        return self._health(self._writer)
 
     def _health(self, writer: SessionWriter) -> RecordingHealth:
         return RecordingHealth(
             "" if writer.file is None else writer.file.name.removesuffix(UNFINISHED),
+            time.monotonic() - self._began_s,
             writer.written_bytes,
             self._pending_bytes + writer.unwritten_bytes,
             writer.lost + self._lost + (0 if self._gap is None else self._gap.count),
             writer.fault,
+            self._free_bytes,
+            active=True,
         )
 
     @property
@@ -192,26 +208,29 @@ class Recorder:
             if writer.file is None and writer.fault is not None:
                 self._writer = None
                 raise OSError(writer.fault)
+            self._report(RecordingReport(f"recording started: {self._health(writer).file}"))
         return self._health(writer)
 
-    async def stop(self) -> RecordingHealth | None:
-        """Write the rest, close the file and return its last state; None without a recording."""
+    async def stop(self) -> RecordingHealth:
+        """Write the rest, close the file and return its last state; do nothing without one."""
         async with self._writing:
             writer = self._writer
-            if writer is None:
-                return None
-            last, rest = self._health(writer), self._take_rest()
-            self._writer = None
-            self._clear()
-            await _in_thread(lambda: _close(writer, rest))
-            self._pass_reports(writer)
-        return replace(
-            last,
-            written_bytes=writer.written_bytes,
-            backlog_bytes=0,
-            failure=writer.fault,
-            active=False,
-        )
+            if writer is not None:
+                self._last, rest = replace(self._health(writer), active=False), self._take_rest()
+                self._writer = None
+                self._clear()
+                await _in_thread(lambda: _close(writer, rest))
+                self._pass_reports(writer)
+                self._last = replace(
+                    self._last,
+                    written_bytes=writer.written_bytes,
+                    backlog_bytes=0,
+                    failure=writer.fault,
+                )
+                size_mb = writer.written_bytes / 1e6
+                text = f"recording stopped: {self._last.file}, {size_mb:.1f} MB"
+                self._report(RecordingReport(text))
+        return self.health()
 
     async def run(self) -> None:
         """Write every 0.3 s until cancelled; then write the rest and close the file.
@@ -220,16 +239,29 @@ class Recorder:
         """
         stopped = threading.Event()
         repair = asyncio.create_task(self._repair(stopped), name="recording repair")
+        measure_s = 0.0
         try:
             while True:
                 began_s = time.monotonic()
                 await self._write()
+                if began_s >= measure_s:
+                    measure_s = began_s + _FREE_S
+                    await _in_thread(self._measure_free_space)
                 took_s = time.monotonic() - began_s
                 await asyncio.sleep(max(_SHORTEST_PAUSE_S, FLUSH_S - took_s))
         finally:
             stopped.set()
             repair.cancel()
             self.close()
+
+    def _measure_free_space(self) -> None:
+        # The folder is created by the first recording.
+        places = (self._directory, *self._directory.parents)
+        try:
+            place = next(place for place in places if place.exists())
+            self._free_bytes = shutil.disk_usage(place).free
+        except OSError:
+            self._free_bytes = None
 
     async def _repair(self, stopped: threading.Event) -> None:
         found = await asyncio.to_thread(

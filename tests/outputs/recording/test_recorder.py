@@ -6,6 +6,7 @@ import asyncio
 import errno
 import os
 import time
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -109,7 +110,8 @@ def test_the_oldest_files_of_the_rig_are_deleted_and_reported(tmp_path: Path) ->
 async def test_a_recording_started_later_begins_with_the_state(
     tmp_path: Path, table: dict[str, Any]
 ) -> None:
-    recorder = Recorder(tmp_path, "rig", autostart=False)
+    reports: list[RecordingReport] = []
+    recorder = Recorder(tmp_path, "rig", report=reports.append, autostart=False)
     configured = Configured(1, parse_rig(table), None)
     for event in (
         configured,
@@ -120,7 +122,7 @@ async def test_a_recording_started_later_begins_with_the_state(
         *chunks(5, 9),
     ):
         recorder.event(event)
-    assert recorder.health() is None
+    assert not recorder.health().active
 
     health = await recorder.start()
     again = await recorder.start()
@@ -128,9 +130,14 @@ async def test_a_recording_started_later_begins_with_the_state(
     assert recorder.path == tmp_path / f"{health.file}.part"
     recorder.event(Tick(10))
     stopped = await recorder.stop()
-    assert stopped is not None
-    assert (stopped.file, stopped.active) == (health.file, False)
-    assert await recorder.stop() is None
+    assert (stopped.file, stopped.active, stopped.backlog_bytes) == (health.file, False, 0)
+    assert stopped.written_bytes == (tmp_path / health.file).stat().st_size
+    assert stopped.duration_s > 0
+    assert await recorder.stop() == recorder.health() == stopped
+    texts = [report.text for report in reports]
+    assert texts[0] == f"recording started: {health.file}"
+    assert texts[1].startswith(f"recording stopped: {health.file}, 0.0 MB")
+    assert len(texts) == 2
 
     recording = open_recording(tmp_path / health.file)
     assert not recording.began_with_daemon
@@ -148,7 +155,25 @@ async def test_a_start_that_creates_no_file_is_refused(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "file", "rig", autostart=False)
     with pytest.raises(OSError, match=r"file: (Not a directory|File exists)"):
         await recorder.start()
-    assert recorder.health() is None
+    assert not recorder.health().active
+
+
+async def test_the_free_space_is_known_before_the_folder_exists(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Path] = []
+
+    def usage(place: Path) -> object:
+        asked.append(place)
+        return SimpleNamespace(free=93 * 10**9)
+
+    monkeypatch.setattr("shutil.disk_usage", usage)
+    recorder = Recorder(tmp_path / "state" / "recordings", "rig", autostart=False)
+    assert recorder.health().free_bytes is None
+    running = asyncio.create_task(recorder.run())
+    await until(lambda: recorder.health().free_bytes == 93 * 10**9)
+    running.cancel()
+    assert asked == [tmp_path]
 
 
 class FailingDisk:
@@ -181,9 +206,7 @@ def test_a_disk_that_is_full_for_a_while_loses_nothing(
     disk.room_bytes = room_bytes
     write(recorder, some[50:100])
     write(recorder, some[100:150])
-    health = recorder.health()
-    assert health is not None
-    assert "No space left" in str(health.failure)
+    assert "No space left" in str(recorder.health().failure)
     disk.room_bytes = float("inf")
     write(recorder, some[150:])
     recorder.close()
@@ -210,7 +233,6 @@ def test_a_disk_that_stays_full_causes_one_gap(
     (gap,) = open_recording(tmp_path).gaps()
     assert gap.first_sequence + gap.count == 500
     assert "No space left" in gap.reason
-    assert health is not None
     assert (health.failure, health.lost) == (None, gap.count)
     found = list(read_events(tmp_path))
     restored = found.pop(gap.first_sequence)  # the state after the gap
