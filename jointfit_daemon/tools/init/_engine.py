@@ -140,22 +140,17 @@ def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -
 
     extended = {**answers, asked.key: value}
     if asked.question.kind == "device" and value != LATER:
-        _check_device(extended, found, asked.subject)
+        if _PORT_WITHOUT_FOLDER.fullmatch(value):
+            raise AnswerError(
+                f"found {value!r}, expected the path of a serial port, as /dev/{value}, or the"
+                " name of a CAN interface, as can0"
+            )
+        if not drivers_for(extended, found, asked.subject):
+            wiring = wiring_of(extended, value)
+            raise AnswerError(f"{value}: no installed driver reads sensors on {wiring} connections")
     if faults := rig_faults(extended, found) - rig_faults(answers, found):
         raise AnswerError("; ".join(sorted(faults)))
     return extended
-
-
-def _check_device(answers: Mapping[Key, Any], found: Found, sensor: str) -> None:
-    device = answers["device", sensor]
-    if _PORT_WITHOUT_FOLDER.fullmatch(device):
-        raise AnswerError(
-            f"found {device!r}, expected the path of a serial port, as /dev/{device}, or the name"
-            " of a CAN interface, as can0"
-        )
-    if not drivers_for(answers, found, sensor):
-        wiring = wiring_of(answers, device)
-        raise AnswerError(f"{device}: no installed driver reads sensors on {wiring} connections")
 
 
 _PORT_WITHOUT_FOLDER = re.compile(r"tty\w+|COM\d+", re.IGNORECASE)

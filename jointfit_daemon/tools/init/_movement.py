@@ -110,7 +110,10 @@ async def find_moved(
         for each in ready.values():
             each.start, each.turned_rad = None, 0.0
         show(f"  Turn the sensor {sensor} by a quarter turn now ({TURN_S:g} s) …")
-        await _until(lambda: _turned(ready) is not None, TURN_S)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(TURN_S):
+                while _turned(ready) is None:  # noqa: ASYNC110 - facts of several devices
+                    await asyncio.sleep(_POLL_S)
         turned = _turned(ready)
     finally:
         for task in tasks:
@@ -146,10 +149,3 @@ def _turned(listeners: Mapping[str, _Listener]) -> str | None:
     second = others[0][1].turned_rad if others else 0.0
     is_clear = first[1].turned_rad >= TURN_RAD and second <= REST_SHARE * first[1].turned_rad
     return first[0] if is_clear else None
-
-
-async def _until(condition: Callable[[], bool], limit_s: float) -> None:
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(limit_s):
-            while not condition():  # noqa: ASYNC110 - facts of several devices
-                await asyncio.sleep(_POLL_S)

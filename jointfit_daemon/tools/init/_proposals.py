@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from itertools import count
+from itertools import chain, count
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.tools.init._answers import (
@@ -18,8 +18,6 @@ from jointfit_daemon.tools.init._answers import (
 from jointfit_daemon.tools.init._found import FoundDevice
 
 if TYPE_CHECKING:
-    from collections.abc import Container
-
     from jointfit_daemon.tools.init._found import Found
 
 Given = Mapping[Key, Any]
@@ -35,13 +33,6 @@ _ID_STEP = 0x100
 """Distance of the identifiers of two sensors in stand-ins."""
 
 
-def _unused(name: str, used: Container[str]) -> str:
-    """Return `name`, with a number if it is used."""
-    if name not in used:
-        return name
-    return next(f"{name}-{k}" for k in count(2) if f"{name}-{k}" not in used)
-
-
 def sensor_rate(answers: Given, _found: Found, _subject: str) -> Any:
     """Return the rate of the poses, if a sensor can be set to it."""
     rate = answers["output_rate_hz", ""]
@@ -53,7 +44,9 @@ def sensors(answers: Given, _found: Found, segment: str) -> tuple[str, ...]:
     used = {*sensors_of(answers)}
     names = []
     for place in limb_of(answers).places[segment]:
-        names.append(_unused(f"{segment.replace('_', '-')}-{place}", used))
+        plain = f"{segment.replace('_', '-')}-{place}"
+        numbered = (f"{plain}-{k}" for k in count(2))
+        names.append(next(name for name in chain((plain,), numbered) if name not in used))
         used.add(names[-1])
     return tuple(names)
 

@@ -40,16 +40,8 @@ Propose = Callable[[Given, Found, str], Any]
 ONCE = ("",)
 
 
-def _once(_answers: Given, _found: Found) -> tuple[str, ...]:
-    return ONCE
-
-
 def _nothing(_answers: Given, _found: Found, _subject: str) -> Any:
     return None
-
-
-def _no_choices(_answers: Given, _found: Found, _subject: str) -> tuple[FoundDevice, ...]:
-    return ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +56,13 @@ class Question:
     help: str
     group: str = ""
     """Adjacent questions of a group are asked subject by subject."""
-    subjects: Callable[[Given, Found], tuple[str, ...]] = _once
+    subjects: Callable[[Given, Found], tuple[str, ...]] = lambda _answers, _found: ONCE
     """Subjects; none if the question does not apply to the answers before it."""
     default: Propose = _nothing
     """Proposal; None without one."""
     stand_in: Propose = _nothing
     """Valid answer in place of a missing default, for the check of the answers before it."""
-    choices: Callable[[Given, Found, str], tuple[FoundDevice, ...]] = _no_choices
+    choices: Callable[[Given, Found, str], tuple[FoundDevice, ...]] = lambda *_: ()
     """Entries of the list that is shown."""
     optional: bool = False
     """Whether the answer may be empty."""

@@ -84,10 +84,14 @@ def monitor(
         )
     if broker is None and rig is None and not any(options[1:]) and _DEFAULT_RIG.is_file():
         rig = _DEFAULT_RIG
-    settings = (
-        _rig_settings(rig, base)
-        if rig is not None
-        else _broker_settings(
+    if rig is not None:
+        from jointfit_daemon.config import load_rig
+
+        settings = load_rig(rig).mqtt
+        if base:
+            settings = settings.model_copy(update={"base": base.strip("/")})
+    else:
+        settings = _broker_settings(
             broker or _DEFAULT_BROKER,
             base=base,
             ca=ca,
@@ -95,7 +99,6 @@ def monitor(
             password_file=password_file,
             request_key_file=request_key_file,
         )
-    )
     if not _has_terminal():
         raise ValueError(
             "standard input and standard error are no terminal: use ssh -t HOST jointfit monitor,"
@@ -128,13 +131,6 @@ def shows_unicode(environment: Mapping[str, str]) -> bool:
     # Python itself sets LC_CTYPE to C.UTF-8 in the locale C, so it is not asked.
     locale = environment.get("LC_ALL") or environment.get("LANG") or "UTF-8"
     return "UTF8" in locale.upper().replace("-", "")
-
-
-def _rig_settings(rig: Path, base: str | None) -> MqttSettings:
-    from jointfit_daemon.config import load_rig
-
-    settings = load_rig(rig).mqtt
-    return settings.model_copy(update={"base": base.strip("/")}) if base else settings
 
 
 def _broker_settings(
