@@ -41,8 +41,9 @@ test-cpu: $(STAMP)  ## the numerical tests six times, as on other processors
 test-root:  ## the tests and the demo on a fresh minimal Debian, as a user without root (mmdebstrap; root or sudo)
 	@$(PYTHON) .ci/minimal_root.py
 
-test-vm: $(STAMP)  ## virtual machines: SocketCAN on a real vcan; the .deb under real systemd, with broker and faults
+test-vm: $(STAMP)  ## virtual machines: SocketCAN on a real vcan; power cuts; the .deb under real systemd, with broker and faults
 	@$(BIN)/python .ci/light_vm.py
+	@$(BIN)/python .ci/power_cut.py
 	@$(BIN)/python .ci/full_vm.py $(ARGS)
 
 $(VENV)/.fuzz: $(STAMP)

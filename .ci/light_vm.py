@@ -38,7 +38,7 @@ CAN_MODULES = (
 HIDDEN = ("/tmp", "/run", "/var/tmp", "/mnt")
 """Folders that are empty in the guest; needed parts of them are mounted back."""
 
-INIT = """\
+PREPARE = """\
 #!/bin/sh
 # PID 1 of the guest. It must power off by itself: a PID 1 that returns is a kernel panic.
 export PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/tmp LANG=C.UTF-8 CI=1
@@ -54,12 +54,16 @@ mkdir -p /dev/pts /dev/shm
 mount -t devpts pts /dev/pts
 mount -t tmpfs shm /dev/shm
 cd {checkout}
+"""
+TESTS = """\
 {python} {script} --guest-modules
 ip link set lo up
 ip link add dev vcan0 type vcan && ip link set vcan0 up && echo "light_vm: vcan0 is up"
 {python} -m pytest --color=no -p no:cacheprovider --basetemp=/tmp/pytest \\
     --junitxml=/mnt/out/junit.xml {tests}
 echo $? > /proc/exitcode
+"""
+END = """\
 exec {python} -c 'import ctypes; ctypes.CDLL(None).reboot(0x4321fedc)'
 """
 
@@ -78,9 +82,12 @@ def main() -> int:
         out = Path(given.out).resolve() if given.out else work / "out"
         out.mkdir(parents=True, exist_ok=True)
         (out / "junit.xml").unlink(missing_ok=True)
-        write_init(work / "init", out, given.tests or ["-m", "vm", "tests/vm"])
+        tests = shlex.join(given.tests or ["-m", "vm", "tests/vm"])
+        script = shlex.quote(str(Path(__file__).resolve()))
+        write_init(work / "init", out, TESTS, script=script, tests=tests)
+        say(f"checkout {CHECKOUT}, Python {sys.executable}, pytest {tests}")
         began = time.monotonic()
-        code = boot(work, given.memory, given.time_limit)
+        code = uml.boot(machine_command(work, given.memory), given.time_limit)
         say(f"the machine ended with {code} after {time.monotonic() - began:.1f} s")
         return uml.judge(code, out / "junit.xml")
 
@@ -114,30 +121,27 @@ def mounts(out: Path) -> list[str]:
     return lines
 
 
-def write_init(path: Path, out: Path, tests: list[str]) -> None:
-    """Write PID 1 of the guest."""
+def write_init(path: Path, out: Path, commands: str, **words: str) -> None:
+    """Write PID 1 of the guest, which runs `commands` in the checkout and powers off."""
     guest = {"LIGHT_VM": "1"} | (uml.NO_AVX if uml.has_amx() else {})
-    text = INIT.format(
+    text = (PREPARE + commands + END).format(
         no_result=uml.NO_RESULT,
         environment=shlex.join(f"{k}={v}" for k, v in guest.items()),
         mounts="\n".join(mounts(out)),
         checkout=shlex.quote(str(CHECKOUT)),
         python=shlex.quote(sys.executable),
-        script=shlex.quote(str(Path(__file__).resolve())),
-        tests=shlex.join(tests),
+        **words,
     )
     path.write_text(text)
     path.chmod(0o755)
-    say(f"checkout {CHECKOUT}, Python {sys.executable}, pytest {shlex.join(tests)}")
 
 
-def boot(work: Path, memory: str, limit_s: float) -> int:
-    """Run the machine on the host's own files, read-only."""
-    command = [
+def machine_command(work: Path, memory: str, *more: str) -> list[str]:
+    """Return the command of a machine on the host's own files, read-only."""
+    return [
         uml.UML, f"mem={memory}", "rootfstype=hostfs", "rootflags=/", "ro", f"init={work / 'init'}",
-        *uml.CONSOLE, "quiet", f"uml_dir={work}", "umid=light",
+        *uml.CONSOLE, "quiet", f"uml_dir={work}", "umid=light", *more,
     ]  # fmt: skip
-    return uml.boot(command, limit_s)
 
 
 def load_modules() -> int:

@@ -58,19 +58,7 @@ def boot(command: list[str], limit_s: float, console: IO[bytes] | None = None) -
 
     Returns the guest's exit status, 128 + a signal's number, or `TIMED_OUT`.
     """
-    environment = os.environ | {"PATH": search_path()}
-    if shutil.disk_usage("/dev/shm").free < 1 << 29:  # noqa: S108 - guest memory lies there
-        environment["TMPDIR"] = VOLATILE
-    if has_amx():
-        say("the processor has AMX: hiding its extended state from UML")
-    parent = os.getpid()
-    machine = subprocess.Popen(  # noqa: S603 - a fixed command
-        command, stdin=subprocess.DEVNULL, stdout=console, env=environment, cwd="/",
-        stderr=subprocess.STDOUT if console else None,
-        preexec_fn=lambda: prepare(parent),  # noqa: PLW1509 - there are no threads here
-    )  # fmt: skip
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        signal.signal(number, lambda *_: sys.exit(stop(machine) or 128 + signal.SIGTERM))
+    machine = start(command, console)
     say(f"booted as process {machine.pid}, at most {limit_s:g} s")
     try:
         return exit_status(machine.wait(limit_s))
@@ -79,6 +67,24 @@ def boot(command: list[str], limit_s: float, console: IO[bytes] | None = None) -
         return TIMED_OUT
     finally:
         stop(machine)
+
+
+def start(command: list[str], console: IO[bytes] | int | None = None) -> subprocess.Popen[bytes]:
+    """Start a machine, which ends with this script; `stop` ends it earlier."""
+    environment = os.environ | {"PATH": search_path()}
+    if shutil.disk_usage("/dev/shm").free < 1 << 29:  # noqa: S108 - guest memory lies there
+        environment["TMPDIR"] = VOLATILE
+    if has_amx():
+        say("the processor has AMX: hiding its extended state from UML")
+    parent = os.getpid()
+    machine = subprocess.Popen(  # noqa: S603 - a fixed command
+        command, stdin=subprocess.DEVNULL, stdout=console, env=environment, cwd="/",
+        stderr=None if console is None else subprocess.STDOUT,
+        preexec_fn=lambda: prepare(parent),  # noqa: PLW1509 - there are no threads here
+    )  # fmt: skip
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, lambda *_: sys.exit(stop(machine) or 128 + signal.SIGTERM))
+    return machine
 
 
 def prepare(parent: int) -> None:

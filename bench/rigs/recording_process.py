@@ -1,8 +1,10 @@
 """A process that records four sensors of 400 Hz and the limb states of 100 Hz, until it is killed.
 
-    python -m bench.rigs.recording_process FOLDER [--seconds S] [--without-recorder]
+    python -m bench.rigs.recording_process FOLDER [--seconds S] [--file-seconds S] [--stamps]
+        [--without-recorder]
 
-It writes ``ready`` when it starts to feed, and its cost as JSON at its end.
+It writes ``ready`` when it starts to feed, and its cost as JSON at its end; with ``--stamps`` also
+the arrival of the last chunk, CLOCK_MONOTONIC ns, ten times a second.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from jointfit_daemon.model import Chunk, LimbState
-from jointfit_daemon.outputs.recording import Recorder
+from jointfit_daemon.outputs.recording import Recorder, RecordingLimits
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived
 from tests.pipeline.core_feed import SENSORS, chunk, opening
@@ -23,6 +25,8 @@ from tests.pipeline.core_feed import SENSORS, chunk, opening
 RATE_HZ, STATES_HZ = 400, 100
 PERIOD_S = 0.01
 """Interval between feeds, s: four samples of each sensor, and one state."""
+STAMP_FEEDS = 10
+"""Feeds between two printed stamps."""
 PREPARED = 400
 """Samples of each sensor that are prepared; they are repeated."""
 
@@ -50,27 +54,30 @@ def peak_memory_kib() -> int:
     return int(status.partition("VmHWM:")[2].split()[0])
 
 
-async def record(folder: Path, seconds: float, *, recording: bool) -> None:
+async def record(options: argparse.Namespace) -> None:
     """Feed the recorder in real time, and print the cost."""
     samples, states = prepared_chunks(), prepared_states()
-    recorder = Recorder(folder, "rig", autostart=False)
+    limits = RecordingLimits(file_s=options.file_seconds)
+    recorder = Recorder(options.folder, "rig", limits, autostart=False)
     for event in opening(mocap=False):
         recorder.event(event)
     task = asyncio.create_task(recorder.run(), name="recorder")
     await asyncio.sleep(0.1)
-    if recording:
+    if not options.without_recorder:
         await recorder.start()
 
     print("ready", flush=True)
     began_s, cpu_s, raw_bytes = time.monotonic(), time.process_time(), 0
     per_feed = round(RATE_HZ * PERIOD_S)
-    for feed in range(round(seconds / PERIOD_S)):
+    for feed in range(round(options.seconds / PERIOD_S)):
         await asyncio.sleep(max(0.0, began_s + feed * PERIOD_S - time.monotonic()))
         for number in range(feed * per_feed, (feed + 1) * per_feed):
             for source, data in samples[number % PREPARED]:
                 recorder.event(ChunkArrived(source, Chunk(time.monotonic_ns(), data)))
                 raw_bytes += len(data)
         recorder.output(states[feed % len(states)]._replace(completed_ns=time.monotonic_ns()))
+        if options.stamps and feed % STAMP_FEEDS == 0:
+            print(time.monotonic_ns(), flush=True)
 
     cost = {
         "cpu_s": time.process_time() - cpu_s,
@@ -88,9 +95,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--file-seconds", type=float, default=3600.0)
+    parser.add_argument("--stamps", action="store_true")
     parser.add_argument("--without-recorder", action="store_true")
-    options = parser.parse_args()
-    asyncio.run(record(options.folder, options.seconds, recording=not options.without_recorder))
+    asyncio.run(record(parser.parse_args()))
 
 
 if __name__ == "__main__":

@@ -30,7 +30,11 @@ from jointfit_daemon.outputs.recording._channels import (
 )
 from jointfit_daemon.outputs.recording._description import RecordingGap, RecordingInfo
 from jointfit_daemon.outputs.recording._event_json import EVENT_KINDS, encode_event, encode_json
-from jointfit_daemon.outputs.recording._part_file import PartFile, RecordedAttachment
+from jointfit_daemon.outputs.recording._part_file import (
+    PartFile,
+    RecordedAttachment,
+    sync_directory,
+)
 from jointfit_daemon.outputs.recording._retention import delete_oldest
 from jointfit_daemon.pipeline.events import ChunkArrived, NoticeLevel
 
@@ -217,6 +221,7 @@ class SessionWriter:
         )
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
+            sync_directory(self.directory.parent)
             documents = (before if before.configured else batch.after).attachments()
             part = self._create(info, documents)
         except OSError as error:
@@ -260,6 +265,7 @@ class SessionWriter:
                 continue
             try:
                 part.flush()
+                sync_directory(self.directory)  # not all file systems write the name with the file
             except OSError:  # leave no file without a message behind
                 part.discard()
                 raise

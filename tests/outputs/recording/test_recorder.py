@@ -6,6 +6,7 @@ import asyncio
 import errno
 import os
 import time
+from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -33,7 +34,6 @@ from tests.outputs.recording.recorded_events import write_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from jointfit_daemon.pipeline.events import Event
 
@@ -78,6 +78,23 @@ def test_rotated_files_are_one_recording(tmp_path: Path) -> None:
     files[2].unlink()
     (gap,) = open_recording(files[1]).gaps()
     assert gap.reason == "a file of the session is missing"
+
+
+def test_the_names_of_a_new_file_and_folder_are_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: set[str] = set()
+    fsync = os.fsync
+
+    def sync(fd: int) -> None:
+        fsync(fd)
+        synced.add(str(Path(f"/proc/self/fd/{fd}").readlink()))
+
+    monkeypatch.setattr(os, "fsync", sync)
+    recorder = Recorder(tmp_path / "recordings", "rig")
+    write(recorder, chunks(1, 2))
+    assert synced == {str(tmp_path), str(tmp_path / "recordings")}
+    recorder.close()
 
 
 def test_files_rotate_by_time(tmp_path: Path) -> None:

@@ -1,0 +1,210 @@
+#!/usr/bin/env python3
+"""Cut the power of a virtual machine that records to ext4, and read what its disk contains.
+
+    .ci/power_cut.py [--cuts N] [--seed N] [--time-limit S]
+
+The light virtual machine records four sensors of 400 Hz to a disk of its own. At N random moments
+it is stopped for an instant, and its disk is copied; at the last one it is killed. Such a disk has
+what the guest wrote, and nothing of the pages that it had not yet written. A second machine mounts
+these disks, which replays their journals, and copies the recordings to the host.
+
+Law: every recording opens, lacks at most its last second, and nothing before it.
+
+Exit status: 0; 1 if a recording lacks more; otherwise as of ``light_vm.py``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import suppress
+from pathlib import Path
+from string import ascii_lowercase
+from threading import Thread
+from typing import NamedTuple
+
+import light_vm
+import uml
+from uml import say
+
+from jointfit_daemon.outputs.recording import RecordedMessage, open_recording
+
+DISK_MIB = 48
+LONGEST_LOSS_S = 1.0
+FILE_S = 2.0
+"""Duration of one file, s: long enough to lose too much of it, and some cuts hit its beginning."""
+RECORDED_S = 6.0
+"""Time in which the power is cut, s."""
+RECORD = """\
+mkdir /tmp/disk && mount -t ext4 /dev/ubda /tmp/disk && exec {python} -m \\
+    bench.rigs.recording_process /tmp/disk/recordings --file-seconds {file_s} --stamps
+"""
+HAND_OVER = """\
+mkdir /tmp/disk
+status=0
+for disk in {disks}; do
+  mount -t ext4 /dev/ubd$disk /tmp/disk && cp -r /tmp/disk/recordings /mnt/out/$disk \\
+      && umount /tmp/disk || status=1
+done
+echo $status > /proc/exitcode
+"""
+
+
+class RecordingMachine:
+    """A machine that records to its disk."""
+
+    def __init__(self, work: Path) -> None:
+        self.stamps_ns: list[int] = []
+        """Arrivals of some chunks in the guest, CLOCK_MONOTONIC ns of the guest."""
+        self.console: list[str] = []
+        self._disk = work / "disk"
+        with self._disk.open("wb") as file:
+            file.truncate(DISK_MIB << 20)
+        mke2fs = shutil.which("mke2fs", path=uml.search_path())
+        subprocess.run([str(mke2fs), "-q", "-t", "ext4", str(self._disk)], check=True)  # noqa: S603 - ours
+
+        light_vm.write_init(work / "init", work / "out", RECORD, file_s=str(FILE_S))
+        command = light_vm.machine_command(work, "256M", f"ubd0={self._disk}")
+        self._machine = uml.start(command, subprocess.PIPE)
+        Thread(target=self._read_console, daemon=True).start()
+
+    def _read_console(self) -> None:
+        for line in self._machine.stdout or ():
+            text = line.decode(errors="replace").strip()
+            if text.isdigit():
+                self.stamps_ns.append(int(text))
+            else:
+                self.console.append(text)
+
+    def wait_for_recording(self, limit_s: float) -> bool:
+        """Wait for the first stamp; return whether there is one."""
+        until_s = time.monotonic() + limit_s
+        while not self.stamps_ns and self._machine.poll() is None and time.monotonic() < until_s:
+            time.sleep(0.01)
+        return bool(self.stamps_ns)
+
+    def copy_disk(self, target: Path) -> int:
+        """Copy the disk as a power cut would leave it now; return the last stamp of the guest."""
+        stopped = [one for one in uml.members(self._machine.pid) if not is_traced(one)]
+        for process in stopped:
+            os.kill(process, signal.SIGSTOP)
+        for process in stopped:
+            while process_state(process) not in "Tt":
+                time.sleep(0.001)
+        shutil.copyfile(self._disk, target)
+        last_ns = self.stamps_ns[-1]
+        for process in stopped:
+            os.kill(process, signal.SIGCONT)
+        return last_ns
+
+    def kill(self) -> Path:
+        """End the machine without any warning; return its disk."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._machine.pid, signal.SIGKILL)
+        uml.stop(self._machine)
+        return self._disk
+
+
+def is_traced(process: int) -> bool:
+    """Whether a process is one of the guest: its tracer, the kernel of the guest, runs it."""
+    status = Path(f"/proc/{process}/status").read_text(encoding="ascii")
+    return "\nTracerPid:\t0\n" not in status
+
+
+def process_state(process: int) -> str:
+    """Return the letter of the state of a process; ``T`` is stopped."""
+    return Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(") ")[2][0]
+
+
+def main() -> int:
+    """Record, cut the power, mount the disks, and read the recordings."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--cuts", type=int, default=6, choices=range(1, 16), metavar="N")
+    parser.add_argument("--seed", type=int, default=random.randrange(1000))  # noqa: S311 - moments of a test
+    parser.add_argument("--time-limit", type=float, default=120.0, help="seconds, each machine")
+    given = parser.parse_args()
+    absent = uml.missing(uml.UML, "mke2fs")
+    if absent:
+        say(f"{', '.join(absent)} not found: apt install user-mode-linux e2fsprogs")
+        return uml.CANNOT_START
+
+    drawn = random.Random(given.seed)  # noqa: S311 - as above
+    period_s = RECORDED_S / given.cuts
+    moments_s = [drawn.uniform(number, number + 1) * period_s for number in range(given.cuts)]
+    say(f"seed {given.seed}, cuts after {', '.join(f'{each:.2f}' for each in moments_s)} s")
+    with tempfile.TemporaryDirectory(prefix="power-cut-") as scratch:
+        work = Path(scratch)
+        (work / "out").mkdir()
+        disks = cut_power(work, moments_s, given.time_limit)
+        code = hand_over(work, [each.disk for each in disks], given.time_limit) if disks else 1
+        if code:
+            say("no recording was made, or its disk cannot be mounted")
+            return code
+        results = [
+            judge(work / "out" / letter, each)
+            for letter, each in zip(ascii_lowercase, disks, strict=False)
+        ]
+    return int(not all(results))
+
+
+class CutDisk(NamedTuple):
+    """A disk after a power cut."""
+
+    disk: Path
+    began_ns: int
+    """First arrival in the guest that must be on the disk, CLOCK_MONOTONIC ns of the guest."""
+    last_ns: int
+    """Last known arrival before the cut."""
+
+
+def cut_power(work: Path, moments_s: list[float], limit_s: float) -> list[CutDisk]:
+    """Record on a machine, and return its disk at each moment; none if it does not record."""
+    machine = RecordingMachine(work)
+    try:
+        if not machine.wait_for_recording(limit_s):
+            print("\n".join(machine.console))
+            return []
+        began_s, began_ns, found = time.monotonic(), machine.stamps_ns[0], []
+        for number, moment_s in enumerate(moments_s[:-1]):
+            time.sleep(max(0.0, began_s + moment_s - time.monotonic()))
+            disk = work / f"disk-{number}"
+            found.append(CutDisk(disk, began_ns, machine.copy_disk(disk)))
+        time.sleep(max(0.0, began_s + moments_s[-1] - time.monotonic()))
+    finally:
+        disk = machine.kill()
+    return [*found, CutDisk(disk, began_ns, machine.stamps_ns[-1])]
+
+
+def hand_over(work: Path, disks: list[Path], limit_s: float) -> int:
+    """Mount the disks in a second machine, which copies the recordings to the host."""
+    letters = ascii_lowercase[: len(disks)]
+    light_vm.write_init(work / "init", work / "out", HAND_OVER, disks=" ".join(letters))
+    attached = [f"ubd{number}={disk}" for number, disk in enumerate(disks)]
+    return uml.boot(light_vm.machine_command(work, "128M", *attached), limit_s)
+
+
+def judge(folder: Path, cut: CutDisk) -> bool:
+    """Whether the recording of a disk is complete up to its last second; print what it has."""
+    recording = open_recording(folder)
+    messages = list(recording.messages())
+    found = [one for one in messages if isinstance(one, RecordedMessage)]
+    arrivals_ns = [one.t_ns for one in found if one.channel.startswith("source/")]
+    lost_s = (cut.last_ns - max(arrivals_ns, default=cut.began_ns)) * 1e-9
+    gaps = len(messages) - len(found)
+    unfinished = sum(each.path.suffix == ".part" for each in recording.parts)
+    say(
+        f"{len(found)} messages in files 1 to {recording.parts[-1].info.part}, {unfinished} "
+        f"unfinished; lost {max(lost_s, 0.0):.2f} s, {gaps} gaps"
+    )
+    return recording.info.part == 1 and not gaps and lost_s <= LONGEST_LOSS_S
+
+
+if __name__ == "__main__":
+    sys.exit(main())
