@@ -167,6 +167,10 @@ def _read_record(file: BinaryIO, place: int, size: int) -> tuple[Block | None, i
     if len(prefix) < _PREFIX.size:
         raise _DamageError("the file ends within a record")
     opcode, length = _PREFIX.unpack(prefix)
+    if opcode == Opcode.MESSAGE_INDEX and not _starts_message_index(
+        prefix + file.read(_MESSAGE_INDEX.size - _PREFIX.size)
+    ):
+        raise _DamageError("the lengths in a message index contradict each other")
     end = place + _PREFIX.size + length
     if end > size:
         raise _DamageError("the file ends within a record, or the length of a record is damaged")
@@ -188,10 +192,26 @@ def _read_record(file: BinaryIO, place: int, size: int) -> tuple[Block | None, i
 def _starts_record(file: BinaryIO, place: int, size: int) -> bool:
     file.seek(place)
     start = file.read(_LONGEST_START)
-    return place == size or _RECORD_START.match(start) is not None or start[:1] == _DATA_END
+    return (
+        place == size
+        or _RECORD_START.match(start) is not None
+        or start[:1] == _DATA_END
+        or _starts_message_index(start)
+    )
 
 
 _DATA_END = bytes([Opcode.DATA_END])
+_MESSAGE_INDEX = struct.Struct("<BQHI")
+"""Opcode, length, channel and bytes of the entries of a message index."""
+
+
+def _starts_message_index(start: bytes) -> bool:
+    """Return whether the two lengths of a message index agree: it has no checksum."""
+    if len(start) < _MESSAGE_INDEX.size:
+        return False
+    opcode, length, _, entries_bytes = _MESSAGE_INDEX.unpack_from(start)
+    own_bytes = _MESSAGE_INDEX.size - _PREFIX.size
+    return bool(opcode == Opcode.MESSAGE_INDEX and length == own_bytes + entries_bytes)
 
 
 def _find_record(file: BinaryIO, place: int, size: int) -> int:

@@ -11,7 +11,7 @@ import os
 from contextlib import suppress
 from typing import IO, TYPE_CHECKING, Any, NamedTuple, cast
 
-from mcap.writer import IndexType, Writer
+from mcap.writer import Writer
 
 from jointfit_daemon.outputs.recording._channels import (
     CHANNEL_METADATA,
@@ -84,10 +84,8 @@ class PartFile:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
         self._buffer = _UnwrittenBytes()
-        # Chunks have their own checksums. Message indexes would take 16 bytes a message.
-        indexes = IndexType.ALL & ~IndexType.MESSAGE
-        output = cast("IO[bytes]", self._buffer)
-        self._writer: Any = Writer(output, _CHUNK_BYTES, index_types=indexes)
+        # Message indexes take 16 bytes a message, but Foxglove and PlotJuggler need them.
+        self._writer: Any = Writer(cast("IO[bytes]", self._buffer), _CHUNK_BYTES)
         self._writer.start(PROFILE, info.software)
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {"": 0}

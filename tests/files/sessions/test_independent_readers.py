@@ -121,6 +121,9 @@ def test_mcap_and_protobuf_decode_the_messages_for_foxglove(
     angles: dict[float, Any] = {}
     logs, times = [], []
     with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+        assert summary is not None
+        assert all(index.message_index_offsets for index in summary.chunk_indexes)
         for schema, channel, message in make_reader(file).iter_messages():
             times.append(message.log_time)
             t_s = round((message.log_time - START_NS) / 1e9, 7)

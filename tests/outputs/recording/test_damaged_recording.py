@@ -15,6 +15,7 @@ import zstandard
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Chunk as ChunkRecord
 
@@ -108,6 +109,17 @@ def test_a_flipped_bit_loses_its_chunk_only(number: int, data: st.DataObject) ->
         return
     assert events == without([number])
     assert [(gap.first_sequence, gap.count) for gap in gaps] == [(number * BATCH, BATCH)]
+
+
+@settings(max_examples=60)
+@given(st.integers(0, BATCHES - 2), st.integers(0, 15))
+def test_a_wrong_length_of_a_message_index_loses_nothing(number: int, bit: int) -> None:
+    whole, chunks = recorded()
+    damaged = bytearray(whole)
+    index = chunks[number].end
+    assert damaged[index] == Opcode.MESSAGE_INDEX
+    damaged[index + 1 + bit // 8] ^= 1 << bit % 8
+    assert content_of(bytes(damaged)) == (EVENTS, [])
 
 
 @settings(max_examples=40)
