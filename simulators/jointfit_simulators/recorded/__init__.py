@@ -1,5 +1,6 @@
 """Recordings of the daemon as virtual devices: their bytes again, at the recorded intervals."""
 
+from jointfit_simulators.recorded._recorded_devices import RecordedCameras
 from jointfit_simulators.recorded._recorded_scene import RecordedScene
 from jointfit_simulators.recorded._session_file import (
     RecordedSession,
@@ -7,4 +8,10 @@ from jointfit_simulators.recorded._session_file import (
     read_session_chunks,
 )
 
-__all__ = ["RecordedScene", "RecordedSession", "UnplayableRecordingError", "read_session_chunks"]
+__all__ = [
+    "RecordedCameras",
+    "RecordedScene",
+    "RecordedSession",
+    "UnplayableRecordingError",
+    "read_session_chunks",
+]

@@ -31,7 +31,7 @@ from jointfit_simulators.devices import NatNetPort, XbusDevice, XbusDeviceOption
 from jointfit_simulators.recorded._session_file import UnplayableRecordingError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from jointfit_simulators.devices import Address
@@ -153,7 +153,7 @@ class RecordedCameras:
         The recording does not contain the description of the server.
     """
 
-    def __init__(self, chunks: Sequence[tuple[int, bytes]], command_port: int = 0) -> None:
+    def __init__(self, chunks: Iterable[tuple[int, bytes]], command_port: int = 0) -> None:
         info: ServerInfo | None = None
         model: bytes | None = None
         self.chunks: list[tuple[int, bytes]] = []
