@@ -1,4 +1,4 @@
-"""Checks of output paths before a command starts its computation."""
+"""Checks of output paths before a command starts its computation; files written as a whole."""
 
 from __future__ import annotations
 
@@ -60,3 +60,16 @@ def check_plot(path: Path | None) -> None:
     check_output("--plot", path, PLOTS)
     if path is not None and importlib.util.find_spec("matplotlib") is None:
         raise PlottingUnavailableError
+
+
+def replace_file(path: Path, text: str) -> None:
+    """Write a text file as a whole, or leave the old one."""
+    partial = path.with_name(f"{path.name}.part")
+    try:
+        with partial.open("w", encoding="utf-8", newline="") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)

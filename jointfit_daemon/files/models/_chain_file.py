@@ -11,7 +11,7 @@ from itertools import compress
 from typing import TYPE_CHECKING, Any, get_args
 
 from jointfit_daemon.files.models._units import require_metres
-from jointfit_daemon.files.text import MalformedFileError, read_json, read_toml
+from jointfit_daemon.files.text import MalformedFileError, read_json, read_toml, toml_value
 from jointfit_daemon.kinematics.chains import (
     ChainModel,
     InvalidChainModelError,
@@ -226,7 +226,7 @@ def _are_numbers(value: Any, count: int) -> bool:
 
 
 def _toml(data: dict[str, Any]) -> str:
-    lines = [f"name = {_quoted(data['name'])}"]
+    lines = [f"name = {toml_value(data['name'])}"]
 
     for what in ("segment", "marker"):
         for row in data[what]:
@@ -236,14 +236,9 @@ def _toml(data: dict[str, Any]) -> str:
 
 def _value(value: Any) -> str:
     if isinstance(value, str):
-        return _quoted(value)
+        return toml_value(value)
     if isinstance(value, list) and value and isinstance(value[0], list):
         return "[\n" + "".join(f"    {_value(row)},\n" for row in value) + "]"
     if isinstance(value, list):
         return f"[{', '.join(repr(float(x)) for x in value)}]"
     return repr(float(value))
-
-
-def _quoted(text: str) -> str:
-    """Return a TOML basic string; its escapes are those of JSON, except for DEL."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

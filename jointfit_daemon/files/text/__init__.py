@@ -1,4 +1,4 @@
-"""Text files read within bounds: TOML, JSON and tables of numbers."""
+"""Text files read within bounds: TOML, JSON and tables of numbers; values as TOML text."""
 
 from jointfit_daemon.files.text._structured import (
     MAX_NESTING,
@@ -24,6 +24,7 @@ from jointfit_daemon.files.text._tables import (
     written,
     written_time,
 )
+from jointfit_daemon.files.text._toml_text import toml_key, toml_value
 
 __all__ = [
     "MAX_NESTING",
@@ -44,6 +45,8 @@ __all__ = [
     "rows_of_numbers",
     "separator_of",
     "strip_trailing_empty",
+    "toml_key",
+    "toml_value",
     "written",
     "written_time",
 ]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from jointfit_daemon.tools.batch.recording_task import REPORT_FILE, RecordingResult
+from jointfit_daemon.tools.output_files import replace_file
 from jointfit_daemon.tools.report.html_document import Link, document, facts, section, table
 
 if TYPE_CHECKING:
@@ -25,20 +26,15 @@ _HEAD = (
 def write_summary(results: Sequence[RecordingResult], out: Path) -> list[Path]:
     """Write ``summary.csv`` and ``summary.html`` in the order of the recordings."""
     ordered = sorted(results, key=lambda result: result.recording)
-    texts = {"summary.csv": _csv(ordered), "summary.html": _page(ordered, out)}
-    for name, text in texts.items():
-        partial = out / f"{name}.part"
-        partial.write_text(text, encoding="utf-8", newline="")
-        partial.replace(out / name)
-    return [out / name for name in texts]
-
-
-def _csv(results: Sequence[RecordingResult]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in fields(RecordingResult)])
+    rows = io.StringIO()
+    writer = csv.DictWriter(rows, [field.name for field in fields(RecordingResult)])
     writer.writeheader()
-    writer.writerows(asdict(result) for result in results)  # None becomes an empty cell
-    return text.getvalue()
+    writer.writerows(asdict(result) for result in ordered)  # None becomes an empty cell
+
+    texts = {"summary.csv": rows.getvalue(), "summary.html": _page(ordered, out)}
+    for name, text in texts.items():
+        replace_file(out / name, text)
+    return [out / name for name in texts]
 
 
 def _page(results: Sequence[RecordingResult], out: Path) -> str:

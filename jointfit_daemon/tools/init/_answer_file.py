@@ -9,11 +9,11 @@ A question that is asked once is a key. One that is asked for several subjects i
 
 from __future__ import annotations
 
-import os
 import tomllib
 from typing import TYPE_CHECKING, Any
 
-from jointfit_daemon.tools.init._rig_text import toml, toml_key
+from jointfit_daemon.files.text import toml_key, toml_value
+from jointfit_daemon.tools.output_files import replace_file
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -52,23 +52,10 @@ def write_answers(path: Path, answers: Mapping[Key, Any]) -> None:
     tables: dict[str, list[str]] = {"": []}
     for (key, subject), value in answers.items():
         # TOML has no null: an empty text is the empty answer.
-        text = toml("" if value is None else value)
+        text = toml_value("" if value is None else value)
         if subject:
             tables.setdefault(key, []).append(f"{toml_key(subject)} = {text}")
         else:
             tables[""].append(f"{key} = {text}")
     parts = [f"[{key}]\n" * bool(key) + "\n".join(lines) + "\n" for key, lines in tables.items()]
     replace_file(path, _HEADER + "\n".join(parts))
-
-
-def replace_file(path: Path, text: str) -> None:
-    """Write a text file as a whole, or leave the old one."""
-    partial = path.with_name(f"{path.name}.part")
-    try:
-        with partial.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

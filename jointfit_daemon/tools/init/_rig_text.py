@@ -1,16 +1,17 @@
-"""Text of a rig.toml with comments, and of answer files.
+"""Text of a rig.toml with comments.
 
 Invariant: the text is TOML whose content equals the table.
 """
 
 from __future__ import annotations
 
-import json
-import re
-from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+from jointfit_daemon.files.text import toml_key, toml_value
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
 _COLUMN = 42
 """Column of the comments behind keys."""
 
@@ -55,38 +56,15 @@ def _section(header: str, content: Mapping[str, Any], name: str) -> str:
     lines, tables = [header], []
     for key, value in content.items():
         if key == "markers":
-            lines += [f"markers.{toml_key(part)} = {toml(names)}" for part, names in value.items()]
+            lines += [
+                f"markers.{toml_key(part)} = {toml_value(names)}" for part, names in value.items()
+            ]
         elif key == "tls":
             tables.append(_section(f"[{name}.tls]", value, f"{name}.tls"))
         elif key == "joint":
             tables += [_section(f"[[{name}.joint]]", joint, f"{name}.joint") for joint in value]
         else:
-            line = f"{key} = {toml(value, hexadecimal=key == _HEXADECIMAL)}"
+            line = f"{key} = {toml_value(value, hexadecimal=key == _HEXADECIMAL)}"
             comment = _COMMENTS.get(f"{name}.{key}")
             lines.append(f"{line:{_COLUMN - 1}} # {comment}" if comment else line)
     return "\n".join(["\n".join(lines) + "\n", *tables])
-
-
-def toml_key(name: str) -> str:
-    """Return a key of TOML, in quotes if necessary."""
-    return name if _BARE_KEY.fullmatch(name) else toml(name)
-
-
-def toml(value: Any, *, hexadecimal: bool = False) -> str:
-    """Return a value of TOML."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int) and hexadecimal:
-        return f"{value:#x}"
-    if isinstance(value, str):
-        # A string of JSON is one of TOML, except for DEL.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, Mapping):
-        pairs = (
-            f"{toml_key(key)} = {toml(inner, hexadecimal=hexadecimal)}"
-            for key, inner in value.items()
-        )
-        return f"{{ {', '.join(pairs)} }}"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(toml, value))}]"
-    return repr(value)

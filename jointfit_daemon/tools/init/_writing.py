@@ -15,10 +15,10 @@ from jointfit_daemon.config import (
     missing_files,
     parse_rig,
 )
-from jointfit_daemon.tools.init._answer_file import replace_file
 from jointfit_daemon.tools.init._engine import without_open_places
 from jointfit_daemon.tools.init._rig_table import rig_table
 from jointfit_daemon.tools.init._rig_text import rig_text
+from jointfit_daemon.tools.output_files import replace_file
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import orjson
+from jointfit_daemon.files.text import toml_key, toml_value
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -29,20 +29,14 @@ def rig_lines(
     servers: Sequence[FoundServer],
 ) -> str:
     """Return tables of rig.toml; names of sensors and segments are to be replaced."""
-    tables = [*_buses(can), *_sensors(ports, serial, can), *_cameras(servers)]
+    names = [traffic.interface for traffic in can if traffic.devices]
+    buses = [
+        _table(f"[can.{toml_key(name)}]", {"interface": "socketcan", "channel": name})
+        for name in names
+    ]
+    tables = [*buses, *_sensors(ports, serial, can), *_cameras(servers)]
     note = "# Replace id and segment: a segment of [chain] for each sensor.\n"
     return note + "\n".join(tables) if tables else ""
-
-
-def _buses(can: Sequence[CanTraffic]) -> Iterator[str]:
-    for traffic in can:
-        if traffic.devices:
-            # A bare key of TOML, otherwise one in quotes.
-            interface = traffic.interface
-            bare = interface.isascii() and interface.replace("_", "").replace("-", "").isalnum()
-            name = interface if bare else _value(interface)
-            keys = {"interface": "socketcan", "channel": traffic.interface}
-            yield _table(f"[can.{name}]", keys)
 
 
 def _sensors(
@@ -93,16 +87,12 @@ def _cameras(servers: Sequence[FoundServer]) -> Iterator[str]:
             keys["command_port"] = server.port
 
         yield _table("[mocap]", keys) + "".join(
-            f"# rigid_body.SEGMENT = {_value(name)}\n" for name in server.bodies
+            f"# rigid_body.SEGMENT = {toml_value(name)}\n" for name in server.bodies
         )
 
 
 def _table(header: str, keys: dict[str, Any]) -> str:
-    return "".join([f"{header}\n", *(f"{key} = {_value(value)}\n" for key, value in keys.items())])
-
-
-def _value(value: Any) -> str:
-    """Return a value in TOML; its strings and numbers are those of JSON."""
-    if isinstance(value, dict):
-        return f"{{ {', '.join(f'{key} = 0x{number:X}' for key, number in value.items())} }}"
-    return orjson.dumps(value).decode()
+    lines = [
+        f"{key} = {toml_value(value, hexadecimal=key == 'ids')}" for key, value in keys.items()
+    ]
+    return "\n".join([header, *lines, ""])

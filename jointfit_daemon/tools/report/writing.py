@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.tools.export import load_data
+from jointfit_daemon.tools.output_files import replace_file
 from jointfit_daemon.tools.report.page import render_report
 
 if TYPE_CHECKING:
@@ -35,9 +36,4 @@ def write_report(recording: Path, page: Path) -> SessionData:
 
 def write_page(session: SessionData, page: Path) -> None:
     """Write the page of a session; a page that exists stays until the new one is complete."""
-    partial = page.with_name(f"{page.name}.part")
-    try:
-        partial.write_text(render_report(session), encoding="utf-8")
-        partial.replace(page)
-    finally:
-        partial.unlink(missing_ok=True)
+    replace_file(page, render_report(session))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import orjson
+from jointfit_daemon.files.text import toml_key, toml_value
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -63,10 +63,10 @@ def toml_text(table: Mapping[str, Any]) -> str:
             nested = {k: v for k, v in value.items() if key == "can" and isinstance(v, dict)}
             rest = {k: v for k, v in value.items() if k not in nested}
             if rest or not nested:
-                parts.append(f"[{_key(key)}]\n{_lines(rest)}")
-            parts += [f"[{_key(key)}.{_key(k)}]\n{_lines(v)}" for k, v in nested.items()]
+                parts.append(f"[{toml_key(key)}]\n{_lines(rest)}")
+            parts += [f"[{toml_key(key)}.{toml_key(k)}]\n{_lines(v)}" for k, v in nested.items()]
         elif _is_table(value):
-            parts += [f"[[{_key(key)}]]\n{_lines(item)}" for item in value]
+            parts += [f"[[{toml_key(key)}]]\n{_lines(item)}" for item in value]
     return "\n".join(parts)
 
 
@@ -77,20 +77,7 @@ def _is_table(value: object) -> bool:
 
 def _lines(table: Mapping[str, Any]) -> str:
     return "".join(
-        f"{_key(key)} = {_value(value)}\n" for key, value in table.items() if value is not None
+        f"{toml_key(key)} = {toml_value(value)}\n"
+        for key, value in table.items()
+        if value is not None
     )
-
-
-def _key(key: str) -> str:
-    return key if key.replace("_", "").replace("-", "").isalnum() else _value(key)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, dict):
-        items = (f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None)
-        return "{ " + ", ".join(items) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_value, value)) + "]"
-    if isinstance(value, float):
-        return repr(value)
-    return orjson.dumps(value).decode()  # strings, integers and booleans are the same in TOML
