@@ -12,7 +12,7 @@ import asyncio
 from typing import TYPE_CHECKING, NamedTuple
 
 from bench.rigs.timestamp_errors import OPTICAL, ObservedCore, judge, unexcused
-from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
+from jointfit_daemon.outputs.recording import encode_state, open_recording, read_events
 from tests.system.station import SENSORS, Listener, Station, running, stopped
 
 if TYPE_CHECKING:
@@ -118,5 +118,5 @@ async def live(
             raise RuntimeError(station.log)
     (log,) = (folder / "state" / "recordings").iterdir()
     core, states = judge(read_events(log), folder / "samples.jsonl", DELAY_MS)
-    same = [encode_state(state) for state in states] == list(read_states(log))
+    same = [encode_state(state) for state in states] == list(open_recording(log).states())
     return RestartRun(core, same)

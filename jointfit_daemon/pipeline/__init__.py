@@ -2,7 +2,6 @@
 
 from jointfit_daemon.pipeline._core import Core
 from jointfit_daemon.pipeline._moving_centers import MovingCenters
-from jointfit_daemon.pipeline._replay import replay, replay_states
 from jointfit_daemon.pipeline.sources import StampedMeasurement
 
-__all__ = ["Core", "MovingCenters", "StampedMeasurement", "replay", "replay_states"]
+__all__ = ["Core", "MovingCenters", "StampedMeasurement"]

@@ -185,7 +185,8 @@ class _ByteComparison:
         self.now_ns = event.chunk.t_ns if isinstance(event, ChunkArrived) else event.t_ns
         if self.begin_ns is None:
             self.begin_ns = self.now_ns
-        self.expected.extend(_recorded_outputs(core.feed(event)))
+        encoded = (encode_output(output) for output in core.feed(event))
+        self.expected.extend(one for one in encoded if one is not None)
         return None
 
     def compare(self, message: RecordedMessage) -> Difference | None:
@@ -208,10 +209,6 @@ class _ByteComparison:
     def seconds(self) -> float:
         """Time since the first event, s."""
         return (self.now_ns - (self.begin_ns or 0)) / _NS_PER_S
-
-
-def _recorded_outputs(outputs: Iterable[Output]) -> list[tuple[str, bytes]]:
-    return [encoded for output in outputs if (encoded := encode_output(output)) is not None]
 
 
 def _verify_bytes(recording: Recording) -> Verification:
@@ -277,13 +274,6 @@ class _Orientations:
         if q is not None and (not stamps or t_ns > stamps[-1]):
             stamps.append(t_ns)
             rows.append(q)
-
-    def add_recorded(self, data: bytes, from_ns: int) -> None:
-        """Append a recorded limb state if its instant is not before `from_ns`."""
-        state = orjson.loads(data)
-        if state["t_ns"] >= from_ns:
-            for segment in state["segments"]:
-                self.add(segment["name"], state["t_ns"], segment["q_world_segment"])
 
     def add_replayed(self, outputs: Iterable[Output]) -> None:
         """Append the limb states among the outputs of the replay."""

@@ -36,6 +36,13 @@ _VERSION = (3, 0)
 _NOWHERE = (0.0, 0.0, 0.0)
 
 
+def replay_states(events: Iterable[Event]) -> list[LimbState]:
+    """Return the limb states of a new core for recorded events."""
+    core = Core()
+    outputs = (output for event in events for output in core.feed(event))
+    return [output for output in outputs if isinstance(output, LimbState)]
+
+
 def table(**head: Any) -> dict[str, Any]:
     """Return a rig.toml of five sources."""
     imus: list[dict[str, Any]] = []

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.outputs.recording import encode_state
-from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed, SourceOpened, Tick
 from jointfit_protocols.can import RECORD_BYTES
 from tests.outputs.recording.recorded_events import after_recording
@@ -25,6 +24,7 @@ from tests.pipeline.core_feed import (
     arrival_ns,
     chunk,
     opening,
+    replay_states,
 )
 
 if TYPE_CHECKING:

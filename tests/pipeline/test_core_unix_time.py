@@ -12,7 +12,7 @@ from typing_extensions import override
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.model import Chunk, MocapFrame
 from jointfit_daemon.outputs.recording import encode_state
-from jointfit_daemon.pipeline import Core, replay_states
+from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     ChunkArrived,
     Configured,
@@ -23,7 +23,16 @@ from jointfit_daemon.pipeline.events import (
 from jointfit_protocols.natnet import FrameOfData, ModelDefinition, ServerInfo
 from jointfit_protocols.natnet import encode as encode_natnet
 from tests.outputs.recording.recorded_events import after_recording
-from tests.pipeline.core_feed import BEGIN_NS, MS, PERIOD_NS, SENSORS, Bench, chunk, table
+from tests.pipeline.core_feed import (
+    BEGIN_NS,
+    MS,
+    PERIOD_NS,
+    SENSORS,
+    Bench,
+    chunk,
+    replay_states,
+    table,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

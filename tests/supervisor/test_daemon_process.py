@@ -27,12 +27,11 @@ from jointfit_daemon.outputs.recording import (
     encode_state,
     open_recording,
     read_events,
-    read_states,
 )
-from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import Configured
 from tests import fake_drivers
 from tests.limb_model.plain_calibration import plain_calibration
+from tests.pipeline.core_feed import replay_states
 from tests.system.station import load_factor
 
 if TYPE_CHECKING:
@@ -141,7 +140,7 @@ async def test_daemon_log_replays_to_byte_identical_states(
     assert "Traceback" not in said
     monkeypatch.setattr("jointfit_daemon.driver.entry_points", fake_drivers.entry_points)
     (log,) = (process.state / "recordings").iterdir()
-    live = list(read_states(log))
+    live = list(open_recording(log).states())
     replayed = [encode_state(state) for state in replay_states(read_events(log))]
     assert len(live) >= 60
     assert replayed == live

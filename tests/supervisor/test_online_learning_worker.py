@@ -12,7 +12,6 @@ import pytest
 
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.pipeline import replay_states
 from jointfit_daemon.pipeline.events import (
     CalibrationReady,
     CalibrationStored,
@@ -28,7 +27,7 @@ from jointfit_protocols.natnet import encode as encode_natnet
 from tests.calibration.calibrated_subject import TWO_AND_TWO, calibration, moving
 from tests.outputs.recording.recorded_events import after_recording
 from tests.pipeline import core_feed
-from tests.pipeline.core_feed import BEGIN_NS, PERIOD_NS, SENSORS, Bench, chunk
+from tests.pipeline.core_feed import BEGIN_NS, PERIOD_NS, SENSORS, Bench, chunk, replay_states
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState
@@ -117,7 +116,7 @@ async def test_online_learning_improves_the_calibration_and_replays_identically(
     steps = [rotation.angle_between(np.array(a), np.array(b)) for a, b in pairwise(around)]
     assert max(steps[19:21]) < 1.5 * max(steps[:19])  # no jump where models were exchanged
     logged = after_recording(bench.fed)
-    assert list(replay_states(logged)) == bench.states
+    assert replay_states(logged) == bench.states
 
 
 @pytest.mark.parametrize(("wanted", "cameras"), [(False, True), (True, False)])

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from jointfit_daemon.outputs.recording import encode_state, read_events, read_states
-from jointfit_daemon.pipeline import replay_states
+from jointfit_daemon.outputs.recording import encode_state, open_recording, read_events
+from tests.pipeline.core_feed import replay_states
 from tests.system.station import (
     SENSORS,
     Listener,
@@ -125,6 +125,6 @@ async def test_poses_continue_as_held_then_lost_while_all_imus_are_silent(
     ]
     assert all(seq >= 1 and us == PERIOD_US * seq for us, seq in steps), set(steps)
     (log,) = (tmp_path / "state" / "recordings").iterdir()
-    live = list(read_states(log))
+    live = list(open_recording(log).states())
     assert len(live) > 5 * OUTPUT_HZ
     assert [encode_state(state) for state in replay_states(read_events(log))] == live

@@ -15,7 +15,6 @@ from jointfit_daemon.outputs.recording._reader import (
     Recording,
     open_recording,
     read_events,
-    read_states,
 )
 from jointfit_daemon.outputs.recording._recorder import Recorder, RecordingHealth
 from jointfit_daemon.outputs.recording._repair import RepairResult, repair_recording
@@ -42,6 +41,5 @@ __all__ = [
     "encode_state",
     "open_recording",
     "read_events",
-    "read_states",
     "repair_recording",
 ]

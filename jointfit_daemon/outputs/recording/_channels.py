@@ -19,13 +19,11 @@ import orjson
 from jointfit_daemon.model import ChainModelState, LimbState, OpticalState
 from jointfit_daemon.outputs.recording._event_json import (
     EVENT_KINDS,
-    encode_event,
     encode_json,
     encode_state,
 )
 from jointfit_daemon.pipeline.events import (
     CalibrationStatus,
-    ChunkArrived,
     DeviceInfo,
     DeviceStatus,
     Notice,
@@ -34,7 +32,7 @@ from jointfit_daemon.pipeline.events import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.pipeline.events import Event, Output
+    from jointfit_daemon.pipeline.events import Output
 
 PROFILE = "jointfit"
 """Profile in the header of the file."""
@@ -70,13 +68,6 @@ def encode_output(output: Output) -> tuple[str, bytes] | None:
     if channel is None:
         return None
     return channel, _ENCODERS.get(channel, encode_json)(output)
-
-
-def encode_input(event: Event) -> tuple[str, bytes]:
-    """Return the channel and the content of an input event."""
-    if isinstance(event, ChunkArrived):
-        return SOURCE + event.source, event.chunk.data
-    return EVENT_CHANNELS[type(event)], encode_event(event)
 
 
 _ENCODERS: dict[str, Callable[[Any], bytes]] = {STATE: encode_state}

@@ -426,16 +426,3 @@ def read_events(path: Path) -> Iterator[Event]:
         It cannot be read.
     """
     yield from open_recording(path).events()
-
-
-def read_states(path: Path) -> Iterator[bytes]:
-    """Yield the limb states of the recording at `path`, as written by `encode_state`.
-
-    Raises
-    ------
-    RecordingError
-        The file is not a recording, or of a later version.
-    OSError
-        It cannot be read.
-    """
-    yield from open_recording(path).states()

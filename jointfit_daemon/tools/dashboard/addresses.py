@@ -10,7 +10,6 @@ LISTEN = "127.0.0.1:8080"
 """Default address of the page: this machine only."""
 PLAIN_PORT, TLS_PORT = 1883, 8883
 """Registered TCP ports of MQTT without and with TLS."""
-_HIGHEST_PORT = 65535
 _SCHEMES = ("mqtt", "mqtts", "ws", "wss")
 
 

@@ -1,8 +1,8 @@
-"""The result of `jointfit doctor`, its JSON Schema, and its text."""
+"""The result of `jointfit doctor`, and its text."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pydantic.dataclasses import dataclass
 
@@ -27,13 +27,6 @@ def report_of(findings: list[Finding]) -> DoctorReport:
     """Return the report with the worst level of `findings`."""
     levels = {finding.level for finding in findings}
     return DoctorReport(next((each for each in _WORST_FIRST if each in levels), "ok"), findings)
-
-
-def doctor_schema() -> dict[str, Any]:
-    """Return the JSON Schema of `jointfit doctor --json`."""
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(DoctorReport).json_schema(mode="serialization")
 
 
 def finding_lines(finding: Finding) -> Iterator[str]:

@@ -1,8 +1,8 @@
-"""The result of `jointfit probe`, its JSON Schema, and its text."""
+"""The result of `jointfit probe`, and its text."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pydantic.dataclasses import dataclass
 
@@ -39,13 +39,6 @@ class ProbeReport:
     """Each request without a result, with its remedy."""
     rig_toml: str
     """Lines for rig.toml; empty if nothing was recognized."""
-
-
-def probe_schema() -> dict[str, Any]:
-    """Return the JSON Schema of `jointfit probe --json`."""
-    from pydantic import TypeAdapter
-
-    return TypeAdapter(ProbeReport).json_schema(mode="serialization")
 
 
 def report_lines(report: ProbeReport) -> Iterator[str]:

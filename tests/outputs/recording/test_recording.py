@@ -31,7 +31,6 @@ from jointfit_daemon.outputs.recording import (
     encode_state,
     open_recording,
     read_events,
-    read_states,
 )
 from jointfit_daemon.pipeline.events import (
     CalibrationStored,
@@ -134,7 +133,7 @@ async def test_recording_returns_events_and_states_in_order(tmp_path: Path) -> N
     path = unfinished.with_suffix("")
     assert [*path.parent.iterdir()] == [path]
     assert list(read_events(path)) == [*given_events, Tick(1000)]
-    assert list(read_states(path)) == [encode_state(state)] * 1000
+    assert list(open_recording(path).states()) == [encode_state(state)] * 1000
 
 
 def test_the_librarys_own_reader_opens_a_recording(tmp_path: Path, table: dict[str, Any]) -> None:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import jsonschema
 import orjson
 import pytest
+from pydantic import TypeAdapter
 from typer.testing import CliRunner
 
 from jointfit_daemon.config import load_rig
@@ -22,7 +23,7 @@ from jointfit_daemon.outputs.mqtt._connection import MqttConnection, Outgoing
 from jointfit_daemon.tools.__main__ import app
 from jointfit_daemon.tools.doctor import _command
 from jointfit_daemon.tools.doctor._command import examine
-from jointfit_daemon.tools.doctor._doctor_report import doctor_schema
+from jointfit_daemon.tools.doctor._doctor_report import DoctorReport
 from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, RigidBodyAsset
 from tests.broker_fixture import free_port
 from tests.tools.doctor.test_doctor_host import gateway
@@ -174,7 +175,7 @@ def test_the_json_of_this_host_follows_its_schema_and_decides_the_exit_code(
     path = rig_file(tmp_path, free_port(), free_port())
     code, text = printed(["--json", "--wait", "0.5"], tmp_path)  # rig.toml is in the folder
     report = orjson.loads(text)
-    jsonschema.validate(report, doctor_schema())
+    jsonschema.validate(report, TypeAdapter(DoctorReport).json_schema(mode="serialization"))
     assert (code, report["level"]) == (1, "error")
     checks = {finding["check"] for finding in report["findings"]}
     assert checks >= {"serial", "clock", "disk", "memory", "processor", "broker", "mocap"}

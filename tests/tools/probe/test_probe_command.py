@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import jsonschema
 import orjson
 import pytest
+from pydantic import TypeAdapter
 from typer.testing import CliRunner
 
 from jointfit_daemon.config import parse_rig
@@ -78,7 +79,8 @@ async def hardware(folder: Path) -> AsyncIterator[NatNetServer]:
 def checked(text: str) -> dict[str, Any]:
     """Return a printed report after the check against its schema."""
     report: dict[str, Any] = orjson.loads(text)
-    jsonschema.validate(report, _probe_report.probe_schema())
+    schema = TypeAdapter(_probe_report.ProbeReport).json_schema(mode="serialization")
+    jsonschema.validate(report, schema)
     return report
 
 
