@@ -121,7 +121,7 @@ class ChainQuality:
     after: MarkerErrors | None = None
     """Errors of the model that is used."""
     parts: Mapping[str, PartQuality] | None = None
-    """By segment of the model with refined markers."""
+    """Result for each segment of the model with refined markers."""
     moved_m: Mapping[str, float] | None = None
     """Displacement of each refined marker in its segment."""
     stopped: str | None = None
@@ -176,7 +176,7 @@ class CenterQuality:
     conditioning: float
     flags: tuple[str, ...]
     segments: Mapping[str, CenterCoordinates]
-    """By body part: the two sides of the joint."""
+    """Coordinates in each of the two body parts of the joint."""
     axis_sd_rad: float | None = None
     """Standard deviation of the axis in each direction across it."""
 

@@ -38,7 +38,7 @@ def find_exchanged_labels(
     """
     rows = np.flatnonzero(far)
     square = ((places[rows, None] - measured[None, rows]) ** 2).sum(axis=-1)
-    # the marker at each place if all labels are assigned anew
+    # the marker at each place if all labels are reassigned
     nearest = linear_sum_assignment(square)[1]
     place_of = np.argsort(nearest)
 

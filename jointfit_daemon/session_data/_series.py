@@ -94,7 +94,7 @@ class JointSeries:
     t_s: Array
     """Instants since the start of the session, s, shape (n,)."""
     angles: Mapping[str, Array] = field(default_factory=dict)
-    """By name (``flexion``, ``adduction`` ...), rad, shape (n,); NaN where unknown."""
+    """Angles by name (``flexion``, ``adduction`` ...), rad, shape (n,); NaN where unknown."""
     angle_sd: Mapping[str, Array] = field(default_factory=dict)
     """Standard deviations of some of the angles, rad, shape (n,)."""
     position: Array | None = None

@@ -49,7 +49,7 @@ class ExitLimit:
         if not self._started.get():
             return
         time.sleep(self._seconds)
-        # Standard error may be a pipe that no process reads, and its lock may be held for ever.
+        # Standard error may be a pipe that no process reads, and its lock may be held permanently.
         report = threading.Thread(target=self._report, daemon=True)
         report.start()
         report.join(_REPORT_S)

@@ -55,9 +55,7 @@ _LOST: dict[int, str] = {
     errno.ETIMEDOUT: "does not answer the USB host in time",
 }
 """Texts of common errors. All of them may clear by themselves; EACCES does, because a port that is
-plugged in exists before udev has set its group.
-"""
-
+plugged in exists before udev has set its group."""
 
 _ABSENT = frozenset({errno.ENOENT, errno.ENODEV, errno.ENXIO})
 """Error numbers of a port that is unplugged."""

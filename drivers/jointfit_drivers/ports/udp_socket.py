@@ -36,7 +36,7 @@ _INSTRUCTION = struct.Struct("@HBBI")
 _PROGRAM = struct.Struct("@HL")
 _LOAD_WORD, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x15, 0x06  # classic BPF
 _SOURCE_ADDRESS = 0xFFF00000 + 12
-"""Offset of the source address in a packet filter: SKF_NET_OFF plus that in the header."""
+"""Offset of the source address for packet filters: SKF_NET_OFF and its place in the header."""
 _WHOLE_PACKET = 0xFFFFFFFF
 _STAMP = struct.Struct("@ll")
 _ANCILLARY = socket.CMSG_SPACE(_STAMP.size)

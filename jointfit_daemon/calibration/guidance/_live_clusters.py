@@ -66,7 +66,8 @@ class LiveClusters:
         self.origins = np.array([c.origin for c in self._clusters]).reshape(-1, 3)
         self._bodies = [i for i, c in enumerate(self._clusters) if c.body is not None]
 
-        # By part: frames with a pose, and misfits. By marker: misfits in which it deviated most.
+        # For each part, the frames with a pose and the misfits; for each marker, the misfits in
+        # which it deviated most.
         self._frames = 0
         self._good = np.zeros(shape[0], dtype=np.int64)
         self._bad = np.zeros(shape[0], dtype=np.int64)

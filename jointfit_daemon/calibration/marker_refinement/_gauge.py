@@ -43,7 +43,7 @@ class Gauge:
     involved: tuple[str, ...]
     """Markers that move along the free directions, the most displaced first."""
     fixed_by: str
-    """What fixes the free directions: "locks", "prior" or "nothing"."""
+    """Constraint of the free directions: "locks", "prior" or "nothing"."""
 
 
 def gauge_of(S: Array, frames: int, coordinates: Sequence[str], *, prior: float) -> Gauge:

@@ -40,7 +40,7 @@ def inertial_rotations(
     Returns
     -------
     dict of str to ndarray, shape (m, 4)
-        By segment; NaN where one of its sensors has no data.
+        Rotation of each segment since the static pose; NaN where one of its sensors has no data.
     """
     found = {}
     for segment, group in zip(chain.segments, chain.sensors, strict=True):

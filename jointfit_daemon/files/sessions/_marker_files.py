@@ -59,7 +59,7 @@ def write_c3d_session(session: SessionData, folder: Path) -> WrittenSession:
     path = folder / f"{session.name}.c3d"
     notes = axis.note(path.name)
 
-    # Frame 1 is at 0 s. What is left below a period goes into a parameter of our own.
+    # Frame 1 is at 0 s. A parameter of our own contains the remainder below a period.
     first_s = float(axis.t_s[0]) if len(axis.t_s) else 0.0
     first_frame = round(first_s * axis.rate_hz) + 1
     if not 1 <= first_frame <= _LATEST_FRAME:

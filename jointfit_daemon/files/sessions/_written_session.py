@@ -19,4 +19,4 @@ class WrittenSession:
 
     files: tuple[Path, ...]
     notes: tuple[str, ...] = ()
-    """What was left out, cut off or resampled."""
+    """Series that were left out, cut off or resampled."""

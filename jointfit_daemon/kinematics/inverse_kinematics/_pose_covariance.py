@@ -38,7 +38,7 @@ def pose_covariance(model: ChainModel, found: IkResult) -> tuple[Array, NDArray[
     Returns
     -------
     covariance
-        Of a step from the true state, rad^2 and m^2, shape (T, nq, nq).
+        Covariance of a step from the true state, rad^2 and m^2, shape (T, nq, nq).
     determined
         Shape (T, nq). False where the information about a degree of freedom, with all others
         free, is less than that of one marker at a distance of 2 cm from its axis.

@@ -171,7 +171,7 @@ def repair_unfinished(
     Returns
     -------
     list of RepairResult or str
-        What was repaired, or the reason why a file was not.
+        Result of every file that was repaired; of the others the reason.
     """
     found: list[RepairResult | str] = []
     try:

@@ -124,7 +124,7 @@ class RequestKind(NamedTuple):
     model: type[RequestArguments]
     """Its arguments."""
     effect: str
-    """What it does, one sentence."""
+    """Its effect, in one sentence."""
 
 
 REQUESTS: dict[str, RequestKind] = {

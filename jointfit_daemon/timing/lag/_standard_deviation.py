@@ -124,7 +124,7 @@ def lag_sigma(solved: LinearizedLag, memory_s: float, stamp_sd_s: float = 0.0) -
 def _unobserved_sawtooth(t_s: Floats, information: Floats, memory_s: float) -> float:
     """Return the standard deviation of the lag due to a sawtooth error of the stamps.
 
-    That of a sawtooth of unit standard deviation, without its scatter between blocks.
+    The sawtooth has unit standard deviation. Its scatter between blocks is not included.
     """
     share = information / information.sum()
     cycles = np.multiply.outer(np.divide.outer(_HARMONICS, STAMP_PERIODS_S), t_s - t_s[0])

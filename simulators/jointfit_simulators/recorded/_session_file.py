@@ -26,7 +26,7 @@ class UnplayableRecordingError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class RecordedSession:
-    """What the devices of a session sent."""
+    """Data that the devices of a session sent."""
 
     rig: dict[str, Any]
     """The parsed rig.toml."""
