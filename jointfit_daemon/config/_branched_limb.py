@@ -47,7 +47,12 @@ def branched_limb(table: ChainTable) -> BranchedLimb:
     while waiting:
         order.append(waiting.pop())
         waiting += [c for c, j in reversed(carried.items()) if j.parent == order[-1]]
-    ends = [joint for segment in order for joint in joints if _is_end(joint, segment, segments)]
+    ends = [
+        joint
+        for segment in order
+        for joint in joints
+        if joint.parent == segment and joint.child not in segments
+    ]
 
     tables = [*(carried[segment] for segment in order[1:]), *ends]
     return BranchedLimb(
@@ -62,10 +67,6 @@ def branched_limb(table: ChainTable) -> BranchedLimb:
 def origin_name(root: str) -> str:
     """Return the name of the origin of the first segment, which is published like a joint."""
     return f"{root}_origin"
-
-
-def _is_end(joint: JointTable, segment: str, segments: set[str]) -> bool:
-    return joint.parent == segment and joint.child not in segments
 
 
 def _side_of(joint: JointTable, carried: Mapping[str, JointTable]) -> str | None:

@@ -89,7 +89,16 @@ def load_chain_model(
 
     parts = body_parts_of(table)
     markers = {part: names for part in parts if (names := (mocap.markers or {}).get(part))}
-    faults = [*_check_markers(loaded.chain, markers), *_check_bare_segments(table, markers)]
+    faults = [*_check_markers(loaded.chain, markers)]
+    faults += [
+        Fault(
+            f"mocap.markers.{segment}",
+            "missing; chain.model is tracked by single markers: name those of this segment "
+            "(a rigid body does not suffice)",
+        )
+        for segment in table.segments or ()
+        if segment not in markers
+    ]
     carriers, more = _find_carriers(loaded.chain, markers)
     faults += more or _check_connections(loaded.chain, carriers, _adjacent(table, carriers))
     known = set(loaded.chain.marker_names)
@@ -142,18 +151,6 @@ def load_refinement(
 def _listed(names: Sequence[str]) -> str:
     rest = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return ", ".join(names[:_LISTED]) + rest
-
-
-def _check_bare_segments(
-    table: ChainTable, markers: Mapping[str, Sequence[str]]
-) -> Iterator[Fault]:
-    for segment in table.segments or ():
-        if segment not in markers:
-            yield Fault(
-                f"mocap.markers.{segment}",
-                "missing; chain.model is tracked by single markers: name those of this segment "
-                "(a rigid body does not suffice)",
-            )
 
 
 def _check_markers(model: ChainModel, markers: Mapping[str, Sequence[str]]) -> Iterator[Fault]:

@@ -482,7 +482,8 @@ def _combine(options: Sequence[Sequence[_Assignment]]) -> list[tuple[int, ...]] 
 
     None if the labels of every cluster are its own, or if another combination is hardly worse.
     """
-    masks = [[_mask(one.columns) for one in each] for each in options]
+    # The columns of an assignment, as bits.
+    masks = [[sum(1 << c for c in one.columns if c >= 0) for one in each] for each in options]
     orders = [np.argsort([-one.cost for one in each]).tolist() for each in options]
     rest = [0.0]  # least cost of the clusters that are not assigned yet
     for each in reversed(options):
@@ -521,8 +522,3 @@ def _combine(options: Sequence[Sequence[_Assignment]]) -> list[tuple[int, ...]] 
     if visited > _MOST_COMBINED or len(close) != 1 or not any(close[0]):
         return None
     return [options[p][i].columns for p, i in enumerate(close[0])]
-
-
-def _mask(columns: Iterable[int]) -> int:
-    """Return columns as bits."""
-    return sum(1 << c for c in columns if c >= 0)

@@ -12,7 +12,7 @@ from jointfit_daemon.tools.command_group import EXIT_MISUSE
 from jointfit_daemon.tools.text_output import echo_wrapped
 
 if TYPE_CHECKING:
-    from jointfit_daemon.config import Rig, Source
+    from jointfit_daemon.config import Source
 
 
 def check(
@@ -54,9 +54,9 @@ def check(
     console = Console()
     console.print(table)
     console.print(
-        f"joints {_joints(rig)}, {rig.output_rate_hz:g} Hz to "
-        f"mqtt://{rig.mqtt.host}:{rig.mqtt.tcp_port}/{rig.mqtt.base}, calibration "
-        f"store {rig.calibration_store!r}, method {rig.calibration.method}"
+        f"joints {(', ' if rig.chain.parents else ' – ').join(rig.chain.joints)}, "
+        f"{rig.output_rate_hz:g} Hz to mqtt://{rig.mqtt.host}:{rig.mqtt.tcp_port}/{rig.mqtt.base}, "
+        f"calibration store {rig.calibration_store!r}, method {rig.calibration.method}"
     )
     if (model := rig.chain_model) is not None:
         chain = model.chain
@@ -78,7 +78,3 @@ def _rate(source: Source) -> str:
     if source.kind == "mocap" and not hasattr(source.settings, "rate_hz"):
         return "its own"
     return f"{source.rate_hz:g} Hz"
-
-
-def _joints(rig: Rig) -> str:
-    return (", " if rig.chain.parents else " – ").join(rig.chain.joints)

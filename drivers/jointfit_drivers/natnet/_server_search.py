@@ -7,6 +7,7 @@ known. Servers in unicast send frames after CONNECT; DISCONNECT ends them.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import socket
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,7 @@ from jointfit_protocols import natnet
 from jointfit_protocols.natnet import NatNetMessageId
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 COMMAND_PORT = 1510
 """Usual command port of Motive."""
@@ -71,25 +72,25 @@ async def find_servers(
         address = str(addresses[0][4][0])
         targets.append((local_address(address, None), address))
 
+    # Local and broadcast address of each network; a server may also run on this host.
+    networks: list[tuple[str, str]] = []
+    if broadcast:
+        cards = [(card.address, card.broadcast) for card in network_cards()]
+        networks = [(_LOOPBACK, _LOOPBACK), *((local, to) for local, to in cards if to is not None)]
+
     async with asyncio.TaskGroup() as group:
         named = [
             group.create_task(_ask_host(local, address, port or COMMAND_PORT, wait_s))
             for local, address in targets
         ]
-        networks = [
+        searched = [
             group.create_task(_ask_network(local, address, port or COMMAND_PORT, wait_s))
-            for local, address in (_networks() if broadcast else ())
+            for local, address in networks
         ]
     # A named host also answers the broadcast; the first answer has its names.
-    found = [server for task in (*named, *networks) for server in task.result()]
+    found = [server for task in (*named, *searched) for server in task.result()]
     unique = {(server.server, server.port): server for server in reversed(found)}
     return sorted(unique.values(), key=lambda server: (server.server, server.port))
-
-
-def _networks() -> list[tuple[str, str]]:
-    """Return local and broadcast address of each network; a server may also run on this host."""
-    cards = [(card.address, card.broadcast) for card in network_cards()]
-    return [(_LOOPBACK, _LOOPBACK), *((local, to) for local, to in cards if to is not None)]
 
 
 async def _ask_host(local: str, address: str, port: int, wait_s: float) -> list[FoundServer]:
@@ -105,29 +106,16 @@ async def _ask_host(local: str, address: str, port: int, wait_s: float) -> list[
         ):
             for _ in range(_TRIES):
                 transport.sendto(natnet.encode(request), server)
-                if await _replied(answers, server, replies, wait_s / _TRIES):
+                with contextlib.suppress(TimeoutError):
+                    async with asyncio.timeout(wait_s / _TRIES):
+                        while server not in replies:
+                            answers.changed.clear()
+                            await answers.changed.wait()
                     break
         transport.sendto(natnet.encode(natnet.Bare(NatNetMessageId.DISCONNECT)), server)
     finally:
         transport.close()
     return _found(local, answers)
-
-
-async def _replied(
-    answers: _Answers,
-    server: tuple[str, int],
-    replies: Mapping[tuple[str, int], object],
-    wait_s: float,
-) -> bool:
-    """Return whether the server is in `replies` within `wait_s`."""
-    try:
-        async with asyncio.timeout(wait_s):
-            while server not in replies:
-                answers.changed.clear()
-                await answers.changed.wait()
-    except TimeoutError:
-        return False
-    return True
 
 
 async def _ask_network(local: str, address: str, port: int, wait_s: float) -> list[FoundServer]:

@@ -94,7 +94,7 @@ def refine_markers(
     unseen = [trial.thinned(settings.frames) for trial in validation]
     checked = check(model, thin, unseen)
     task = _task(model, checked, settings)
-    control = _RunControl(progress or _ignore, stop or _never)
+    control = _RunControl(progress or (lambda _share, _error: None), stop or (lambda: False))
     ended = _METHODS[settings.method](task, settings, control)
     after = model.with_markers(ended.positions)
     within = IkOptions(limit_m2=settings.limit_m2)
@@ -131,14 +131,6 @@ def refine_markers(
 class _RunControl:
     progress: Progress
     stop: Stop
-
-
-def _ignore(_share: float, _error: float) -> None:
-    return
-
-
-def _never() -> bool:
-    return False
 
 
 @dataclass(frozen=True, slots=True)

@@ -148,7 +148,9 @@ def _outcome(wanted: ChainRefinement, found: Refinement, unseen: MotionTrial) ->
     figures = _figures(wanted, found, judge, parts, shift)
     notes += _notes(wanted, found, figures)
     used = {s for s, part in parts.items() if part.refined}
-    return ChainOutcome(_record(model, found, used), figures, tuple(notes))
+    positions = {m.name: vector(m.position) for m in found.model.markers if m.segment in used}
+    record = RefinedChain(model.name, chain_fingerprint(model), positions) if used else None
+    return ChainOutcome(record, figures, tuple(notes))
 
 
 def _select(
@@ -246,10 +248,3 @@ def _notes(wanted: ChainRefinement, found: Refinement, figures: ChainQuality) ->
             f"{_MM * ACCEPTED_MAXIMUM_M:.0f} mm: check labels, scale and joints of the model"
         )
     return notes
-
-
-def _record(model: ChainModel, found: Refinement, used: set[str]) -> RefinedChain | None:
-    if not used:
-        return None
-    positions = {m.name: vector(m.position) for m in found.model.markers if m.segment in used}
-    return RefinedChain(model.name, chain_fingerprint(model), positions)

@@ -147,7 +147,11 @@ def two_sided_estimate(
     if markers is not None:
         noise = ClusterNoise.of(markers[0]), ClusterNoise.of(markers[1])
         fit = fit_two_sides(poses, noise, c, Vt[:rank].T, robust=robust)
-    found = _answer(name, fit, Vt, _arc(*poses), near, posture=posture)
+
+    # Arc of the direction that rotated most; the length of its mean is the resultant.
+    R = rotation.to_matrix(rotation.multiply(rotation.conjugate(poses[0].q), poses[1].q))
+    arc = arc_of(float(np.linalg.svd(R.mean(axis=0))[1][2]))
+    found = _answer(name, fit, Vt, arc, near, posture=posture)
     if markers is None or not np.isfinite(found.center).all():
         return found
 
@@ -222,13 +226,6 @@ def _covariances(
     white = noise2 * inverse
     total = white * (1.0 + rho) / (1.0 - rho) + soft_tissue2 * inverse
     return white[:3, :3], total[:3, :3], rho, repeated
-
-
-def _arc(parent: BodyPoses, child: BodyPoses) -> float:
-    """Return the arc of the direction that rotated most, rad."""
-    R = rotation.to_matrix(rotation.multiply(rotation.conjugate(parent.q), child.q))
-    # the length of the mean of that direction is its resultant
-    return arc_of(float(np.linalg.svd(R.mean(axis=0))[1][2]))
 
 
 def _huber_weights(N: Array, rhs: Array, *, hinge: bool) -> Array:

@@ -104,9 +104,21 @@ def write_bids_session(session: SessionData, folder: Path) -> WrittenSession:
     motion.mkdir(parents=True)
     stem = f"{_SUBJECT}_task-{_label(session.name)}"
 
-    _write_json(root / "dataset_description.json", _description_of(session))
+    description = {
+        "Name": session.name,
+        "BIDSVersion": BIDS_VERSION,
+        "DatasetType": "raw",
+        "GeneratedBy": [{"Name": "jointfitd", "Version": jointfit_daemon.__version__}],
+        "JointfitDescription": dict(session.description),
+    }
+    _write_json(root / "dataset_description.json", description)
     (root / "README.md").write_text(_readme(session), encoding="utf-8")
     (root / "participants.tsv").write_text(f"participant_id\n{_SUBJECT}\n", encoding="utf-8")
+
+    acquired = _MISSING
+    if session.start_unix_ns is not None:
+        start = datetime.fromtimestamp(session.start_unix_ns / 1e9, UTC)
+        acquired = start.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
     scans = []
     labels: set[str] = set()
     for stream in merge_streams(streams_of(session)):
@@ -120,7 +132,7 @@ def write_bids_session(session: SessionData, folder: Path) -> WrittenSession:
             {"reference_frame": {"Description": "Frame of the channel.", "Levels": levels}},
         )
         _write_json(motion / f"{base}_motion.json", _sidecar(session, stream))
-        scans.append(f"motion/{base}_motion.tsv\t{_acquired(session)}")
+        scans.append(f"motion/{base}_motion.tsv\t{acquired}")
 
     if session.events:
         _write_events(motion, stem, session.events)
@@ -143,16 +155,6 @@ def _free_label(stream: ChannelStream, taken: set[str]) -> str:
         label = f"{base}x{count}"
     taken.add(label.lower())
     return label
-
-
-def _description_of(session: SessionData) -> dict[str, Any]:
-    return {
-        "Name": session.name,
-        "BIDSVersion": BIDS_VERSION,
-        "DatasetType": "raw",
-        "GeneratedBy": [{"Name": "jointfitd", "Version": jointfit_daemon.__version__}],
-        "JointfitDescription": dict(session.description),
-    }
 
 
 def _readme(session: SessionData) -> str:
@@ -228,18 +230,12 @@ def _sidecar(session: SessionData, stream: ChannelStream) -> dict[str, Any]:
     }
 
 
-def _acquired(session: SessionData) -> str:
-    if session.start_unix_ns is None:
-        return _MISSING
-    at = datetime.fromtimestamp(session.start_unix_ns / 1e9, UTC)
-    return at.strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-
-
 def _write_events(folder: Path, stem: str, events: Sequence[TimelineEvent]) -> None:
     rows = ["\t".join(_EVENT_COLUMNS)]
     for event in events:
         data = orjson.dumps(dict(event.data)).decode()
-        texts = (event.kind, event.id or _MISSING, _one_line(event.text) or _MISSING, data)
+        text = " ".join(event.text.split())  # on one line
+        texts = (event.kind, event.id or _MISSING, text or _MISSING, data)
         rows.append("\t".join((f"{event.t_s:.9f}", "0", *texts)))
     (folder / f"{stem}_events.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     _write_json(
@@ -251,10 +247,6 @@ def _write_events(folder: Path, stem: str, events: Sequence[TimelineEvent]) -> N
             "data": {"Description": "Further values, a JSON object."},
         },
     )
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
 
 
 def _write_json(path: Path, content: Any) -> None:

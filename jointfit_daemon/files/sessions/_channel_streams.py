@@ -107,10 +107,13 @@ def streams_of(session: SessionData) -> list[ChannelStream]:
             columns |= _scalar(segment.name, ORIENTATION_SD, segment.sd_rad)
             streams.append(_stream(group, segment.name, segment.t_s, columns))
     for group in ("joints", "optical_joints"):
-        streams += [
-            _stream(group, joint.name, joint.t_s, _joint_columns(joint))
-            for joint in getattr(session, group)
-        ]
+        for joint in getattr(session, group):
+            angles, sds = joint.angles.items(), joint.angle_sd.items()
+            columns = {Channel(joint.name, ANGLE, name): angle for name, angle in angles}
+            columns |= {Channel(joint.name, ANGLE_SD, name): sd for name, sd in sds}
+            columns |= _vectors(joint.name, POSITION, joint.position, "xyz")
+            columns |= _scalar(joint.name, POSITION_SD, joint.position_sd)
+            streams.append(_stream(group, joint.name, joint.t_s, columns))
     return streams
 
 
@@ -180,13 +183,6 @@ def _series(stream: ChannelStream, item: str) -> SensorSeries | SegmentSeries | 
     return SegmentSeries(
         item, stream.t_s, orientation, _named(stream, item, ORIENTATION_SD).get("")
     )
-
-
-def _joint_columns(joint: JointSeries) -> dict[Channel, Array]:
-    columns = {Channel(joint.name, ANGLE, name): angle for name, angle in joint.angles.items()}
-    columns |= {Channel(joint.name, ANGLE_SD, name): sd for name, sd in joint.angle_sd.items()}
-    columns |= _vectors(joint.name, POSITION, joint.position, "xyz")
-    return columns | _scalar(joint.name, POSITION_SD, joint.position_sd)
 
 
 def _vectors(

@@ -87,7 +87,8 @@ def _read_sensor(path: Path) -> tuple[float, SensorSeries]:
     rows = rows_of_numbers(path, body, separator, len(names))
     columns = {name: rows[:, k] for k, name in enumerate(names)}
 
-    start_s, t_s = _times(path, columns, _rate_hz(lines[:at]))
+    rate = _RATE.search("\n".join(lines[:at]))
+    start_s, t_s = _times(path, columns, None if rate is None else float(rate[1]))
     require_times(path, t_s)
     orientation = _orientation(columns, len(t_s))
     signals = [_vector(columns, f"{word}_{{}}") for word in ("Gyr", "Acc", "Mag")]
@@ -98,11 +99,6 @@ def _read_sensor(path: Path) -> tuple[float, SensorSeries]:
         )
     serial = _SERIAL.search(path.stem)
     return start_s, SensorSeries(serial[1] if serial else path.stem, "", t_s, orientation, *signals)
-
-
-def _rate_hz(comments: Sequence[str]) -> float | None:
-    found = _RATE.search("\n".join(comments))
-    return float(found[1]) if found else None
 
 
 def _times(path: Path, columns: Mapping[str, Array], rate_hz: float | None) -> tuple[float, Array]:

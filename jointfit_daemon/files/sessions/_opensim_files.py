@@ -17,7 +17,6 @@ from jointfit_daemon.files.axes import from_z_up, to_z_up
 from jointfit_daemon.files.orientations import (
     OrientationTable,
     TimeTable,
-    WrittenTable,
     read_orientations_sto,
     read_sto,
     write_known_values,
@@ -145,8 +144,10 @@ def write_mot_session(session: SessionData, folder: Path) -> WrittenSession:
         table = TimeTable(
             tuple(columns), axis.t_s, values, in_degrees=True, name=path.stem, header=header
         )
-        _collect(write_known_values(path, table), files, notes)
-        notes += axis.note(path.name)
+        written = write_known_values(path, table)
+        if written.frames:
+            files.append(written.path)
+        notes += [*written.notes, *axis.note(path.name)]
     return _written(session, "joints, which MOT files hold", files, notes)
 
 
@@ -160,10 +161,9 @@ def read_mot_session(path: Path) -> SessionData:
     facts = header_facts(table.header)
     values = {name: table.values[:, k] for k, name in enumerate(table.columns)}
     if table.in_degrees:
-        values = {
-            name: column if _is_length(name) else np.deg2rad(column)
-            for name, column in values.items()
-        }
+        for name, column in values.items():
+            if not (_TRANSLATION.search(name) or name.endswith("_position_sd")):  # a length
+                values[name] = np.deg2rad(column)
     declared = facts.get("joints")
     found = tuple(
         _declared_joints(table.t_s, values, declared)
@@ -195,10 +195,6 @@ def _joint_columns(joint: JointSeries, axis: UniformAxis) -> dict[str, Array]:
         sd = axis.values(joint.name, joint.t_s, joint.position_sd)
         columns[f"{joint.name}_position_sd"] = sd
     return columns
-
-
-def _is_length(name: str) -> bool:
-    return bool(_TRANSLATION.search(name)) or name.endswith("_position_sd")
 
 
 def _declared_joints(
@@ -234,12 +230,6 @@ def _position(values: Mapping[str, Array], joint: str, parts: Sequence[str]) -> 
     columns = [values.get(joint + part) for part in parts]
     known = [column for column in columns if column is not None]
     return to_z_up(np.column_stack(known), "y") if len(known) == len(parts) else None
-
-
-def _collect(written: WrittenTable, files: list[Path], notes: list[str]) -> None:
-    if written.frames:
-        files.append(written.path)
-    notes += written.notes
 
 
 def _written(

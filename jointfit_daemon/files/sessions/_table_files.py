@@ -54,14 +54,13 @@ def write_csv_session(session: SessionData, folder: Path) -> WrittenSession:
 
 def _texts_of(name: str, values: NDArray[Any]) -> list[str]:
     if name in TEXT_COLUMNS:
-        quoted = {text: _quoted(text) for text in set(values.tolist())}
+        quoted = {
+            text: f'"{text.replace(chr(34), 2 * chr(34))}"' if _NEEDS_QUOTES & set(text) else text
+            for text in set(values.tolist())
+        }
         return [quoted[text] for text in values.tolist()]
     form = "{:.9f}" if name == "t_s" else "{:.9g}"
     return ["" if isnan(value) else form.format(value) for value in values.tolist()]
-
-
-def _quoted(text: str) -> str:
-    return f'"{text.replace(chr(34), 2 * chr(34))}"' if _NEEDS_QUOTES & set(text) else text
 
 
 def read_csv_session(path: Path) -> SessionData:

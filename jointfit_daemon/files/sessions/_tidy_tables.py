@@ -71,11 +71,18 @@ def tables_of(session: SessionData) -> dict[str, Table]:
 
     for source, prefix in _SOURCES.items():
         for segment in getattr(session, f"{prefix}segments"):
-            parts["segments"].append(_segment_table(source, segment))
+            head = {"t_s": segment.t_s, "source": source, "segment": segment.name}
+            cells = _columns(_Q, segment.orientation) | {"sd_deg": _degrees(segment.sd_rad)}
+            parts["segments"].append(_filled(head | cells))
         for joint in getattr(session, f"{prefix}joints"):
-            parts["angles"] += _angle_tables(source, joint)
+            head = {"t_s": joint.t_s, "source": source, "joint": joint.name}
+            for name, angle in joint.angles.items():
+                sd_deg = _degrees(joint.angle_sd.get(name))
+                cells = {"angle": name, "angle_deg": np.rad2deg(angle), "sd_deg": sd_deg}
+                parts["angles"].append(_filled(head | cells))
             if joint.position is not None:
-                parts["positions"].append(_position_table(source, joint))
+                cells = _columns(_XYZ, joint.position) | {"sd_m": joint.position_sd}
+                parts["positions"].append(_filled(head | cells))
     if session.events:
         parts["events"].append(_event_table(session.events))
     return {
@@ -99,29 +106,6 @@ def _sensor_table(sensor: SensorSeries) -> Table:
     for name, columns in _INERTIAL.items():
         table |= _columns(columns, getattr(sensor, name))
     return _filled(table)
-
-
-def _segment_table(source: str, segment: SegmentSeries) -> Table:
-    table = {"t_s": segment.t_s, "source": source, "segment": segment.name}
-    table |= _columns(_Q, segment.orientation)
-    return _filled(table | {"sd_deg": _degrees(segment.sd_rad)})
-
-
-def _angle_tables(source: str, joint: JointSeries) -> list[Table]:
-    head = {"t_s": joint.t_s, "source": source, "joint": joint.name}
-    return [
-        _filled(
-            head
-            | {"angle": name}
-            | {"angle_deg": np.rad2deg(angle), "sd_deg": _degrees(joint.angle_sd.get(name))}
-        )
-        for name, angle in joint.angles.items()
-    ]
-
-
-def _position_table(source: str, joint: JointSeries) -> Table:
-    table = {"t_s": joint.t_s, "source": source, "joint": joint.name}
-    return _filled(table | _columns(_XYZ, joint.position) | {"sd_m": joint.position_sd})
 
 
 def _event_table(events: Sequence[TimelineEvent]) -> Table:

@@ -9,6 +9,7 @@ Channels are described as https://github.com/sccn/xdf/wiki/Mocap-Meta-Data propo
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, cast
 from xml.etree import ElementTree as ET
@@ -45,7 +46,6 @@ from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.session_data import TimelineEvent, is_uniform, sample_rate_hz
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from jointfit_daemon.arrays import Array
@@ -107,17 +107,13 @@ def stream_description(stream: ChannelStream) -> ET.Element:
         element = ET.SubElement(channels, "channel")
         _add(element, "label", channel.label)
         _add(element, "object", channel.object)
-        _add(element, "type", _mocap_type(channel))
+        word = _MOCAP_WORDS.get(channel.quantity)
+        _add(element, "type", word + channel.component.upper() if word else channel.quantity)
         _add(element, "unit", {"m": "meters"}.get(channel.unit, channel.unit))
         _add(element, "quantity", channel.quantity)
         _add(element, "component", channel.component)
         _add(element, "placement", channel.placement)
     return description
-
-
-def _mocap_type(channel: Channel) -> str:
-    word = _MOCAP_WORDS.get(channel.quantity)
-    return word + channel.component.upper() if word else channel.quantity
 
 
 def _stream_header(stream: ChannelStream) -> bytes:
@@ -199,7 +195,11 @@ def read_xdf_session(path: Path) -> SessionData:
             " types PositionX or OrientationW, or streams of strings: describe the channels"
         )
     if not start:
-        numeric, events = _from_zero(numeric, events)
+        # Without a start of the session, the first time stamp is at 0 s.
+        firsts = [s.t_s[0] for s in numeric if len(s.t_s)] + [event.t_s for event in events]
+        first = float(min(firsts, default=0.0))
+        numeric = [replace(stream, t_s=stream.t_s - first) for stream in numeric]
+        events = [replace(event, t_s=event.t_s - first) for event in events]
     return session_of(
         numeric,
         path.stem,
@@ -288,13 +288,3 @@ def _channel_of(element: ET.Element, stream: str) -> Channel | None:
         if text("type").startswith(word) and len(text("type")) == len(word) + 1:
             return Channel(item, quantity, text("type")[-1].lower())
     return None
-
-
-def _from_zero(
-    streams: Sequence[ChannelStream], events: Sequence[TimelineEvent]
-) -> tuple[list[ChannelStream], list[TimelineEvent]]:
-    """Return streams and events with the first time stamp at 0 s."""
-    firsts = [float(s.t_s[0]) for s in streams if len(s.t_s)] + [event.t_s for event in events]
-    first = min(firsts, default=0.0)
-    moved = [ChannelStream(s.group, s.name, s.t_s - first, s.channels, s.values) for s in streams]
-    return moved, [TimelineEvent(e.t_s - first, e.kind, e.id, e.text, e.data) for e in events]

@@ -208,13 +208,14 @@ class SessionWriter:
 
         self._retry_s = now_s + RETRY_S
         before, t_ns = batch.before, time.monotonic_ns()
+        offset_ns = before.unix_offset_ns
         info = RecordingInfo(
             FORMAT,
             self.session,
             self._number + 1,
             self.rig,
             self.began_with_daemon,
-            before.unix_offset_ns if before.unix_offset_ns is not None else _unix_offset_ns(),
+            time.time_ns() - time.monotonic_ns() if offset_ns is None else offset_ns,
             batch.first_sequence,
             t_ns,
             SOFTWARE,
@@ -373,7 +374,3 @@ class SessionWriter:
         t_ns = gap.to_t_ns
         part.add(GAP, t_ns, t_ns, batch.first_sequence, content)
         self._add_snapshot(part, batch.before, batch.first_sequence)
-
-
-def _unix_offset_ns() -> int:
-    return time.time_ns() - time.monotonic_ns()

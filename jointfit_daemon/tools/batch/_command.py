@@ -12,9 +12,7 @@ from jointfit_daemon.tools.command_group import EXIT_FAILED
 from jointfit_daemon.tools.text_output import check_choice
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from jointfit_daemon.tools.batch.recording_task import RecordingResult
+    from collections.abc import Sequence
 
 
 def batch(
@@ -63,7 +61,11 @@ def batch(
         running = run_on_cluster(tasks, scheduler)
     else:
         running = run_in_pool(tasks, jobs or os.cpu_count() or 1)
-    results = _collect(running, len(tasks))
+    results = []
+    for number, result in enumerate(running, start=1):
+        text = f": {result.error}" if result.error else ""
+        typer.echo(f"[{number}/{len(tasks)}] {result.recording}: {result.status}{text}", err=True)
+        results.append(result)
     for path in write_summary(results, output):
         typer.echo(f"wrote {path}", err=True)
     if any(result.status != "done" for result in results):
@@ -76,13 +78,3 @@ def _words(option: str, text: str, choices: Sequence[str]) -> tuple[str, ...]:
     for word in words or [""]:
         check_choice(option, word, choices)
     return tuple(choice for choice in choices if choice in words)
-
-
-def _collect(running: Iterable[RecordingResult], total: int) -> list[RecordingResult]:
-    """Print one line for every finished recording, and return all."""
-    results = []
-    for number, result in enumerate(running, start=1):
-        text = f": {result.error}" if result.error else ""
-        typer.echo(f"[{number}/{total}] {result.recording}: {result.status}{text}", err=True)
-        results.append(result)
-    return results

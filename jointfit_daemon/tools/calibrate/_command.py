@@ -86,16 +86,12 @@ class OutputLostError(Exception):
     """Standard error is closed, for example because the terminal was closed."""
 
 
-def _complete_phase(incomplete: str) -> list[str]:
-    return [name for name in _PHASES if name.startswith(incomplete)]
-
-
 _Phases = Annotated[
     list[str] | None,
     typer.Option(
         help="align, static, functional, abort or revert; repeatable. Default: static, and"
         " functional if rig.toml has a motion-capture source.",
-        autocompletion=_complete_phase,
+        autocompletion=lambda incomplete: [p for p in _PHASES if p.startswith(incomplete)],
     ),
 ]
 _Seconds = Annotated[

@@ -106,10 +106,12 @@ def listen_can(
     sizes = {key: found[-1][1] for key, found in arrivals.items()}
     devices = tuple(_decode(sizes, chunks))
     owners = {key: device.driver for device in devices for key in _keys(device.settings)}
-    identifiers = tuple(
-        _identifier(key, found, owners.get(key)) for key, found in sorted(arrivals.items())
-    )
-    return CanTraffic(interface, None, identifiers, devices, errors)
+    identifiers = []
+    for key, found in sorted(arrivals.items()):
+        (first_ns, _), (last_ns, size) = found[0], found[-1]
+        rate_hz = (len(found) - 1) * 1e9 / (last_ns - first_ns) if last_ns > first_ns else None
+        identifiers.append(CanIdentifier(*key, size, len(found), rate_hz, owners.get(key)))
+    return CanTraffic(interface, None, tuple(identifiers), devices, errors)
 
 
 def _decode(sizes: Mapping[tuple[int, bool], int], chunks: list[Chunk]) -> Iterator[DecodedDevice]:
@@ -139,14 +141,6 @@ def _keys(table: Mapping[str, Any]) -> set[tuple[int, bool]]:
     """Return the identifiers in the key ``ids`` of a table."""
     extended = bool(table.get("extended_ids"))
     return {(number, extended) for number in (table.get("ids") or {}).values()}
-
-
-def _identifier(
-    key: tuple[int, bool], found: list[tuple[int, int]], driver: str | None
-) -> CanIdentifier:
-    span_ns = found[-1][0] - found[0][0]
-    rate_hz = (len(found) - 1) * 1e9 / span_ns if span_ns > 0 else None
-    return CanIdentifier(*key, found[-1][1], len(found), rate_hz, driver)
 
 
 def _receive(

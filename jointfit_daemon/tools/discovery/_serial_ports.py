@@ -63,8 +63,10 @@ def find_serial_ports(root: Path = Path("/")) -> list[SerialPortInfo]:
     by_id, by_path = _links(root, "by-id"), _links(root, "by-path")
     found = []
     for tty in sorted((root / "sys/class/tty").glob("*")):
-        if not (tty / "device").exists() or _is_empty_socket(tty):
-            continue  # consoles and pseudo-terminals have no device
+        # Consoles and pseudo-terminals have no device. For type 0, PORT_UNKNOWN, the kernel
+        # reserves the name without hardware.
+        if not (tty / "device").exists() or read_number(tty / "type") == 0:
+            continue
         hardware = (tty / "device").resolve()
         # The USB device that contains the port; None for other buses.
         usb = next((up for up in (hardware, *hardware.parents) if (up / "idVendor").exists()), None)
@@ -84,11 +86,6 @@ def find_serial_ports(root: Path = Path("/")) -> list[SerialPortInfo]:
             )
         )
     return found
-
-
-def _is_empty_socket(tty: Path) -> bool:
-    """Return whether the kernel reserves the name without hardware: type 0, PORT_UNKNOWN."""
-    return read_number(tty / "type") == 0
 
 
 def _links(root: Path, kind: str) -> dict[str, str]:

@@ -17,11 +17,9 @@ import typer
 from jointfit_daemon.tools.command_group import EXIT_FAILED
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration
-    from jointfit_daemon.reprocessing import Changes, Verification
+    from jointfit_daemon.reprocessing import Changes
 
 _FASTEST = "max"
 _CHOICES = (
@@ -145,7 +143,17 @@ def _verify(file: Path, *, json: bool) -> None:
     found = verify_recording(file)
     took_s = time.monotonic() - began
     if json:
-        typer.echo(orjson.dumps(_verification_table(found, took_s)))
+        result = {
+            "passed": found.passed,
+            "seconds": found.seconds,
+            "took_s": took_s,
+            "compared": found.compared,
+            "until_s": found.until_s,
+            "difference": found.difference,
+            "gaps": found.gaps,
+            "tolerant": found.tolerant,
+        }
+        typer.echo(orjson.dumps(result))
     else:
         for line in found.lines():
             typer.echo(line)
@@ -155,16 +163,3 @@ def _verify(file: Path, *, json: bool) -> None:
         )
     if not found.passed:
         raise typer.Exit(EXIT_FAILED)
-
-
-def _verification_table(found: Verification, took_s: float) -> Mapping[str, object]:
-    return {
-        "passed": found.passed,
-        "seconds": found.seconds,
-        "took_s": took_s,
-        "compared": found.compared,
-        "until_s": found.until_s,
-        "difference": found.difference,
-        "gaps": found.gaps,
-        "tolerant": found.tolerant,
-    }

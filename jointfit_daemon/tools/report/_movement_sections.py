@@ -348,8 +348,12 @@ def comparison_section(results: SessionResults) -> str:
         for found in results.differences
     ]
     head = ("Angle", "RMS", "Bias", "SD", "Limits of agreement", "Largest", "Inside interval")
-    shown = _first_angles(results.differences)
-    panels = "".join(_difference_figure(found) + _agreement_figure(found) for found in shown)
+
+    # Panels of the first angle of every joint: flexion, or elevation.
+    shown: dict[str, AngleDifference] = {}
+    for found in results.differences:
+        shown.setdefault(found.joint, found)
+    panels = "".join(_difference_figure(one) + _agreement_figure(one) for one in shown.values())
     return section(
         "cameras",
         "Sensors against cameras",
@@ -365,14 +369,6 @@ def comparison_section(results: SessionResults) -> str:
             ),
         ],
     )
-
-
-def _first_angles(differences: tuple[AngleDifference, ...]) -> list[AngleDifference]:
-    """Return the first angle of every joint: flexion, or elevation."""
-    first: dict[str, AngleDifference] = {}
-    for found in differences:
-        first.setdefault(found.joint, found)
-    return list(first.values())
 
 
 def _difference_figure(found: AngleDifference) -> str:

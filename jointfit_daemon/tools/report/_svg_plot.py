@@ -177,7 +177,12 @@ def line(area: PlotArea, x: Array, y: Array, kind: str) -> str:
     if len(x) > 2 * area.columns:
         x, low, high = column_extremes(area, x, y, y)
         x, y = np.repeat(x, 2), np.column_stack([low, high]).ravel()
-    return _path(area.x_px(x), area.y_px(y), f"line {kind}")
+    x_px, y_px = area.x_px(x), area.y_px(y)
+    parts = []
+    for start, end in runs(np.isfinite(x_px) & np.isfinite(y_px)):
+        pairs = zip(x_px[start:end], y_px[start:end], strict=True)
+        parts.append("M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in pairs))
+    return f'<path class="line {kind}" d="{"".join(parts)}"/>' if parts else ""
 
 
 def band(area: PlotArea, x: Array, low: Array, high: Array, kind: str) -> str:
@@ -222,11 +227,3 @@ def column_extremes(
     span = area.x[1] - area.x[0]
     centers = area.x[0] + (np.arange(area.columns) + 0.5) / area.columns * span
     return centers, lowest, highest
-
-
-def _path(x_px: Array, y_px: Array, kind: str) -> str:
-    parts = []
-    for start, end in runs(np.isfinite(x_px) & np.isfinite(y_px)):
-        pairs = zip(x_px[start:end], y_px[start:end], strict=True)
-        parts.append("M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in pairs))
-    return f'<path class="{kind}" d="{"".join(parts)}"/>' if parts else ""

@@ -82,8 +82,11 @@ def _name(session: SessionData) -> str:
 
 
 def _header(results: SessionResults) -> str:
-    session = results.session
-    pairs = [("Date", _date(session)), ("Duration", duration(session.duration_s))]
+    session, date = results.session, UNKNOWN
+    if session.start_unix_ns is not None:
+        start = datetime.fromtimestamp(session.start_unix_ns // 1_000_000_000, tz=UTC)
+        date = f"{start.day} {start:%B %Y, %H:%M:%S} UTC"
+    pairs = [("Date", date), ("Duration", duration(session.duration_s))]
     pairs += [
         (label, session.description[key])
         for key, label in _DESCRIBED
@@ -100,13 +103,6 @@ def _header(results: SessionResults) -> str:
         f'<header><p class="kicker">Session report</p><h1>{escape(_name(session))}</h1>'
         f'{facts(pairs, "facts head")}<nav aria-label="Sections">{links}</nav></header>'
     )
-
-
-def _date(session: SessionData) -> str:
-    if session.start_unix_ns is None:
-        return UNKNOWN
-    start = datetime.fromtimestamp(session.start_unix_ns // 1_000_000_000, tz=UTC)
-    return f"{start.day} {start:%B %Y, %H:%M:%S} UTC"
 
 
 def _summary(results: SessionResults) -> str:
