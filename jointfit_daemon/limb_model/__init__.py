@@ -36,7 +36,12 @@ from jointfit_daemon.limb_model._kernel_expert import KernelExpert, as_rows
 from jointfit_daemon.limb_model._kernel_features import TILTS, bumps, smooth_terms, widths_of
 from jointfit_daemon.limb_model._kernel_model import KernelModel, mix_corrections, model_inputs
 from jointfit_daemon.limb_model._kernel_trend import LEVEL_AXES, trend
-from jointfit_daemon.limb_model._label_search import LabelFault, LabelSearch, explain_trial
+from jointfit_daemon.limb_model._label_search import (
+    LabelFault,
+    LabelSearch,
+    explain_trial,
+    join_words,
+)
 from jointfit_daemon.limb_model._leverage_variance import FARTHEST, WITHIN, LeverageVariance
 from jointfit_daemon.limb_model._marker_cluster import (
     MarkerCluster,
@@ -126,6 +131,7 @@ __all__ = [
     "inner_joints",
     "is_left",
     "is_line",
+    "join_words",
     "joint_parts",
     "level_axis",
     "mix_corrections",

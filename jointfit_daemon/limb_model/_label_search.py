@@ -75,6 +75,12 @@ _CONFIRMED = 0.5
 """Share of the suspicious frames of a trial that an explanation needs."""
 
 
+def join_words(words: Iterable[str]) -> str:
+    """Return one or more words as ``a``, ``a and b`` or ``a, b and c``."""
+    *first, last = words
+    return f"{', '.join(first)} and {last}" if first else last
+
+
 class LabelFault(NamedTuple):
     """Labels of one frame that are not at their own places."""
 
@@ -91,20 +97,16 @@ class LabelFault(NamedTuple):
         """Return which marker is at whose place, as a clause."""
         names = self.markers
         following = zip(names, names[1:] + (names[:1] if self.cycle else ()), strict=False)
-        *first, last = [f"{name} is at the place of {other}" for name, other in following]
-        return f"{', '.join(first)} and {last}" if first else last
+        return join_words(f"{name} is at the place of {other}" for name, other in following)
 
     @property
     def text(self) -> str:
         """Return what is wrong with two or more markers, as a sentence without its end."""
         if self.cycle:
-            *first, last = self.markers
-            return f"{', '.join(first)} and {last} look exchanged: {self.places}"
-        *first, last = self.markers[:-1]
-        if first:
-            names = f"{', '.join(first)} and {last}"
-            return f"{names} have labels of other markers: {self.places}, which is hidden"
-        return f"{last} has the label of another marker: {self.places}, which is hidden"
+            return f"{join_words(self.markers)} look exchanged: {self.places}"
+        names = self.markers[:-1]
+        wrong = "have labels of other markers" if names[1:] else "has the label of another marker"
+        return f"{join_words(names)} {wrong}: {self.places}, which is hidden"
 
 
 class LabelFinding(NamedTuple):

@@ -20,6 +20,7 @@ from jointfit_daemon.limb_model import (
     LabelFault,
     LabelSearch,
     body_parts,
+    join_words,
     joint_parts,
     restore_cluster,
 )
@@ -191,7 +192,7 @@ class LabelMonitor:
             )
             if len(frames) >= _FEWEST and bad <= _ABSENT * len(frames):
                 del self.faults[fault]
-                text = f"{_joined(fault.markers)}: at the expected place again, and in use"
+                text = f"{join_words(fault.markers)}: at the expected place again, and in use"
                 notices.append(_notice(t_ns, fault.markers[0], "ok", text, fault))
         for part in sorted(self.misfits):
             frames = self._frames(t_ns, [part], FAULT_NS)
@@ -248,8 +249,3 @@ def _notice(t_ns: int, name: str, state: str, text: str, fault: LabelFault) -> N
     level = NoticeLevel.INFO if state == "ok" else NoticeLevel.WARNING
     data = {"state": str(state), "markers": list(fault.markers), "segments": list(fault.parts)}
     return Notice(t_ns, NoticeKind.MARKER, name, text, level, data)
-
-
-def _joined(words: Iterable[str]) -> str:
-    *first, last = words
-    return f"{', '.join(first)} and {last}" if first else last

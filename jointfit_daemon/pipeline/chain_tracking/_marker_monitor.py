@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_daemon.kinematics.exchanged_labels import find_exchanged_labels
+from jointfit_daemon.limb_model import join_words
 from jointfit_daemon.model import MarkerFlag
 from jointfit_daemon.pipeline.chain_tracking._segment_labels import SegmentLabels
 
@@ -228,12 +229,12 @@ class MarkerMonitor:
 
     def _report(self, markers: tuple[int, ...], distances: Array) -> MarkerReport:
         names = [self.model.markers[m].name for m in markers]
-        shown = _joined(f"{1000 * distances[m]:.0f} mm" for m in markers)
+        shown = join_words(f"{1000 * distances[m]:.0f} mm" for m in markers)
         if len(markers) > 1:
             following = zip(names, names[1:] + names[:1], strict=True)
-            order = _joined(f"{name} is at the place of {other}" for name, other in following)
+            order = join_words(f"{name} is at the place of {other}" for name, other in following)
             text = (
-                f"{_joined(names)} look exchanged ({shown} from their places in the model): "
+                f"{join_words(names)} look exchanged ({shown} from their places in the model): "
                 f"{order}. Correct their labels; they are excluded until then"
             )
             return MarkerReport(names[0], MarkerFlag.EXCHANGED, text, {"markers": names})
@@ -273,7 +274,7 @@ class MarkerMonitor:
             self._by_shape.discard(flag)
             self.excluded[list(markers)] = False
             names = [self.model.markers[m].name for m in markers]
-            text = f"{_joined(names)}: at the expected place again, and in use"
+            text = f"{join_words(names)}: at the expected place again, and in use"
             reports.append(MarkerReport(names[0], "ok", text, {"markers": names}))
         return reports
 
@@ -311,8 +312,3 @@ class MarkerMonitor:
         )
         data = {"segment": marker.segment, "moves_with": segment}
         return MarkerReport(marker.name, MarkerFlag.MISPLACED, text, data)
-
-
-def _joined(words: Iterable[str]) -> str:
-    *first, last = words
-    return f"{', '.join(first)} and {last}" if first else last
