@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain, product
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +21,7 @@ from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.chains import exp_matrix
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
@@ -43,23 +42,6 @@ _TRIED = 24
 _TOGETHER = 250
 """Instants that are compared with the tried poses at once, which bounds the memory."""
 _THREE_ANGLES = 3
-_FEW_ITERATIONS = 8
-"""Iterations from the coordinates of the instant before; two are typical."""
-_FARTHEST_STEP = 0.8
-"""Largest step of an angle at run time, rad: most inversions begin close to the solution."""
-_CLOSE = 1e-3
-"""Distance, rad and m, from which one more step leads to the solution at run time: the remaining
-error is about its square."""
-_SETTLED = 1e-4
-"""Largest step at run time, rad and m, of a joint that its coordinates describe in part only."""
-_FARTHEST_MISFIT = 0.5
-"""Largest rotation that its coordinates may leave undescribed, rad; more is another solution."""
-_RETRY = 10
-"""Instants between two attempts to find coordinates without those of the instant before."""
-_QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
-"""Angles from which an inversion begins without an instant before, rad."""
-_STEEP = 0.87
-"""The same for the second of three rotations: 50 degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,150 +179,6 @@ def coordinate_table(
         np.concatenate(sd, axis=1),
         misfit,
     )
-
-
-class CoordinateTracker:
-    """Coordinates of one state after the other, each inverted from the values before.
-
-    The result is that of `coordinate_table`, in a hundredth of its time per instant. Where a joint
-    has fewer coordinates than degrees of freedom, the sine of the rotation that they leave is
-    minimized instead of the rotation.
-
-    Parameters
-    ----------
-    model
-        The chain.
-    coordinates
-        One entry for each segment, in the order of the model.
-    """
-
-    def __init__(self, model: ChainModel, coordinates: tuple[JointCoordinates, ...]) -> None:
-        self._model, self._coordinates = model, coordinates
-        self._last: list[Array | None] = [None] * len(coordinates)
-        self._waiting = [0] * len(coordinates)
-        """Instants until the next attempt of each joint to find coordinates without a start."""
-
-    def read(self, state: ChainState, covariance: Array) -> tuple[Array, Array]:
-        """Return values and standard deviations, rad and m, shape (K,); angles within half a turn.
-
-        Parameters
-        ----------
-        state
-            State at one instant.
-        covariance
-            Covariance of a step, rad^2 and m^2, shape (nq, nq).
-
-        Returns
-        -------
-        values, sd
-            NaN for a joint whose pose its coordinates do not describe.
-        """
-        values, sd, coupled, free = [], [], 0, 0
-        for i, (joint, segment) in enumerate(
-            zip(self._coordinates, self._model.segments, strict=True)
-        ):
-            block = covariance[self._model.columns[i], self._model.columns[i]]
-            is_free = segment.joint.kind == "free"
-            if joint.pose is None and state.couplings is not None:
-                values.append(state.couplings[0, coupled, :1])
-                sd.append(np.sqrt(block[0]))
-                coupled += 1
-                continue
-
-            origin = state.origins[0, free] if is_free else np.zeros(3)
-            free += is_free
-            found, G = self._invert(i, state.rotations[0, i], origin, is_free=is_free)
-            values.append(found)
-            P = _pseudo_inverse(G)
-            if segment.joint.kind == "hinge":
-                P = P @ np.asarray(segment.joint.axis)[:, None]
-            sd.append(np.sqrt(np.einsum("kj,jl,kl->k", P, block, P)))
-        return np.concatenate(values), np.concatenate(sd)
-
-    def _invert(
-        self, number: int, A: Array, origin: Array, *, is_free: bool
-    ) -> tuple[Array, Array]:
-        """Return the values and their derivative, NaN if no start leads to the pose."""
-        joint, last = self._coordinates[number], self._last[number]
-        rows = 6 if is_free else 3
-        unknown = np.full(len(joint.names), np.nan), np.full((rows, len(joint.names)), np.nan)
-        if self._waiting[number]:
-            self._waiting[number] -= 1
-            return unknown
-        for start in _starts(joint) if last is None else chain([last], _starts(joint)):
-            found = _invert_from(joint, start, A, origin, rows)
-            if found is None:
-                continue
-            values, G = found
-            turns = np.round(values / (2.0 * np.pi)) * joint.is_angle
-            values = values - 2.0 * np.pi * turns
-            second = 0.0 if joint.middle is None else abs(values[joint.middle])
-            if second <= 0.5 * np.pi + _CLOSE:
-                self._last[number] = values
-                return values, G
-        self._last[number], self._waiting[number] = None, _RETRY
-        return unknown
-
-
-def _starts(joint: JointCoordinates) -> Iterator[Array]:
-    """Yield values from which an inversion can begin, small ones first."""
-    turning = np.flatnonzero(joint.is_angle)
-    if len(turning) > _THREE_ANGLES:
-        return
-    for quarters in product(*[_QUARTERS] * len(turning)):
-        values = np.zeros(len(joint.names))
-        values[turning] = quarters
-        if joint.middle is None or abs(values[joint.middle]) < 0.5 * np.pi:
-            yield values
-        elif values[joint.middle] < np.pi:
-            values[joint.middle] = np.copysign(_STEEP, values[joint.middle])
-            yield values
-
-
-def _invert_from(
-    joint: JointCoordinates, values: Array, A: Array, origin: Array, rows: int
-) -> tuple[Array, Array] | None:
-    """Return the values of one pose, shape (k,), and their derivative, shape (rows, k).
-
-    None if the iteration does not converge to the pose.
-    """
-    for _ in range(_FEW_ITERATIONS):
-        missing, G, off = _linearize(joint, values, A, origin, rows)
-        step = _pseudo_inverse(G) @ missing
-        turned = float(np.abs(step * joint.is_angle).max(initial=0.0))
-        scale = min(1.0, _FARTHEST_STEP / max(turned, _CONVERGED))
-        values = values + np.where(joint.is_angle, scale * step, step)
-        if off < _CLOSE:
-            return values, G
-
-        # Fewer coordinates than degrees of freedom describe a noisy pose by least squares.
-        if len(values) < rows and np.abs(step).max() < _SETTLED and off < _FARTHEST_MISFIT:
-            return values, G
-    return None
-
-
-def _linearize(
-    joint: JointCoordinates, values: Array, A: Array, origin: Array, rows: int
-) -> tuple[Array, Array, float]:
-    """Return the step from the pose at `values` to (A, origin), its derivative, and its size."""
-    count = len(values)
-    shift = _DIFFERENCE * np.eye(count)
-    R, t = _pose(joint, np.concatenate((values[None], values - shift, values + shift)))
-    to_R, to_t = (
-        np.concatenate((A[None], R[1 + count :])),
-        np.concatenate((origin[None], t[1 + count :])),
-    )
-    between = R[: 1 + count].swapaxes(-1, -2) @ to_R
-
-    # sin(x) instead of x: exact for the small rotations at the end
-    steps = np.empty((1 + count, 6))
-    steps[:, :3] = 0.5 * (between[:, (2, 0, 1), (1, 2, 0)] - between[:, (1, 2, 0), (2, 0, 1)])
-    steps[:, 3:] = to_t - t[: 1 + count]
-    missing, G = steps[0, :rows], steps[1:, :rows].T / (2.0 * _DIFFERENCE)
-
-    # the sine is also small near half a turn, where the trace is below 1
-    far = float(between[0].trace()) < 1.0
-    return missing, G, np.inf if far else float(np.abs(missing).max())
 
 
 def _inverted(

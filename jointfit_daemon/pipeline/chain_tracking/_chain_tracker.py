@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_daemon.kinematics.accepted_errors import is_accepted
-from jointfit_daemon.kinematics.chain_coordinates import CoordinateTracker
+from jointfit_daemon.kinematics.coordinate_tracking import CoordinateTracker
 from jointfit_daemon.kinematics.inverse_kinematics import LiveInverseKinematics, LiveOptions
 from jointfit_daemon.model import ChainModelState, MarkerFitErrors, MarkerFlag, ModelCoordinate
 from jointfit_daemon.pipeline.chain_tracking._marker_monitor import MarkerMonitor
