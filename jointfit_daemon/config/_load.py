@@ -18,7 +18,7 @@ from jointfit_daemon.config import _bandwidth, _checks
 from jointfit_daemon.config._branched_limb import branched_limb
 from jointfit_daemon.config._bus_faults import complete_bus, likely_interface, unusable_keys
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
-from jointfit_daemon.config._open_places import fill_open_places
+from jointfit_daemon.config._open_places import fill_open_places, with_known_ids
 from jointfit_daemon.config._readable import contradictions, readable_part
 from jointfit_daemon.config._rig import MOCAP, Rig, Source
 from jointfit_daemon.config._syntax import read_table, without_unreadable
@@ -154,7 +154,7 @@ class _RigReader:
 
         # Checks across tables, even if some of them have faults.
         self.faults += _checks.check_ports(self.imus_read, buses)
-        self.faults += _checks.check_can_ids(self.imus_read)
+        self.faults += _checks.check_can_ids(with_known_ids(self.imus_read, self.faults))
         reported = {fault.key for fault in self.faults}  # a wrong bit rate has no load
         loads = [
             *_bandwidth.check_serial_lines(self.imus_with_load),

@@ -1,7 +1,7 @@
-"""Open places of a rig.toml: keys with the word ``later`` instead of a device.
+"""Open places of a rig.toml: keys with the word ``later`` instead of a value.
 
-`jointfit init` writes them where no device was connected yet. Invariant: an open place is one fault
-with its remedy, and causes no other fault.
+`jointfit init` writes them where a device, its identifiers or its names were not known yet.
+Invariant: an open place is one fault with its remedy, and causes no other fault.
 """
 
 from __future__ import annotations
@@ -11,10 +11,14 @@ from typing import TYPE_CHECKING, Any
 from jointfit_daemon.config._fault_messages import Fault
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterable, Mapping
+
+    from jointfit_daemon.config._rig import Source
 
 LATER = "later"
-"""Word in place of a device that is not known yet."""
+"""Word in place of a device, identifiers or names that are not known yet."""
+_FEW = 4
+"""Number of markers in an open place: more than every check asks for."""
 _AGAIN = "`jointfit init FOLDER --force` asks for the open places only"
 _PORT = (
     "not filled in yet: connect the sensor and enter its serial port, which `jointfit probe` lists;"
@@ -23,6 +27,18 @@ _PORT = (
 _SERVER = (
     "not filled in yet: enter the address of the motion-capture computer, which `jointfit probe"
     f" --network` finds; or remove [mocap] to use IMUs only. {_AGAIN}"
+)
+_IDS = (
+    "not filled in yet: enter the identifiers that the sensor sends, which `jointfit probe` lists"
+    f" for a CAN interface. {_AGAIN}"
+)
+_MARKERS = (
+    "not filled in yet: enter the names of the markers as in the stream, which `jointfit probe"
+    f" --network` lists. {_AGAIN}"
+)
+_PLATE = (
+    "not filled in yet: enter the name of the rigid body of the plate, or remove this key to"
+    f" calibrate without the align phase. {_AGAIN}"
 )
 
 
@@ -34,12 +50,44 @@ def fill_open_places(table: Mapping[str, Any]) -> tuple[dict[str, Any], list[Fau
     if isinstance(imus, list):
         filled["imu"] = list(imus)
         for at, imu in enumerate(imus):
-            if isinstance(imu, dict) and imu.get("port") == LATER:
+            if not isinstance(imu, dict):
+                continue
+            key = f"imu[{imu.get('id', at)}]"
+            if imu.get("port") == LATER:
                 filled["imu"][at] = imu | {"port": f"/dev/{LATER}-{at}"}
-                faults.append(Fault(f"imu[{imu.get('id', at)}].port", _PORT, LATER))
+                faults.append(Fault(f"{key}.port", _PORT, LATER))
+            if imu.get("ids") == LATER:
+                # The defaults of the driver may be those of another sensor: see `with_known_ids`.
+                filled["imu"][at] = {name: value for name, value in imu.items() if name != "ids"}
+                faults.append(Fault(f"{key}.ids", _IDS, LATER))
 
     mocap = table.get("mocap")
-    if isinstance(mocap, dict) and mocap.get("server") == LATER:
-        filled["mocap"] = mocap | {"server": "192.0.2.1"}  # an address for documentation
-        faults.append(Fault("mocap.server", _SERVER, LATER))
+    if isinstance(mocap, dict):
+        filled["mocap"], open_keys = _filled_cameras(mocap)
+        faults += open_keys
     return filled, faults
+
+
+def _filled_cameras(mocap: Mapping[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
+    filled, faults = dict(mocap), []
+    if mocap.get("server") == LATER:
+        filled["server"] = "192.0.2.1"  # an address for documentation
+        faults.append(Fault("mocap.server", _SERVER, LATER))
+    if mocap.get("plate") == LATER:
+        filled["plate"] = f"{LATER}-plate"
+        faults.append(Fault("mocap.plate", _PLATE, LATER))
+
+    markers = mocap.get("markers")
+    if isinstance(markers, dict):
+        filled["markers"] = dict(markers)
+        for part, names in markers.items():
+            if names == LATER:
+                filled["markers"][part] = [f"{LATER}-{part}-{k}" for k in range(_FEW)]
+                faults.append(Fault(f"mocap.markers.{part}", _MARKERS, LATER))
+    return filled, faults
+
+
+def with_known_ids(sources: Iterable[Source], faults: Iterable[Fault]) -> list[Source]:
+    """Return the sensors whose identifiers are no open place."""
+    open_keys = {fault.key for fault in faults if fault.value == LATER}
+    return [source for source in sources if f"imu[{source.id}].ids" not in open_keys]

@@ -181,7 +181,7 @@ class RequestHandlers:
 
         found = asdict(health)
         del found["backlog_bytes"]
-        return request.reply("ok", {"directory": str(recorder.directory), **found})
+        return request.reply("ok", {"directory": str(recorder.directory.absolute()), **found})
 
     async def selftest(self, request: Request) -> Reply:
         """Check devices, clocks, store, broker and host."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import io
 import re
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,8 @@ from tests.test_docs_commands import environment, shorten_simulations
 from tests.tools.dashboard.browser import OpenedPage, chromium, opened
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
     from tests.broker_fixture import Broker
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -34,6 +37,10 @@ WALK_S = 20.0
 """Time after the calibration before the last pictures, s: the length of the curve."""
 CLOCKS_S = 8.0
 """Time for the clocks of the sensors to settle, s."""
+MARKED_S = 4.0
+"""Time between two marks, s."""
+MARGIN_PX = 16.0
+"""Margin below the recording in its picture."""
 START_S = 6.0
 """Time until the subject walks after the calibration, s."""
 MOST_LINES = 16
@@ -90,22 +97,30 @@ class TutorialRun:
             await self._terminal(shell, "jointfit calibrate")
             await self._walk()
             await self._dashboard("live", "#angle-value", "°", WALK_S)
+            async with self._page() as page:
+                self._write("recording.webp", webp(await recording_picture(page)))
             await asyncio.to_thread(shell.run, self._command("python examples"))
             await self._terminal(shell, "head", before="python examples")
             shell.stop_services()
 
     async def _dashboard(self, name: str, selector: str, words: str, wait_s: float) -> None:
         """Take a picture of the dashboard, some time after an element contains the words."""
+        async with self._page() as page:
+            await page.until_text(selector, words, 60)
+            await asyncio.sleep(wait_s)
+            await page.page.evaluate(SHOW_BROKER, "127.0.0.1:1883")  # the port of a reader
+            png = await page.page.screenshot(full_page=True)
+            self._write(f"tutorial-{name}.webp", webp(png))
+
+    @asynccontextmanager
+    async def _page(self) -> AsyncIterator[OpenedPage]:
         server = DashboardServer(BrokerAddress(HOST, self._broker.port), base=BASE)
         async with (
             chromium() as browser,
             server.listening(ListenAddress(HOST, 0)) as url,
             opened(browser, url) as page,
         ):
-            await page.until_text(selector, words, 60)
-            await asyncio.sleep(wait_s)
-            await page.page.evaluate(SHOW_BROKER, "127.0.0.1:1883")  # the port of a reader
-            await self._screenshot(page, name)
+            yield page
 
     async def _terminal(self, shell: Shell, begin: str, before: str | None = None) -> None:
         """Run a command, or start a service, and draw the terminal."""
@@ -132,13 +147,6 @@ class TutorialRun:
         lines = own.splitlines()
         return "\n".join(lines[-MOST_LINES:] if len(lines) > MOST_LINES else lines)
 
-    async def _screenshot(self, page: OpenedPage, name: str) -> None:
-        png = await page.page.screenshot(full_page=True)
-        packed = io.BytesIO()
-        with Image.open(io.BytesIO(png)) as image:
-            image.convert("RGB").save(packed, "WEBP", quality=QUALITY, method=6)
-        self._write(f"tutorial-{name}.webp", packed.getvalue())
-
     def _write(self, name: str, content: bytes) -> None:
         (self._pictures / name).write_bytes(content)
         print(f"{name}: {len(content) / 1000:.0f} kB", flush=True)
@@ -158,6 +166,36 @@ class TutorialRun:
                 pass
         drawn = moving_limb.draw(moving_limb.walk(poses["pose"], poses["optical/pose"]))
         self._write("walking-leg.svg", drawn.encode())
+
+
+async def recording_picture(page: OpenedPage) -> bytes:
+    """Record with two marks by the buttons of the page; return a PNG of curve and recording."""
+    await page.until_text("#angle-value", "°", 60)
+    await page.page.click("text=Start recording")
+    await asyncio.sleep(MARKED_S)
+    await page.page.fill("#recording input", "heel strike")
+    await page.page.keyboard.press("Escape")
+    for _ in range(2):
+        await page.page.keyboard.press("m")
+        await asyncio.sleep(MARKED_S)
+    views = await page.page.locator("#views").bounding_box()
+    panel = await page.page.locator("#recording").bounding_box()
+    assert views is not None
+    assert panel is not None
+    height = panel["y"] + panel["height"] + MARGIN_PX - views["y"]
+    png = await page.page.screenshot(clip={**views, "height": height})
+    await page.page.click("text=Stop recording")
+    await page.page.click("#action .primary")
+    await page.until_text("#action .answer", "Recorded")
+    return png
+
+
+def webp(png: bytes) -> bytes:
+    """Return a picture as WebP."""
+    packed = io.BytesIO()
+    with Image.open(io.BytesIO(png)) as image:
+        image.convert("RGB").save(packed, "WEBP", quality=QUALITY, method=6)
+    return packed.getvalue()
 
 
 def run_tutorial(folder: Path, pictures: Path) -> None:

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from jointfit_daemon.outputs.recording import open_recording
+from jointfit_daemon.pipeline.events import Request
 from tests.broker_fixture import HOST
 from tests.system.station import BASE, FIT_PATIENCE_S, Station
 from tests.tools.dashboard.browser import PICTURES, SIZES, VIEWS, OpenedPage, chromium, opened
@@ -157,6 +159,22 @@ async def see_the_limb_move(page: OpenedPage) -> None:
     )
 
 
+async def record(page: OpenedPage) -> str:
+    """Start, mark and stop a recording in the page; return the name of its file."""
+    await page.page.click("text=Start recording")
+    await page.until_text("#recording-fact", "0:00:0")
+    await page.page.keyboard.press("m")
+    await page.until_text("#recording [role=status]", "Mark 1 at")
+    await page.until_text("#recording", "MB")
+    await page.page.reload()
+    await page.page.click("text=Stop recording")
+    await page.page.click("#action .primary")
+    await page.until_text("#action .answer", "nothing lost")
+    command = await page.text("#action pre")
+    await page.page.click("#action .buttons .button:not(.primary)")
+    return command.removeprefix("jointfit report ")
+
+
 async def turn_a_sensor(page: OpenedPage, simulator: Simulator) -> None:
     """Turn a simulated sensor while the subject stands: its axes follow."""
     await page.show("sensors")
@@ -267,6 +285,9 @@ async def test_a_rig_is_calibrated_in_the_page_and_survives_daemon_and_broker(
                     cost = await measured(browser, page, server)
                     await page.page.wait_for_function(FULL_CURVE, timeout=60_000)
                     await page.picture("run-dashboard")
+                    recorded = open_recording(Path(await record(page))).events()
+                    commands = [e.command for e in recorded if isinstance(e, Request)]
+                    assert commands == ["mark"]
                     await revert(page)
                     await simulator.say("play stand")
                     await turn_a_sensor(page, simulator)

@@ -21,6 +21,7 @@ from jointfit_daemon.outputs.payload_models._state import (
     Health,
     Info,
     Progress,
+    Recording,
     State,
 )
 from jointfit_daemon.outputs.payload_models._streams import OpticalPose, Pose, PoseJoint
@@ -38,6 +39,7 @@ __all__ = [
     "Pose",
     "PoseJoint",
     "Progress",
+    "Recording",
     "State",
     "StoredVersion",
     "answer_schema",

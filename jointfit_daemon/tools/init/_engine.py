@@ -45,7 +45,7 @@ class Asked:
     @property
     def proposal(self) -> Any:
         """Answer of the Enter key: the default, ``later`` for an open place, or None."""
-        is_open = self.default is None and self.question.postponable
+        is_open = self.default is None and self.question.postponable and not self.optional
         return LATER if is_open else self.default
 
     @property

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from itertools import chain, count
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.config import LATER
 from jointfit_daemon.tools.init._answers import (
     Key,
     driver_of,
@@ -90,7 +91,7 @@ def _ids_in_use(answers: Given, bus: str) -> list[tuple[int, ...]]:
     return [
         ids
         for (key, sensor), ids in answers.items()
-        if key == "ids" and answers.get(("device", sensor)) == bus
+        if key == "ids" and ids != LATER and answers.get(("device", sensor)) == bus
     ]
 
 
@@ -114,7 +115,12 @@ def unused_ids(answers: Given, found: Found, sensor: str) -> tuple[int, ...]:
 
 
 def _markers_in_use(answers: Given) -> set[str]:
-    return {name for (key, _), names in answers.items() if key == "markers" for name in names}
+    return {
+        name
+        for (key, _), names in answers.items()
+        if key == "markers" and names != LATER
+        for name in names
+    }
 
 
 def markers(answers: Given, found: Found, part: str) -> tuple[str, ...] | None:

@@ -222,9 +222,10 @@ QUESTIONS: tuple[Question, ...] = (
         "ids",
         "CAN identifiers of the sensor {subject}, as 0x105 0x106 0x121",
         "Identifiers of the messages of this sensor. 'find' receives on a"
-        " CAN interface and proposes the identifiers of its sensors. If they are unknown, return"
-        " with '<' and leave the connection for 'later'.",
+        " CAN interface and proposes the identifiers of its sensors. 'later' leaves the place open"
+        " until they are known.",
         group="sensor",
+        postponable=True,
         subjects=lambda answers, found: tuple(
             name
             for name in sensors_of(answers)
@@ -276,7 +277,9 @@ QUESTIONS: tuple[Question, ...] = (
         "names",
         "Markers on the {subject}",
         "Names in the stream, separated by commas: at least three that are not on one line."
-        " 'find' reads the names from the stream. Body parts beside the segments may have none.",
+        " 'find' reads the names from the stream. 'later' leaves the place open until they are"
+        " known. Body parts beside the segments may have none.",
+        postponable=True,
         subjects=lambda answers, _: marked_parts(answers),
         default=_proposals.markers,
         stand_in=_proposals.unused_markers,
@@ -286,7 +289,9 @@ QUESTIONS: tuple[Question, ...] = (
         "plate",
         "text",
         "Rigid body of the plate for the align phase",
-        "Name in the stream of the plate that carries all sensors once per laboratory.",
+        "Name in the stream of the plate that carries all sensors once per laboratory. 'later'"
+        " leaves the place open until it is known.",
+        postponable=True,
         subjects=_if(lambda answers: _has_sensors(answers) and has_cameras(answers)),
         default=_proposals.plate,
         optional=True,

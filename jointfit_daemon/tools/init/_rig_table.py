@@ -109,7 +109,9 @@ def _imu(answers: Given, found: Found, buses: Mapping[str, str], name: str) -> d
     table |= {"port": device} if driver.wiring == "serial" else {"can": buses[device]}
     if driver.baud is not None and device != LATER:
         table["baud"] = answers["baud", name]
-    if driver.ids:
+    if driver.ids and answers["ids", name] == LATER:
+        table["ids"] = LATER
+    elif driver.ids:
         table["ids"] = dict(zip(driver.ids, answers["ids", name], strict=True))
         if any(number > _STANDARD_MAX for number in answers["ids", name]):
             table["extended_ids"] = True
@@ -130,7 +132,10 @@ def _mocap(answers: Given, found: Found) -> dict[str, Any]:
     if answers.get(("plate", "")) is not None:
         table["plate"] = answers["plate", ""]
     named = {part: answers["markers", part] for part in marked_parts(answers)}
-    return table | {"markers": {part: list(names) for part, names in named.items() if names}}
+    markers = {
+        part: LATER if names == LATER else [*names] for part, names in named.items() if names
+    }
+    return table | {"markers": markers}
 
 
 def _mqtt(answers: Given) -> dict[str, Any]:

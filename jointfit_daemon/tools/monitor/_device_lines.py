@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from rich.cells import cell_len
 
+from jointfit_daemon.tools.monitor._recording_words import recording_text
 from jointfit_daemon.tools.monitor._text_lines import Column, Line, fit_text, table, wrap
 from jointfit_daemon.tools.monitor._words import (
     SYMBOLS,
@@ -161,7 +162,7 @@ def health_lines(rig: RigView, width: int, now: Moment, broker: str) -> list[Lin
     if health is None:
         return wrap("Waiting for bridge/health: the daemon sends it every 10 s.", width, "muted")
     lines = [line for name in health.devices for line in _counters(rig, name, width, now)]
-    lines += [Line(), Line.of("Daemon", "strong"), *_daemon(rig, health, width, broker)]
+    lines += [Line(), Line.of("Daemon", "strong"), *_daemon(rig, health, width, broker, now)]
     return lines
 
 
@@ -195,7 +196,7 @@ def _ms(microseconds: float | None) -> float | None:
     return None if microseconds is None else microseconds / 1000.0
 
 
-def _daemon(rig: RigView, health: Health, width: int, broker: str) -> list[Line]:
+def _daemon(rig: RigView, health: Health, width: int, broker: str, now: Moment) -> list[Line]:
     """Return the state of the process, its link, learning and recording."""
     process, link, frames = health.process, health.link, health.frames
     memory_mb = None if process.rss_bytes is None else process.rss_bytes / 1e6
@@ -218,12 +219,7 @@ def _daemon(rig: RigView, health: Health, width: int, broker: str) -> list[Line]
     faults = (health.state.fault, health.state.not_stored)
     texts += [(f"✖ {fault}", "error") for fault in faults if fault]
     if health.recording is not None:
-        failure = health.recording.failure
-        written_mb = format_number(health.recording.written_bytes / 1e6, 1, " MB")
-        texts.append(
-            (f"✖ recording interrupted: {failure}", "error") if failure
-            else (f"recording {health.recording.file}: {written_mb}", "")
-        )  # fmt: skip
+        texts.append(recording_text(rig, now))
     if rig.info is not None:
         texts.append((f"jointfitd {rig.info.software}, rig {rig.info.rig}", "muted"))
     return [line for text, style in texts for line in wrap(text, width, style, indent=2)]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from jointfit_daemon.outputs.log import printable
 from jointfit_daemon.outputs.payload_models import CalibrationsAnswer
 from jointfit_daemon.tools.monitor._decoding import UnreadablePayloadError, decode_answer
+from jointfit_daemon.tools.monitor._recording_words import recording_of
 from jointfit_daemon.tools.monitor._rig_view import RigView
 from jointfit_daemon.tools.monitor._words import RUNNING
 
@@ -96,6 +97,8 @@ class MonitorState:
     listed: tuple[object, ...] | None = None
     """Calibration for which the stored versions were requested."""
     notice: Notice | None = None
+    asked_to_stop: bool = False
+    """Whether the same key again stops the recording."""
 
     # --- connection ----------------------------------------------------------------------------
 
@@ -128,8 +131,7 @@ class MonitorState:
         elif answer.get("status") == "error":
             self.refused(f"jointfitd refuses {command}: {_fault_text(answer)}", now_s)
         else:
-            done = "started" if answer.get("status") == "accepted" else "done"
-            text = printable(f"{_words_of(command, answer)}: {done}")
+            text = printable(_words_of(command, answer))
             self.notice = Notice(text, False, now_s + _NOTICE_S)
             self.listed = None
 
@@ -172,6 +174,8 @@ class MonitorState:
         """Change the state by a key; return an action for the program, if the key has one."""
         if key in {"q", "ctrl+c", "ctrl+q"}:
             return Quit()
+        if key != "R":
+            self.asked_to_stop = False
         if self.base is None:
             bases = [*self.rigs]
             if key in {"up", "down"} and bases:
@@ -238,10 +242,20 @@ class MonitorState:
             return False
         return True
 
+    def _record(self) -> Action | None:
+        """Return the request that starts the recording, or at the second call the one to stop."""
+        recording, asked = recording_of(self.rig), self.asked_to_stop
+        self.asked_to_stop = recording is not None and recording.active and not asked
+        if recording is None or self.asked_to_stop:
+            return None
+        return SendRequest("record", {"action": "stop" if recording.active else "start"})
+
     def _requested_by(self, key: str) -> Action | None:
         """Return the request of a key; phases other than the static pose have it in their view."""
         if key == "m":
             return AskMark()
+        if key == "R":
+            return self._record()
         if key == "s" and not self.is_running:
             return SendRequest("static")
         if key == "x" and self.is_running:
@@ -277,10 +291,14 @@ def _words_of(command: str, answer: Mapping[str, Any]) -> str:
     """Return the effect of a request, in words."""
     data = answer.get("data")
     data = data if isinstance(data, dict) else {}
+    done = "started" if answer.get("status") == "accepted" else "done"
     if command == "mark":
-        return f"mark {data.get('number')}"
+        return f"mark {data.get('number')}: {done}"
     if command == "use-calibration":
-        return f"calibration in force is version {data.get('version')}"
+        return f"calibration in force is version {data.get('version')}: {done}"
     if command in {"calibrate", "static"}:
-        return f"{data.get('phase', 'static')} phase"
-    return command
+        return f"{data.get('phase', 'static')} phase: {done}"
+    if command == "record":
+        folder = f"{data.get('file')} in {data.get('directory')}"
+        return f"recording started: {folder}" if data.get("active") else f"recorded {folder}"
+    return f"{command}: {done}"

@@ -13,6 +13,7 @@ from jointfit_daemon.tools.monitor._calibration_lines import calibration_lines, 
 from jointfit_daemon.tools.monitor._device_lines import health_lines
 from jointfit_daemon.tools.monitor._live_lines import STALE_S, live_lines, pose_age_s
 from jointfit_daemon.tools.monitor._monitor_state import VIEWS
+from jointfit_daemon.tools.monitor._recording_words import recording_mark, recording_of
 from jointfit_daemon.tools.monitor._text_lines import Line, wrap
 from jointfit_daemon.tools.monitor._words import (
     SYMBOLS,
@@ -63,7 +64,9 @@ def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> l
             chosen = name == state.view
             text = f"[{number} {titles[name]}]" if chosen else f" {number} {titles[name]} "
             style: Style = "chosen" if chosen else "muted"
-            line = line.add(text, style).add(gap)
+            line = line.add(gap if line.spans else "").add(text, style)
+        if width >= _WIDE:
+            line = _spread(line, Line.of(*recording_mark(state.rig, now)), width)
         top.append(line)
     top += wrap(f"✖ {loss}" if loss else "", width, "error")[:_LOSS_LINES]
 
@@ -124,7 +127,7 @@ def page_state(state: MonitorState, now: Moment) -> tuple[Level, str, str]:
     level: Level = "error" if fault else "warning" if poor else "good"
     if calibration is None or calibration.phase == "uncalibrated" or state.is_running:
         level = "error" if fault else "muted"
-    return level, calibration_sentence(calibration), fault
+    return level, calibration_sentence(calibration, rig.gateway_us(now)), fault
 
 
 def _header(state: MonitorState, level: Level, words: str, width: int, now: Moment) -> list[Line]:
@@ -141,7 +144,10 @@ def _header(state: MonitorState, level: Level, words: str, width: int, now: Mome
         clock += f" ({format_duration(abs(error_s))} {direction})"
 
     if width < _WIDE:
-        first = _spread(Line.of(name, "strong"), Line.of(clock, "muted"), width)
+        recording, recording_style = recording_mark(rig, now)
+        shown = f"{recording}  " if recording else ""
+        side = Line.of(shown, recording_style).add(clock, "muted")
+        first = _spread(Line.of(name, "strong"), side, width)
         return [first, *wrap(words, width, style)[:2]]
     right = Line.of(f"{state.broker}  {clock}", "muted")
     return [_spread(Line.of(f"{name}  ", "strong").add(words, style), right, width)]
@@ -244,5 +250,9 @@ def _keys(state: MonitorState) -> list[tuple[str, str]]:
         "health": [("↑↓", "scroll")],
         "log": [("↑↓", "scroll"), ("w", "all" if state.only_problems else "warnings only")],
     }[state.view]
+    if state.asked_to_stop:
+        return [("R", "stop the recording"), ("any other key", "continue it")]
     phase = ("x", "stop phase") if state.is_running else ("s", "static pose")
-    return [("1–5", "views"), *keys, phase, ("m", "mark"), ("q", "quit")]
+    recording = recording_of(state.rig)
+    record = [] if recording is None else [("R", "stop rec" if recording.active else "record")]
+    return [("1–5", "views"), *keys, phase, *record, ("m", "mark"), ("q", "quit")]

@@ -22,6 +22,7 @@ RUNNING = frozenset({"align", "static", "functional", "fitting"})
 """Phases during which the daemon records or fits."""
 LARGE_SIGMA_US = 2000.0
 """Standard deviation of a clock, µs, above which it is a warning."""
+_MINUTE_S = 60.0
 _PHASES = {
     "uncalibrated": "Not calibrated",
     "align": "Align phase runs",
@@ -94,19 +95,35 @@ def angle_name(key: str) -> str:
     return "inner angle" if key == "inner_deg" else key.removesuffix("_deg").replace("_", " ")
 
 
-def calibration_sentence(calibration: CalibrationState | None) -> str:
-    """Return the state of the calibration in words."""
+def calibration_sentence(calibration: CalibrationState | None, now_us: float | None = None) -> str:
+    """Return the state of the calibration in words, with its age at a UNIX time of the gateway."""
     if calibration is None:
         return "Waiting for the calibration state"
     phase = str(calibration.phase)
     if phase == "calibrated":
         version = calibration.version
-        stored = "not stored yet" if version is None else f"version {version}"
+        age = _age_words(calibration.created_utc, now_us)
+        stored = "not stored yet" if version is None else f"version {version}{age}"
         rejected = "; the last result was rejected" if calibration.kept else ""
         return f"Calibrated, {stored}{rejected}"
     if phase == "aborted":
         return f"Calibration aborted: {calibration.text}"
     return _PHASES.get(phase, phase)
+
+
+def _age_words(created_utc: str | None, now_us: float | None) -> str:
+    """Return the time since a date in words; empty if it is unknown."""
+    if created_utc is None or now_us is None:
+        return ""
+    try:
+        created_us = datetime.fromisoformat(created_utc).timestamp() * 1e6
+    except (ValueError, OverflowError):
+        return ""
+    age_s = (now_us - created_us) / 1e6
+    if age_s < _MINUTE_S:
+        return ", just now"
+    # In whole minutes, which do not change every second.
+    return f", {format_duration(age_s) if age_s >= 1.5 * _MINUTE_S else '1 min'} ago"
 
 
 def clock_quality(device: DeviceCounts | None) -> tuple[Level, str]:

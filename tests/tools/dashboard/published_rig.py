@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 
 PERIOD_S = 0.1
 """Interval of `pose/ui`, s."""
+HEALTH_POSES = 20
+"""Poses from one health message to the next."""
+WRITTEN_BYTES_S = 66_600
+"""Growth of a recording, bytes/s: four IMUs at 100 Hz."""
 THIGH_M, SHANK_M = 0.43, 0.39
 STEP_S = 1.2
 """Period of the simulated walk, s."""
@@ -72,6 +76,19 @@ STORED = {
 """Data of the answer to the request `calibrations`."""
 
 
+RECORDING_FILE = "bench-1-20261123T091420-0001.mcap"
+RECORDING = {
+    "file": RECORDING_FILE, "duration_s": 724.0, "written_bytes": 48_213_000, "lost": 0,
+    "failure": None, "free_bytes": 93_200_000_000, "active": True,
+}  # fmt: skip
+"""State of the recording at the start of a rig."""
+STOPPED = {
+    "file": "", "duration_s": 0.0, "written_bytes": 0, "lost": 0, "failure": None,
+    "free_bytes": 93_200_000_000, "active": False,
+}  # fmt: skip
+"""The same without any recording."""
+
+
 @dataclass
 class PublishedRig:
     """Payloads of a rig with the joints hip, knee and ankle."""
@@ -105,10 +122,15 @@ class PublishedRig:
         default_factory=lambda: {"status": "accepted", "data": {}, "error": None}
     )
 
+    recording: dict[str, Any] = field(default_factory=lambda: dict(RECORDING))
+    """State of the recording, which requests change."""
+    marks: int = 0
+    """Number of marks that were set."""
     answers: dict[str, dict[str, Any]] = field(
         default_factory=lambda: {"calibrations": {"status": "ok", "data": STORED}}
     )
-    """Answers by command; `answer` to all others."""
+    """Answers by command; `answer` to all others but `record` and `mark`."""
+    _began_s: float = field(default_factory=time.monotonic)
 
     @property
     def devices(self) -> dict[str, dict[str, Any]]:
@@ -156,7 +178,32 @@ class PublishedRig:
             "process": {"cpu_pct": 9.1, "rss_bytes": 91000000},
             "learning": {"state": "waiting", "reason": "no live camera frames"},
             "link": {"connected": True, "sent": 9123, "dropped": 0, "denied": []},
+            "recording": {"backlog_bytes": 0, **self._recorded()},
         }  # fmt: skip
+
+    def _recorded(self) -> dict[str, Any]:
+        grown_s = time.monotonic() - self._began_s if self.recording["active"] else 0.0
+        size = self.recording["written_bytes"] + round(WRITTEN_BYTES_S * grown_s)
+        duration_s = self.recording["duration_s"] + grown_s
+        return self.recording | {"duration_s": duration_s, "written_bytes": size}
+
+    def reply(self, command: str, request: dict[str, Any]) -> dict[str, Any]:
+        """Return the answer to a request; `record` and `mark` have their effect."""
+        if command in self.answers:
+            return self.answers[command]
+        if command not in ("record", "mark") or self.answer["status"] == "error":
+            return self.answer
+        if command == "mark":
+            self.marks += 1
+            mark = {"number": self.marks, "t_us": self.now_us(), "text": request["text"]}
+            return {"status": "ok", "data": mark}
+        if request["action"] == "start" and not self.recording["active"]:
+            self.recording = STOPPED | {"file": RECORDING_FILE, "active": True}
+            self._began_s = time.monotonic()
+        elif request["action"] == "stop":
+            self.recording = self._recorded() | {"active": False}
+        state = {"directory": "/var/lib/jointfitd/recordings", **self._recorded()}
+        return {"status": "ok", "data": state}
 
     def calibration(self) -> dict[str, Any]:
         def tilted(degrees: float) -> list[float]:
@@ -307,6 +354,9 @@ async def _publish_poses(rig: PublishedRig, client: aiomqtt.Client) -> None:
             await client.publish(f"{rig.base}/optical/pose", orjson.dumps(optical))
             orientations = orjson.dumps(rig.orientations())
             await client.publish(f"{rig.base}/sensors/pose", orientations)
+        if seq % HEALTH_POSES == HEALTH_POSES - 1:
+            health = orjson.dumps(rig.health() | {"v": rig.version})
+            await client.publish(f"{rig.base}/bridge/health", health, 1, retain=True)
         seq += 1
         await asyncio.sleep(PERIOD_S)
 
@@ -319,7 +369,15 @@ async def _answer(rig: PublishedRig, client: aiomqtt.Client) -> None:
             if request.get("count") != 1:
                 rig.requests.append(request)
                 rig.commands.append(command)
-            found = rig.answers.get(command, rig.answer)
+            found = rig.reply(command, request)
             answer = {"v": 1, "transaction": request.get("transaction"), **found}
             topic = message.topic.value.replace("/request/", "/response/")
             await client.publish(topic, orjson.dumps(answer), 1)
+            if command == "record":
+                health = orjson.dumps(rig.health())
+                await client.publish(f"{rig.base}/bridge/health", health, 1, retain=True)
+            if command == "mark" and found["status"] == "ok":
+                event = {"v": 1, "kind": "mark", "id": rig.name, "level": "info"}
+                text, number = found["data"]["text"], found["data"]["number"]
+                event |= {"t_us": found["data"]["t_us"], "text": text, "data": {"number": number}}
+                await client.publish(f"{rig.base}/bridge/event", orjson.dumps(event), 1)

@@ -190,9 +190,7 @@ async def test_a_stored_calibration_is_chosen_in_the_history(broker: Broker) -> 
         await page.show("log")
         await page.page.fill("#view-log input[maxlength]", "first step")
         await page.page.keyboard.press("Enter")
-        await page.page.wait_for_function(
-            "() => document.querySelector('#view-log input[maxlength]').value === ''"
-        )
+        await page.until_text("#view-log [role=status]", "first step")
         assert rig.requests[-1]["text"] == "first step"
 
 

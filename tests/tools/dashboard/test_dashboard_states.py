@@ -121,6 +121,8 @@ async def test_an_account_that_may_not_send_requests_is_told_so(
         await page.until_text("#login-reason", "asks for a user name")
         await log_in(page, "viewer", "v")
         await page.until_text("#notices", "The account viewer can watch only")
+        await page.until_text("#recording", "This account can watch only")
+        assert await page.page.is_disabled("#recording .stop-recording")
         await show_state(page, "viewer")
         assert "receives nothing" not in await page.text("#notices")
 
@@ -321,6 +323,7 @@ async def test_daemon_broker_and_server_are_lost_and_regained_with_a_gap_in_the_
         async with publishing(rig, each_broker.port):
             await page.until_text("#angle-value", "°")
         await page.until_text("#banner", "jointfitd stopped or lost its broker")
+        await page.until_text("#recording", "It completes a file that it was writing")
         await show_state(page, "no-daemon")
         async with publishing(rig, each_broker.port):
             await page.until_text("#angle-value", "°")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from typer.testing import CliRunner
 
-from jointfit_daemon.config import load_rig
+from jointfit_daemon.config import LATER, load_rig
 from jointfit_daemon.device_search import FoundServer
 from jointfit_daemon.tools.__main__ import app
 from jointfit_daemon.tools.discovery import SerialPortInfo
@@ -153,6 +153,54 @@ def test_the_computer_of_the_cameras_can_be_postponed(tmp_path: Path, machine: M
     assert "1 fault" in checked.output
 
 
+UNKNOWN = """
+cameras = true
+server = "192.168.1.10"
+plate = "later"
+[sensors]
+thigh = ["a"]
+shank = ["b"]
+[device]
+a = "can0"
+b = "can0"
+[ids]
+a = "later"
+b = "later"
+[markers]
+thigh = "later"
+shank = "later"
+"""
+OPEN = ["imu[a].ids", "imu[b].ids", "mocap.plate", "mocap.markers.thigh", "mocap.markers.shank"]
+
+
+@pytest.mark.usefixtures("machine")
+def test_identifiers_and_names_that_are_unknown_are_filled_in_later(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.toml"
+    file = answer_file(tmp_path / "a.toml", UNKNOWN)
+    done = init(tmp_path, "--answers", file, "--json")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["open"] == OPEN
+    assert f'ids = "{LATER}"' in rig.read_text()
+
+    # Every open place is one fault with its remedy, and the only one.
+    for command in (["check"], ["doctor", "--config"]):
+        checked = CliRunner().invoke(app, [*command, str(rig)])
+        assert checked.exit_code == 2
+        assert checked.output.count("not filled in yet: enter the") == len(OPEN)
+        assert "5 faults" in checked.output
+
+    # The open places alone are asked, some of them a second time.
+    identifiers = ["0x105 0x106 0x121", "later"]
+    markers = ["T1, T2, T3", "S1, S2, S3"]
+    assert init(tmp_path, "--force", lines=[*identifiers, *markers, "Plate"]).exit_code == 0
+    assert tomllib.loads(rig.read_text())["imu"][1]["ids"] == LATER
+    assert init(tmp_path, "--force", lines=["0x205 0x206 0x221"]).exit_code == 0
+    cameras = load_rig(rig).sources[-1].settings
+    assert cameras.plate == "Plate"
+    assert cameras.markers["shank"] == ("S1", "S2", "S3")
+    assert not (tmp_path / "rig.answers.toml").exists()
+
+
 def test_help_names_the_enter_key_only_where_there_is_a_proposal(
     tmp_path: Path, machine: Machine
 ) -> None:
@@ -160,9 +208,8 @@ def test_help_names_the_enter_key_only_where_there_is_a_proposal(
     done = init(tmp_path, lines=[*[""] * 8, "?", "", "can0", "?", ""])
     before, _, ids = done.output.partition("CAN identifiers of")
     assert "Enter takes the proposal" not in before.partition("Serial ports that are")[2]
-    assert "Enter takes the proposal" not in ids
-    assert "'<' returns." in ids
-    assert "an answer is needed here: '?' explains the question, Ctrl-C stores the others" in ids
+    assert "Enter takes the proposal in brackets, '<' returns." in ids
+    assert "[later] ('find' searches)" in ids
 
 
 @pytest.mark.parametrize("kept", range(0, len(TYPED), 3))

@@ -19,6 +19,10 @@ START_S = 5_000.0
 PERIOD_S = 0.1
 THIGH_M, SHANK_M = 0.43, 0.39
 STEP_S = 1.2
+RECORDING = {
+    "file": "bench-1-20261121T082216-0001.mcap", "duration_s": 724.0, "written_bytes": 48_213_000,
+    "lost": 0, "failure": None, "free_bytes": 93_200_000_000, "active": True,
+}  # fmt: skip
 LEG = {"thigh": ["S1", "S2"], "shank": ["S3", "S4"]}
 
 
@@ -40,6 +44,7 @@ class SampleRig:
     joints: tuple[str, ...] = ("hip", "knee", "ankle")
     offline: frozenset[str] = frozenset()
     cameras: bool = True
+    recording: dict[str, Any] = field(default_factory=lambda: dict(RECORDING))
     clock_offset_s: float = 0.0
     """Clock of the gateway minus that of the terminal, s."""
 
@@ -90,7 +95,8 @@ class SampleRig:
             "process": {"cpu_pct": 9.1, "rss_bytes": 91_000_000, "loop_delay_p99_ms": 1.1},
             "link": {"connected": True, "connects": 1, "confirmed": True, "denied": [],
                      "sent": 9123, "queued": 0, "dropped": 0, "ignored_requests": 0, "noise": 0},
-            "state": {"fault": None, "not_stored": None}, "recording": None,
+            "state": {"fault": None, "not_stored": None},
+            "recording": {"backlog_bytes": 0, **self.recording},
         }  # fmt: skip
 
     def calibration(self, phase: str = "calibrated", **changes: Any) -> dict[str, Any]:
@@ -111,7 +117,7 @@ class SampleRig:
         done = phase == "calibrated"
         return {
             "v": 1, "t_us": self.t_us(0), "phase": phase, "kept": None,
-            "done": [], "created_utc": "2026-11-23T09:30:00+00:00" if done else None,
+            "done": [], "created_utc": "2026-11-21T06:30:00+00:00" if done else None,
             "text": "stored as version 3" if done else "", "version": 3 if done else None,
             "quality": quality if done else {},
         } | changes  # fmt: skip

@@ -12,6 +12,7 @@ import pytest
 from jointfit_daemon.tools.monitor._app import MonitorApp
 from jointfit_daemon.tools.monitor._monitor_state import MonitorState, SendRequest
 from tests.tools.monitor.sample_rig import (
+    RECORDING,
     SampleRig,
     connected_state,
     live_state,
@@ -94,6 +95,20 @@ def health() -> MonitorState:
     return state
 
 
+def interrupted() -> MonitorState:
+    fault = {"failure": "recordings: No space left on device", "lost": 312, "free_bytes": 0}
+    state = live_state(replace(LEG, recording=RECORDING | fault))
+    state.press("4")
+    state.scroll = 99
+    return state
+
+
+def stopping() -> MonitorState:
+    state = live()
+    state.press("R")
+    return state
+
+
 def log() -> MonitorState:
     state = offline()
     take(state, "bridge/event", LEG.event("mark: squats begin", id="bench-1", at_s=11.0))
@@ -129,6 +144,8 @@ STATES: dict[str, tuple[Callable[[], MonitorState], tuple[int, int]]] = {
     "history": (history, (80, 24)),
     "health": (health, (80, 24)),
     "log": (log, (80, 24)),
+    "recording-interrupted": (interrupted, (80, 24)),
+    "recording-stop": (stopping, (40, 20)),
     "several-rigs": (several_rigs, (80, 24)),
     "arabic": (lambda: live_state(ARABIC), (80, 24)),
     "chinese": (lambda: live_state(CHINESE), (80, 24)),
@@ -237,7 +254,7 @@ async def test_a_changed_number_redraws_only_its_cells(monkeypatch: pytest.Monke
             return refresh(*areas, **options)
 
         monkeypatch.setattr(app.screen_widget, "refresh", note)
-        take(state, "bridge/health", LEG.health() | {"t_us": 1})
+        take(state, "bridge/health", LEG.health())
         assert state.rig.health is not None
         state.rig.health.devices["S1"].rate_hz = 99.9
         app.draw()

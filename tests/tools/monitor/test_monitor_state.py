@@ -15,7 +15,7 @@ from jointfit_daemon.tools.monitor._monitor_state import (
     SendRequest,
     chosen_angle,
 )
-from tests.tools.monitor.sample_rig import SampleRig, connected_state, live_state, take
+from tests.tools.monitor.sample_rig import RECORDING, SampleRig, connected_state, live_state, take
 
 
 def calibrating() -> MonitorState:
@@ -52,11 +52,27 @@ def test_other_phases_start_in_their_view_only_and_a_running_phase_can_be_stoppe
     assert state.press("x") == SendRequest("calibrate", {"phase": "abort"})
 
 
+def test_one_key_starts_the_recording_and_pressed_twice_stops_it() -> None:
+    state = live_state(SampleRig(recording=RECORDING | {"active": False}), 0.5)
+    assert state.press("R") == SendRequest("record", {"action": "start"})
+    take(state, "bridge/health", SampleRig().health())
+    assert state.press("R") is None
+    assert state.press("j") is None
+    assert state.press("R") is None  # another key in between
+    assert state.press("R") == SendRequest("record", {"action": "stop"})
+    answer = {"status": "ok", "data": {"directory": "/state", "file": "a.mcap", "active": False}}
+    state.take_answer("record", answer, 0.0)
+    assert state.notice is not None
+    assert state.notice.text == "recorded a.mcap in /state"
+
+
 def test_every_request_of_a_key_is_one_that_the_daemon_knows() -> None:
     requests = [SendRequest("static"), SendRequest("calibrate", {"phase": "align"}),
                 SendRequest("calibrate", {"phase": "functional", "force": True}),
                 SendRequest("use-calibration", {"version": 2}), SendRequest("calibrations"),
-                SendRequest("use-calibration", {"revert": True})]  # fmt: skip
+                SendRequest("use-calibration", {"revert": True}),
+                SendRequest("record", {"action": "start"}),
+                SendRequest("record", {"action": "stop"})]  # fmt: skip
     for request in requests:
         REQUESTS[request.command].model.model_validate(dict(request.arguments))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 import pytest
@@ -13,7 +14,14 @@ from jointfit_daemon.tools.monitor._limb_figure import _bones
 from jointfit_daemon.tools.monitor._monitor_state import VIEWS, MonitorState
 from jointfit_daemon.tools.monitor._screen_lines import screen_lines
 from jointfit_daemon.tools.monitor._text_lines import Line, fit_text, wrap
-from tests.tools.monitor.sample_rig import SampleRig, connected_state, live_state, moment, take
+from tests.tools.monitor.sample_rig import (
+    RECORDING,
+    SampleRig,
+    connected_state,
+    live_state,
+    moment,
+    take,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -76,10 +84,38 @@ def test_wrapped_text_keeps_every_character(content: str, width: int) -> None:
 
 def test_the_live_view_shows_angle_deviation_and_devices() -> None:
     found = words(live_state(SampleRig(offline=frozenset({"S4"})), 3.0), 100)
-    for part in ("bench-1", "Calibrated, version 3", "localhost:1883", "08:34:23", "Knee flexion",
-                 "± 2.1°", "S1 thigh 100.0 Hz 0.01 % fitted ±20 µs ✔ Works",
+    for part in ("bench-1", "Calibrated, version 3, 2 h ago", "● rec 0:12:07", "localhost:1883",
+                 "08:34:23", "Knee flexion", "± 2.1°",
+                 "S1 thigh 100.0 Hz 0.01 % fitted ±20 µs ✔ Works",
                  "S4 shank – 0.01 % – ✖ No data: check cable, power", "q quit"):  # fmt: skip
         assert part in found
+
+
+@pytest.mark.parametrize(
+    ("age_us", "expected"),
+    [(0, "just now"), (61e6, "1 min ago"), (7.4e9, "2 h ago"), (9e11, "10 days")],
+)
+def test_the_age_of_the_calibration_is_that_by_the_clock_of_the_gateway(
+    age_us: float, expected: str
+) -> None:
+    state = live_state(SampleRig(clock_offset_s=-7200.0), 3.0)
+    assert state.rig.calibration is not None
+    now_us = state.rig.gateway_us(moment(3.0))
+    assert now_us is not None
+    made = datetime.fromtimestamp((now_us - age_us) / 1e6, UTC)
+    state.rig.calibration.created_utc = made.isoformat()
+    assert f"version 3, {expected}" in words(state, 100)
+
+
+def test_a_recording_that_is_off_and_its_last_file_are_shown() -> None:
+    state = live_state(SampleRig(recording=RECORDING | {"active": False}), 3.0)
+    assert "○ not recording" in words(state)
+    assert "R record" in words(state)
+    state.press("4")
+    assert (
+        "not recording; last file bench-1-20261121T082216-0001.mcap, 0:12:04, 48.2 MB; 93.2 GB free"
+        in words(state)
+    )
 
 
 def styles_of(state: MonitorState, style: str) -> Sequence[str]:

@@ -1,7 +1,7 @@
 // Requests to the daemon that a user starts: confirmation, fields, and the text of the response.
 
 import { byId, createElement, createTable, setText } from "./dom.js";
-import { formatClock, formatNumber } from "./words.js";
+import { formatBytes, formatClock, formatNumber, formatStopwatch } from "./words.js";
 
 /**
  * Connect the menu of the header; return a function that opens an action for a device.
@@ -36,6 +36,12 @@ const ACTIONS = {
     menu: "Self-test", title: "Self-test", command: "selftest", immediate: true,
     text: "Checks devices, clocks, calibration, store, broker and host.",
     answer: selfTestContent,
+  }),
+  stopRecording: () => ({
+    menu: "", title: "Stop the recording", done: "Recording stopped", button: "Stop recording", command: "record",
+    text: "jointfitd completes the file. What the sensors send afterwards is not recorded.",
+    content: () => ({ action: "stop" }),
+    answer: recordedContent,
   }),
   rate: (store) => ({
     menu: "Output rate…", title: "Output rate", button: "Change the rate", command: "rate",
@@ -115,6 +121,7 @@ async function sendAction(dialog, action, input, request, showView) {
     }
     const answer = action.answer(data);
     showAnswer(dialog, ...(typeof answer === "string" ? [createElement("p", { class: "good" }, answer)] : answer));
+    setText(dialog.title, action.done ?? action.title);
     dialog.send.hidden = true;
     dialog.field.replaceChildren();
     dialog.text.hidden = true;
@@ -128,6 +135,22 @@ async function sendAction(dialog, action, input, request, showView) {
 }
 
 const showAnswer = (dialog, ...content) => dialog.answer.replaceChildren(...content);
+
+// The file, and the command that continues with it on the gateway.
+function recordedContent(data) {
+  if (!data.file) return "Nothing is recorded.";
+  const lost = data.lost > 0 ? `${data.lost} messages lost` : "nothing lost";
+  const sentence = `Recorded ${formatStopwatch(data.duration_s)}, ${formatBytes(data.written_bytes)}, ${lost}.`;
+  const failure = data.failure ? createElement("p", { class: "bad" }, `The file could not be completed: ${data.failure}. jointfitd repairs it at its next start.`) : "";
+  const command = `jointfit report ${shellWord(`${data.directory}/${data.file}`)}`;
+  return [
+    createElement("p", { class: data.lost > 0 ? "" : "good" }, sentence), failure,
+    createElement("p", {}, "For a page with angles, gait cycles and faults, run on the gateway:"),
+    createElement("pre", { class: "command", tabindex: "0" }, createElement("code", {}, command)),
+  ];
+}
+
+const shellWord = (text) => (/^[\w./:=@-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 
 const LEVELS = { ok: "ok", warning: "warning", error: "error" };
 

@@ -8,6 +8,7 @@ const NUMBER_MS = 200;
 const STALE_MS = 1500;
 const OPTICAL_GAP_US = 150_000;
 const GAP_PERIODS = 3.5; // a longer pause than these periods interrupts the curve
+const MARK = { dash: [4, 4], font: "600 12px system-ui, sans-serif" };
 const STORED_CHOICE = "jointfit-angle";
 
 /** Show the angle of a store; return the view. */
@@ -169,7 +170,7 @@ function updateChart(view) {
   const element = byId("chart");
   if (element.clientWidth === 0 || typeof uPlot === "undefined") return;
   const data = curvesOf(view.store, view.choice);
-  if (view.chart === null) view.chart = createChart(element, data);
+  if (view.chart === null) view.chart = createChart(element, data, view.store);
   else view.chart.setData(data);
   updateChartCaption(view, data);
 }
@@ -187,7 +188,28 @@ function updateChartCaption(view, [, values, , , optical]) {
   return setText(byId("chart-caption"), `Last ${shownSeconds} s: ${range}${cameras}`);
 }
 
-function createChart(element, data) {
+/** Draw the marks of the shown time as numbered lines. */
+function drawMarks(plot, store, color) {
+  const { ctx, bbox } = plot;
+  const scale = devicePixelRatio;
+  ctx.save();
+  Object.assign(ctx, { strokeStyle: color, fillStyle: color, lineWidth: scale, textAlign: "left", textBaseline: "top" });
+  ctx.font = MARK.font.replace("12px", `${12 * scale}px`);
+  ctx.setLineDash(MARK.dash.map((length) => length * scale));
+  for (const event of store.events) {
+    const age_s = (store.pose.t_us - event.t_us) / 1e6;
+    if (event.kind !== "mark" || age_s < 0 || age_s > shownSeconds) continue;
+    const x = plot.valToPos(-age_s, "x", true);
+    ctx.beginPath();
+    ctx.moveTo(x, bbox.top);
+    ctx.lineTo(x, bbox.top + bbox.height);
+    ctx.stroke();
+    ctx.fillText(String(event.data?.number ?? ""), x + 4 * scale, bbox.top);
+  }
+  ctx.restore();
+}
+
+function createChart(element, data, store) {
   const style = getComputedStyle(document.documentElement);
   const color = (name) => style.getPropertyValue(`--${name}`).trim();
   const axis = {
@@ -218,6 +240,7 @@ function createChart(element, data) {
         line("optical", { width: 2, dash: [7, 5] }),
       ],
       bands: [{ series: [2, 3], fill: color("imu-band") }],
+      hooks: { draw: [(plot) => drawMarks(plot, store, color("text"))] },
     },
     data,
     element,

@@ -1,6 +1,7 @@
 // Header of the page: rig, state in words, broker, clock, and the one button that matters now.
 
 import { byId, createElement, setClass, setText } from "./dom.js";
+import { recordingState } from "./recording_panel.js";
 import { gatewayNow, poseAgeMs } from "./store.js";
 import { calibrationSentence, formatClock, isRunning } from "./words.js";
 
@@ -48,6 +49,9 @@ export function createHeader(link, store, configuration, actions) {
     setText(byId("rig-state"), state.words);
     setClass(byId("rig-state"), `state ${state.level}`.trim());
     setText(byId("broker-text"), link.state === "connected" ? configuration.broker : `${configuration.broker}: not connected`);
+    const [level, words] = recordingState(store);
+    setText(byId("recording-fact"), words);
+    setClass(byId("recording-fact"), `digits status ${level === "off" ? "unknown" : level}`);
     updateBanner(state.loss ?? "");
     let label, kind, enabled;
     ({ label, kind, enabled = true, action } = mainAction(link, store, actions));
@@ -55,7 +59,7 @@ export function createHeader(link, store, configuration, actions) {
     setClass(button, `button ${kind}`);
     button.disabled = !enabled;
   };
-  for (const subject of ["bridge", "info", "calibration"]) store.on(subject, update);
+  for (const subject of ["bridge", "info", "calibration", "recording"]) store.on(subject, update);
   setInterval(() => {
     const now = gatewayNow(store);
     setText(byId("gateway-clock"), formatClock(now ?? NaN));

@@ -1,6 +1,7 @@
 // The event log: newest first, by level.
 
 import { byId, createElement, setText } from "./dom.js";
+import { createMarkForm, createMarker } from "./marks.js";
 import { formatClock } from "./words.js";
 
 const LEVELS = { info: ["ok", "info"], warning: ["warning", "warning"], error: ["error", "error"] };
@@ -10,6 +11,7 @@ export function createLogView(store, request) {
   const view = { visible: false, unseen: 0, onlyProblems: false };
   const list = createElement("ul", { class: "events" });
   const none = createElement("p", { class: "caption" }, "No event since this page was opened.");
+  const marks = createMarkForm(createMarker(store, request));
   const box = createElement("input", { type: "checkbox" });
   box.addEventListener("change", () => { view.onlyProblems = box.checked; update(); });
   byId("view-log").append(createElement(
@@ -17,7 +19,7 @@ export function createLogView(store, request) {
     createElement("div", { class: "panel-head" },
       createElement("h2", {}, "Events"),
       createElement("div", { class: "filters" }, createElement("label", {}, box, "Warnings and errors only"))),
-    createMarkForm(request), none, list,
+    marks.root, none, list,
   ));
 
   function update() {
@@ -39,25 +41,6 @@ export function createLogView(store, request) {
     update();
   };
   return view;
-}
-
-/** Return the form that marks an instant: the mark is an event, also in a recording. */
-function createMarkForm(request) {
-  const text = createElement("input", { maxlength: "200", "aria-label": "Text of the mark", placeholder: "Text of a mark" });
-  const note = createElement("span", { class: "caption", role: "status" });
-  const mark = async () => {
-    if (text.value.trim() === "") { setText(note, "Enter a text first."); return; }
-    try {
-      const data = await request("mark", { text: text.value.trim() });
-      setText(note, `Mark ${data.number} at ${formatClock(data.t_us)}`);
-      text.value = "";
-    } catch (error) {
-      setText(note, error.message);
-    }
-  };
-  text.addEventListener("keydown", (event) => { if (event.key === "Enter") mark(); });
-  const button = createElement("button", { class: "button", type: "button", onclick: mark }, "Mark this instant");
-  return createElement("div", { class: "filters" }, text, button, note);
 }
 
 function showCount(view) {

@@ -13,6 +13,7 @@ import { createLimbView, updateLimbCaption } from "./limb_view.js";
 import { createLink } from "./link.js";
 import { createLogView } from "./log_view.js";
 import { createNotices } from "./notices.js";
+import { createRecordingPanel } from "./recording_panel.js";
 import { createRequests } from "./requests.js";
 import { createSensorCards } from "./sensor_cards.js";
 import { createSensorsView } from "./sensors_view.js";
@@ -74,9 +75,14 @@ async function start() {
   const limb = createLimbView(store);
   const angle = createAngleView(store);
   const updateCards = createSensorCards(store);
-  const request = (command, content) => requests.ask(command, content, dialogs.askForKey);
+  const request = async (command, content) => {
+    const data = await requests.ask(command, content, dialogs.askForKey);
+    if (command === "record") store.takeRecording(data);
+    return data;
+  };
   const calibrate = createCalibrateView(store, request);
   const openAction = createActions(store, request, (name) => showView(name));
+  const updateRecording = createRecordingPanel(store, access, request, openAction);
   const views = { history: createHistoryView(store, request), sensors: createSensorsView(store, link, openAction), log: createLogView(store, request), table: createTableView(store) };
   const updateHeader = createHeader(link, store, configuration, {
     reconnect: () => link.connect(),
@@ -98,6 +104,7 @@ async function start() {
     updateLimbCaption(store);
     updateAngleAge(angle);
     updateCards();
+    updateRecording();
     announce(announcement(link, store, angle));
     setText(byId("versions"), [`jointfit ${configuration.version}`, store.info ? `jointfitd ${store.info.software}` : ""].filter(Boolean).join(" · "));
   }

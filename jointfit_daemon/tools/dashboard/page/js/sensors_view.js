@@ -3,7 +3,7 @@
 import { byId, createElement, createTable, patchTable } from "./dom.js";
 import { createAxesCheck } from "./axes_check.js";
 import { summaryOf } from "./sensor_cards.js";
-import { UNKNOWN, formatNumber } from "./words.js";
+import { UNKNOWN, formatBytes, formatNumber } from "./words.js";
 
 /** Show the health of a store's devices in a view; `openAction(name, device)` starts a request. */
 export function createSensorsView(store, link, openAction) {
@@ -58,6 +58,12 @@ function tablesOf(store, openAction) {
   return [createTable("Devices", columns, rows), createTable("Daemon", [{ name: "item" }, { name: "value", text: true }], daemonRows(store))];
 }
 
+function recordingWords({ recording }) {
+  if (recording === null) return UNKNOWN;
+  if (!recording.active) return "off";
+  return recording.failure ? `interrupted: ${recording.failure}` : `${recording.file}, ${formatBytes(recording.written_bytes)}`;
+}
+
 function daemonRows(store) {
   const health = store.health ?? {};
   const link = health.link ?? {};
@@ -68,6 +74,6 @@ function daemonRows(store) {
     ["Processor and memory", `${formatNumber(health.process?.cpu_pct, 1, " %")}, ${formatNumber(health.process?.rss_bytes == null ? null : health.process.rss_bytes / 1e6, 0, " MB")}`],
     ["Messages to the broker", `${formatNumber(link.sent, 0)} sent, ${formatNumber(link.dropped, 0)} dropped${denied}`],
     ["Online learning", health.learning?.reason ? `${health.learning.state}: ${health.learning.reason}` : health.learning?.state ?? UNKNOWN],
-    ["Recording", health.recording?.failure ?? health.recording?.file ?? "off"],
+    ["Recording", recordingWords(store)],
   ];
 }

@@ -17,6 +17,8 @@ export function createStore() {
     health: null,
     calibration: null,
     progress: null,
+    /** State of the recording, with `t_us` of the gateway and `receivedMs` of the browser. */
+    recording: null,
     devices: new Map(),
     lastEvents: new Map(),
     events: [],
@@ -58,6 +60,11 @@ export function createStore() {
       if (topic === "bridge/info") store.otherVersion = null;
       takeMessage(store, topic, payload);
     },
+    /** Take the state of the recording: of a health message, or of an answer of this instant. */
+    takeRecording(state, t_us = gatewayNow(store)) {
+      store.recording = { ...state, t_us, receivedMs: performance.now() };
+      store.changed("recording");
+    },
     /** Mark the state of the daemon as unknown: the page lost its connection. */
     disconnected() {
       if (store.bridge === "lost") return;
@@ -73,7 +80,7 @@ export function createStore() {
     /** Forget everything that another rig or another connection might contradict. */
     reset(base) {
       Object.assign(store, {
-        base, bridge: "unknown", info: null, health: null, calibration: null, progress: null,
+        base, bridge: "unknown", info: null, health: null, calibration: null, progress: null, recording: null,
         pose: null, poseReceivedMs: null, optical: null, sensors: null, clock: null,
         events: [], poses: [], opticals: [], otherVersion: null, faulty: null,
       });
@@ -108,6 +115,7 @@ function takeMessage(store, topic, payload) {
       return store.changed("info");
     case "bridge/health":
       store.health = payload;
+      if (payload.recording) store.takeRecording(payload.recording, payload.t_us);
       return store.changed("health");
     case "calibration":
       return takeCalibration(store, payload);
@@ -153,6 +161,14 @@ function noteClock(store, t_us, nowMs) {
 export function gatewayNow(store) {
   if (store.clock === null) return null;
   return (performance.now() - Math.min(store.clock.before, store.clock.least)) * 1000;
+}
+
+/** Return the present duration of the recording, s. */
+export function recordingSeconds(store) {
+  const { duration_s, t_us, receivedMs } = store.recording;
+  const now_us = gatewayNow(store);
+  const age_s = t_us !== null && now_us !== null ? (now_us - t_us) / 1e6 : (performance.now() - receivedMs) / 1000;
+  return duration_s + Math.max(0, age_s);
 }
 
 /** Return the time since the last pose, ms; infinite without one. */

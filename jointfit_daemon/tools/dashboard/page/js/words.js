@@ -24,6 +24,20 @@ export function ageInWords(seconds) {
   return seconds < 90 ? "1 min ago" : `${formatDuration(seconds)} ago`;
 }
 
+/** Return a duration as hours, minutes and seconds: "0:12:04". */
+export function formatStopwatch(seconds) {
+  if (!Number.isFinite(seconds)) return UNKNOWN;
+  const whole = Math.max(0, Math.floor(seconds));
+  const pad = (value) => String(value % 60).padStart(2, "0");
+  return `${Math.floor(whole / 3600)}:${pad(Math.floor(whole / 60))}:${pad(whole)}`;
+}
+
+/** Return a size in MB or GB. */
+export function formatBytes(bytes) {
+  if (bytes >= 1e9) return formatNumber(bytes / 1e9, bytes < 1e11 ? 1 : 0, " GB");
+  return formatNumber(bytes / 1e6, 1, " MB");
+}
+
 /** Return the time of day of a UNIX time in microseconds. */
 export function formatClock(microseconds) {
   if (!Number.isFinite(microseconds)) return UNKNOWN;
