@@ -10,6 +10,7 @@ from jointfit_daemon.config._open_places import LATER
 from jointfit_daemon.config._rig import Rig, Source
 from jointfit_daemon.config._schema import rig_schema
 from jointfit_daemon.config._tables import (
+    DEFAULT_STORE,
     LslSettings,
     MetricsSettings,
     MqttSettings,
@@ -19,6 +20,7 @@ from jointfit_daemon.config._tables import (
 )
 
 __all__ = [
+    "DEFAULT_STORE",
     "LATER",
     "ConfigError",
     "Fault",

@@ -173,11 +173,15 @@ class ChainRefinementTable(Settings):
         return weights
 
 
+DEFAULT_STORE = "default"
+"""Calibration store of a rig that names none."""
+
+
 class CalibrationTable(Settings):
     """``[calibration]``."""
 
     store: str = Field(
-        "default", description="name of the calibration folder below $STATE_DIRECTORY"
+        DEFAULT_STORE, description="name of the calibration folder below $STATE_DIRECTORY"
     )
     method: Method = Field("anchored", description="method that combines redundant sensors")
     procedure: Procedure = Field(

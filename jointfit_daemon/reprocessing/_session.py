@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon import __version__
 from jointfit_daemon.calibration.record import MOST_BYTES, calibration_of
+from jointfit_daemon.config import DEFAULT_STORE
 from jointfit_daemon.files.text import parse_json, read_bounded
-from jointfit_daemon.outputs.recording import RecordingGap, open_recording, read_events
+from jointfit_daemon.outputs.recording import PROGRAM, RecordingGap, open_recording, read_events
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
     CalibrationPhase,
@@ -60,7 +60,8 @@ def load_session(
     last_rig: Rig | None = None
     in_force, now_ns = "none", 0
     changes = Changes(rig, calibration)
-    events = _note_gaps(open_recording(path), collector)
+    recording = open_recording(path)
+    events = _note_gaps(recording, collector)
     for event, outputs in process_events(events, changes, core):
         collector.add_event(event, outputs)
         if not isinstance(event, ChunkArrived):
@@ -80,11 +81,14 @@ def load_session(
         "recording": path.name,
         "limb": ", ".join(chain.segments),
         "side": "both" if chain.parents else "left" if chain.left_side else "right",
-        "subject": last_rig.calibration_store,
         "calibration": in_force,
-        "software": f"jointfitd {__version__}",
+        "software": recording.info.program,
         "source": "processed again" if changes.any else "as recorded",
     }
+    if last_rig.calibration_store != DEFAULT_STORE:
+        description["subject"] = last_rig.calibration_store
+    if recording.info.program != PROGRAM:
+        description["processed"] = PROGRAM
     return collector.session(last_rig, core.lags_ns, description)
 
 

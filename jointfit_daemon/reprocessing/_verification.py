@@ -16,6 +16,7 @@ import orjson
 
 from jointfit_daemon.model import LimbState
 from jointfit_daemon.outputs.recording import (
+    PROGRAM,
     STATE,
     RecordingGap,
     encode_output,
@@ -102,6 +103,8 @@ class Verification:
     """Time up to which outputs could be compared, s; None: to the end."""
     tolerant: TolerantComparison | None = None
     """Comparison with a tolerance; None if bytes were compared."""
+    program: str = PROGRAM
+    """Name and version of the daemon that wrote the recording."""
 
     @property
     def passed(self) -> bool:
@@ -111,8 +114,17 @@ class Verification:
         return self.difference is None and sum(self.compared.values()) > 0
 
     def lines(self) -> list[str]:
+        """Return the gaps and the result as sentences."""
+        return [*(f"the recording has a gap {gap}" for gap in self.gaps), *self.result_lines()]
+
+    def result_lines(self) -> list[str]:
         """Return the result as sentences."""
-        found = [f"the recording has a gap {gap}" for gap in self.gaps]
+        found = []
+        if self.program != PROGRAM:
+            found.append(
+                f"the recording was made by {self.program} and replayed by {PROGRAM}: results of "
+                "another version can differ"
+            )
         if self.tolerant is not None:
             return [*found, *_tolerant_lines(self.tolerant)]
 
@@ -229,7 +241,10 @@ def _verify_bytes(recording: Recording) -> Verification:
         elif (event := item.event()) is not None:
             _check_begins_with_configuration(comparison.begin_ns, event)
             difference = comparison.feed(core, event)
-    return Verification(comparison.seconds, comparison.compared, difference, tuple(gaps), until_s)
+    return Verification(
+        comparison.seconds, comparison.compared, difference, tuple(gaps), until_s,
+        program=recording.info.program,
+    )  # fmt: skip
 
 
 def _check_begins_with_configuration(begin_ns: int | None, event: Event) -> None:
@@ -321,7 +336,8 @@ def _verify_orientations(recording: Recording) -> Verification:
         float(np.median(errors)) if errors.size else float("nan"),
         float(errors.max()) if errors.size else float("nan"),
     )
-    return Verification((now_ns - begin_ns) / _NS_PER_S, {}, None, tuple(gaps), None, found)
+    seconds = (now_ns - begin_ns) / _NS_PER_S
+    return Verification(seconds, {}, None, tuple(gaps), None, found, recording.info.program)
 
 
 def _orientation_errors(

@@ -49,7 +49,7 @@ def rig_table(**head: Any) -> dict[str, Any]:
     """Return the rig.toml of four sensors without cameras."""
     table = core_feed.table(**head)
     del table["mocap"]
-    return table | {"calibration": {"static_s": 1.0}}
+    return table | {"calibration": {"static_s": 1.0, "store": "subject-07"}}
 
 
 @dataclass

@@ -9,12 +9,22 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.config import parse_rig
+from jointfit_daemon.outputs.recording import PROGRAM, _session_writer
 from jointfit_daemon.reprocessing import ReprocessingError, load_session
 from tests.pipeline import core_feed
 from tests.pipeline.core_feed import BEGIN_NS, SENSORS
-from tests.reprocessing.recorded_run import END, FITTED, UNIX_NS, RecordedRun, rig_table
+from tests.reprocessing.recorded_run import (
+    END,
+    FITTED,
+    UNIX_NS,
+    RecordedRun,
+    record_run,
+    rig_table,
+)
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from jointfit_daemon.session_data import SessionData
 
 
@@ -48,6 +58,22 @@ def test_session_has_the_segments_and_joints_of_the_run(
     after = thigh.t_s > 0.01 * (FITTED + 2)
     assert np.isfinite(thigh.orientation[after]).all()
     assert np.isfinite(knee.angles["flexion"][after]).all()
+
+
+def test_session_names_its_subject_and_the_program_that_recorded_it(
+    session: SessionData, run: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert session.description["subject"] == "subject-07"
+    assert session.description["software"] == PROGRAM
+    assert "processed" not in session.description
+
+    without = parse_rig(rig_table() | {"calibration": {"static_s": 1.0}})
+    assert "subject" not in load_session(run.path, without).description
+
+    monkeypatch.setattr(_session_writer, "SOFTWARE", "jointfitd 0.0.9, mcap 1")
+    record_run(tmp_path)
+    older = load_session(tmp_path).description
+    assert (older["software"], older["processed"]) == ("jointfitd 0.0.9", PROGRAM)
 
 
 def test_marks_phases_and_losses_are_on_the_time_line(session: SessionData) -> None:

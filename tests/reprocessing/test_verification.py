@@ -11,7 +11,13 @@ import pytest
 from jointfit_daemon.config import parse_rig
 from jointfit_daemon.kinematics.rotation_scalar import multiply_one
 from jointfit_daemon.model import LimbState
-from jointfit_daemon.outputs.recording import Recorder, Recording, _recorder
+from jointfit_daemon.outputs.recording import (
+    PROGRAM,
+    Recorder,
+    Recording,
+    _recorder,
+    _session_writer,
+)
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import Configured, SourceOpened, UnixOffset
 from jointfit_daemon.reprocessing import _verification, verify_recording
@@ -94,6 +100,19 @@ def test_outputs_after_a_gap_are_not_compared(
     text = "\n".join(found.lines())
     assert "the recording has a gap at" in text
     assert "cannot be compared" in text
+
+
+def test_a_recording_of_another_version_is_named_with_both_versions(
+    run: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "version" not in " ".join(verify_recording(run.path).lines())
+
+    monkeypatch.setattr(_session_writer, "SOFTWARE", "jointfitd 0.0.9, mcap 1")
+    record_run(tmp_path)
+    assert verify_recording(tmp_path).lines()[0] == (
+        f"the recording was made by jointfitd 0.0.9 and replayed by {PROGRAM}: results of another "
+        "version can differ"
+    )
 
 
 @pytest.mark.parametrize(("turned_deg", "agrees"), [(0.0, True), (3.0, False)])

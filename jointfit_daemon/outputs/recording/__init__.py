@@ -18,11 +18,16 @@ from jointfit_daemon.outputs.recording._reader import (
 )
 from jointfit_daemon.outputs.recording._recorder import Recorder, RecordingHealth
 from jointfit_daemon.outputs.recording._repair import RepairResult, repair_recording
-from jointfit_daemon.outputs.recording._session_writer import RecordingLimits, RecordingReport
+from jointfit_daemon.outputs.recording._session_writer import (
+    PROGRAM,
+    RecordingLimits,
+    RecordingReport,
+)
 
 __all__ = [
     "DAEMON_HEALTH",
     "DAEMON_NOTICE",
+    "PROGRAM",
     "STATE",
     "RecordedMessage",
     "RecordedPart",

@@ -41,6 +41,11 @@ class RecordingInfo:
     software: str
     """Names and versions of the programs that wrote the file."""
 
+    @property
+    def program(self) -> str:
+        """Name and version of the daemon that wrote the file."""
+        return self.software.partition(",")[0]
+
     def metadata(self) -> dict[str, str]:
         """Return the metadata record of this file."""
         return sealed({key: orjson.dumps(value).decode() for key, value in asdict(self).items()})

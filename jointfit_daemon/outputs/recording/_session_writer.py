@@ -61,7 +61,9 @@ _LONGEST_PAUSED_S = 0.05
 """Time after which a batch is encoded without pauses, s: on a busy machine they take long, and
 messages that are not written are lost at a kill."""
 
-SOFTWARE = f"jointfitd {__version__}, {LIBRARY_IDENTIFIER}, Python {sys.version.split()[0]}"
+PROGRAM = f"jointfitd {__version__}"
+"""Name and version of this program."""
+SOFTWARE = f"{PROGRAM}, {LIBRARY_IDENTIFIER}, Python {sys.version.split()[0]}"
 """Programs that write a recording."""
 
 

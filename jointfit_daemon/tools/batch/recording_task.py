@@ -19,11 +19,13 @@ from jointfit_daemon import __version__
 
 if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
-    from jointfit_daemon.session_data import SessionData
+    from jointfit_daemon.session_data import SessionData, TimelineEvent
 
 STEPS = ("calibrate", "replay", "export", "report")
 """Steps in the order in which they run."""
 REPORT_FILE, CALIBRATION_FILE = "report.html", "calibration.json"
+_NAMED_GAPS = 5
+"""Gaps that a row of the summary names; the others are counted."""
 MARKS = ".done"
 """Folder of the marks of processed recordings, in the output folder."""
 
@@ -63,6 +65,8 @@ class RecordingResult:
     faults: int | None = None
     verified: str = ""
     """Result of the step ``replay``."""
+    gaps: str = ""
+    """Missing parts of the recording."""
     notes: str = ""
     error: str = ""
 
@@ -161,7 +165,7 @@ def _run_steps(task: RecordingTask, folder: Path) -> RecordingResult:
     if verification is None:
         return result
     status = "done" if verification.passed else "differs"
-    return replace(result, status=status, verified=verification.lines()[-1])
+    return replace(result, status=status, verified="; ".join(verification.result_lines()))
 
 
 def _calibrate(recording: Path, folder: Path, notes: list[str]) -> Calibration | None:
@@ -200,8 +204,16 @@ def _measured(task: RecordingTask, session: SessionData, notes: str) -> Recordin
         gait_cycles=sum(len(gait.cycles_s) for gait in results.gait.values()),
         lost_percent=round(100.0 * max(known), 3) if known else None,
         faults=results.faults,
+        gaps=_gaps_text([event for event in session.events if event.kind == "gap"]),
         notes=notes,
     )
+
+
+def _gaps_text(gaps: list[TimelineEvent]) -> str:
+    """Return the missing parts of a recording with their times, at most `_NAMED_GAPS` of them."""
+    texts = [f"at {gap.t_s:.3f} s: {gap.text}" for gap in gaps[:_NAMED_GAPS]]
+    more = len(gaps) - len(texts)
+    return "; ".join([*texts, f"{more} more gaps"] if more else texts)
 
 
 def _mark(task: RecordingTask) -> Path:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 _UNKNOWN = "–"
 _HEAD = (
     "Recording", "Status", "Duration, s", "RMS against cameras", "Largest range", "Gait cycles",
-    "Lost, %", "Faults", "Replay", "Notes",
+    "Lost, %", "Faults", "Gaps", "Replay", "Notes",
 )  # fmt: skip
 
 
@@ -64,6 +64,7 @@ def _row(result: RecordingResult, out: Path) -> tuple[str, ...]:
         _text(result.gait_cycles, 0),
         _text(result.lost_percent, 2),
         _text(result.faults, 0),
+        result.gaps or _UNKNOWN,
         result.verified or _UNKNOWN,
         result.error or result.notes or _UNKNOWN,
     )

@@ -137,6 +137,7 @@ def _calibration(given: str, rig: Rig) -> Calibration:
 
 
 def _verify(file: Path, *, json: bool) -> None:
+    from jointfit_daemon.outputs.recording import PROGRAM
     from jointfit_daemon.reprocessing import verify_recording
 
     began = time.monotonic()
@@ -152,6 +153,8 @@ def _verify(file: Path, *, json: bool) -> None:
             "difference": found.difference,
             "gaps": found.gaps,
             "tolerant": found.tolerant,
+            "recorded_by": found.program,
+            "replayed_by": PROGRAM,
         }
         typer.echo(orjson.dumps(result))
     else:

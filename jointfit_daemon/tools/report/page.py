@@ -56,6 +56,7 @@ _DESCRIBED = (
     ("side", "Side"),
     ("calibration", "Calibration"),
     ("software", "Recorded with"),
+    ("processed", "Processed with"),
     ("gateway", "Gateway"),
     ("recording", "File"),
     ("source", "Source"),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import html
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,6 +14,7 @@ from typing import TYPE_CHECKING
 import pytest
 from typer.testing import CliRunner
 
+from jointfit_daemon.outputs.recording._blocks import ChunkBlock, read_blocks
 from jointfit_daemon.tools.__main__ import app
 from jointfit_daemon.tools.batch import executors
 from jointfit_daemon.tools.batch.executors import run_in_pool
@@ -94,6 +97,23 @@ def test_one_bad_file_stops_only_itself(recordings: Recordings, tmp_path: Path) 
     page = (out / "summary.html").read_text("utf-8")
     assert "▲ failed" in page
     assert 'href="trial-0000/report.html"' in page
+
+
+def test_the_row_of_a_damaged_recording_names_its_gap(
+    recordings: Recordings, tmp_path: Path
+) -> None:
+    (path,), out = recordings(1).iterdir(), tmp_path / "out"
+    content = bytearray(path.read_bytes())
+    chunk = [block for block in read_blocks(path) if isinstance(block, ChunkBlock)][-1]
+    content[chunk.end - 100] ^= 1
+    path.write_bytes(content)
+    arguments = ["batch", str(path.parent), "--do", "replay,report", "--jobs", "1"]
+    assert run(app, [*arguments, "--out", str(out)]).exit_code == 0
+
+    (row,) = rows_of(out)
+    assert "cannot be compared because of the gap" in row["verified"]
+    assert re.match(r"at [\d.]+ s: \d+ messages .* are missing: bytes .* are damaged", row["gaps"])
+    assert html.escape(row["gaps"]) in (out / "summary.html").read_text("utf-8")
 
 
 def test_finished_recordings_are_not_processed_again(

@@ -67,7 +67,7 @@ def test_stored_version_and_calibration_file_are_used(
     run: RecordedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path))
-    store = CalibrationStore(tmp_path / "calibrations", "default")
+    store = CalibrationStore(tmp_path / "calibrations", "subject-07")
     version = store.save(run.calibration)
     for given in (version, store.path(version)):
         ended = invoke("replay", run.path, "--calibration", given)
