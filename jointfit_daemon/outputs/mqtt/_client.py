@@ -59,7 +59,10 @@ class MqttClient:
         self.dropped = 0
         """Messages dropped because the reader was too slow."""
         self._settings = settings
-        self._connection = MqttConnection(settings, longest_bytes=_LONGEST_BYTES)
+        # One read of the socket may receive many messages before the reader runs.
+        self._connection = MqttConnection(
+            settings, longest_bytes=_LONGEST_BYTES, most_unread=_UNREAD_CAPACITY
+        )
         self._own = uuid.uuid4().hex
         """Last level of the response topics of this client (MQTT 5)."""
         self._unread: deque[Incoming] = deque()

@@ -50,8 +50,8 @@ GOODBYE_S = 1.0
 """Limit of an orderly disconnect, s."""
 _Properties: Any = Properties  # the constructor is not annotated, its attributes are dynamic
 
-_INCOMING_CAPACITY = 64
-"""Unread messages kept; requests are rare."""
+_UNREAD_CAPACITY = 64
+"""Unread messages of a daemon; requests are rare."""
 _REFUSED = 0x80
 """Lowest MQTT reason code of a refusal."""
 _TAKEN_OVER = 0x8E
@@ -134,6 +134,8 @@ class MqttConnection:
     admit
         Called with topic and retain flag of each incoming message before it is decoded, which
         takes 100 µs; False drops it. Only for subscriptions with `live`.
+    most_unread
+        Unread messages beyond which the newest are dropped.
 
     Raises
     ------
@@ -150,10 +152,12 @@ class MqttConnection:
         farewell: Outgoing | None = None,
         longest_bytes: int = LONGEST_PACKET_BYTES,
         admit: Callable[[str, bool], bool] | None = None,
+        most_unread: int = _UNREAD_CAPACITY,
     ) -> None:
         self._settings, self._identifier = settings, identifier
         self._will, self._farewell = will, farewell
         self._longest_bytes, self._admit = longest_bytes, admit
+        self._most_unread = most_unread
         self._modern = settings.version == "5"
         self._cached: dict[int | None, Any] = {}
         self._paho_log = _PahoLog()
@@ -274,7 +278,7 @@ class MqttConnection:
         stop_if_cancelled()
 
     async def messages(self) -> AsyncIterator[Incoming]:
-        """Yield incoming messages; beyond 64 unread messages the newest are dropped."""
+        """Yield incoming messages."""
         arriving = self._client.messages
         while True:
             try:
@@ -321,7 +325,7 @@ class MqttConnection:
             clean_session=None if self._modern else True,
             timeout=ANSWER_S,
             keepalive=KEEPALIVE_S,
-            max_queued_incoming_messages=_INCOMING_CAPACITY,
+            max_queued_incoming_messages=self._most_unread,
             tls_context=context,
             logger=self._paho_log,
             properties=limit,

@@ -81,6 +81,11 @@ class Outbox:
         return any(origin is None or origin[0] is not self._streams for origin in sending)
 
     @property
+    def is_empty(self) -> bool:
+        """Whether no message is waiting or being sent."""
+        return not self.queued and not self._unacknowledged
+
+    @property
     def retained(self) -> dict[str, bytes]:
         """Last value of every retained topic."""
         return dict(self._state)

@@ -195,10 +195,15 @@ class MqttPublisher:
             await asyncio.sleep(delay_s * random.uniform(0.5, 1.0))  # noqa: S311 - no secret
             delay_s = min(2 * delay_s, _LAST_RETRY_S)
 
-    async def emptied(self, within_s: float) -> None:
-        """Wait until the broker has all state and events; at most `within_s`, if connected."""
-        until = self._loop.time() + within_s
-        while self.connected and self._outbox.has_unsent and self._loop.time() < until:  # noqa: ASYNC110 - three conditions
+    async def emptied(self, within_s: float, *, streams: bool = False) -> None:
+        """Wait until the broker has all state and events; at most `within_s`, if connected.
+
+        With `streams`, also until the streams are sent.
+        """
+        until, outbox = self._loop.time() + within_s, self._outbox
+        while self.connected and self._loop.time() < until:
+            if not (outbox.has_unsent or (streams and not outbox.is_empty)):
+                break
             await asyncio.sleep(_POLL_S)
 
     @property

@@ -37,6 +37,8 @@ class PlaySummary:
     seconds: float = 0.0
     """Recorded time, s."""
     took_s: float = 0.0
+    dropped: int = 0
+    """Messages that the broker did not take."""
     settings: str = "as recorded"
     """Whether rig and calibration are the recorded ones."""
 
@@ -50,16 +52,17 @@ class PlaySummary:
         """Return the summary with its names."""
         return {
             "rig": self.rig, "events": self.events, "states": self.states, "seconds": self.seconds,
-            "took_s": self.took_s, "settings": self.settings,
+            "took_s": self.took_s, "settings": self.settings, "dropped": self.dropped,
         }  # fmt: skip
 
     def text(self) -> str:
         """Return the summary as a sentence."""
         factor = self.seconds / self.took_s if self.took_s else math.inf
+        lost = f"; the broker did not take {self.dropped} messages" if self.dropped else ""
         return (
             f"{self.rig}: {self.states} limb states from {self.events} events, "
             f"{self.settings}: {self.seconds:.1f} s in {self.took_s:.1f} s ({factor:.0f} × real "
-            "time)"
+            f"time){lost}"
         )
 
 
@@ -122,6 +125,7 @@ async def play_recording(
         finally:
             if publication is not None:
                 await publication.stop()
+                summary.dropped = publication.dropped
     summary.took_s = pace.took_s
     return summary
 

@@ -31,7 +31,7 @@ PREFIX = "replay/"
 """Prefix of the base topic, so that no subscriber takes a replay for the daemon."""
 CONNECT_S = 5.0
 """Longest wait for the broker, s."""
-_DRAIN_S = 2.0
+_DRAIN_S = 5.0
 """Longest wait for the broker to accept the last messages, s."""
 _FULL, _POLL_S = 100, 0.002
 """Waiting messages at which the replay waits for the broker, and the interval of its checks, s."""
@@ -79,7 +79,8 @@ class Publication:
         self._clock = RecordedClock()
         rig = self._moved(rig)
         self._settings = rig.mqtt
-        self._outbox = Outbox(topics.BRIDGE_STATE.name(rig.mqtt.base))
+        # Without a clock no message expires: a replay waits for the broker instead.
+        self._outbox = Outbox(topics.BRIDGE_STATE.name(rig.mqtt.base), clock=lambda: 0.0)
         self._link = MqttPublisher(rig.mqtt, self._outbox, lambda _: None)
         self._topics = TopicWriter(rig, self._outbox, self._clock)
         self._task: asyncio.Task[None] | None = None
@@ -88,6 +89,11 @@ class Publication:
     def base(self) -> str:
         """Base topic of the replay."""
         return self._settings.base
+
+    @property
+    def dropped(self) -> int:
+        """Messages that the broker did not take."""
+        return self._outbox.dropped + self._outbox.queued
 
     def _moved(self, rig: Rig) -> Rig:
         """Return `rig` with the broker and the base topic of the replay."""
@@ -131,7 +137,7 @@ class Publication:
 
     async def stop(self) -> None:
         """Send the last messages, remove the retained ones, and disconnect."""
-        await self._link.emptied(_DRAIN_S)
+        await self._link.emptied(_DRAIN_S, streams=True)
         for topic in self._outbox.retained:
             if topic != self._outbox.state_topic:
                 self._outbox.retain(topic, b"")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
 from typing import TYPE_CHECKING
 
 import pytest
@@ -116,8 +117,9 @@ def test_missing_driver_is_named(run: RecordedRun, monkeypatch: pytest.MonkeyPat
     assert "xbus" in ended.stderr
 
 
-async def test_replay_over_mqtt_has_its_own_topics_and_recorded_times(
-    run: RecordedRun, broker: Broker
+@pytest.mark.parametrize("speed", [5.0, math.inf])
+async def test_replay_over_mqtt_has_its_own_topics_and_recorded_times_and_drops_nothing(
+    run: RecordedRun, broker: Broker, speed: float
 ) -> None:
     settings = MqttSettings(host=broker.host, port=broker.port, base="replay/jointfit/r")
     poses: list[dict[str, float]] = []
@@ -130,12 +132,14 @@ async def test_replay_over_mqtt_has_its_own_topics_and_recorded_times(
 
         listening = asyncio.create_task(listen())
         address = f"{broker.host}:{broker.port}"
-        summary = await play_recording(run.path, Changes(), 5.0, (None, address), quiet=True)
-        await asyncio.sleep(0.2)
+        summary = await play_recording(run.path, Changes(), speed, (None, address), quiet=True)
+        async with asyncio.timeout(10):
+            while len(poses) < summary.states:
+                await asyncio.sleep(0.01)
         listening.cancel()
     retained = await retained_topics(settings)
-    assert summary.took_s >= summary.seconds / 5.0
-    assert len(poses) > 100  # a slow machine drops some
+    assert summary.took_s >= summary.seconds / speed
+    assert (len(poses), summary.dropped) == (summary.states, 0)
     begin_s = (BEGIN_NS + UNIX_NS) / 1e9  # the stamps are those of the recording
     assert all(-1.0 < pose["t_us"] / 1e6 - begin_s < 6.0 for pose in poses)
     assert retained == {}
