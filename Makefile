@@ -8,7 +8,7 @@ STAMP  := $(VENV)/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-experiments test-cpu test-root fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
+.PHONY: help install compiled demo test test-compiled test-experiments test-cpu test-root fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -34,6 +34,15 @@ test: $(STAMP)  ## all tests that this machine can run, on all cores; what is sk
 
 test-experiments: $(STAMP)  ## the short experiments of bench against their targets
 	@$(BIN)/python .ci/suite.py --experiments $(ARGS)
+
+compiled: $(STAMP)  ## compile the modules of the frame's path, into build/compiled (C compiler); nothing else uses them
+	@$(BIN)/python packaging/compiled.py $(ARGS)
+
+test-compiled: compiled  ## the tests of the core, on the compiled modules
+	@JOINTFIT_TEST_VARIANT=compiled PYTHONPATH=$(CURDIR)/build/compiled $(BIN)/python -m pytest -q \
+	  -o pythonpath="build/compiled ." --junitxml=build/compiled-tests.xml \
+	  tests/protocols tests/timing tests/fusion tests/drivers tests/pipeline tests/reprocessing tests/packaging/test_variants.py \
+	  -m "not experiment and not system and not alone"
 
 test-cpu: $(STAMP)  ## the numerical tests six times, as on other processors
 	@$(BIN)/python .ci/cpu_features.py $(ARGS)
@@ -76,10 +85,10 @@ docs: $(STAMP)  ## the documentation as a site, warnings are errors
 	@$(BIN)/python -m bench.framework.pages
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --site-dir build/site
 
-wheel: $(STAMP)  ## wheel and sdist in build/packages: reproducible, checked, installed in empty environments
+wheel: $(STAMP)  ## wheels (pure; compiled with a C compiler) and sdist in build/packages: checked, installed in empty environments
 	@$(BIN)/python .ci/check_wheel.py build/packages
 
-deb: $(STAMP)  ## the Debian package in build/packages; for a Raspberry Pi: ARGS="--arch arm64"
+deb: $(STAMP)  ## the Debian package in build/packages, compiled with a C compiler; for a Raspberry Pi, pure: ARGS="--arch arm64"
 	@$(BIN)/python packaging/deb.py $(ARGS)
 
 sbom: $(STAMP)  ## what the package carries, as CycloneDX JSON in build/packages

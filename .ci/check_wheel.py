@@ -1,7 +1,7 @@
-"""Build wheel and sdist, check both, install each as a user would: `check_wheel.py [FOLDER]`.
+"""Build wheels and sdist, check them, install each as a user would: `check_wheel.py [FOLDER]`.
 
-Both into empty environments: the wheel by pip, the sdist by pipx. With FOLDER what was built is
-kept there.
+All into empty environments: the wheels by pip, the sdist by pipx. With FOLDER what was built is
+kept there. The compiled wheel is made if this machine has a C compiler and the headers of Python.
 """
 
 import hashlib
@@ -15,6 +15,10 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "packaging"))
+
+from compiled import compiler  # noqa: E402 - a folder of programs, no package
+
 LOCK = ROOT / "requirements.lock"
 EXAMPLE = ROOT / "examples" / "knee.toml"
 COMMANDS = (["jointfitd", "--version"], ["jointfit", "--help"], ["jointfit-sim", "--help"])
@@ -28,8 +32,8 @@ SHARED = (
 )
 
 
-def run(*words: str | Path, cwd: Path, **environment: str) -> None:
-    """Run a command away from the checkout, so that nothing is imported from there."""
+def run(*words: str | Path, cwd: Path, **environment: str) -> str:
+    """Run a command, usually away from the checkout, and return its output."""
     print("+", *words, flush=True)
     done = subprocess.run(  # noqa: S603 - our own commands
         [str(word) for word in words], cwd=cwd, text=True, check=False, capture_output=True,
@@ -37,18 +41,13 @@ def run(*words: str | Path, cwd: Path, **environment: str) -> None:
     )  # fmt: skip
     if done.returncode:
         sys.exit(f"{done.stdout}{done.stderr}ended with {done.returncode}")
+    return done.stdout
 
 
-def build(folder: Path) -> list[Path]:
-    """Return the wheel and the sdist of this checkout."""
-    words = ["-m", "hatchling", "build", "--directory", str(folder)]
-    print("+ python", *words, flush=True)
-    done = subprocess.run(  # noqa: S603 - our own command
-        [sys.executable, *words], cwd=ROOT, text=True, capture_output=True, check=False
-    )
-    if done.returncode:
-        sys.exit(f"{done.stdout}{done.stderr}ended with {done.returncode}")
-    return [next(folder.glob("*.whl")), next(folder.glob("*.tar.gz"))]
+def build(folder: Path, *options: str, compiled: bool = False) -> None:
+    """Write the archives of this checkout to `folder`."""
+    words = ["-m", "hatchling", "build", "--directory", str(folder), *options]
+    run(sys.executable, *words, cwd=ROOT, JOINTFIT_COMPILED=str(int(compiled)))
 
 
 def try_out(binaries: Path, work: Path) -> None:
@@ -68,12 +67,16 @@ def carry_the_page(wheel: Path) -> None:
         sys.exit(f"not in {wheel.name}: {missing}")
 
 
-def install(archive: Path, work: Path) -> None:
-    """Install into an empty environment and try it."""
-    home = work / "venv"
+def install(archive: Path, work: Path, variant: str) -> None:
+    """Install into an empty environment and try it, also without the compiled modules."""
+    home = work / f"venv-{variant}"
     venv.create(home, with_pip=True)
     run(home / "bin" / "pip", "install", "--quiet", "--constraint", LOCK, archive, cwd=work)
     try_out(home / "bin", work)
+    for expected, pure in ((variant, "0"), ("pure", "1")):
+        text = run(home / "bin" / "jointfitd", "--version", cwd=work, JOINTFIT_PURE=pure)
+        if f"({expected})" not in text:
+            sys.exit(f"{archive.name}, JOINTFIT_PURE={pure}: expected {expected}, found {text}")
     missing = [name for name in SHARED if not (home / name).is_file()]
     if missing:
         sys.exit(f"not in {archive.name}: {missing}")
@@ -94,15 +97,25 @@ def main() -> None:
     """Build, check, install, run; end with the output of the first step that fails."""
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
-        wheel, sdist = build(work / "first")
-        for one, other in zip((wheel, sdist), build(work / "second"), strict=True):
-            if one.read_bytes() != other.read_bytes():
-                sys.exit(f"{one.name}: two builds differ")
+        build(work / "first")
+        build(work / "second")
+        wheel, sdist = archives = sorted((work / "first").iterdir())
+        for archive in archives:
+            if archive.read_bytes() != (work / "second" / archive.name).read_bytes():
+                sys.exit(f"{archive.name}: two builds differ")
         carry_the_page(wheel)
-        run(sys.executable, "-m", "twine", "check", "--strict", sdist, wheel, cwd=work)
-        install(wheel, work)
+        install(wheel, work, "pure")
         install_by_pipx(sdist, work)
-        for archive in (wheel, sdist):
+
+        if compiler() is None:
+            print("no compiled wheel: the C compiler or the headers of Python are missing")
+        else:
+            build(work / "compiled", "--target", "wheel", compiled=True)
+            (compiled,) = (work / "compiled").iterdir()
+            install(compiled, work, "compiled")
+            archives.append(compiled)
+        run(sys.executable, "-m", "twine", "check", "--strict", *archives, cwd=work)
+        for archive in archives:
             print(hashlib.sha256(archive.read_bytes()).hexdigest(), archive.name)
             if len(sys.argv) > 1:
                 target = Path(sys.argv[1])

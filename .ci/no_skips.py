@@ -18,7 +18,8 @@ NOT_INSTALLABLE = (
 )
 """Reasons of tests that a clean machine may skip; they are counted and printed."""
 NOT_IN_MINIMAL = tuple(
-    f"(Debian: apt install {package})" for package in ("mosquitto", "systemd", "groff-base")
+    f"(Debian: apt install {package})"
+    for package in ("mosquitto", "systemd", "groff-base", "gcc python3-dev")
 )
 """Further reasons of tests that the minimal system may skip."""
 

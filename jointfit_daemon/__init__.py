@@ -1,5 +1,9 @@
 """Joint positions and angles from body-worn IMUs in real time."""
 
+from jointfit_variant import select_variant
+
+select_variant(__path__)
+
 
 def __getattr__(name: str) -> str:
     """Return ``__version__``, read on demand: the metadata of packages is slow to import."""

@@ -35,8 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.version:
         from jointfit_daemon import __version__
+        from jointfit_variant import running_variant
 
-        print(f"jointfitd {__version__}")
+        print(f"jointfitd {__version__} ({running_variant()})")
         return 0
     if options.config is None:
         parser.error("the following arguments are required: --config")

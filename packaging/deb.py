@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
 """Build the Debian package: `python packaging/deb.py [--arch amd64|arm64] [--out DIR]`.
 
-Invariant: the content depends on ``requirements.lock`` and the commit only, not on the machine that
-builds it; the same commit gives the same bytes (SOURCE_DATE_EPOCH, default: of the commit). Wheels
-are only unpacked, so a package for arm64 can be built here, too.
+Invariant: the content depends on ``requirements.lock``, the commit and the C compiler only; the
+same commit gives the same bytes (SOURCE_DATE_EPOCH, default: of the commit). Wheels are only
+unpacked, so a package for another architecture can be built here, too. Only a package for this
+architecture contains compiled modules (packaging/compiled.py), if there is a C compiler.
 
 The package carries its own site-packages behind /usr/lib/jointfitd/bin/python3, a link to Debian's
 Python: nothing of it is seen by other programs, and nothing of theirs by it.
@@ -16,6 +17,7 @@ import compileall
 import gzip
 import hashlib
 import os
+import platform
 import py_compile
 import shutil
 import subprocess
@@ -25,10 +27,13 @@ import tomllib
 from email.utils import formatdate
 from pathlib import Path
 
+from compiled import compiler
+
 ROOT = Path(__file__).resolve().parents[1]
 DEBIAN = Path(__file__).with_name("debian")
 HOME = Path("usr/lib/jointfitd")
 PYTHON = f"{sys.version_info.major}.{sys.version_info.minor}"
+THIS_ARCHITECTURE = {"x86_64": "amd64", "aarch64": "arm64"}.get(platform.machine())
 PLATFORMS = {
     "amd64": ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64"),
     "arm64": ("manylinux_2_28_aarch64", "manylinux_2_17_aarch64", "manylinux2014_aarch64"),
@@ -118,7 +123,15 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
     """Unpack our wheel and its dependencies where Debian's Python will find them."""
     site = tree / HOME / "lib" / f"python{PYTHON}" / "site-packages"
     pip: list[str | Path] = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
-    _run([*pip, "wheel", "--quiet", "--no-deps", "--wheel-dir", scratch, ROOT], epoch)
+    is_compiled = architecture == THIS_ARCHITECTURE and compiler() is not None
+    _run(
+        [
+            *pip, "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", scratch,
+            ROOT,
+        ],
+        epoch,
+        JOINTFIT_COMPILED=str(int(is_compiled)),
+    )  # fmt: skip
     wheel = next(scratch.glob("jointfitd-*.whl"))
     platforms = [word for name in PLATFORMS[architecture] for word in ("--platform", name)]
     _run(

@@ -34,7 +34,6 @@ class PatentSegmentFuser(SegmentFuser):
         Contains the model of all sensors.
     """
 
-    @override
     def __init__(self, name: str, sensors: Sequence[str], calibration: SegmentCalibration) -> None:
         super().__init__(name, sensors, calibration)
         self._key = model_key(self._sensors, None)

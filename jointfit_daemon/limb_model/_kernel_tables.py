@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.arrays import Array  # noqa: TC001 - mypyc evaluates the types of fields
 from jointfit_daemon.limb_model._kernel_expert import LARGEST, KernelExpert
 from jointfit_daemon.limb_model._kernel_features import TILTS, smooth_terms_one, widths_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Vector
 
 _BENDS = 6

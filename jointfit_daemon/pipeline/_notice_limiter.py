@@ -9,16 +9,13 @@ totals.
 
 from __future__ import annotations
 
+from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types of fields
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Corrupt, DeviceEvent
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.pipeline.health import MOST_LOST
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 QUIET_NS = 60_000_000_000
 """Shortest time between two notices of one device and kind, ns. ``bridge/health`` counts all."""

@@ -55,8 +55,9 @@ app.add_typer(fuse.app)
 def _print_version(wanted: bool) -> None:
     if wanted:
         from jointfit_daemon import __version__
+        from jointfit_variant import running_variant
 
-        typer.echo(__version__)
+        typer.echo(f"{__version__} ({running_variant()})")
         raise typer.Exit
 
 

@@ -11,14 +11,13 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray  # noqa: TC002 - mypyc evaluates the types of fields
 
 from jointfit_drivers.natnet._binding import body_key
 from jointfit_protocols.natnet import BODY_TRACKED, MARKER_OCCLUDED, MARKER_POINT_CLOUD_SOLVED
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from numpy.typing import NDArray
 
     from jointfit_daemon.model import Quaternion, Vector
     from jointfit_drivers.natnet._binding import Binding, Key

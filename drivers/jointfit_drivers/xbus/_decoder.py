@@ -9,6 +9,7 @@ Invariant: the output depends only on the chunks fed; the decoder reads no clock
 
 from __future__ import annotations
 
+from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types of fields
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
@@ -27,7 +28,7 @@ from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, Trigger, decode_item, split, world_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable
 
     from jointfit_daemon.model import Chunk, Decoded, DeviceEventKind
     from jointfit_drivers.xbus._raw_orientation import RawOrientation

@@ -8,6 +8,7 @@ Invariant: the cost per frame is O(1); a state is reported at most once in a row
 
 from __future__ import annotations
 
+from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types of fields
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from jointfit_daemon.fusion.faults._stuck import StuckSensorDetector
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from jointfit_daemon.model import Chain, Quaternion
 

@@ -6,9 +6,11 @@ calibration and other sources.
 
 from __future__ import annotations
 
+from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types of fields
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple
 
+from jointfit_daemon.config import Source  # noqa: TC001 - mypyc evaluates the types of fields
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame, SyncPulse
 from jointfit_daemon.pipeline.health import ClockHealth, DeviceHealth, WireCounts
 from jointfit_daemon.pipeline.sources._latency_prior import latency_prior
@@ -16,9 +18,6 @@ from jointfit_daemon.pipeline.sources._sync_lines import SyncLines
 from jointfit_daemon.timing.clock import DeviceClock, Edge
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from jointfit_daemon.config import Source
     from jointfit_daemon.driver import Decoder
     from jointfit_daemon.fusion import SensorMonitor
     from jointfit_daemon.model import Chunk, Decoded, TickClock

@@ -19,13 +19,12 @@ extrapolated: frames are emitted one period earlier, never before t_k itself.
 
 from __future__ import annotations
 
+from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types of fields
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from jointfit_daemon.timing.alignment._stream import SampleOutcome, Stream
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from jointfit_daemon.model import Quaternion, Vector
 
 __all__ = ["AlignedFrame", "FrameAligner", "Mode", "SampleOutcome"]

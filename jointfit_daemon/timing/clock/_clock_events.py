@@ -5,10 +5,8 @@ Each text names the finding and its likely cause.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, NamedTuple
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types of fields
+from typing import Literal, NamedTuple
 
 SKEW_LIMIT_PPM = 500.0
 """Largest plausible skew of a crystal, ppm."""

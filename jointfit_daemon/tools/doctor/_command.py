@@ -81,9 +81,11 @@ def examine(
     progress
         Called with the share of the work that is done, 0 to 1.
     """
+    from jointfit_daemon.device_search import Finding
     from jointfit_daemon.tools.doctor import _host_checks as of_host
     from jointfit_daemon.tools.doctor._can_checks import check_can
     from jointfit_daemon.tools.doctor._serial_checks import check_serial
+    from jointfit_variant import running_variant
 
     cameras = None if rig is None else next((s for s in rig.sources if s.kind == "mocap"), None)
     by_ptp = cameras is not None and getattr(cameras.settings, "time", "server") != "server"
@@ -94,11 +96,10 @@ def examine(
         *of_host.check_disk(host),
         *of_host.check_memory(host),
         *of_host.check_processor(host),
+        Finding("software", "", "ok", f"modules of the frame's path: {running_variant()}"),
     ]
     progress(0.2)
     if rig is None:
-        from jointfit_daemon.device_search import Finding
-
         text = "no rig.toml: broker and cameras were not checked"
         return [*findings, Finding("rig", "", "unknown", text, "jointfit doctor --config rig.toml")]
 

@@ -1,0 +1,64 @@
+"""Compiled and interpreted modules: which of them runs, and that both return the same values."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import sysconfig
+from pathlib import Path
+
+import pytest
+
+from jointfit_variant import running_variant
+from tests.compiled_variant import ROOT, run_compiled
+
+FRAMES = Path(__file__).with_name("variant_frames.py")
+PACKAGE = "from jointfit_variant import select_variant\nselect_variant(__path__)\n"
+
+
+def test_tests_run_on_sources_unless_the_compiled_modules_are_requested() -> None:
+    assert running_variant() == os.environ.get("JOINTFIT_TEST_VARIANT", "pure")
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A package with the module `wire` in both forms, the compiled one not loadable."""
+    inner = tmp_path / "mixed" / "inner"
+    inner.mkdir(parents=True)
+    (inner.parent / "__init__.py").write_text(PACKAGE)
+    (inner / "__init__.py").write_text("")
+    (inner / "wire.py").write_text("FORM = 'source'\n")
+    (inner / f"wire{sysconfig.get_config_var('EXT_SUFFIX')}").write_bytes(b"no library")
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("value", "imported"), [("1", "source"), ("0", "extension"), (None, "extension")]
+)
+def test_jointfit_pure_imports_sources_instead_of_extension_modules(
+    package: Path, value: str | None, imported: str
+) -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join((str(package), str(ROOT)))}
+    environment.pop("JOINTFIT_PURE", None)
+    if value is not None:
+        environment["JOINTFIT_PURE"] = value
+    done = subprocess.run(
+        [sys.executable, "-c", "import mixed.inner.wire as w; print(w.FORM)"],
+        env=environment, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if imported == "source":
+        assert done.stdout == "source\n", done.stderr
+    else:  # Python found the extension module, which is none
+        assert "ImportError" in done.stderr
+
+
+def test_compiled_modules_and_their_sources_give_the_same_frames_bit_for_bit() -> None:
+    outputs = {}
+    for pure in (False, True):
+        done = run_compiled(FRAMES, pure=pure)
+        assert done.returncode == 0, done.stderr
+        variant, *outputs[pure] = done.stdout.splitlines()
+        assert variant == ("pure" if pure else "compiled")
+    assert len(outputs[True]) > 500
+    assert outputs[False] == outputs[True]
