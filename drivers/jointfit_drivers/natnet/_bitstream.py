@@ -12,12 +12,21 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from jointfit_protocols.corrupt import CorruptBytes
-from jointfit_protocols.natnet import NatNetMessageId, decode, is_versioned, supported
+from jointfit_protocols.natnet import (
+    FrameLayout,
+    FrameOfData,
+    NatNetMessageId,
+    decode,
+    is_versioned,
+    supported,
+)
 
 if TYPE_CHECKING:
     from jointfit_protocols.natnet import Message, Version
 
 UNKNOWN: Version = (0, 0)
+_MOST_LAYOUTS = 64
+"""Lengths of frames whose layouts are stored."""
 FRAME_START = int(NatNetMessageId.FRAMEOFDATA).to_bytes(2, "little")
 """First bytes of a datagram with a frame, in every bitstream."""
 
@@ -36,6 +45,8 @@ class BitstreamTracker:
         self._wanted = wanted
         self._announced: Version | None = None
         self._confirmed: Version | None = None
+        self._layouts: dict[tuple[Version, int], FrameLayout] = {}
+        """Layout of the last frame with this version and length; a server sends few lengths."""
 
     @property
     def known(self) -> bool:
@@ -59,7 +70,20 @@ class BitstreamTracker:
 
     def decode(self, datagram: bytes) -> Message | CorruptBytes:
         """Return the message in `datagram`; adopt a candidate that alone decodes it."""
+        key = self.version, len(datagram)
+        layout = self._layouts.get(key)
+        if layout is not None:
+            frame = layout.read(datagram)
+            if frame is not None:
+                return frame
+
         message = decode(datagram, self.version)
+        if isinstance(message, FrameOfData):
+            new = FrameLayout.of(datagram, message, self.version)
+            if new is not None:
+                if len(self._layouts) >= _MOST_LAYOUTS:  # the number of markers varies
+                    self._layouts.clear()
+                self._layouts[key] = new
         if not isinstance(message, CorruptBytes) or not self.known or not is_versioned(datagram):
             return message
 

@@ -93,14 +93,20 @@ class PoseConverter:
     def _labeled(
         self, frame: FrameOfData, known: frozenset[Key], unknown: list[int]
     ) -> dict[Key, Vector]:
-        place = self._place
+        place, far = self._place, _FARTHEST_M
         seen: dict[Key, Vector] = {}
         twice: set[int] = set()
         for number, x, y, z, _, params, _ in frame.markers:
             if number not in known:
                 if number >> 16:  # model 0: a marker without a model
                     unknown.append(number)
-            elif params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED and _near(x, y, z):
+            # as _near, which would take a third of the time of this loop
+            elif (
+                params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED
+                and -far <= x <= far
+                and -far <= y <= far
+                and -far <= z <= far
+            ):
                 if number in seen:
                     twice.add(number)
                 seen[number] = place(x, y, z)

@@ -19,6 +19,7 @@ from jointfit_protocols.natnet._frame import (
     decode_frame,
     supported,
 )
+from jointfit_protocols.natnet._frame_layout import FrameLayout
 from jointfit_protocols.natnet._frame_time import DECIDING, PrecisionTime, timecode_of
 from jointfit_protocols.natnet._messages import (
     HEADER,
@@ -67,6 +68,7 @@ __all__ = [
     "Discovery",
     "EchoRequest",
     "EchoResponse",
+    "FrameLayout",
     "FrameOfData",
     "LabeledMarker",
     "MarkerSet",

@@ -1,0 +1,41 @@
+"""Decoding by the layout of an earlier frame: equal to the decoder of any frame, or refused."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_protocols.natnet import FrameLayout, FrameOfData, decode, encode
+from tests.protocols.natnet.test_natnet_messages import frames
+
+
+@given(pair=frames(), data=st.data())
+def test_frame_by_layout_equals_the_decoded_one_for_any_changed_byte(
+    pair: tuple[FrameOfData, tuple[int, int]], data: st.DataObject
+) -> None:
+    frame, version = pair
+    datagram = encode(frame._replace(skeletons=(), assets=(), force_plates=(), devices=()), version)
+    decoded = decode(datagram, version)
+    assert isinstance(decoded, FrameOfData)
+    layout = FrameLayout.of(datagram, decoded, version)
+    assert layout is not None
+    assert layout.read(datagram) == decoded
+
+    changed = bytearray(datagram)
+    changed[data.draw(st.integers(0, len(datagram) - 1))] ^= data.draw(st.integers(1, 255))
+    found = layout.read(bytes(changed))
+    # texts, because NaN differs from itself
+    assert found is None or repr(found) == repr(decode(bytes(changed), version))
+
+
+@given(pair=frames())
+def test_frame_with_items_of_variable_size_has_no_layout(
+    pair: tuple[FrameOfData, tuple[int, int]],
+) -> None:
+    frame, version = pair
+    datagram = encode(frame, version)
+    decoded = decode(datagram, version)
+    assert isinstance(decoded, FrameOfData)
+    layout = FrameLayout.of(datagram, decoded, version)
+    variable = decoded.skeletons + decoded.assets + decoded.force_plates + decoded.devices
+    assert (layout is None) == bool(variable)
