@@ -335,14 +335,10 @@ def _orientations(
             parts.append(q[None])
     else:
         columns = [layout.markers.index(m) if m in layout.markers else -1 for m in cluster.markers]
-        absent = np.full((1, 3), np.nan)  # column -1: a marker that the stream does not contain
         for start in range(0, len(rows), _FRAMES_PER_STEP):
-            positions = np.stack(
-                [
-                    np.concatenate((frame.markers, absent))[columns]
-                    for _, frame in rows[start : start + _FRAMES_PER_STEP]
-                ]
-            )
+            seen = np.stack([frame.markers for _, frame in rows[start : start + _FRAMES_PER_STEP]])
+            absent = np.full((len(seen), 1, 3), np.nan)  # column -1: not part of the stream
+            positions = np.concatenate((seen, absent), axis=1).take(columns, axis=1)
             parts.append(rigid_fit(cluster.template, positions)[0])
             yield
     return np.array([t for t, _ in rows], dtype=np.int64), np.concatenate(parts)

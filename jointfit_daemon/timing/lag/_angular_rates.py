@@ -150,6 +150,7 @@ class Interpolant:
 
     def __init__(self, rates: Rates) -> None:
         self._t, self._w, self._run = rates.t_s, rates.w, rates.run
+        self._gapless = bool(self._run.size) and bool(self._run[0] == self._run[-1])
         self.slopes = np.zeros_like(rates.w)
         """Time derivative at the samples, rad/s², shape (n, 3)."""
         for run in rates.runs():
@@ -162,22 +163,38 @@ class Interpolant:
 
     def locate(self, t: Floats) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         """Return the interval of each instant, and whether it is inside a run."""
-        if self._t.size < 2:  # noqa: PLR2004 - an interval has two ends
-            return np.zeros(t.size, dtype=np.intp), np.zeros(t.size, dtype=np.bool_)
-        at = np.clip(np.searchsorted(self._t, t, side="right") - 1, 0, self._t.size - 2)
-        inside = (t >= self._t[at]) & (t <= self._t[at + 1]) & (self._run[at] == self._run[at + 1])
+        at, inside, _, _ = self._intervals(t)
         return at, inside
+
+    def _intervals(self, t: Floats) -> tuple[NDArray[np.intp], NDArray[np.bool_], Floats, Floats]:
+        """Return the interval of each instant, whether it is inside a run, and its two ends, s."""
+        if self._t.size < 2:  # noqa: PLR2004 - an interval has two ends
+            nowhere = np.zeros(t.size)
+            return (
+                np.zeros(t.size, dtype=np.intp),
+                np.zeros(t.size, dtype=np.bool_),
+                nowhere,
+                nowhere,
+            )
+        at = np.searchsorted(self._t, t, side="right") - 1
+        at = np.minimum(np.maximum(at, 0), self._t.size - 2)
+        low, high = self._t[at], self._t[at + 1]
+        inside = (t >= low) & (t <= high)
+        if not self._gapless:
+            inside &= self._run[at] == self._run[at + 1]
+        return at, inside, low, high
 
     def __call__(self, t: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
         """Return value and time derivative, shape (n, 3) each, and validity at instants `t`, s."""
-        at, inside = self.locate(t)
+        at, inside, low, high = self._intervals(t)
         if not inside.any():
             return np.zeros((t.size, 3)), np.zeros((t.size, 3)), inside
 
-        h = (self._t[at + 1] - self._t[at])[:, None]
-        x = (t - self._t[at])[:, None] / h
-        f0, f1 = self._w[at], self._w[at + 1]
-        d0, d1 = self.slopes[at] * h, self.slopes[at + 1] * h
+        h = (high - low)[:, None]
+        x = (t - low)[:, None] / h
+        after = at + 1
+        f0, f1 = self._w.take(at, axis=0), self._w.take(after, axis=0)
+        d0, d1 = self.slopes.take(at, axis=0) * h, self.slopes.take(after, axis=0) * h
         rise = f1 - f0
         c2, c3 = 3.0 * rise - 2.0 * d0 - d1, d0 + d1 - 2.0 * rise
         value = f0 + x * (d0 + x * (c2 + x * c3))

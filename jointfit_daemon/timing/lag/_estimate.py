@@ -361,13 +361,20 @@ def _correlations(imu: Rates, ref: Rates, step: float, reach: int) -> Floats:
 
     least = _LEAST_OVERLAP * a_ok.sum()
     scores = np.full(2 * reach + 1, -inf)
+    whole = bool(a_ok.all() and b_ok.all() and grid.size > 2)  # noqa: PLR2004 - as below
+    centered = a - a.mean() if whole else a
+    power = centered @ centered
     for shift in range(scores.size):
-        both = a_ok & b_ok[shift : shift + grid.size]
-        if both.sum() > max(2.0, least):
-            x = a[both] - a[both].mean()
-            y = b[shift : shift + grid.size][both]
-            y = y - y.mean()
-            scores[shift] = (x @ y) / np.sqrt(max((x @ x) * (y @ y), 1e-300))
+        y = b[shift : shift + grid.size]
+        x = centered
+        if not whole:
+            both = a_ok & b_ok[shift : shift + grid.size]
+            if both.sum() <= max(2.0, least):
+                continue
+            x, y = a[both] - a[both].mean(), y[both]
+            power = x @ x
+        y = y - y.mean()
+        scores[shift] = (x @ y) / np.sqrt(max(power * (y @ y), 1e-300))
     return scores
 
 

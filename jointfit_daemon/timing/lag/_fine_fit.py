@@ -38,6 +38,8 @@ LEAST_PAIRS = 16
 
 _FIRST_HUBER = 2.4
 _TINY = 1e-12
+_BY_BIAS = -np.eye(3)
+"""Derivative of a residual by the bias."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,16 +156,28 @@ def _linearize(
     g, slope, ok = cubic(slow.t_s + state.tau)
     if ok.sum() < LEAST_PAIRS:
         return None
-    omega = slow.w[ok]
+    omega, t_s = slow.w, slow.t_s
+    if not ok.all():
+        g, slope, omega, t_s = g[ok], slope[ok], omega[ok], t_s[ok]
     turned = omega @ state.rot.T
-    r = g[ok] - state.bias - turned
-    norm = np.linalg.norm(r, axis=1)
+    r = g - state.bias - turned
+    norm = _norms(r)
     weight = _clipped(norm, _FIRST_HUBER * _scale(norm) if clip is None else clip)
 
-    by_bias = np.broadcast_to(-np.eye(3), (*weight.shape, 3, 3))
-    jacobian = np.concatenate((rotation.skew(turned), by_bias, slope[ok][:, :, None]), axis=2)
-    give = (weight < 1.0).astype(np.float64)
-    return LinearizedLag(jacobian, r, weight, give, omega, slow.t_s[ok])
+    # Derivatives by rotation (the matrix of the cross product), bias and lag.
+    x, y, z = turned.T
+    jacobian = np.zeros((len(r), 3, 7))
+    jacobian[:, 0, 1], jacobian[:, 0, 2] = -z, y
+    jacobian[:, 1, 0], jacobian[:, 1, 2] = z, -x
+    jacobian[:, 2, 0], jacobian[:, 2, 1] = -y, x
+    jacobian[:, :, 3:6] = _BY_BIAS
+    jacobian[:, :, 6] = slope
+    return LinearizedLag(jacobian, r, weight, (weight < 1.0).astype(np.float64), omega, t_s)
+
+
+def _norms(vectors: Floats) -> Floats:
+    norms: Floats = np.sqrt(np.add.reduce(vectors * vectors, axis=1))
+    return norms
 
 
 def _scale(norm: Floats) -> float:
@@ -182,7 +196,8 @@ def _best_clip(linear: LinearizedLag) -> float:
     h is the information of a row about the lag. Correlations between residuals are neglected, since
     they are the same for all thresholds.
     """
-    norm = np.linalg.norm(linear.residual, axis=1)
+    norm = _norms(linear.residual)
+    scale = _scale(norm)
     information = np.sum(linear.jacobian[:, :, 6] ** 2, axis=1)
 
     def variance(clip: float) -> float:
@@ -191,7 +206,7 @@ def _best_clip(linear: LinearizedLag) -> float:
         spread = float(information @ (weight * norm) ** 2)
         return spread / float(information @ curve + _TINY) ** 2
 
-    return min((huber * _scale(norm) for huber in HUBERS), key=variance)
+    return min((huber * scale for huber in HUBERS), key=variance)
 
 
 def _step(linear: LinearizedLag, state: _State) -> tuple[_State, float]:
@@ -200,10 +215,12 @@ def _step(linear: LinearizedLag, state: _State) -> tuple[_State, float]:
     normal = np.einsum("nij,nik->jk", weighted, linear.jacobian)
     gradient = np.einsum("nij,ni->j", weighted, linear.residual)
 
-    normal[np.arange(3), np.arange(3)] += RIDGE * max(np.trace(normal[:3, :3]), _TINY)
+    ridge = RIDGE * max(normal[0, 0] + normal[1, 1] + normal[2, 2], _TINY)
+    for axis in range(3):
+        normal[axis, axis] += ridge
     normal[6, 6] += _TINY
 
     move = -np.linalg.solve(normal, gradient)
-    tau = float(np.clip(move[6], -STEP_S, STEP_S))
+    tau = float(min(max(move[6], -STEP_S), STEP_S))
     rot = rotation.to_matrix(rotation.exp(move[:3])) @ state.rot
     return _State(state.tau + tau, rot, state.bias + move[3:6]), abs(tau)
