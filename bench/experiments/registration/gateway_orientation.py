@@ -15,7 +15,7 @@ from bench.framework.experiment import Experiment, Result
 from bench.framework.material import BOARD
 from bench.subjects import raw_imu_trials
 from jointfit_daemon.kinematics import rotation
-from jointfit_drivers.gateway_orientation import SETTLE_S
+from jointfit_drivers.gateway_orientation import LONGEST_SETTLE_S
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -79,7 +79,7 @@ def begun_in_motion(data: Path) -> list[Result]:
     for start in chosen:
         part = slice(int(start), int(start) + 7 * SECOND)
         felt = [values[part] for values in trial.felt]
-        for settle_s, errors in ((0.0, at_once), (SETTLE_S, settled)):
+        for settle_s, errors in ((0.0, at_once), (LONGEST_SETTLE_S, settled)):
             said = raw_imu_trials.through_driver(felt, magnetometer=True, settle_s=settle_s)
             # withheld orientations are at the beginning
             optical = trial.optical[part][-len(said) :]

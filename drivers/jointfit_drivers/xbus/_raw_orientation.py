@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 from jointfit_daemon.model import DeviceEvent, ImuSample
 from jointfit_drivers.gateway_orientation import (
-    SETTLE_S,
+    LONGEST_SETTLE_S,
     FilterOutput,
     GatewayOrientation,
     RawReading,
@@ -66,13 +66,15 @@ class RawOrientation:
         Longest time without output after the start of the filter, s.
     """
 
-    def __init__(self, rate_hz: float, *, magnetometer: bool, settle_s: float = SETTLE_S) -> None:
+    def __init__(
+        self, rate_hz: float, *, magnetometer: bool, settle_s: float = LONGEST_SETTLE_S
+    ) -> None:
         self._made = (rate_hz, magnetometer, settle_s)
         self._filter = GatewayOrientation(rate_hz, magnetometer=magnetometer, settle_s=settle_s)
         self._waiting: tuple[RawMessage, RawReading] | None = None
         self._ticks: int | None = None
         self._t_ns = 0
-        self._reported_ns, self._reported = -_REPORT_NS, (False, False)
+        self._reported_ns, self._reported = -_REPORT_NS, (False, False, False)
         self._clipped_ns = -_REPORT_NS
         self._rate: Vector = (0.0, 0.0, 0.0)
         self._started = False
@@ -159,10 +161,12 @@ class RawOrientation:
 
         state = self._filter.state
         if state is None or (
-            since_ns < _REPORT_NS and (state.rest, state.disturbed) == self._reported
+            since_ns < _REPORT_NS
+            and (state.rest, state.disturbed, state.converging) == self._reported
         ):
             return out
-        self._reported_ns, self._reported = self._t_ns, (state.rest, state.disturbed)
+        self._reported_ns = self._t_ns
+        self._reported = (state.rest, state.disturbed, state.converging)
 
         data: dict[str, object] = {
             "rest": state.rest,
@@ -171,6 +175,7 @@ class RawOrientation:
             "magnetometer": self._made[1],
             "disturbed": state.disturbed,
             "settled": not self._filter.settling,
+            "converging": state.converging,
             "period_ms": round(self._filter.period_ns * 1e-6, 6),
         }
         out.append(DeviceEvent("info", "orientation filter", {"orientation_filter": data}))

@@ -54,11 +54,11 @@ class XbusSettings(ImuSettings):
         "must then send at `rate_hz`, too; left out it drifts freely. The same for all IMUs",
     )
     settle_s: float = Field(
-        gateway_orientation.SETTLE_S,
+        gateway_orientation.LONGEST_SETTLE_S,
         ge=0,
         le=60,
         description='with `orientation = "gateway"`: longest time, s, after the start (or a gap) '
-        "without output while the filter finds the vertical; half of it at rest",
+        "without output while the orientation is uncertain; 1.5 s at rest",
     )
     reset_if_stuck: bool = Field(
         False, description="reset a device that streams but does not answer; its clock restarts"

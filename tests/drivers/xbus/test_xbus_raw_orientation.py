@@ -15,8 +15,7 @@ from pydantic import ValidationError
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample
-from jointfit_drivers import gateway_orientation
-from jointfit_drivers.gateway_orientation import GatewayOrientation, RawReading
+from jointfit_drivers.gateway_orientation import GatewayOrientation, RawReading, _filter
 from jointfit_drivers.xbus import XbusImu, XbusSettings
 from jointfit_protocols import xbus
 from jointfit_protocols.xbus import mtdata2
@@ -238,20 +237,20 @@ def delayed_fields(delay_s: float, amplitude: float) -> tuple[np.ndarray, ...]:
 
 def test_delay_of_the_magnetometer_is_estimated_in_spite_of_an_absurd_field() -> None:
     q, rates, fields = delayed_fields(0.013, 1.5)
-    clean = gateway_orientation._field_delay(q, rates, fields)
+    clean = _filter._field_delay(q, rates, fields)
     assert clean == pytest.approx(0.013, rel=0.15)
     fields[500] = (1e5, -1e5, 1e5)
-    found = gateway_orientation._field_delay(q, rates, fields)
+    found = _filter._field_delay(q, rates, fields)
     assert found == pytest.approx(clean, rel=0.01)
 
 
 def test_delay_of_the_magnetometer_is_unknown_at_rest() -> None:
-    assert gateway_orientation._field_delay(*delayed_fields(0.013, 0.0)) is None
+    assert _filter._field_delay(*delayed_fields(0.013, 0.0)) is None
 
 
 def test_field_beyond_all_sensors_is_refused() -> None:
     reading = RawReading(0, (0.0, 0.0, 0.0), (0.0, 0.0, 9.81), (1e200, 0.0, 0.0))
-    assert not gateway_orientation.is_plausible(reading)
+    assert not _filter.is_plausible(reading)
 
 
 def test_after_a_long_gap_in_fast_motion_the_sensor_is_silent_till_it_has_settled() -> None:
@@ -376,7 +375,7 @@ def test_clipped_reading_is_reported_once() -> None:
 def test_without_the_package_the_rig_is_refused_with_the_remedy(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(gateway_orientation, "find_spec", lambda _: None)
+    monkeypatch.setattr(_filter, "find_spec", lambda _: None)
     with pytest.raises(ValidationError, match=r"pip install 'jointfitd\[vqf\]'"):
         setup()
     assert setup(orientation="device").orientation == "device"

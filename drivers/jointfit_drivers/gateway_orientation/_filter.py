@@ -16,13 +16,13 @@ the error is 20 degrees in the first second and 4 degrees in the next two, and n
 (``gateway-orientation-start-in-motion``). No orientation is therefore returned until the filter has
 detected rest or has run for `SETTLE_S`.
 
-The heading from a magnetometer contains the error of the inclination, multiplied by the tangent of
-the dip of the field. While the filter settles it therefore runs without magnetometer. Then the
-retained readings are processed backwards, which gives the inclination at the start, and again
-forwards, backwards and forwards with the magnetometer, so that all of them contribute to the
-heading (``gateway-orientation-ten-starts``). Magnetometers are slower than gyroscopes: at 579
-degrees per second the delay of 13 ms of the recorded sensor is an error of 8 degrees. The delay is
-estimated from the retained readings and compensated.
+With a magnetometer, `StartEstimator` then estimates orientation and gyroscope bias from the
+readings since the start, and continues with every reading. Orientations are returned once their
+standard deviation is at most `SETTLED_SD`. VQF continues with the result at the first rest, or once
+the bias is known as well as VQF estimates it in motion, but after `CONVERGE_S` at the latest.
+Magnetometers are slower than gyroscopes: at 579 degrees per second the delay of 13 ms of the
+recorded sensor is an error of 8 degrees. The delay is estimated from the readings since the start
+and compensated.
 
 Invariant: a function of the readings fed, without a clock of its own: a replay yields identical
 orientations. Only this module imports ``vqf`` (an extra), and it contains no device.
@@ -35,10 +35,17 @@ from __future__ import annotations
 from collections import deque
 from importlib import import_module
 from importlib.util import find_spec
-from math import atan2, ceil, cos, sin
+from math import atan2, ceil, cos, degrees, radians, remainder, sin, tau
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+
+from jointfit_drivers.gateway_orientation._start_estimator import (
+    GRAVITY,
+    StartEstimator,
+    StartReading,
+    multiply,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -53,6 +60,14 @@ MOST_MISSING = 3
 """Consecutive missing readings that are interpolated; more restart the filter."""
 SETTLE_S = 3.0
 """Time constant of the filter's accelerometer, s: its vertical is a mean over this time."""
+LONGEST_SETTLE_S = 8.0
+"""Time, s, after which orientations are returned, however uncertain they are."""
+SETTLED_SD = radians(5.0)
+"""Standard deviation of the angle of the orientation, rad, of a settled filter."""
+CONVERGE_S = 60.0
+"""Longest time that the start is estimated, s."""
+KNOWN_BIAS_SD = radians(0.1)
+"""Standard deviation of the bias, rad/s, that VQF reaches in motion (its ``biasSigmaMotion``)."""
 FASTEST = 200.0
 """Largest plausible angular rate, rad/s: 11 000 degrees per second."""
 HARDEST = 5000.0
@@ -119,6 +134,8 @@ class FilterState(NamedTuple):
     """Upper bound of the bias standard deviation, rad/s."""
     disturbed: bool
     """Magnetic disturbance: heading comes from the gyroscope alone."""
+    converging: bool
+    """The filter started in motion, and its bias is not known yet."""
 
 
 def is_installed() -> bool:
@@ -145,10 +162,13 @@ class GatewayOrientation:
     magnetometer : bool
         Whether heading comes from the magnetometer (9D) or drifts (6D).
     settle_s : float
-        Longest time without output after a start of the filter, s.
+        Longest time without output after a start of the filter, s; without magnetometer at most
+        `SETTLE_S`.
     """
 
-    def __init__(self, rate_hz: float, *, magnetometer: bool, settle_s: float = SETTLE_S) -> None:
+    def __init__(
+        self, rate_hz: float, *, magnetometer: bool, settle_s: float = LONGEST_SETTLE_S
+    ) -> None:
         self._nominal_ns = 1e9 / rate_hz
         self._settle_ns = round(settle_s * _NS)
         self._started_ns: int | None = None  # None: it has settled
@@ -157,7 +177,9 @@ class GatewayOrientation:
         self._last: RawReading | None = None
         self._period_ns = 0.0  # step for which the filter was created
         self._delay_s = 0.0
-        self._withheld: deque[tuple[Vector, Vector, Vector]] = deque()
+        self._withheld: deque[StartReading] = deque()
+        self._estimator: StartEstimator | None = None  # None: settling, or converged
+        self._converging_ns = 0
         self._passed_ns = self._steps = 0
         self._turn: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -181,7 +203,13 @@ class GatewayOrientation:
         bias, sd = self._filter.getBiasEstimate()
         x, y, z = bias.tolist()
         rest, disturbed = self._filter.getRestDetected(), self._filter.getMagDistDetected()
-        return FilterState(bool(rest), (x, y, z), float(sd), self._magnetic and bool(disturbed))
+        return FilterState(
+            bool(rest),
+            (x, y, z),
+            float(sd),
+            self._magnetic and bool(disturbed),
+            self._estimator is not None,
+        )
 
     def take(self, reading: RawReading) -> FilterStep:
         """Update the filter with the next plausible reading, in order of time."""
@@ -215,74 +243,118 @@ class GatewayOrientation:
 
         # No output before the filter has settled.
         if self._started_ns is not None:
-            waited_ns = reading.t_ns - self._started_ns
-            if waited_ns < self._settle_ns and not self._filter.getRestDetected():
-                oriented.clear()
-            else:
-                self._started_ns = None
-                oriented = [self._refine(reading)]
+            self._settle(reading.t_ns, reading.t_ns - self._started_ns)
+            oriented = [] if self.settling else [self._output(reading)]
         return FilterStep(tuple(oriented), steps - 1, restarted=not followed)
 
     def _start(self, period_ns: float, t_ns: int) -> None:
         self._period_ns = period_ns
         self._started_ns = t_ns if self._settle_ns else None
-        # The last readings suffice for the heading, however long the filter settles.
+        # The last readings suffice, however long the filter settles.
         self._withheld = deque(maxlen=ceil(SETTLE_S * _NS / period_ns) + MOST_MISSING)
+        self._estimator = None
         self._filter = import_module("vqf").VQF(period_ns / _NS)  # an extra
+        # Orientations by the gyroscope assume a constant bias until the start is estimated.
+        self._filter.setMotionBiasEstEnabled(not (self._magnetic and self.settling))
 
     def _update(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
         """Update with one reading; after a gap, continue with the same heading."""
         # w_fed = w T_mean / T_s: every step turns by the true angle
         scale = self.period_ns / self._period_ns
         x, y, z = reading.rate
-        self._rate[:] = (x * scale, y * scale, z * scale)
-        self._force[:] = reading.force
+        fed = (x * scale, y * scale, z * scale)
+        field = reading.magnetic if self._magnetic else None
+        if field is not None and self._delay_s != 0.0:
+            field = _ahead(field, reading.rate, self._delay_s)
 
-        if self._magnetic and self.settling:
-            fed = (x * scale, y * scale, z * scale)
-            self._withheld.append((fed, reading.force, reading.magnetic or NO_FIELD))
+        self._rate[:], self._force[:] = fed, reading.force
+        if field is None:
             self._filter.update(self._rate, self._force)
-        elif self._magnetic and reading.magnetic is not None:
-            self._field[:] = _ahead(reading.magnetic, reading.rate, self._delay_s)
-            self._filter.update(self._rate, self._force, self._field)
         else:
-            self._filter.update(self._rate, self._force)
+            self._field[:] = field
+            self._filter.update(self._rate, self._force, self._field)
+
+        if self._magnetic and (self.settling or self._estimator is not None):
+            w, i, j, k = self._filter.getQuat3D().tolist()
+            part = StartReading((w, i, j, k), fed, reading.force, field or NO_FIELD)
+            if self._estimator is None:
+                self._withheld.append(part._replace(field=reading.magnetic or NO_FIELD))
+            elif self._estimator.add(part):
+                self._continue_start(self._estimator, reading.t_ns)
         return self._output(reading, follows=follows)
 
-    def _refine(self, reading: RawReading) -> FilterOutput:
-        """Process the readings since the start again, twice backwards and forwards."""
+    def _settle(self, t_ns: int, waited_ns: int) -> None:
+        """Start the estimate of the start, and note when the filter has settled."""
+        rest = self._filter.getRestDetected()
+        if not rest and waited_ns < min(self._settle_ns, SETTLE_S * _NS):
+            return
+        if self._withheld:
+            self._estimate_start(t_ns, rest=rest)
+
+        estimator = self._estimator
+        uncertain = estimator is not None and estimator.orientation_sd > SETTLED_SD
+        if not uncertain or waited_ns >= self._settle_ns:
+            self._started_ns = None
+
+    def _estimate_start(self, t_ns: int, *, rest: bool) -> None:
+        """Estimate orientation and bias from the readings since the start."""
         withheld = list(self._withheld)
         self._withheld.clear()
-        if not withheld:
-            return self._output(reading)
+        if not any(any(part.field) for part in withheld):
+            self._filter.setMotionBiasEstEnabled(True)
+            return
 
-        rates, forces = (np.array([part[kind] for part in withheld]) for kind in (0, 1))
-        backwards = (np.ascontiguousarray(-rates[::-1]), np.ascontiguousarray(forces[::-1]))
-
-        # inclination at the start, and the delay of the magnetometer
-        self._run_backwards(*backwards)
-        q = self._filter.updateBatch(rates, forces)["quat6D"]
-        found_s = _field_delay(q, rates, np.array([part[2] for part in withheld]))
+        q, rates, fields = (np.array([part[kind] for part in withheld]) for kind in (0, 1, 3))
+        found_s = _field_delay(q, rates, fields)
         self._delay_s = self._delay_s if found_s is None else found_s
-        fields = np.array([_ahead(field, rate, self._delay_s) for rate, _, field in withheld])
+        parts = [
+            part._replace(field=_ahead(part.field, part.rate, self._delay_s)) for part in withheld
+        ]
 
-        # heading from all readings
-        self._run_backwards(*backwards, np.ascontiguousarray(fields[::-1]))
-        self._filter.updateBatch(rates, forces, fields)
-        return self._output(reading)
+        # At rest the mean rate is the bias.
+        assumed, bias_sd = self._filter.getBiasEstimate()
+        bias = assumed
+        if rest:
+            bias = np.array(self._filter.state["restLastGyrLp"])
+            bias_sd = radians(self._filter.params["biasSigmaRest"])
+        self._estimator = StartEstimator(parts, self._period_ns / _NS, assumed, bias, bias_sd)
+        self._converging_ns = t_ns
+        self._continue_start(self._estimator, t_ns)
 
-    def _run_backwards(self, *readings: NDArray[np.float64]) -> None:
-        """Process readings in reverse order, in which the gyroscope bias has the opposite sign."""
-        for values in (readings, None):
-            bias, sd = self._filter.getBiasEstimate()
-            self._filter.setBiasEstimate(-bias, sd)
-            if values is not None:
-                self._filter.updateBatch(*values)
+    def _continue_start(self, estimator: StartEstimator, t_ns: int) -> None:
+        """Set the filter to the estimated bias, and to the whole estimate at the end."""
+        known = estimator.bias_sd <= KNOWN_BIAS_SD
+        late = t_ns - self._converging_ns >= CONVERGE_S * _NS
+        if not (known or late or self._filter.getRestDetected()):
+            self._filter.setBiasEstimate(estimator.bias, estimator.bias_sd)
+            return
+
+        # The mean of the accelerometer begins as if it had always been the estimated vertical.
+        vqf, state = self._filter, self._filter.state
+        q = estimator.q_world_gyro
+        up = _rotated(np.array([(q[0], -q[1], -q[2], -q[3])]), np.array([(0.0, 0.0, GRAVITY)]))[0]
+        low_pass = [np.array(vqf.coeffs[name]) for name in ("accLpB", "accLpA")]
+        initial = [vqf.filterInitialState(float(value), *low_pass) for value in up]
+        state["lastAccLp"], state["accLpState"] = up.tolist(), np.concatenate(initial).tolist()
+
+        # VQF's own frame retains its heading: its bias estimator contains means in it.
+        w, _, _, z = _heading_between(tuple(state["accQuat"]), q)
+        state["accQuat"] = list(multiply((w, 0.0, 0.0, -z), q))
+        state["delta"] = remainder(2.0 * atan2(z, w), tau)
+        state["bias"] = estimator.bias.tolist()
+        # (0.01 deg/s)^2
+        state["biasP"] = (degrees(100.0) ** 2 * estimator.bias_covariance).ravel().tolist()
+        vqf.state = state
+        vqf.setMotionBiasEstEnabled(True)
+        self._estimator = None
 
     def _output(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
         """Return the present orientation, and the rate of a reading without bias."""
         vqf = self._filter
-        w, i, j, k = (vqf.getQuat9D() if self._magnetic else vqf.getQuat6D()).tolist()
+        if self._estimator is not None:
+            w, i, j, k = multiply(self._estimator.q_world_gyro, tuple(vqf.getQuat3D().tolist()))
+        else:
+            w, i, j, k = (vqf.getQuat9D() if self._magnetic else vqf.getQuat6D()).tolist()
         if not follows and not self._magnetic:
             self._turn = _heading_between((w, i, j, k), self._q)
         # The rotation about the vertical: (c, 0, 0, s) ⊗ q.

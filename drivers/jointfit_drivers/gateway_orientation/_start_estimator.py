@@ -1,0 +1,304 @@
+r"""Orientation, gyroscope bias and field of an IMU whose orientation filter has just started.
+
+VQF takes the vertical from a mean over 3 s, and the heading from the field with that vertical. With
+a dip of 70 degrees, the heading has 2.7 times the error of the vertical, and an unknown bias turns
+both. VQF does not use the field to estimate the bias. This Kalman filter estimates all of them from
+gravity and field together, in steps of `STEP_S`. Its state is
+
+.. math:: (\varphi, b, v, B_n, B_u)
+
+with the error of the orientation, rad, in the world; the bias, rad/s; the velocity relative to its
+mean, m/s; and the north and up components of the field. :math:`R` is the orientation by a gyroscope
+whose bias is assumed as :math:`\hat b`. With sums over the readings of a step, at intervals T,
+
+.. math::
+
+    \varphi &\leftarrow \varphi - \sum R\,T\,(b - \hat b) \\
+    v &\leftarrow v + \sum R f\,T - g\,\Delta t + \varphi \times \sum R f\,T
+
+Two observations follow. The velocity of a body part is limited, and the mean field of the step is
+:math:`\bar y = B + B \times \varphi`. Their deviations last for about a second. The variance of one
+step is therefore that of the deviation times `LASTING_S` over the length of the step.
+
+Invariant: a function of the readings added; no clock, no device and no other filter.
+
+Source: error-state Kalman filter, Solà 2017, arXiv:1711.02508.
+"""
+
+from __future__ import annotations
+
+from math import cos, radians, sin, sqrt
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from jointfit_daemon.model import Quaternion, Vector
+
+STEP_S = 0.1
+"""Length of a step, s."""
+GRAVITY = 9.81
+"""Gravity, m/s^2."""
+SPEED_SD = 0.7
+"""Expected standard deviation of the velocity of a body part about its mean, m/s."""
+SPEED_KNOWN_S = 1.0
+"""Weight of the expectation against the velocity that is estimated, s."""
+FIELD_SD = 0.03
+"""Standard deviation of the field in motion, relative to its strength."""
+FIELD_LIMIT = 0.1
+"""Deviation of the field, relative to its strength, above which its weight decreases."""
+LASTING_S = 1.0
+"""Correlation time of velocity and field, s."""
+SCALE_SD = 0.002
+"""Error of the scale and the axes of a gyroscope."""
+FORCE_SD = 0.3
+"""Error of an accelerometer in motion, m/s^2."""
+REVERSAL_S = 0.3
+"""Time in which a movement reverses, s: the correlation time of both errors."""
+RATE_NOISE = radians(0.02)
+"""Noise of the angle by a gyroscope, rad per root second."""
+TILT_SD = radians(1.0)
+"""Standard deviation of the first vertical of a sensor without change of velocity, rad."""
+HEADING_SD = 0.5
+"""Standard deviation of the first heading, rad."""
+
+_PHI, _BIAS, _VELOCITY, _FIELD = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
+_SIZE = 11
+_HALF_TURN = np.array((-1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0))
+"""Signs of the state after half a turn of the world about the vertical."""
+
+
+class StartReading(NamedTuple):
+    """One reading, with the orientation by the gyroscope."""
+
+    q: Quaternion
+    """Orientation by integrated angular rates; arbitrary at the start."""
+    rate: Vector
+    """Angular rate, rad/s."""
+    force: Vector
+    """Specific force, m/s^2."""
+    field: Vector
+    """Magnetic field; zeros if the reading has none."""
+
+
+class StartEstimator:
+    """Kalman filter of one IMU.
+
+    Parameters
+    ----------
+    readings : sequence of StartReading
+        Readings since the start of the filter, some of them with a field.
+    period_s : float
+        Interval of the readings, s.
+    assumed : ndarray, shape (3,)
+        Bias that the orientations of these readings assume, rad/s.
+    bias : ndarray, shape (3,)
+        Expected bias, rad/s.
+    bias_sd : float
+        Its standard deviation, rad/s.
+    """
+
+    def __init__(
+        self,
+        readings: Sequence[StartReading],
+        period_s: float,
+        assumed: NDArray[np.float64],
+        bias: NDArray[np.float64],
+        bias_sd: float,
+    ) -> None:
+        self._period_s = period_s
+        self._step = max(1, round(STEP_S / period_s))
+        self._pending: list[StartReading] = []
+
+        # vertical: mean specific force in the frame of the gyroscope
+        q, force, field = (np.array([part[kind] for part in readings]) for kind in (0, 2, 3))
+        matrices = _matrices(q)
+        up = np.einsum("nij,nj->i", matrices, force)
+        self.q_world_gyro = _shortest_rotation(up / np.linalg.norm(up))
+
+        # heading: median field, which short disturbances do not turn, horizontal part to the north
+        known = field.any(axis=1)
+        self._strength = float(np.median(np.linalg.norm(field[known], axis=1)))
+        usual = np.median(np.einsum("nij,nj->ni", matrices[known], field[known]), axis=0)
+        east, north, up_part = _matrix(self.q_world_gyro) @ usual
+        half = 0.5 * float(np.arctan2(east, north))
+        self.q_world_gyro = multiply((cos(half), 0.0, 0.0, sin(half)), self.q_world_gyro)
+        self._field = np.array((np.hypot(east, north), up_part))
+
+        # The second pass knows from the first how fast the sensor moves.
+        begins = range(0, len(readings) - self._step + 1, self._step)
+        parts = [readings[begin : begin + self._step] for begin in begins]
+        start = (self.q_world_gyro, self._field)
+        speed_sd = SPEED_SD
+        for _ in range(2):
+            self.q_world_gyro, self._field = start[0], start[1].copy()
+            self.bias, self._velocity = np.array(bias), np.zeros(3)
+            self.covariance = _first_covariance(
+                speed_sd, len(readings) * period_s, bias_sd, self._strength
+            )
+            self._squared, self._observed_s = speed_sd**2 * SPEED_KNOWN_S, SPEED_KNOWN_S
+            for part in parts:
+                self._update(part, assumed)
+            speed_sd = self.speed_sd
+
+    @property
+    def orientation_sd(self) -> float:
+        """Standard deviation of the angle of the orientation, rad."""
+        return sqrt(float(np.trace(self.covariance[_PHI, _PHI])))
+
+    @property
+    def speed_sd(self) -> float:
+        """Standard deviation of the velocity about its mean, m/s."""
+        return sqrt(self._squared / self._observed_s)
+
+    @property
+    def bias_sd(self) -> float:
+        """Standard deviation of the bias about its least certain axis, rad/s."""
+        return sqrt(float(np.linalg.eigvalsh(self.covariance[_BIAS, _BIAS])[-1]))
+
+    @property
+    def bias_covariance(self) -> NDArray[np.float64]:
+        """Covariance of the bias, shape (3, 3), rad^2/s^2."""
+        return self.covariance[_BIAS, _BIAS]
+
+    def add(self, reading: StartReading) -> bool:
+        """Add the next reading, which assumes the present bias; return whether it ends a step."""
+        self._pending.append(reading)
+        if len(self._pending) < self._step:
+            return False
+        self._update(self._pending, self.bias.copy())
+        self._pending.clear()
+        return True
+
+    def _update(self, readings: Sequence[StartReading], assumed: NDArray[np.float64]) -> None:
+        """Update with the readings of one step, whose orientations assume a bias."""
+        q, rate, force, field = (np.array(kind) for kind in zip(*readings, strict=True))
+        duration_s = len(readings) * self._period_s
+        matrices = _matrix(self.q_world_gyro) @ _matrices(q)
+
+        # prediction
+        turn = matrices.sum(axis=0) * self._period_s
+        impulse = np.einsum("nij,nj->i", matrices, force) * self._period_s
+        error = np.zeros(_SIZE)
+        error[_PHI] = -turn @ (self.bias - assumed)
+        self._velocity += impulse - (0.0, 0.0, GRAVITY * duration_s)
+        self._velocity += np.cross(error[_PHI], impulse)
+
+        transition = np.eye(_SIZE)
+        transition[_PHI, _BIAS] = -turn
+        transition[_VELOCITY, _PHI] = -_skew(impulse)
+        covariance = transition @ self.covariance @ transition.T
+        squared_rate = float(np.mean(np.sum(rate**2, axis=1)))
+        angle_variance = SCALE_SD**2 * squared_rate * REVERSAL_S + RATE_NOISE**2
+        covariance[_PHI, _PHI] += angle_variance * duration_s * np.eye(3)
+        covariance[_VELOCITY, _VELOCITY] += FORCE_SD**2 * REVERSAL_S * duration_s * np.eye(3)
+
+        # observation of the velocity and, if there is one, of the field
+        known = field.any(axis=1)
+        has_field = bool(known.any())
+        count = 6 if has_field else 3
+        observed, innovation = np.zeros((count, _SIZE)), np.empty(count)
+        variances = np.empty(count)
+        observed[:3, _VELOCITY] = np.eye(3)
+        innovation[:3] = -self._velocity
+        variances[:3] = self.speed_sd**2 * LASTING_S / duration_s
+        if has_field:
+            world = np.array((0.0, *self._field))
+            observed[3:, _PHI] = _skew(world)
+            observed[3:, _FIELD] = np.eye(3)[:, 1:]
+            mean = np.einsum("nij,nj->i", matrices[known], field[known]) / np.sum(known)
+            innovation[3:] = mean - world - observed[3:, _PHI] @ error[_PHI]
+            variances[3:] = self._field_variance(innovation[3:]) * LASTING_S / duration_s
+
+        crossed = observed @ covariance
+        gain = np.linalg.solve(crossed @ observed.T + np.diag(variances), crossed).T
+        error += gain @ innovation
+        covariance -= gain @ crossed
+        self.covariance = 0.5 * (covariance + covariance.T)
+        self._correct(error, duration_s)
+
+    def _field_variance(self, innovation: NDArray[np.float64]) -> float:
+        """Return the variance of the field, larger if the field is disturbed."""
+        off = float(np.linalg.norm(innovation)) / (FIELD_LIMIT * self._strength)
+        return (FIELD_SD * self._strength * max(1.0, off)) ** 2
+
+    def _correct(self, error: NDArray[np.float64], duration_s: float) -> None:
+        """Move an estimated error into the estimates."""
+        x, y, z = (0.5 * error[_PHI]).tolist()
+        self.q_world_gyro = multiply((1.0, x, y, z), self.q_world_gyro)
+        self.bias += error[_BIAS]
+        self._velocity += error[_VELOCITY]
+        self._field += error[_FIELD]
+
+        # A first heading that was wrong by more than a right angle: half a turn about the vertical.
+        if self._field[0] < 0.0:
+            self.q_world_gyro = multiply((0.0, 0.0, 0.0, 1.0), self.q_world_gyro)
+            self._velocity[:2] *= -1.0
+            self._field[0] *= -1.0
+            self.covariance *= np.outer(_HALF_TURN, _HALF_TURN)
+
+        self._squared += float(np.mean(self._velocity**2)) * duration_s
+        self._observed_s += duration_s
+
+
+def _first_covariance(
+    speed_sd: float, duration_s: float, bias_sd: float, strength: float
+) -> NDArray[np.float64]:
+    """Return the covariance before the first step."""
+    # A change of velocity during the readings tilts their mean.
+    tilt_sd = TILT_SD + sqrt(2.0) * speed_sd / (GRAVITY * duration_s)
+    variances = np.empty(_SIZE)
+    variances[_PHI] = (tilt_sd**2, tilt_sd**2, HEADING_SD**2)
+    variances[_BIAS] = bias_sd**2
+    variances[_VELOCITY] = speed_sd**2
+    variances[_FIELD] = strength**2
+    return np.diag(variances)
+
+
+def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Return the Hamilton product of norm 1."""
+    a, b, c, d = p
+    w, x, y, z = q
+    r = (
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
+    scale = 1.0 / sqrt(r[0] ** 2 + r[1] ** 2 + r[2] ** 2 + r[3] ** 2)
+    return (scale * r[0], scale * r[1], scale * r[2], scale * r[3])
+
+
+def _matrices(q: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rotation matrices, shape (n, 3, 3), of quaternions, shape (n, 4)."""
+    w, x, y, z = q.T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def _matrix(q: Quaternion) -> NDArray[np.float64]:
+    """Return the rotation matrix of a quaternion."""
+    return np.asarray(_matrices(np.array([q]))[0])
+
+
+def _skew(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the matrix of the cross product with a vector."""
+    x, y, z = v.tolist()
+    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+
+
+def _shortest_rotation(up: NDArray[np.float64]) -> Quaternion:
+    """Return the shortest rotation that brings a unit vector to +z."""
+    x, y, z = up.tolist()
+    if z < -1.0 + 1e-12:
+        return (0.0, 1.0, 0.0, 0.0)
+    w = sqrt(0.5 * (1.0 + z))
+    return (w, 0.5 * y / w, -0.5 * x / w, 0.0)
