@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import itertools
 import logging
 import os
@@ -12,6 +13,7 @@ import socket
 import time
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 import orjson
 import pytest
 
@@ -47,6 +49,7 @@ from jointfit_daemon.supervisor._source_tasks import run_source
 from jointfit_daemon.supervisor._systemd_notifier import SystemdNotifier
 from jointfit_daemon.supervisor.daemon import Daemon
 from tests.broker_fixture import free_port
+from tests.lsl_fixture import receive
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
@@ -395,6 +398,31 @@ async def test_a_run_of_the_real_core_gives_poses_and_health(
     assert seqs == list(range(seqs[0], seqs[0] + len(seqs)))
     assert health["process"]["rss_bytes"] > 1e6
     assert health["link"]["connected"] is True
+
+
+@pytest.mark.system
+async def test_a_receiver_of_lsl_gets_the_frames_of_the_daemon(
+    lsl: Any,
+    table: dict[str, Any],
+    tmp_path: Path,
+    broker: Broker,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(gc, "freeze", lambda: None)  # frozen outlets keep their sockets
+    rig = small(table, broker.port) | {"lsl": {"name": f"daemon {os.getpid()}"}}
+
+    def pull() -> tuple[list[str], list[float], list[float], float]:
+        segments = receive(lsl, f"daemon {os.getpid()} segments")
+        rows = [segments.pull_sample(timeout=10.0) for _ in range(50)]
+        channels = segments.info(timeout=10.0).get_channel_labels()
+        return channels, rows[-1][0], [stamp for _, stamp in rows], lsl.local_clock()
+
+    async with daemon(rig, tmp_path):
+        channels, values, stamps, now_s = await asyncio.to_thread(pull)
+    assert channels[:4] == ["thigh_qw", "thigh_qx", "thigh_qy", "thigh_qz"]
+    assert len(values) == len(channels)
+    assert np.diff(stamps) == pytest.approx(0.01, abs=0.005)
+    assert 0.0 < now_s - stamps[-1] < 60.0
 
 
 # --- parts --------------------------------------------------------------------------------------

@@ -20,17 +20,9 @@ from jointfit_daemon.model import (
     SyncState,
 )
 from jointfit_daemon.outputs.lsl import LslError, LslOutlet
+from tests.lsl_fixture import receive
 
 RATE_HZ = 100.0
-
-
-@pytest.fixture
-def lsl() -> Any:
-    try:
-        import pylsl  # noqa: PLC0415 - skips where its library is missing
-    except (ImportError, RuntimeError, OSError) as missing:
-        pytest.skip(f"pylsl cannot be used: {missing}")
-    return pylsl
 
 
 def frame(number: int, t_ns: int, *, known: bool = True) -> LimbState:
@@ -46,14 +38,6 @@ def frame(number: int, t_ns: int, *, known: bool = True) -> LimbState:
         (SegmentState("thigh", q, 0.02 if known else None, ("S1",)),),
         (JointState("knee", (0.1, 0.2, 0.3) if known else None, None, angles, None, 0.04),),
     )
-
-
-def receive(lsl: Any, name: str) -> Any:
-    found = lsl.resolve_byprop("name", name, timeout=10.0)
-    assert found, "the stream was not found"
-    inlet = lsl.StreamInlet(found[0])
-    inlet.open_stream(timeout=10.0)
-    return inlet
 
 
 class Received(NamedTuple):
