@@ -164,7 +164,7 @@ async def record(page: OpenedPage) -> str:
     await page.page.click("text=Start recording")
     await page.until_text("#recording-fact", "0:00:0")
     await page.page.keyboard.press("m")
-    await page.until_text("#recording [role=status]", "Mark 1 at")
+    await page.until_text("#recording [role=status]", ": mark")
     await page.until_text("#recording", "MB")
     await page.page.reload()
     await page.page.click("text=Stop recording")

@@ -117,3 +117,28 @@ async def test_a_question_fits_every_window_and_theme(
             assert await page.accessibility_faults() == []
             width = await page.page.evaluate("document.documentElement.scrollWidth - innerWidth")
             assert width <= 0
+
+
+async def test_the_answer_that_was_chosen_or_typed_last_is_sent(tmp_path: Path) -> None:
+    typed = {"device.thigh-front": "can0", "sensors.thigh": "thigh-front"}
+    async with chromium() as browser, served(tmp_path) as (server, url):
+        assert server.session is not None
+        session = server.session
+        question = session.handle({"do": "show"})["question"]
+        while question["name"] != "ids.thigh-front":
+            reply = {"do": "answer", "value": typed.get(question["name"], "")}
+            question = session.handle(reply)["question"]
+
+        async with opened(browser, url) as page:
+            await page.until_text("#question-text", "CAN identifiers of the sensor thigh-front")
+            later = page.page.locator("input[value=later]")
+            assert await later.is_checked()  # nothing was received
+            await page.page.fill("#typed", "0x105 0x106 0x121")
+            assert not await later.is_checked()
+            await later.check()
+            assert await page.page.input_value("#typed") == ""
+            assert await page.accessibility_faults() == []
+            await page.picture("set-up-later")
+            await page.page.click("button.primary")
+            await page.until_text("#question-text", "Connection of the sensor")
+            assert session.dialogue.answers["ids", "thigh-front"] == "later"

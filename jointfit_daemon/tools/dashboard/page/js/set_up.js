@@ -76,12 +76,17 @@ function showQuestion(question, position) {
     createElement("input", { type: "radio", name: "choice", value, checked: value === question.default }),
     createElement("span", { dir: "auto" }, value, text ? createElement("span", { class: "about" }, text) : null),
   ));
-  const typed = createElement("label", { class: "typed" }, options.length ? "Or type it" : "Answer",
-    createElement("input", { id: "typed", type: "text", autocomplete: "off", spellcheck: "false", dir: "auto",
-      value: options.length ? "" : question.default, placeholder: question.optional ? "empty: none" : null }));
-  byId("question-field").replaceChildren(
-    ...(options.length ? [createElement("fieldset", { "aria-labelledby": "question-text" }, ...options)] : []),
-    ...(question.closed ? [] : [typed]));
+  const isListed = question.choices.some(({ value }) => value === question.default);
+  const postponed = options.length === 1; // only "later": a typed answer is the usual one
+  const input = createElement("input", { id: "typed", type: "text", autocomplete: "off", spellcheck: "false", dir: "auto",
+    value: isListed ? "" : question.default, placeholder: question.optional ? "empty: none" : null });
+  const typed = createElement("label", { class: "typed" }, options.length && !postponed ? "Or type it" : "Answer", input);
+  const list = createElement("fieldset", { "aria-labelledby": "question-text" }, ...options);
+  // The last answer that was chosen or typed is sent.
+  list.addEventListener("change", () => { input.value = ""; });
+  input.addEventListener("input", () => { for (const radio of list.querySelectorAll("input")) radio.checked = false; });
+  const parts = [...(options.length ? [list] : []), ...(question.closed ? [] : [typed])];
+  byId("question-field").replaceChildren(...(postponed ? parts.reverse() : parts));
   byId("question-form").onsubmit = (event) => {
     event.preventDefault();
     const chosen = document.querySelector("input[name=choice]:checked")?.value;
