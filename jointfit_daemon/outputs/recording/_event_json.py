@@ -136,10 +136,12 @@ def _event(kind: str, given: dict[str, Any]) -> UnchunkedEvent:
 
 
 def _to_json(value: object) -> object:
+    # first the named tuples, which orjson does not write: a limb state contains ten of them
+    if isinstance(value, tuple):
+        names: tuple[str, ...] | None = getattr(value, "_fields", None)
+        return list(value) if names is None else dict(zip(names, value, strict=True))
     if isinstance(value, Calibration | FitResult):
         return value.to_dict()
-    if isinstance(value, tuple):  # orjson does not write named tuples
-        return cast("Any", value)._asdict() if hasattr(value, "_asdict") else list(value)
     if hasattr(value, "items"):
         return dict(value.items())
     if is_dataclass(value):

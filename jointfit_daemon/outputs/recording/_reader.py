@@ -10,7 +10,7 @@ import re
 import struct
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -56,7 +56,10 @@ _PART_NAME = re.compile(r"(?P<stem>.+-\d{8}T\d{6})-(?P<part>\d{4,})\.mcap(\.part
 _MESSAGE = struct.Struct("<BQHIQQ")
 """Opcode, length, channel, sequence number, log time and publish time of a message."""
 _PREFIX = struct.Struct("<BQ")
-_SEQUENCES = 2**32
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)  # an enumeration is compared slowly
+_RESTORING = {SNAPSHOT, GAP.partition("/")[0] + "/"}
+"""Prefixes of channels whose messages have no number of their own."""
+_SEQUENCES, _HALF = 2**32, 2**31
 
 
 class RecordedMessage(NamedTuple):
@@ -81,15 +84,22 @@ class RecordedMessage(NamedTuple):
         ConfigError
             The rig of the recording cannot be loaded (a driver is missing).
         """
-        if self.channel.startswith(SOURCE):
-            return ChunkArrived(self.channel[len(SOURCE) :], Chunk(self.t_ns, self.data))
-        for prefix in (EVENT, SNAPSHOT):
-            if self.channel.startswith(prefix):
-                try:
-                    return decode_event(self.channel[len(prefix) :], self.data)
-                except DamagedEventError as error:
-                    raise RecordingError(f"message {self.sequence}: {error}") from error
+        prefix, name = _channel_parts(self.channel)
+        if prefix == SOURCE:
+            return ChunkArrived(name, Chunk(self.t_ns, self.data))
+        if prefix in {EVENT, SNAPSHOT}:
+            try:
+                return decode_event(name, self.data)
+            except DamagedEventError as error:
+                raise RecordingError(f"message {self.sequence}: {error}") from error
         return None
+
+
+@lru_cache(maxsize=256)
+def _channel_parts(channel: str) -> tuple[str, str]:
+    """Return the prefix of a channel, with its slash, and its name."""
+    prefix, slash, name = channel.partition("/")
+    return prefix + slash, name
 
 
 @dataclass(frozen=True)
@@ -171,11 +181,10 @@ def _messages(
         end = place + _PREFIX.size + length
         if end > size:
             return
-        if opcode == Opcode.MESSAGE and length >= _MESSAGE.size - _PREFIX.size:
+        if opcode == _MESSAGE_OPCODE and length >= _MESSAGE.size - _PREFIX.size:
             _, _, number, low, log_ns, publish_ns = _MESSAGE.unpack_from(content, place)
             # Numbers are stored modulo 2**32; the distance to the last one is far smaller.
-            half = _SEQUENCES // 2
-            expected += (low - expected + half) % _SEQUENCES - half
+            expected += (low - expected + _HALF) % _SEQUENCES - _HALF
             data = content[place + _MESSAGE.size : end]
             yield RecordedMessage(
                 expected, topics.get(number, ""), log_ns - offset_ns, publish_ns - offset_ns, data
@@ -240,7 +249,10 @@ class Recording:
         for part in self.parts:
             sequencer.damage = ""
             for item in part.messages():
-                yield from sequencer.follow(item)
+                if isinstance(item, RecordedMessage) and sequencer.continues(item):
+                    yield item
+                else:
+                    yield from sequencer.follow(item)
 
     def events(self) -> Iterator[Event]:
         """Yield the input events of the core in order; raises the errors of `messages`."""
@@ -270,6 +282,13 @@ class _Sequencer:
         self._restoring = True
         self.damage = ""
         """Last damaged place, the reason of the next gap."""
+
+    def continues(self, item: RecordedMessage) -> bool:
+        """Return whether a message is the next one, and count it; snapshots and gaps are none."""
+        if item.sequence != self._expected or _channel_parts(item.channel)[0] in _RESTORING:
+            return False
+        self._expected, self._t_ns, self._restoring = item.sequence + 1, item.t_ns, False
+        return True
 
     def follow(
         self, item: RecordedMessage | DamagedBlock | PartEnd
