@@ -66,16 +66,20 @@ class ClusterPose:
         self._cluster = cluster
         self._offsets: Array = points - cluster.origin
         self._subsets: dict[bytes, _MarkerSubset | None] = {}
-        self._columns = _columns(cluster, layout)
+        columns = _columns(cluster, layout)
+        self._columns = None if columns is None else np.array(columns, dtype=np.intp)
+        self._all = None if cluster.body else self._subset(bytes([1]) * len(cluster.markers))
+        """All markers, the usual case."""
 
     def fit(self, frame: MocapFrame) -> FittedPose | None:
         """Return the pose in `frame`, or None if too few markers are visible."""
-        if self._columns is None:
+        columns = self._columns
+        if columns is None:
             return None
         if self._cluster.body is None:
-            return self._fit_markers(frame.markers[self._columns])
+            return self._fit_markers(frame.markers.take(columns, axis=0))
 
-        column = self._columns[0]
+        column = columns[0]
         x, y, z = position = frame.body_positions[column].tolist()
         now = as_quaternion(frame.body_orientations[column].tolist())
         if not all(map(isfinite, (*position, *now))):
@@ -90,26 +94,31 @@ class ClusterPose:
         With the singular values s of the cross moment and the sign d of the third axis, the sum of
         squared residuals is :math:`\sum |a|^2 + \sum |y|^2 - 2 (s_1 + s_2 + d s_3)`.
         """
-        visible = np.isfinite(seen).all(axis=1).tobytes()  # one byte for each marker
-        if visible not in self._subsets:
-            self._subsets[visible] = self._subset(visible)
-        subset = self._subsets[visible]
+        subset, total = self._all, np.add.reduce(seen)  # NaN unless all markers are visible
+        if not all(map(isfinite, total.tolist())):
+            visible = np.isfinite(seen).all(axis=1).tobytes()  # one byte for each marker
+            if visible not in self._subsets:
+                self._subsets[visible] = self._subset(visible)
+            subset = self._subsets[visible]
+            if subset is not None:
+                seen = seen[subset.rows]
+                total = np.add.reduce(seen)
         if subset is None:
             return None
 
-        count = len(subset.rows)
-        y = seen if count == len(seen) else seen[subset.rows]
-        mean = y.sum(axis=0) / count
-        y = y - mean
+        count = len(seen)
+        mean = total / count
+        y = seen - mean
         u, s, vt = np.linalg.svd(subset.centered @ y)
         sign = 1.0 if _determinant(u.tolist()) * _determinant(vt.tolist()) > 0.0 else -1.0
         vt[2] *= sign
 
-        residual = subset.moment + float((y * y).sum()) - 2.0 * float(s[0] + s[1] + sign * s[2])
+        squares = float(np.add.reduce(y * y, axis=None))
+        residual = subset.moment + squares - 2.0 * float(s[0] + s[1] + sign * s[2])
         if not residual <= MAX_FIT_RMS_M**2 * count:
             return None
-        points = np.array([(offset @ u) @ vt + mean for offset in subset.offsets])
-        return FittedPose(from_matrix_one((u @ vt).T.tolist()), _vectors(points))
+        points = [((offset @ u) @ vt + mean).tolist() for offset in subset.offsets]
+        return FittedPose(from_matrix_one((u @ vt).T.tolist()), [(x, y, z) for x, y, z in points])
 
     def _subset(self, visible: bytes) -> _MarkerSubset | None:
         rows = [row for row, seen in enumerate(visible) if seen]

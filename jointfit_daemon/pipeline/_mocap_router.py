@@ -13,7 +13,7 @@ from jointfit_daemon.model import ImuSample
 
 if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
-    from jointfit_daemon.model import Chain, Vector
+    from jointfit_daemon.model import Chain, MocapFrame, Vector
     from jointfit_daemon.pipeline.calibration_session import CalibrationSession
     from jointfit_daemon.pipeline.online_learning import OnlineFrameCollector
     from jointfit_daemon.pipeline.sources import LagMonitor, StampedMeasurement
@@ -29,8 +29,16 @@ class MocapRouter:
         self._live_ns: int | None = None
         self._used = self._idle = 0
         self._locator: OpticalOrigin | None = None
-        self.origin: Vector | None = None
+        self._origin: Vector | None = None
+        self._unlocated: MocapFrame | None = None
+        """Last frame, until O1 is requested: cameras may be faster than the limb states."""
+
+    @property
+    def origin(self) -> Vector | None:
         """O1 in the last frame, optical world, m; None if not visible."""
+        if self._unlocated is not None and self._locator is not None:
+            self._origin, self._unlocated = self._locator.locate(self._unlocated), None
+        return self._origin
 
     def reset_counts(self) -> None:
         """Set the counts to 0: the rig has no mocap source any more."""
@@ -39,7 +47,7 @@ class MocapRouter:
     def set_calibration(self, chain: Chain, calibration: Calibration | None) -> None:
         """Locate O1 by the markers of `calibration`, or not at all."""
         self._locator = OpticalOrigin(chain, calibration) if calibration else None
-        self.origin = None
+        self._origin = self._unlocated = None
 
     def is_fresh(self, now_ns: int) -> bool:
         """Return whether a live frame arrived within the last 200 ms."""
@@ -72,7 +80,7 @@ class MocapRouter:
                 session.add_mocap(stamp.t_ns, frame)
             if self._locator is not None:
                 used = True
-                self.origin = self._locator.locate(frame)
+                self._unlocated = frame
         if used:
             self._used += 1
         else:
