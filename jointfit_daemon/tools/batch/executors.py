@@ -7,10 +7,10 @@ it.
 from __future__ import annotations
 
 import multiprocessing
+from collections import deque
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from importlib import import_module
-from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.tools.batch.recording_task import (
@@ -60,19 +60,20 @@ def _run_pool(
 ) -> Generator[RecordingResult, None, list[RecordingTask]]:
     """Yield results; return the tasks without one, because a process died."""
     context = multiprocessing.get_context("spawn")  # a fork would copy threads of numpy
-    waiting = iter(tasks)
+    waiting = deque(tasks)
     running: dict[Future[RecordingResult], RecordingTask] = {}
     with ProcessPoolExecutor(jobs, context) as pool:
         try:
-            for task in islice(waiting, _AHEAD * jobs):
-                running[pool.submit(process_recording, task)] = task
-            while running:
+            while waiting or running:
+                # A task leaves `waiting` after its submission, which fails if a process died.
+                while waiting and len(running) < _AHEAD * jobs:
+                    future = pool.submit(process_recording, waiting[0])
+                    running[future] = waiting.popleft()
+
                 finished, _ = wait(running, return_when=FIRST_COMPLETED)
                 for future in finished:
                     result = future.result()
                     del running[future]
-                    for task in islice(waiting, 1):
-                        running[pool.submit(process_recording, task)] = task
                     yield result
         except BrokenProcessPool:
             return [*running.values(), *waiting]

@@ -9,6 +9,8 @@ import re
 import signal
 import subprocess
 import sys
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING
 
 import pytest
@@ -20,6 +22,7 @@ from jointfit_daemon.tools.batch import executors
 from jointfit_daemon.tools.batch.executors import run_in_pool
 from jointfit_daemon.tools.batch.find_recordings import find_recordings
 from jointfit_daemon.tools.batch.recording_task import (
+    RecordingResult,
     RecordingTask,
     finished_result,
     process_recording,
@@ -201,6 +204,38 @@ def test_wrong_options_are_named(tmp_path: Path, arguments: list[str], named: st
     assert result.exit_code == 2
     assert named in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+class BreakingPool:
+    """A pool that is broken at its fifth task, while results of the others are ready."""
+
+    def __init__(self, *_: object) -> None:
+        self.submitted = 0
+
+    def __enter__(self) -> BreakingPool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def submit(
+        self, work: Callable[[RecordingTask], RecordingResult], task: RecordingTask
+    ) -> Future[RecordingResult]:
+        self.submitted += 1
+        if self.submitted > 4:
+            raise BrokenProcessPool
+        done: Future[RecordingResult] = Future()
+        done.set_result(work(task))
+        return done
+
+
+def test_no_recording_is_lost_if_the_pool_breaks_at_a_submission(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(executors, "ProcessPoolExecutor", BreakingPool)
+    monkeypatch.setattr(executors, "process_recording", process_or_die)
+    tasks = [RecordingTask(name, (), str(tmp_path), ("report",), ()) for name in "abcdef"]
+    assert sorted(result.recording for result in run_in_pool(tasks, 2)) == [*"abcdef"]
 
 
 @pytest.mark.system
