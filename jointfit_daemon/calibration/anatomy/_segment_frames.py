@@ -152,7 +152,10 @@ def find_anatomy(
 
     ends = [_segment_ends(chain, i, joints) for i in range(len(chain.segments))]
     branched = [len(distal_joints(chain, i)) > 1 for i in range(len(chain.segments))]
-    z = [_UP if wide else _long_axis(*pair) for wide, pair in zip(branched, ends, strict=True)]
+    long_axes = [
+        None if wide else _direction(*pair) for wide, pair in zip(branched, ends, strict=True)
+    ]
+    z = [_UP if axis is None else axis for axis in long_axes]
     axes = _flexion_axes(chain, tracks, z)
 
     flags = [
@@ -163,7 +166,7 @@ def find_anatomy(
 
     q_static, lengths, sources = {}, {}, {}
     for i, segment in enumerate(chain.segments):
-        x = _line_between(*ends[i]) if branched[i] else None
+        x = _direction(*ends[i]) if branched[i] else None
         x = _right_axis(chain, i, axes) if x is None else x
         if x is None and _jointed(chain, tracks):
             raise CalibrationError(
@@ -397,18 +400,12 @@ def _right_axis(chain: Chain, i: int, axes: Mapping[str, FlexionAxis]) -> Array 
     return None
 
 
-def _line_between(right: JointCenter | None, left: JointCenter | None) -> Array | None:
-    if right is None or left is None:
+def _direction(end: JointCenter | None, begin: JointCenter | None) -> Array | None:
+    """Return the unit vector from `begin` to `end`; None if one of them is unknown."""
+    if end is None or begin is None:
         return None
-    x = right.center - left.center
-    return np.asarray(x / np.linalg.norm(x))
-
-
-def _long_axis(top: JointCenter | None, bottom: JointCenter | None) -> Array:
-    if top is None or bottom is None:
-        return _UP
-    z = top.center - bottom.center
-    return np.asarray(z / np.linalg.norm(z))
+    between = end.center - begin.center
+    return np.asarray(between / np.linalg.norm(between))
 
 
 def _frame(segment: str, x: Array, z: Array) -> Array:

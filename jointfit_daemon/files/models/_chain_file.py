@@ -105,6 +105,20 @@ def write_model(path: Path, model: ChainModel) -> None:
 
 def as_data(model: ChainModel) -> dict[str, Any]:
     """Return a chain model as lists and dicts, without default values."""
+    segments: list[dict[str, Any]] = []
+    for s in model.segments:
+        data: dict[str, Any] = {"name": s.name}
+        if s.parent is not None:
+            data["parent"] = s.parent
+        data["joint"] = s.joint.kind
+        for key in ("center_in_parent", "center", "axis", "rest", "limits"):
+            value = getattr(s.joint, key)
+            if value != getattr(Joint(), key):
+                data[key] = list(value)
+        if s.joint.path:
+            data["path"] = [list(sample) for sample in s.joint.path]
+        segments.append(data)
+
     markers: list[dict[str, Any]] = []
     for m in model.markers:
         markers.append({"name": m.name, "segment": m.segment, "position": list(m.position)})
@@ -112,25 +126,7 @@ def as_data(model: ChainModel) -> dict[str, Any]:
             markers[-1]["weight"] = m.weight
         if any(m.locked):
             markers[-1]["locked"] = "".join(compress(_AXES, m.locked))
-    return {
-        "name": model.name,
-        "segment": [_segment_data(s) for s in model.segments],
-        "marker": markers,
-    }
-
-
-def _segment_data(s: Segment) -> dict[str, Any]:
-    data: dict[str, Any] = {"name": s.name}
-    if s.parent is not None:
-        data["parent"] = s.parent
-    data["joint"] = s.joint.kind
-    for key in ("center_in_parent", "center", "axis", "rest", "limits"):
-        value = getattr(s.joint, key)
-        if value != getattr(Joint(), key):
-            data[key] = list(value)
-    if s.joint.path:
-        data["path"] = [list(sample) for sample in s.joint.path]
-    return data
+    return {"name": model.name, "segment": segments, "marker": markers}
 
 
 def _segment(data: dict[str, Any]) -> Segment:

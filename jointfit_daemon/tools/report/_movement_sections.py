@@ -76,7 +76,9 @@ def angles_section(results: SessionResults) -> str:
         return section("angles", "Joint angles", [paragraph(text)])
 
     parts = []
-    known_s, end_s = _first_angle(results), results.end_s
+    known = (joint.t_s[np.isfinite(joint.angles[angle])] for joint, angle in results.angles)
+    known_s = min((float(t_s[0]) for t_s in known if len(t_s)), default=results.start_s)
+    end_s = results.end_s
     if known_s - results.start_s > _UNSHOWN * (end_s - results.start_s):
         after = decimal(known_s - results.start_s, 0)
         parts.append(paragraph(f"No angle is known before {after} s, so the curves begin there."))
@@ -103,12 +105,6 @@ def angles_section(results: SessionResults) -> str:
             f'<div class="panels">{panels}</div></div>'
         )
     return section("angles", "Joint angles", parts)
-
-
-def _first_angle(results: SessionResults) -> float:
-    """Return the time of the first known value of any angle, s."""
-    known = (joint.t_s[np.isfinite(joint.angles[angle])] for joint, angle in results.angles)
-    return min((float(t_s[0]) for t_s in known if len(t_s)), default=results.start_s)
 
 
 def _detail_start(results: SessionResults) -> float | None:
