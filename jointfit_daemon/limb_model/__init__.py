@@ -36,6 +36,7 @@ from jointfit_daemon.limb_model._kernel_expert import KernelExpert, as_rows
 from jointfit_daemon.limb_model._kernel_features import TILTS, bumps, smooth_terms, widths_of
 from jointfit_daemon.limb_model._kernel_model import KernelModel, mix_corrections, model_inputs
 from jointfit_daemon.limb_model._kernel_trend import LEVEL_AXES, trend
+from jointfit_daemon.limb_model._label_examination import LabelExamination
 from jointfit_daemon.limb_model._label_search import (
     LabelFault,
     LabelSearch,
@@ -95,6 +96,7 @@ __all__ = [
     "JointCalibration",
     "KernelExpert",
     "KernelModel",
+    "LabelExamination",
     "LabelFault",
     "LabelSearch",
     "LeverageVariance",

@@ -6,7 +6,7 @@ correct one, and a marker that is somewhere else is less probable still. A clust
 same after an exchange is turned by it: its joint centers leave those of the adjacent clusters.
 
 Invariant: an explanation is unique. Every hypothesis that disagrees with it has a higher cost by
-`_MARGIN`.
+`_MARGIN`. A search consists of short parts, which `LabelExamination` spreads over frames.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from jointfit_daemon.limb_model._rigid_fit import MAX_FIT_RMS_M, MIN_MARKERS, is_line
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Generator, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -69,6 +69,8 @@ _BEST = 16
 """Number of assignments of one cluster that are combined with those of the others."""
 _MOST_COMBINED = 2000
 """Largest number of partial combinations: none of a healthy limb has more than a few."""
+_COMBINED_AT_ONCE = 150
+"""Number of partial combinations in one part of a search."""
 _SAMPLED = 40
 """Frames of a trial in which labels are searched."""
 _CONFIRMED = 0.5
@@ -202,6 +204,20 @@ class LabelSearch:
         points : ndarray, shape (M, 3)
             Markers in the order of `labels`, m; NaN if hidden.
         """
+        parts = self.parts(points)
+        while True:
+            try:
+                next(parts)
+            except StopIteration as end:
+                finding: LabelFinding = end.value
+                return finding
+
+    def parts(self, points: Array) -> Generator[None, None, LabelFinding]:
+        """Search like `explain`, and yield between the parts of the search.
+
+        The fit of all clusters is one part, which ends the search if they fit. Every suspect
+        cluster is another one, and so are some of the combinations of their labels.
+        """
         padded = np.concatenate((points, np.full((1, 3), np.nan)))
         seen = np.isfinite(padded).all(axis=1)
         if not len(self.clusters):
@@ -219,7 +235,9 @@ class LabelSearch:
                 suspect[beside] = True
         if not suspect.any():
             return LabelFinding(rms, ())
-        return LabelFinding(rms, self._faults(padded, seen, rms, centers, suspect))
+        yield
+        faults = yield from self._faults(padded, seen, rms, centers, suspect)
+        return LabelFinding(rms, faults)
 
     def neighbors(self, parts: Iterable[str]) -> frozenset[str]:
         """Return the body parts that share a joint with some parts."""
@@ -244,19 +262,21 @@ class LabelSearch:
         rms: Array,
         centers: Array,
         suspect: NDArray[np.bool_],
-    ) -> tuple[LabelFault, ...]:
+    ) -> Generator[None, None, tuple[LabelFault, ...]]:
         suspects = np.flatnonzero(suspect).tolist()
         distances = np.sqrt(((points[:, None] - points[None]) ** 2).sum(axis=-1))
         frame = _Frame(points, seen, distances)
         pool = np.concatenate([self._own[p][seen[self._own[p]]] for p in suspects])
-        options = [self._assignments(p, frame, pool, float(rms[p])) for p in suspects]
-        for i, each in enumerate(options):
+        options = []
+        for p in suspects:
+            each = self._assignments(p, frame, pool, float(rms[p]))
             known = _gap_costs(np.array([one.centers for one in each]), centers[~suspect])
             costs = [one.cost for one in each] + known.sum(axis=1)
-            options[i] = [
-                one._replace(cost=cost) for one, cost in zip(each, costs.tolist(), strict=True)
-            ]
-        best = _combine(options)
+            options.append(
+                [one._replace(cost=cost) for one, cost in zip(each, costs.tolist(), strict=True)]
+            )
+            yield
+        best = yield from _combine(options)
         if best is None:
             return ()
 
@@ -479,7 +499,9 @@ def _cost(rms: Array, count: Array) -> Array:
     return cost
 
 
-def _combine(options: Sequence[Sequence[_Assignment]]) -> list[tuple[int, ...]] | None:
+def _combine(
+    options: Sequence[Sequence[_Assignment]],
+) -> Generator[None, None, list[tuple[int, ...]] | None]:
     """Return the assignments with the least cost in which every label is used once.
 
     None if the labels of every cluster are its own, or if another combination is hardly worse.
@@ -504,6 +526,8 @@ def _combine(options: Sequence[Sequence[_Assignment]]) -> list[tuple[int, ...]] 
     best, visited = np.inf, 0
     stack: list[tuple[float, int, tuple[int, ...]]] = [(0.0, 0, ())]
     while stack and (visited := visited + 1) <= _MOST_COMBINED:
+        if not visited % _COMBINED_AT_ONCE:
+            yield
         cost, taken, chosen = stack.pop()
         p = len(chosen)
         cost += sum(

@@ -17,6 +17,7 @@ import numpy as np
 
 from jointfit_daemon.limb_model import (
     MAX_FIT_RMS_M,
+    LabelExamination,
     LabelFault,
     LabelSearch,
     body_parts,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 RATE_HZ = 5.0
-"""Examined frames per second: a search takes milliseconds, a fit of all clusters 0.1 ms."""
+"""Examined frames per second: a search takes milliseconds, which the frames after it share."""
 FAULT_NS = 2_000_000_000
 """Time after which a fault begins or ends, ns."""
 MISFIT_NS = 4_000_000_000
@@ -82,6 +83,7 @@ class LabelMonitor:
             {parts: np.array(center) for parts, center in self._given[2].items()},
         )
         self._rate = RateDivider(RATE_HZ)
+        self._examination: LabelExamination | None = None
         self._examined: deque[_Examined] = deque()
         self._layout: MocapLayout | None = None
         self._columns: list[int] = []
@@ -99,6 +101,7 @@ class LabelMonitor:
 
     def reset(self) -> None:
         """Forget all frames and faults: markers are being placed or calibrated again."""
+        self._examination = None
         self._examined.clear()
         self.faults, self.misfits = {}, frozenset()
         self._hidden = self._hidden[:0]
@@ -112,19 +115,27 @@ class LabelMonitor:
         return replace(frame, markers=markers)
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
-        """Examine a live frame, if one is due, and return notices."""
-        if not self._search.clusters or not self._rate.is_due(t_ns):
+        """Examine a live frame, if one is due, or continue with an earlier one. Return notices."""
+        if not self._search.clusters:
             return []
-
-        # The markers of the clusters in a frame, m, shape (M, 3); NaN where missing.
         if frame.layout is not self._layout:
             self._layout = frame.layout
             column = {name: k for k, name in enumerate(frame.layout.markers)}
             self._columns = [column.get(name, -1) for name in self._search.labels]
             self._hide()
-        padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
-        rms, faults = self._search.explain(padded[self._columns])
+        if self._examination is None:
+            if not self._rate.is_due(t_ns):
+                return []
+            # The markers of the clusters in a frame, m, shape (M, 3); NaN where missing.
+            padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
+            points = padded[self._columns]
+            self._examination = LabelExamination(self._search, t_ns, points)
 
+        finding = self._examination.advance(t_ns)
+        if finding is None:
+            return []
+        t_ns, (rms, faults) = self._examination.t_ns, finding
+        self._examination = None
         named = dict(zip((one.name for one in self._search.clusters), rms.tolist(), strict=True))
         fitted = frozenset(name for name, one in named.items() if np.isfinite(one))
         refused = {name: one for name, one in named.items() if one > MAX_FIT_RMS_M}

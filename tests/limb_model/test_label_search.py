@@ -10,7 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.kinematics import rotation
-from jointfit_daemon.limb_model import LabelSearch, MarkerCluster, explain_trial, rigid_fit
+from jointfit_daemon.limb_model import (
+    LabelExamination,
+    LabelSearch,
+    MarkerCluster,
+    explain_trial,
+    rigid_fit,
+)
 from tests.limb_model.clusters_of_limb import LABELS, centers_of, cycled, person
 
 EXCHANGES = [
@@ -50,6 +56,34 @@ def test_an_exchange_is_named_in_most_frames_and_hardly_ever_another_one(
     wrong = [bool(one) and not ok for one, ok in zip(found, right, strict=True)]
     assert np.mean(right) > 0.75
     assert np.mean(wrong) < 0.15  # one of the markers is hidden
+
+
+@pytest.mark.parametrize("labels", EXCHANGES, ids="-".join)
+def test_a_search_spread_over_frames_finds_the_same_with_one_cluster_a_frame(
+    labels: tuple[str, ...],
+) -> None:
+    clusters, _, positions = person(2, skin_m=0.006, occluded=0.02)
+    search = LabelSearch(clusters, centers_of(clusters))
+    for points in cycled(positions[::240], *labels):
+        examination, frames = LabelExamination(search, 0, points), 0
+        finding = None
+        while finding is None:
+            finding = examination.advance(10_000_000 * frames)
+            frames += 1
+        expected = search.explain(points)
+        np.testing.assert_array_equal(finding.rms, expected.rms)
+        assert finding.faults == expected.faults
+        suspects = int((expected.rms > 0.012).sum())
+        assert suspects + (suspects > 0) <= frames <= len(clusters) + 4
+
+
+def test_a_search_is_finished_in_few_frames_of_slow_cameras() -> None:
+    clusters, _, positions = person(2)
+    points = cycled(positions[300], "pelvis0", "thigh1", "shank2", "foot3")
+    examination = LabelExamination(LabelSearch(clusters), 0, points)
+    found = [examination.advance(k * 100_000_000) for k in range(3)]
+    assert found[-1] is not None
+    assert found[:-1] == [None, None]
 
 
 def test_two_independent_exchanges_are_two_faults() -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.limb_model import LabelFault, LabelSearch
+from jointfit_daemon.limb_model import LabelExamination, LabelFault, LabelSearch
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import MocapFrame, MocapLayout
 
 _INTERVAL = 24
-"""One of so many frames is examined: a search takes milliseconds."""
+"""One of so many frames is examined: a search takes milliseconds, which the next frames share."""
 _RECENT = 12
 """Examined frames that decide: 2 to 3 s of camera frames at 100 to 120 Hz."""
 _CONFIRMED = 0.6
@@ -35,21 +35,27 @@ class LiveLabels:
     def __init__(self, clusters: Mapping[str, MarkerCluster]) -> None:
         self._search = LabelSearch(clusters.values())
         self._frames = 0
+        self._examination: LabelExamination | None = None
         self._recent: deque[tuple[LabelFault, ...]] = deque(maxlen=_RECENT)
         self._layout: MocapLayout | None = None
         self._columns: list[int] = []
 
     def feed(self, frame: MocapFrame) -> None:
-        """Examine one frame of `_INTERVAL`."""
+        """Examine one frame of `_INTERVAL`, or continue with an earlier one."""
         self._frames += 1
-        if self._frames % _INTERVAL:
-            return
-        if frame.layout is not self._layout:
-            self._layout = frame.layout
-            column = {name: k for k, name in enumerate(frame.layout.markers)}
-            self._columns = [column.get(name, -1) for name in self._search.labels]
-        padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
-        self._recent.append(self._search.explain(padded[self._columns]).faults)
+        if self._frames % _INTERVAL == 0:
+            if frame.layout is not self._layout:
+                self._layout = frame.layout
+                column = {name: k for k, name in enumerate(frame.layout.markers)}
+                self._columns = [column.get(name, -1) for name in self._search.labels]
+            padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
+            # stamps without progress: one part per frame
+            self._examination = LabelExamination(self._search, 0, padded[self._columns])
+
+        finding = None if self._examination is None else self._examination.advance(0)
+        if finding is not None:
+            self._recent.append(finding.faults)
+            self._examination = None
 
     def exchanges(self) -> list[LabelFault]:
         """Return the exchanges that explain most of the last frames."""

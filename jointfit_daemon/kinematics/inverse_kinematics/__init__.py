@@ -10,6 +10,7 @@ from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
 )
 from jointfit_daemon.kinematics.inverse_kinematics._pose_covariance import pose_covariance
 from jointfit_daemon.kinematics.inverse_kinematics._sequential_solver import (
+    MOST_EVALUATIONS,
     LiveInverseKinematics,
     LiveOptions,
     LivePose,
@@ -23,6 +24,7 @@ from jointfit_daemon.kinematics.inverse_kinematics._solver import (
 )
 
 __all__ = [
+    "MOST_EVALUATIONS",
     "OPEN_M2",
     "Band",
     "IkOptions",

@@ -108,6 +108,11 @@ class MarkerFit:
             np.einsum("tsik,tsik->t", self.cloud[..., 4:, :], self.weighted[..., 4:, :])
         )
 
+    def reweighted(self, weights: Array) -> MarkerFit:
+        """Return the fit with other weights, shape (T, S, K)."""
+        weighted = self.cloud * weights[:, :, None, :]
+        return MarkerFit(self.world, self.cloud, weighted, self.couplings)
+
     def take(self, instants: NDArray[np.intp]) -> MarkerFit:
         """Return the fit at some instants."""
         some = None if self.couplings is None else self.couplings[instants]

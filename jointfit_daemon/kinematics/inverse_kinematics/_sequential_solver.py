@@ -2,13 +2,16 @@ r"""Sequential inverse kinematics: one instant at a time, with the covariance of
 
 Each instant starts from the last pose extrapolated by its own motion and takes one or a few
 safeguarded Gauss-Newton steps. If the marker errors remain large, it restarts from the markers
-alone. The covariance of a pose, in the columns of a step, is
+alone (`start_from_markers`). The covariance of a pose, in the columns of a step, is
 
 .. math:: \Sigma = \sigma^2 \left(\sum_m w_m J_m^T J_m\right)^{-1}
 
 with :math:`\sigma` the marker error per axis, given or estimated from the residuals. Degrees of
 freedom that the markers leave undetermined are held at the last instant; :math:`\Sigma` is large
 there, but finite.
+
+Invariant: an instant evaluates the marker errors at most `MOST_EVALUATIONS` times, whatever the
+markers.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from jointfit_daemon.kinematics.chains import ChainState, rest_state, step_state
+from jointfit_daemon.kinematics.inverse_kinematics._initial_pose import start_from_markers
 from jointfit_daemon.kinematics.inverse_kinematics._levenberg_marquardt import Band
 from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
     MarkerFit,
@@ -27,7 +31,7 @@ from jointfit_daemon.kinematics.inverse_kinematics._normal_equations import (
     marker_fit,
     marker_slots,
 )
-from jointfit_daemon.kinematics.inverse_kinematics._solver import OPEN_M2, IkOptions, solve_frames
+from jointfit_daemon.kinematics.inverse_kinematics._solver import OPEN_M2
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
@@ -35,7 +39,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.kinematics.chains import ChainModel
 
+MOST_EVALUATIONS = 24
+"""Largest number of evaluations of the marker errors in one instant."""
+_MOST_FOLLOWING = 12
+"""Largest number without those of a restart. A search that they end continues in the next
+instant."""
 _TRIES = 6
+"""Attempts of a step, each with more damping."""
+_RESTART_STEPS = 10
+"""Largest number of steps after a restart."""
 _LAST_STEP = 3e-3
 """Step below which the remaining error is negligible, rad and m."""
 _DAMPING = 1e-2
@@ -94,6 +106,8 @@ class LivePose:
     """The markers left a degree of freedom undetermined, which was held at the last instant."""
     restarted: bool
     """The instant did not start from the last one."""
+    evaluations: int
+    """Number of evaluations of the marker errors."""
 
 
 class LiveInverseKinematics:
@@ -120,7 +134,10 @@ class LiveInverseKinematics:
         self._patience = 1
         """Restart intervals to wait: doubled by every restart that does not help."""
         self._learned = 0
-        self._lead = np.zeros(model.nq)
+        self._still = np.zeros(model.nq)
+        self._lead = self._still
+        self._identity = np.eye(model.nq)
+        self._evaluations = 0
 
     def feed(self, markers: ArrayLike) -> LivePose:
         """Return the pose of the next instant.
@@ -144,18 +161,19 @@ class LiveInverseKinematics:
         measured = self._slots.filled_vectors(np.where(seen[:, None], given, 0.0)[None])
         weights = self._slots.filled((self._model.weights * seen)[None])
         self._fed += 1
-        place, restarted = self._solve(given, measured, weights)
-        self._lead = np.zeros(self._model.nq) if place.is_open or restarted else place.moved
+        self._evaluations = 0
+        place, restarted = self._solve(measured, weights)
+        self._lead = self._still if place.is_open or restarted else place.moved
         self._state = place.state if self._fed % _STRAIGHTEN else _straightened(place.state)
         return self._pose(place, seen, restarted=restarted)
 
-    def _solve(self, given: Array, measured: Array, weights: Array) -> tuple[_Place, bool]:
+    def _solve(self, measured: Array, weights: Array) -> tuple[_Place, bool]:
         """Return the state of the chain and whether it was restarted from the markers alone."""
-        still = np.zeros(self._model.nq)
         if self._state is None:
-            return self._follow(self._start(given), still, measured, weights), True
+            return self._restart(measured, weights), True
 
-        place = self._follow(self._state, self._lead, measured, weights)
+        steps = max(self._options.steps, 1)
+        place = self._follow(self._state, self._lead, measured, weights, (steps, _MOST_FOLLOWING))
         if not self._is_lost(place):
             self._patience = 1
             return place, False
@@ -163,53 +181,70 @@ class LiveInverseKinematics:
             return place, False
 
         self._restarted_at = self._fed
-        again = self._follow(self._start(given), still, measured, weights)
+        again = self._restart(measured, weights)
         self._patience = min(2 * self._patience, _MOST_PATIENCE) if self._is_lost(again) else 1
         return (again, True) if again.cost < place.cost else (place, False)
 
-    def _start(self, given: Array) -> ChainState:
-        """Return a state from the markers alone."""
-        if not np.isfinite(given).any():
-            return rest_state(self._model)
-        options = IkOptions(iterations=15, huber_m=self._options.huber_m)
-        return solve_frames(self._model, given[None], options=options).state
+    def _restart(self, measured: Array, weights: Array) -> _Place:
+        """Return the state of an instant from its markers alone."""
+        start = rest_state(self._model)
+        if weights.any():
+            start = start_from_markers(self._model, measured, weights)[0]
+        limits = (_RESTART_STEPS, MOST_EVALUATIONS)
+        return self._follow(start, self._still, measured, weights, limits)
 
     def _is_lost(self, place: _Place) -> bool:
         return place.cost > float(place.at.weighted[..., 3, :].sum()) * self._options.lost_m**2
 
-    def _follow(self, last: ChainState, lead: Array, measured: Array, weights: Array) -> _Place:
+    def _follow(
+        self,
+        last: ChainState,
+        lead: Array,
+        measured: Array,
+        weights: Array,
+        limits: tuple[int, int],
+    ) -> _Place:
         """Take the steps of one instant, starting from the last state extrapolated by `lead`.
 
+        `limits` are those of the steps, and of all evaluations in the instant.
         The returned Cholesky factor is that of the start of the last step. The difference to the
         final state is far below the accuracy of a covariance.
         """
-        place = self._moved(last, lead, measured, weights)
+        steps, most = limits
+        place, w = self._moved(last, lead, measured, weights), weights
         travelled, equations = lead, None
-        for _ in range(max(self._options.steps, 1)):
-            w = self._robust(place.at, weights)
-            if w is not weights:
-                place = self._moved(place.state, None, measured, w)
+        for _ in range(steps):
+            robust = self._robust(place.at, weights)
+            if robust is not w:
+                at, w = place.at.reweighted(robust), robust
+                place = _Place(place.state, at, float(at.cost[0]))
             equations = self._equations(place, last)
-            step, place = self._one_step(place, equations, measured, w)
+            tries = min(_TRIES, most - self._evaluations)
+            step, place = self._one_step(place, equations, measured, w, tries)
             travelled = travelled + step
-            if np.abs(step).max() < _LAST_STEP:
+            is_last = self._evaluations >= most
+            if is_last or max(float(step.max()), -float(step.min())) < _LAST_STEP:
                 break
-        return replace(place, moved=travelled, equations=equations)
+        return _Place(place.state, place.at, place.cost, travelled, equations)
 
-    def _moved(
-        self, state: ChainState, step: Array | None, measured: Array, weights: Array
-    ) -> _Place:
-        if step is not None:
-            state = step_state(self._slots.layout, state, step[None])
+    def _moved(self, state: ChainState, step: Array, measured: Array, weights: Array) -> _Place:
+        self._evaluations += 1
+        state = step_state(self._slots.layout, state, step[None])
         at = marker_fit(self._slots, state, measured, weights)
         return _Place(state, at, float(at.cost[0]))
 
     def _robust(self, at: MarkerFit, weights: Array) -> Array:
-        if self._options.huber_m is None:
+        """Return the robust weights; the given ones if no error exceeds the threshold."""
+        limit = self._options.huber_m
+        if limit is None:
             return weights
         errors = at.errors
-        size = np.sqrt(np.einsum("tsik,tsik->tsk", errors, errors))
-        return np.asarray(weights * np.minimum(1.0, self._options.huber_m / (size + 1e-12)))
+        square = np.einsum("tsik,tsik->tsk", errors, errors)
+        # errors of missing markers are meaningless, but rarely small
+        square *= weights > 0.0
+        if square.max() <= (limit - _ROUNDING) ** 2:
+            return weights
+        return np.asarray(weights * np.minimum(1.0, limit / (np.sqrt(square) + 1e-12)))
 
     def _equations(self, place: _Place, reference: ChainState) -> _Equations:
         """Return normal matrix and gradient.
@@ -232,12 +267,12 @@ class LiveInverseKinematics:
         return _Equations(H, g, factor, is_open)
 
     def _one_step(
-        self, place: _Place, equations: _Equations, measured: Array, weights: Array
+        self, place: _Place, equations: _Equations, measured: Array, weights: Array, tries: int
     ) -> tuple[Array, _Place]:
         """Return a step that does not raise the cost, and the state it leads to."""
         factor, damping = equations.factor, 0.0
         most = place.cost * (1.0 + (_OPEN_SLACK if equations.is_open else _ROUNDING))
-        for _ in range(_TRIES):
+        for _ in range(tries):
             step = lapack.dpotrs(factor, -equations.g, lower=1)[0]
             there = self._moved(place.state, step, measured, weights)
             if there.cost <= most:
@@ -245,16 +280,16 @@ class LiveInverseKinematics:
             damping = max(_DAMPING, 10.0 * damping)
             damped = equations.H + damping * np.diag(equations.H.diagonal())
             factor, _ = lapack.dpotrf(damped, lower=1)
-        return np.zeros(self._model.nq), place
+        return self._still, place
 
     def _pose(self, place: _Place, seen: NDArray[np.bool_], *, restarted: bool) -> LivePose:
         residuals = self._slots.taken(place.at.errors)[0]
         residuals[~seen] = np.nan
         self._learn(place.cost, int(seen.sum()))
-        half, _ = lapack.dpotri(place.factor, lower=1)
-        determined = half.diagonal() * OPEN_M2 * self._typical <= 1.0
-        covariance = self._variance * (half + half.T)
-        covariance.ravel()[:: len(half) + 1] *= 0.5
+        # dpotri would start threads for every matrix, however small
+        inverse = lapack.dpotrs(place.factor, self._identity, lower=1)[0]
+        determined = inverse.diagonal() * OPEN_M2 * self._typical <= 1.0
+        covariance = self._variance * inverse
         return LivePose(
             place.state,
             place.at.world[0, :, :3, :3],
@@ -264,6 +299,7 @@ class LiveInverseKinematics:
             determined,
             place.is_open,
             restarted,
+            self._evaluations,
         )
 
     def _learn(self, cost: float, seen: int) -> None:

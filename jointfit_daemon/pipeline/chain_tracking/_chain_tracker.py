@@ -6,7 +6,8 @@ Invariant: nothing here depends on an IMU or on a calibration of the limb.
 from __future__ import annotations
 
 from collections import deque
-from math import sqrt
+from itertools import islice
+from math import isfinite, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -40,8 +41,8 @@ FEWEST_MARKERS = 3
 """Markers of a frame with a solution: fewer do not determine the position of the first segment."""
 OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
 """Up to six steps, because frames are 100 ms apart. The Huber threshold bounds the influence of an
-exchanged marker until it is excluded. A restart takes ten times as long as a frame, so
-restarts that do not help become rare."""
+exchanged marker until it is excluded. A restart takes longer than a frame, so restarts that do not
+help become rare."""
 
 
 class _FrameErrors(NamedTuple):
@@ -71,11 +72,13 @@ class ChainTracker:
         self._solver = LiveInverseKinematics(model, OPTIONS)
         self._monitor = MarkerMonitor(model)
         self._coordinates = CoordinateTracker(model, loaded.coordinates)
-        self._described = [
-            (name, is_angle, columns)
-            for joint, columns in zip(loaded.coordinates, model.columns, strict=True)
+        self._counts = [len(joint.names) for joint in loaded.coordinates]
+        self._starts = np.array([columns.start for columns in model.columns])
+        self._unknown = tuple(
+            ModelCoordinate(name, is_angle, None, None)
+            for joint in loaded.coordinates
             for name, is_angle in zip(joint.names, joint.is_angle, strict=True)
-        ]
+        )
         self._rate = RateDivider(rate_hz)
         self._layout: MocapLayout | None = None
         self._columns: list[int | None] = []
@@ -90,6 +93,7 @@ class ChainTracker:
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
         """Return the state of the model in a live frame, if one is due, and notices."""
+        self._monitor.search_labels(t_ns)
         if not self._rate.is_due(t_ns):
             return []
 
@@ -108,8 +112,7 @@ class ChainTracker:
         used: NDArray[np.bool_] = seen & ~self._monitor.excluded & (self._model.weights > 0.0)
         names = self._model.marker_names
         if used.sum() < FEWEST_MARKERS:
-            unknown = tuple(ModelCoordinate(n, a, None, None) for n, a, _ in self._described)
-            state = self._state(t_ns, frame, unknown, dict.fromkeys(names), None)
+            state = self._state(t_ns, frame, self._unknown, dict.fromkeys(names), None)
             return [state, *_notices(t_ns, reports)]
 
         pose = self._solver.feed(np.where(used[:, None], measured, np.nan))
@@ -124,12 +127,14 @@ class ChainTracker:
 
     def _values(self, pose: LivePose) -> tuple[ModelCoordinate, ...]:
         values, sd = self._coordinates.read(pose.state, pose.covariance)
-        found = zip(self._described, values.tolist(), sd.tolist(), strict=True)
+        found = iter(zip(self._unknown, values.tolist(), sd.tolist(), strict=True))
+        known = np.logical_and.reduceat(pose.determined, self._starts).tolist()
         return tuple(
-            ModelCoordinate(name, is_angle, value, spread)
-            if pose.determined[columns].all() and np.isfinite(value)
-            else ModelCoordinate(name, is_angle, None, None)
-            for (name, is_angle, columns), value, spread in found
+            ModelCoordinate(one.name, one.is_angle, value, spread)
+            if joint_is_known and isfinite(value)
+            else one
+            for joint_is_known, count in zip(known, self._counts, strict=True)
+            for one, value, spread in islice(found, count)
         )
 
     def _errors(self, t_ns: int, distances: Array) -> MarkerFitErrors:

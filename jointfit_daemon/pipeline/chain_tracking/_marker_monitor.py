@@ -119,6 +119,10 @@ class MarkerMonitor:
             return seen_ns
         return t_ns if self._began_ns is None else self._began_ns
 
+    def search_labels(self, t_ns: int) -> None:
+        """Continue the search of exchanged labels in a frame of the cameras."""
+        self._labels.advance(t_ns)
+
     def see(self, t_ns: int, seen: NDArray[np.bool_]) -> list[MarkerReport]:
         """Record the visible markers of a frame, shape (M,)."""
         self._began_ns = t_ns if self._began_ns is None else self._began_ns
@@ -172,10 +176,13 @@ class MarkerMonitor:
         exchanged: list[tuple[int, ...]] = []
         if far.any() or self._by_shape:
             # By the shapes of the segments, which exchanged markers turn; then by the places.
-            exchanged = [*self._labels.search(measured)]
+            self._labels.begin(t_ns, measured)
+            exchanged = [*self._labels.faults]
             turned = {segments[m] for group in exchanged for m in group}
             far &= ~np.isin(segments, list(turned))
             exchanged += find_exchanged_labels(places, measured, far)
+        else:
+            self._labels.forget()
         grouped = {m for group in exchanged for m in group}
         suspects = {self._flag(MarkerFlag.EXCHANGED, *group): group for group in exchanged}
         for m in np.flatnonzero(far).tolist():
@@ -184,8 +191,7 @@ class MarkerMonitor:
 
         reports = self._recover(t_ns, distances)
         reports += self._exclude(t_ns, suspects, distances)
-        local = np.einsum("sji,smj->smi", rotations, measured[None] - origins[:, None])
-        return distances, [*reports, *self._observe(local, distances)]
+        return distances, [*reports, *self._observe(measured, rotations, origins, distances)]
 
     def _flag(self, kind: MarkerFlag, *markers: int) -> str:
         return f"{kind}:{'~'.join(self.model.markers[m].name for m in markers)}"
@@ -200,10 +206,12 @@ class MarkerMonitor:
         self, t_ns: int, suspects: Mapping[str, tuple[int, ...]], distances: Array
     ) -> list[MarkerReport]:
         """Exclude lasting suspects, unless the model as a whole does not fit."""
+        lasting = self._lasting(t_ns, "far", suspects, FAULT_NS)
+        if not lasting and not self.misfit:
+            return []
         visible = np.isfinite(distances)
         few = int(((distances > FAR_M) & visible).sum()) <= _MOST_EXCLUDED * int(visible.sum())
         fits = few and float(np.median(distances[visible])) < NEAR_M
-        lasting = self._lasting(t_ns, "far", suspects, FAULT_NS)
         if self.misfit:
             ended = self._lasting(t_ns, "fits", [MarkerFlag.MISFIT] if fits else [], RECOVERY_NS)
             self.misfit = not ended
@@ -278,18 +286,18 @@ class MarkerMonitor:
             reports.append(MarkerReport(names[0], "ok", text, {"markers": names}))
         return reports
 
-    def _observe(self, local: Array, distances: Array) -> list[MarkerReport]:
-        """Compare the movement of misplaced markers with that of every segment.
-
-        `local` is the position of each marker in the axes of each segment, m, shape (S, M, 3).
-        """
+    def _observe(
+        self, measured: Array, rotations: Array, origins: Array, distances: Array
+    ) -> list[MarkerReport]:
+        """Compare the movement of misplaced markers with that of every segment."""
         single = {markers[0] for markers in self._faults.values() if len(markers) == 1}
         self._observed = {m: seen for m, seen in self._observed.items() if m in single}
         reports = []
         for m in single:
             if not np.isfinite(distances[m]):
                 continue
-            x = local[:, m]
+            # in the axes of each segment, m, shape (S, 3)
+            x = np.einsum("sji,sj->si", rotations, measured[m] - origins)
             seen = self._observed.setdefault(m, _Observation(x, np.zeros(len(x))))
             off = x - seen.mean
             seen.mean = seen.mean + _MEMORY * off

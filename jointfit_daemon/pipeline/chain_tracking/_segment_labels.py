@@ -2,6 +2,8 @@
 
 A segment at the end of a chain turns to where its exchanged markers fit best, so that they are near
 the places of others, or only some are far from theirs. The shape of its markers does not change.
+
+Invariant: a frame takes a bounded part of a search. The last result holds until the next one.
 """
 
 from __future__ import annotations
@@ -12,7 +14,13 @@ import numpy as np
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.chains import rest_state, segment_poses
-from jointfit_daemon.limb_model import MIN_MARKERS, LabelSearch, MarkerCluster
+from jointfit_daemon.limb_model import (
+    MIN_MARKERS,
+    LabelExamination,
+    LabelSearch,
+    MarkerCluster,
+)
+from jointfit_daemon.timing.alignment import RateDivider
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -22,6 +30,8 @@ if TYPE_CHECKING:
 
 _FITS_M = 0.02
 """RMS residual of a segment with correct labels, m."""
+SEARCH_HZ = 5.0
+"""Most searches per second."""
 
 
 class SegmentLabels:
@@ -57,26 +67,46 @@ class SegmentLabels:
         self._rows = [model.marker_names.index(label) for label in self._search.labels]
         self._segments = [model.segment_names[s] for s in segments]
         self._number = {name: m for m, name in enumerate(model.marker_names)}
-        self._faults: tuple[tuple[int, ...], ...] = ()
-        self._rms: Array = np.full(len(clusters), np.nan)
+        self._rate = RateDivider(SEARCH_HZ)
+        self._examination: LabelExamination | None = None
+        self.forget()
 
-    def search(self, measured: Array) -> tuple[tuple[int, ...], ...]:
-        """Return exchanged markers in one frame, as `find_exchanged_labels` does.
+    def forget(self) -> None:
+        """Forget the last result and end the search, because no marker is suspect."""
+        self._examination = None
+        self.faults: tuple[tuple[int, ...], ...] = ()
+        """Exchanged markers in the last examined frame, as `find_exchanged_labels` returns them."""
+        self._rms: Array = np.full(len(self._names), np.nan)
+
+    def begin(self, t_ns: int, measured: Array) -> None:
+        """Search the labels of a frame, if a search is due and none is under way.
 
         Parameters
         ----------
+        t_ns : int
+            Instant of the frame.
         measured : ndarray, shape (M, 3)
             Markers of the model, m; NaN where hidden.
         """
-        self._rms, faults = self._search.explain(measured[self._rows])
-        self._faults = tuple(
-            tuple(self._number[name] for name in fault.markers) for fault in faults if fault.cycle
+        if self._examination is None and self._rate.is_due(t_ns):
+            self._examination = LabelExamination(self._search, t_ns, measured[self._rows])
+
+    def advance(self, t_ns: int) -> None:
+        """Continue the search in a frame of the cameras."""
+        finding = None if self._examination is None else self._examination.advance(t_ns)
+        if finding is None:
+            return
+        self._examination = None
+        self._rms = finding.rms
+        self.faults = tuple(
+            tuple(self._number[name] for name in fault.markers)
+            for fault in finding.faults
+            if fault.cycle
         )
-        return self._faults
 
     def fit(self, markers: Iterable[int]) -> bool:
-        """Return whether the segments of some markers fit in the last frame, without exchange."""
+        """Return whether the segments of some markers fit in the last examined frame."""
         parts = {self._segments[m] for m in markers}
         rms = [self._rms[self._names.index(part)] for part in parts if part in self._names]
-        exchanged = {m for fault in self._faults for m in fault}
+        exchanged = {m for fault in self.faults for m in fault}
         return bool(rms) and bool(np.max(rms) < _FITS_M) and exchanged.isdisjoint(markers)

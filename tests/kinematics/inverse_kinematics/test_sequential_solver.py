@@ -17,6 +17,8 @@ from jointfit_daemon.kinematics.chains import (
     step_between,
 )
 from jointfit_daemon.kinematics.inverse_kinematics import (
+    MOST_EVALUATIONS,
+    IkOptions,
     LiveInverseKinematics,
     LiveOptions,
     LivePose,
@@ -158,3 +160,51 @@ def test_rotations_remain_orthonormal() -> None:
 def test_another_number_of_markers_is_refused() -> None:
     with pytest.raises(ValueError, match="expected \\(8, 3\\)"):
         LiveInverseKinematics(limb()).feed(np.zeros((7, 3)))
+
+
+def hostile(y: np.ndarray) -> dict[str, np.ndarray]:
+    """Return faulty markers: they jump, are exchanged or hidden, or belong to another model."""
+    rng = np.random.default_rng(7)
+    hidden, part, stray = y.copy(), y.copy(), y.copy()
+    hidden[20:30] = np.nan
+    part[20:, 3:] = np.nan
+    stray[20:, 2] += 0.5
+    return {
+        "rotated": np.concatenate((y[:20], y[20:] @ np.diag([-1.0, -1.0, 1.0]) + (2.0, 1.0, 0.0))),
+        "exchanged": np.concatenate((y[:20], y[20:, ::-1])),
+        "too large": 1.5 * y,
+        "random": rng.normal(0.0, 1.0, y.shape),
+        "hidden": hidden,
+        "few": part,
+        "stray": stray,
+    }
+
+
+@pytest.mark.parametrize("fault", hostile(np.zeros((40, 8, 3))))
+@pytest.mark.parametrize("huber_m", [None, 0.02])
+def test_no_markers_make_an_instant_evaluate_its_errors_often(
+    fault: str, huber_m: float | None
+) -> None:
+    model = limb()
+    y = hostile(noisy(model, swing(model, 40)))[fault]
+    options = LiveOptions(steps=6, huber_m=huber_m, restart_interval=1)
+    counts = [pose.evaluations for pose in followed(model, y, options)]
+    assert max(counts) <= MOST_EVALUATIONS
+    assert all(np.isfinite(pose.rotations).all() for pose in followed(model, y, options))
+
+
+def test_a_healthy_instant_takes_three_evaluations() -> None:
+    model = limb()
+    y = noisy(model, swing(model, 400))
+    counts = [pose.evaluations for pose in followed(model, y, LiveOptions(steps=6, huber_m=0.02))]
+    assert np.mean(counts[1:]) < 3.2
+
+
+@pytest.mark.parametrize("instant", range(0, COUNT, 15))
+def test_a_restart_reaches_the_minimum_of_a_full_search(instant: int) -> None:
+    model = limb()
+    y = noisy(model, swing(model))[instant]
+    first = LiveInverseKinematics(model, LiveOptions(huber_m=0.02)).feed(y)
+    full = solve_frames(model, y[None], options=IkOptions(huber_m=0.02))
+    assert first.restarted
+    assert np.abs(step_between(model, full.state, first.state)).max() < 2e-4

@@ -66,10 +66,12 @@ def markers(t_s: float) -> Array:
 
 
 def track(
-    seconds: float, change: Callable[[float, Array], Array] = lambda _, points: points
+    seconds: float,
+    change: Callable[[float, Array], Array] = lambda _, points: points,
+    rate_hz: float = RATE_HZ,
 ) -> tuple[list[ChainModelState], list[Notice]]:
     """Return states and notices of frames at 50 Hz."""
-    tracker = ChainTracker(LoadedModel(model(), default_coordinates(model())), RATE_HZ)
+    tracker = ChainTracker(LoadedModel(model(), default_coordinates(model())), rate_hz)
     states: list[ChainModelState] = []
     notices: list[Notice] = []
     layout = MocapLayout(NAMES, ())
@@ -197,6 +199,24 @@ def test_cycled_labels_at_the_ends_of_the_chain_are_named_by_their_shape_until_c
     assert [(n.data["state"], n.data["markers"]) for n in notices] == [
         ("exchanged", list(labels)), ("ok", list(labels)),
     ]  # fmt: skip
+    assert states[-1].flags == ()
+
+
+@pytest.mark.parametrize("labels", [("thigh0", "thigh3"), ("thigh0", "shank1", "foot0")])
+@pytest.mark.parametrize("rate_hz", [5.0, 50.0])
+def test_exchanged_labels_are_named_at_every_rate(labels: tuple[str, ...], rate_hz: float) -> None:
+    rows = [NAMES.index(name) for name in labels]
+
+    def rotate(t_s: float, points: Array) -> Array:
+        if 1.0 < t_s < 5.0:
+            points[rows] = points[rows[1:] + rows[:1]]
+        return points
+
+    states, notices = track(9.0, rotate, rate_hz)
+    assert [(n.data["state"], n.data["markers"]) for n in notices] == [
+        ("exchanged", list(labels)), ("ok", list(labels)),
+    ]  # fmt: skip
+    assert [n.t_ns / 1e9 for n in notices] == pytest.approx([2.2, 7.2], abs=0.4)
     assert states[-1].flags == ()
 
 
