@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import gc
 import inspect
 import itertools
@@ -14,7 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+import typer.testing
 from hypothesis import settings
+from typer.main import get_command
 
 from tests.broker_fixture import EmbeddedBroker, MosquittoBroker, chosen_broker
 from tests.fake_rig import fakes, table  # noqa: F401 - fixtures
@@ -36,12 +39,22 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the unit has it: read w
 # jsonschema imports it for the format `iri`, which our schemas do not use: two seconds of a worker.
 sys.modules.setdefault("rfc3987_syntax", None)  # type: ignore[arg-type]  # None: import fails
 
+# The runner builds all commands anew in each of a thousand calls: 35 ms of processor time.
+typer.testing._get_command = functools.cache(get_command)  # type: ignore[attr-defined]  # private
+
 PARTS = ("parallel", "alone", "experiments", "experiments-alone")
 """Which tests run together: by the markers `experiment` and `alone`."""
 GRACE_S = 1.0
 """How long a descriptor may take to close: executors and child processes end a little later."""
+BEGUN = pytest.StashKey[bool]()
+"""Whether this worker has begun a test."""
 QUEUES_THAT_WAIT = 2
 """Number of workers that begin with system tests: they wait for half of their time."""
+FIT_NICE = 10
+"""Decrease of the priority of a worker that begins with tests that compute: that of a fit.
+
+Daemons and devices in real time come first, and their fits do not wait for all other tests.
+"""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -86,8 +99,8 @@ def _longest_first(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
     """Sort the tests so that the long ones, which wait, run beside those that compute.
 
     xdist gives each worker a queue of equal length, in the order of the tests, and an idle worker
-    takes tests from the end of the longest queue. The system tests go to the beginning of two
-    queues, file by file, those with the longest time limit first.
+    takes tests from the end of the longest queue. The system tests and those in real time go to
+    the beginning of two queues, file by file, those with the longest time limit first.
     """
 
     def limit_s(item: pytest.Item) -> float:
@@ -97,11 +110,11 @@ def _longest_first(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
     def in_file(item: pytest.Item) -> tuple[float, Path]:
         return -limit_s(item), item.path
 
-    long = sorted((item for item in items if item.get_closest_marker("system")), key=in_file)
+    long = sorted((item for item in items if _waits(item)), key=in_file)
     waiting: list[list[pytest.Item]] = [[] for _ in range(min(QUEUES_THAT_WAIT, workers))]
     for _, tests in itertools.groupby(long, key=in_file):
         min(waiting, key=lambda queue: sum(map(limit_s, queue))).extend(tests)
-    others = iter([item for item in items if item.get_closest_marker("system") is None])
+    others = iter([item for item in items if not _waits(item)])
 
     ordered: list[pytest.Item] = []
     for worker in range(workers):
@@ -109,6 +122,20 @@ def _longest_first(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
         queue = waiting[worker] if worker < len(waiting) else []
         ordered += [*queue, *itertools.islice(others, max(0, length - len(queue)))]
     return [*ordered, *others]
+
+
+def _waits(item: pytest.Item) -> bool:
+    return any(item.get_closest_marker(name) is not None for name in ("system", "real_time"))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Lower the priority of a worker whose first test computes, if others run system tests."""
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    first = not item.config.stash.get(BEGUN, False)
+    item.config.stash[BEGUN] = True
+    if first and workers > QUEUES_THAT_WAIT and not _waits(item):
+        os.nice(FIT_NICE)
 
 
 @pytest.fixture(scope="session")

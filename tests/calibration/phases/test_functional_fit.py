@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from jointfit_daemon.calibration import CalibrationError
+from jointfit_daemon.calibration import CalibrationError, CalibrationTrial
 from jointfit_daemon.calibration.phases import (
     fit_calibration,
     fit_plate_alignment,
@@ -20,6 +20,7 @@ from jointfit_daemon.calibration.phases import (
 )
 from jointfit_daemon.calibration.phases._acceptance import compare_calibrations
 from jointfit_daemon.calibration.phases._static_pose import fit_static_only
+from jointfit_daemon.calibration.record import trials_digest
 from jointfit_daemon.calibration.record._content_check import content_faults
 from jointfit_daemon.calibration.soft_tissue import METHODS
 from jointfit_daemon.kinematics import rotation
@@ -92,14 +93,20 @@ def test_json_is_exact_through_text(clean: tuple[Subject, Calibration]) -> None:
 
 
 @pytest.fixture(scope="module")
-def regressed() -> Calibration:
-    """Return a calibration by regression, with a knee center from markers and IMUs."""
+def short_trials() -> tuple[CalibrationTrial, CalibrationTrial]:
+    """Return a static and a functional trial without headings."""
     subject = Subject(11, flaws=Imperfections(heading_deg=0.0))
     static, functional, _ = static_and_functional(subject, 12.0)
+    return static, functional
+
+
+@pytest.fixture(scope="module")
+def regressed(short_trials: tuple[CalibrationTrial, CalibrationTrial]) -> Calibration:
+    """Return a calibration by regression, with a knee center from markers and IMUs."""
     settings = replace(
         SETTINGS, method="patent12", joint_center_methods={"knee": "oriented", "hip": "score"}
     )
-    return fit_calibration(static, functional, None, settings, CHAIN)
+    return fit_calibration(*short_trials, None, settings, CHAIN)
 
 
 def test_rotations_and_regression_coefficients_in_use_are_published(
@@ -312,16 +319,15 @@ def test_worse_or_incomplete_calibration_is_not_preferred(
     assert compare_calibrations(blind, replace(old, joints=("a", "b", "c"))).better
 
 
-def test_digest_differs_between_trials(clean: tuple[Subject, Calibration]) -> None:
-    subject, calibration = clean
-    static, functional, _ = static_and_functional(subject, 24.0)
+def test_digest_differs_between_trials(
+    short_trials: tuple[CalibrationTrial, CalibrationTrial], regressed: Calibration
+) -> None:
+    static, functional = short_trials
     track = functional.sensors["S1"]
     q = track.q_world_sensor.copy()
     q[5, 0] += 1e-9
     other = replace(
         functional, sensors={**functional.sensors, "S1": replace(track, q_world_sensor=q)}
     )
-    alignment = fit_plate_alignment(plate_trial(subject), SETTINGS)
-    same = fit_calibration(static, functional, alignment, SETTINGS, CHAIN)
-    assert same.digest == calibration.digest
-    assert fit_calibration(static, other, alignment, SETTINGS, CHAIN).digest != calibration.digest
+    assert trials_digest(static, functional) == regressed.digest
+    assert trials_digest(static, other) != regressed.digest

@@ -70,59 +70,64 @@ def phase_of(listener: Listener) -> str | None:
 
 @pytest.mark.system
 @pytest.mark.timeout(240)
-async def test_stop_signal_aborts_the_phase_of_the_command(tmp_path: Path) -> None:
+async def test_every_ending_of_the_command_is_reported(
+    tmp_path: Path, subtests: pytest.Subtests
+) -> None:
     async with walking(tmp_path) as (rig, listener):
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            process = await calibrate(rig, *STATIC)
-            await line_with(process, "static:")
-            await listener.until(lambda: phase_of(listener) == "static")
-            process.send_signal(number)
-            output = await rest_of(process)
-            assert process.returncode == 128 + number, output
-            assert "static: aborted" in output
-            assert f"stopped by {number.name}" in output
-            await listener.until(lambda: phase_of(listener) == "aborted")
+            with subtests.test(f"{number.name} aborts the phase of the command"):
+                await stop_by_signal(rig, listener, number)
+        with subtests.test("a closed terminal aborts the phase"):
+            await close_the_terminal(rig, listener)
+        with subtests.test("a refused request suggests the abort command"):
+            await request_twice(rig, listener)
 
 
-@pytest.mark.system
-@pytest.mark.timeout(240)
-async def test_closed_terminal_aborts_the_phase(tmp_path: Path) -> None:
-    async with walking(tmp_path) as (rig, listener):
-        read_end, write_end = os.pipe()
-        try:
-            process = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "jointfit_daemon.tools", "calibrate", str(rig), *STATIC),
-                stdin=asyncio.subprocess.DEVNULL,
-                stderr=write_end,
-            )
-            await listener.until(lambda: phase_of(listener) == "static")
-        finally:
-            os.close(write_end)
-            os.close(read_end)
-        async with asyncio.timeout(PATIENCE_S):
-            assert await process.wait() == 1
-        await listener.until(lambda: phase_of(listener) == "aborted")
+async def stop_by_signal(rig: Path, listener: Listener, number: signal.Signals) -> None:
+    process = await calibrate(rig, *STATIC)
+    await line_with(process, "static:")
+    await listener.until(lambda: phase_of(listener) == "static")
+    process.send_signal(number)
+    output = await rest_of(process)
+    assert process.returncode == 128 + number, output
+    assert "static: aborted" in output
+    assert f"stopped by {number.name}" in output
+    await listener.until(lambda: phase_of(listener) == "aborted")
 
 
-@pytest.mark.system
-@pytest.mark.timeout(240)
-async def test_refused_request_suggests_the_abort_command(tmp_path: Path) -> None:
-    async with walking(tmp_path) as (rig, listener):
-        leading = await calibrate(rig, *STATIC)
-        await line_with(leading, "static:")
-        await line_with(leading, "%")  # progress, although there is no terminal
+async def close_the_terminal(rig: Path, listener: Listener) -> None:
+    read_end, write_end = os.pipe()
+    try:
+        process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "jointfit_daemon.tools", "calibrate", str(rig), *STATIC),
+            stdin=asyncio.subprocess.DEVNULL,
+            stderr=write_end,
+        )
+        await listener.until(lambda: phase_of(listener) == "static")
+    finally:
+        os.close(write_end)
+        os.close(read_end)
+    async with asyncio.timeout(PATIENCE_S):
+        assert await process.wait() == 1
+    await listener.until(lambda: phase_of(listener) == "aborted")
 
-        second = await calibrate(rig, *STATIC)
-        output = await rest_of(second)
-        assert second.returncode == 1
-        assert "--abort" in output
-        assert phase_of(listener) == "static"  # another's phase is left alone
 
-        ending = await calibrate(rig, "--abort")
-        assert "aborted" in await rest_of(ending)
-        assert ending.returncode == 0
-        assert "static was aborted: abort requested" in await rest_of(leading)
-        assert leading.returncode == 1
+async def request_twice(rig: Path, listener: Listener) -> None:
+    leading = await calibrate(rig, *STATIC)
+    await line_with(leading, "static:")
+    await line_with(leading, "%")  # progress, although there is no terminal
+
+    second = await calibrate(rig, *STATIC)
+    output = await rest_of(second)
+    assert second.returncode == 1
+    assert "--abort" in output
+    assert phase_of(listener) == "static"  # another's phase is left alone
+
+    ending = await calibrate(rig, "--abort")
+    assert "aborted" in await rest_of(ending)
+    assert ending.returncode == 0
+    assert "static was aborted: abort requested" in await rest_of(leading)
+    assert leading.returncode == 1
 
 
 def test_progress_is_reported_at_the_start_of_a_phase_and_every_five_seconds() -> None:
