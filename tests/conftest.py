@@ -9,6 +9,7 @@ import gc
 import inspect
 import itertools
 import os
+import re
 import sys
 import time
 from pathlib import Path
@@ -21,7 +22,6 @@ from typer.main import get_command
 
 from tests.broker_fixture import EmbeddedBroker, MosquittoBroker, chosen_broker
 from tests.fake_rig import fakes, table  # noqa: F401 - fixtures
-from tests.lsl_fixture import lsl  # noqa: F401 - a fixture
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Generator, Iterator
@@ -44,6 +44,8 @@ typer.testing._get_command = functools.cache(get_command)  # type: ignore[attr-d
 
 PARTS = ("parallel", "alone", "experiments", "experiments-alone")
 """Which tests run together: by the markers `experiment` and `alone`."""
+ONLY_EXPERIMENTS = re.compile(r"^pytestmark = .*\bmark\.experiment\b", re.MULTILINE)
+"""Line of a file whose tests are all experiments."""
 GRACE_S = 1.0
 """How long a descriptor may take to close: executors and child processes end a little later."""
 BEGUN = pytest.StashKey[bool]()
@@ -75,6 +77,15 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files with experiments only, unless experiments run: each worker imports files."""
+    part = config.getoption("part")
+    if part not in {"parallel", "alone"} or collection_path.suffix != ".py":
+        return None
+    text = collection_path.read_text(encoding="utf-8")
+    return True if ONLY_EXPERIMENTS.search(text) else None
 
 
 @pytest.hookimpl(trylast=True)  # after pytest has sorted by parameters of fixtures

@@ -42,14 +42,14 @@ ALL_SENSORS = frozenset(OWNER)
 SUBJECT = Subject(21, flaws=Imperfections(sensor_deg=0.2, tissue_deg=4.0, skin_m=0.003))
 
 
-@pytest.fixture(scope="module")
-def calibration() -> Calibration:
-    return calibrated(SUBJECT)
-
-
 @cache
 def calibrated_with(method: Method) -> Calibration:
     return calibrated(SUBJECT, settings=replace(SETTINGS, method=method))
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    return calibrated_with(SETTINGS.method)
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -51,8 +52,8 @@ SECONDS = 9.0
 
 @cache
 def calibration() -> Calibration:
-    static, functional, _ = static_and_functional(SUBJECT, 30.0)
-    return fit_calibration(static, functional, None, SETTINGS, CHAIN)
+    static, functional, _ = static_and_functional(SUBJECT, 15.0)
+    return fit_calibration(static, functional, None, replace(SETTINGS, method="mean"), CHAIN)
 
 
 @cache

@@ -95,21 +95,26 @@ UNKNOWN_KEYS = orjson.dumps({f"k{number}": number for number in range(1500)})
 
 
 @pytest.mark.timeout(180)
-@pytest.mark.parametrize("signed", [False, True])
-async def test_malformed_requests_are_answered_with_errors_and_cost_little_memory(
-    tmp_path: Path, broker: Broker, *, signed: bool
+async def test_malformed_signed_requests_are_answered_with_errors_and_cost_little_memory(
+    tmp_path: Path, broker: Broker
 ) -> None:
     (tmp_path / "key").write_bytes(b"k" * 32)
     line = "health_s = 0.5\n"
-    signing = f'request_key_file = "{tmp_path / "key"}"\n' if signed else ""
     station = Station(tmp_path, broker.port)
     async with (
-        station.simulator((line, line + signing)),
+        station.simulator((line, f'{line}request_key_file = "{tmp_path / "key"}"\n')),
         station.daemon() as daemon,
         listening(station.port) as listener,
-        aiomqtt.Client(broker.host, broker.port, protocol=aiomqtt.ProtocolVersion.V5) as attacker,
     ):
         await listener.connected(SENSORS)
+        await send_malformed_requests(broker, daemon, listener)
+
+
+async def send_malformed_requests(broker: Broker, daemon: ChildProcess, listener: Listener) -> None:
+    """Send malformed requests; check the answers, the poses, the memory and the connection."""
+    async with aiomqtt.Client(
+        broker.host, broker.port, protocol=aiomqtt.ProtocolVersion.V5
+    ) as attacker:
         await attacker.subscribe(f"{BASE}/bridge/response/#")
         async with unharmed(daemon, listener):
             for payload in (NESTED, NESTED_OBJECTS, UNKNOWN_KEYS, b"\xff", b"[]"):
@@ -203,14 +208,17 @@ class Fuzzer:
             client.loop_stop()
 
 
-@pytest.mark.timeout(180)
-async def test_random_topics_payloads_and_properties_do_not_disturb_the_daemon(
-    tmp_path: Path, broker: Broker
+@pytest.mark.timeout(240)
+async def test_malformed_and_random_requests_do_not_disturb_the_daemon(
+    tmp_path: Path, broker: Broker, subtests: pytest.Subtests
 ) -> None:
     fuzzer = Fuzzer(broker)
     async with running(Station(tmp_path, broker.port)) as (_, daemon, listener):
-        async with unharmed(daemon, listener):
-            await asyncio.to_thread(fuzzer.run, CASES)
-        assert fuzzer.sent >= CASES
-        await listener.health()
-        assert listener.latest["bridge/health"]["link"]["connects"] == 1
+        with subtests.test("malformed requests are answered with errors and cost little memory"):
+            await send_malformed_requests(broker, daemon, listener)
+        with subtests.test("random topics, payloads and properties"):
+            async with unharmed(daemon, listener):
+                await asyncio.to_thread(fuzzer.run, CASES)
+            assert fuzzer.sent >= CASES
+            await listener.health()
+            assert listener.latest["bridge/health"]["link"]["connects"] == 1
