@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.kinematics.chains import ChainModel
 
-MOST_EVALUATIONS = 24
+MOST_EVALUATIONS = 16
 """Largest number of evaluations of the marker errors in one instant."""
-_MOST_FOLLOWING = 12
+_MOST_FOLLOWING = 8
 """Largest number without those of a restart. A search that they end continues in the next
 instant."""
 _TRIES = 6
