@@ -41,7 +41,7 @@ compiled: $(STAMP)  ## compile the modules of the frame's path, into build/compi
 test-compiled: compiled  ## the tests of the core, on the compiled modules
 	@JOINTFIT_TEST_VARIANT=compiled PYTHONPATH=$(CURDIR)/build/compiled $(BIN)/python -m pytest -q \
 	  -o pythonpath="build/compiled ." --junitxml=build/compiled-tests.xml \
-	  tests/protocols tests/timing tests/fusion tests/drivers tests/pipeline tests/reprocessing tests/packaging/test_variants.py \
+	  tests/pipeline/test_core.py tests/timing/alignment tests/timing/clock tests/drivers/xbus tests/drivers/xcdi tests/packaging/test_variants.py \
 	  -m "not experiment and not system and not alone"
 
 test-cpu: $(STAMP)  ## the numerical tests six times, as on other processors
