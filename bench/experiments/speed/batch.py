@@ -1,4 +1,4 @@
-"""Batch of recordings: two processes against one, and memory over hundreds of recordings."""
+"""Batch of recordings: two processes against one, and memory over a thousand recordings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SAMPLES = 5000
 """Samples of each sensor in a recording for the speed, 50 s: long beside the start of processes."""
 COUNT, ROUNDS = 16, 2
 """Recordings of a round, and alternating rounds."""
-MANY, WARM = 300, 50
+MANY, WARM = 1000, 50
 """Short recordings for the memory, and those after which all libraries are loaded."""
 
 
