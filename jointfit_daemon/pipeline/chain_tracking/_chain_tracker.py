@@ -39,6 +39,8 @@ FARTHEST_M = 1000.0
 the squares of larger distances would spoil the solution."""
 FEWEST_MARKERS = 3
 """Markers of a frame with a solution: fewer do not determine the position of the first segment."""
+_FEW_EVALUATIONS = 8
+"""Evaluations of the marker errors in a frame that may also search labels: those of no restart."""
 OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
 """Up to six steps, because frames are 100 ms apart. The Huber threshold bounds the influence of an
 exchanged marker until it is excluded. A restart takes longer than a frame, so restarts that do not
@@ -93,8 +95,8 @@ class ChainTracker:
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
         """Return the state of the model in a live frame, if one is due, and notices."""
-        self._monitor.search_labels(t_ns)
         if not self._rate.is_due(t_ns):
+            self._monitor.search_labels(t_ns)
             return []
 
         # The markers of the model in a frame, m, shape (M, 3); NaN where missing.
@@ -116,6 +118,9 @@ class ChainTracker:
             return [state, *_notices(t_ns, reports)]
 
         pose = self._solver.feed(np.where(used[:, None], measured, np.nan))
+        # not in the frame of a restart, which takes as long
+        if pose.evaluations <= _FEW_EVALUATIONS:
+            self._monitor.search_labels(t_ns)
         distances, faults = self._monitor.compare(t_ns, measured, pose.rotations, pose.origins)
         shown = {
             name: d if seen_one else None
