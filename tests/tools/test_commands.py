@@ -16,14 +16,16 @@ from typer.testing import CliRunner
 from jointfit_daemon import __version__
 from jointfit_daemon.tools.__main__ import app
 from jointfit_daemon.tools.command_group import ON_DEMAND_ERRORS
+from jointfit_variant import running_variant
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "knee.toml"
 COMPLETION = EXAMPLE.parents[1] / "packaging" / "completions" / "jointfit.bash"
 run = CliRunner().invoke
 
 
-def test_the_version_is_the_packages() -> None:
-    assert run(app, ["--version"]).stdout.strip() == __version__
+def test_the_version_is_the_packages_and_its_variant_is_named() -> None:
+    expected = f"{__version__} ({running_variant()})"
+    assert run(app, ["--version"]).stdout.strip() == expected
 
 
 @pytest.mark.parametrize(
