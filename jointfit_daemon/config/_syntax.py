@@ -42,7 +42,7 @@ _ASSIGNED = re.compile(r"\s*[\w.\"'-]+\s*=")
 _DECIMAL_COMMA = re.compile(r"[=\[,]\s*[+-]?\d+,\d+\s*(#.*)?$")
 _BOOLEAN = re.compile(r"=\s*(True|False|TRUE|FALSE|yes|no|on|off)\b")
 _REMEDIES = (
-    ("Invalid value", "a text needs quotation marks"),
+    ("Invalid value", "write a number, true or false, or a text in quotation marks"),
     ("Unterminated string", "close it with the quotation marks that open it"),
     ("Unclosed array", "separate its values by commas and close it with ]"),
     ("Unclosed inline table", "separate its keys by commas and close it with }"),

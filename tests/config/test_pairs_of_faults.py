@@ -102,7 +102,7 @@ MISTAKES = (
      "sync[0].line = 'out1'"),
     ('"shank"\ndriver = "xcdi"\ncan = "can1"\nb', '"shnak"\ndriver = "xcdi"\ncan = "can1"\nb',
      "imu[S3].segment = 'shnak'"),
-    ('= "big"', "= big", "a text needs quotation marks"),
+    ('= "big"', "= big", "or a text in quotation marks"),
     ("lag_sd_ms = 0.1", "lag_sd_ms = 0,1", "use a decimal point"),
     ("sample_time = 0x105", "sample_time = 0x106", "each identifier once"),
     ("quaternion = 0x121", "quaternion = 0x921", "above 0x7FF"),

@@ -22,7 +22,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import MocapLayout
-from jointfit_daemon.nearest_name import did_you_mean
+from jointfit_daemon.nearest_name import nearest_name
 from jointfit_protocols import natnet
 
 if TYPE_CHECKING:
@@ -224,7 +224,9 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
         else:
             found.unknown.append(name)
             known = free_entries if len(problems) < _MOST_SUGGESTED else {}
-            problems.append(f"{what} {name!r} (mocap.{key}) " + _problem(name, fitting, known))
+            near = None if fitting else nearest_name(name, islice(known, _MOST_COMPARED))
+            free_entries.pop(near or "", None)  # two names in rig.toml are not one marker
+            problems.append(f"{what} {name!r} (mocap.{key}) {_problem(fitting, near)}")
 
     used = set(found.names)
     most = _MOST_COLUMNS + len(used)
@@ -243,16 +245,15 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
     if problems:
         server = ", ".join(sorted(plain)[:_MOST_NAMED]) or "none"
         more = f" and {len(plain) - _MOST_NAMED} more" if len(plain) > _MOST_NAMED else ""
-        found.warnings.append(f"{'; '.join(problems)}. The server has: {server}{more}")
+        found.warnings.append(f"{' '.join(problems)} The server has: {server}{more}")
     return found
 
 
-def _problem(name: str, fitting: list[ModelEntry], plain: Mapping[str, list[ModelEntry]]) -> str:
+def _problem(fitting: list[ModelEntry], near: str | None) -> str:
     if fitting:
         choices = [repr(next(iter(e.aliases), e.name)) for e in fitting[:_MOST_NAMED]]
-        return f"is ambiguous: write {' or '.join(choices)}"
-    hint = did_you_mean(name, islice(plain, _MOST_COMPARED))
-    return "; ".join(filter(None, ("is not in the stream", hint)))
+        return f"is ambiguous: write {' or '.join(choices)}."
+    return "is not in the stream" + (f"; did you mean {near!r}?" if near else ".")
 
 
 def _unused_name(

@@ -39,11 +39,11 @@ _VERSION = (
 _IDENTIFIER = "the broker refuses the client id: check that no other program uses it"
 _UNAVAILABLE = "the broker is not available: check its log"
 _CREDENTIALS = (
-    "the broker refuses user name or password: correct username and password_file in [mqtt]"
+    "the broker refuses user name or password: set or correct username and password_file in [mqtt]"
 )
 _RIGHTS = (  # mosquitto sends this code for a wrong password, too
-    "the broker does not authorize this user: correct username and password_file in [mqtt], or the"
-    " broker's ACL"
+    "the broker does not authorize this user: set or correct username and password_file in [mqtt],"
+    " or correct the broker's ACL"
 )
 _MQTT_ERRORS = {
     1: _VERSION,

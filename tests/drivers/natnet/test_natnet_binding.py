@@ -71,6 +71,13 @@ def test_unknown_names_are_reported_together_with_suggestions() -> None:
     assert set(markers.data["unknown"]) == {"T9", "Q", "Shink", "Plate"}  # type: ignore[call-overload]
 
 
+def test_no_marker_is_suggested_for_two_names() -> None:
+    feeder = ready(markers={"thigh": ["T1", "T2", "Tt3"], "shank": ["S1", "S2", "T33"]})
+    (warning,) = told(feeder.events, "warning")
+    assert "'Tt3' (mocap.markers.thigh) is not in the stream; did you mean 'T3'? " in warning.text
+    assert warning.text.count("'T3'") == 1
+
+
 def test_a_marker_in_use_is_not_suggested_for_another_one() -> None:
     feeder = ready(markers={"thigh": ["T1", "T2", "T3", "T4"]})
     (markers,) = told(feeder.events, "warning")
