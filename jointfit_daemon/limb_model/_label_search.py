@@ -106,9 +106,11 @@ class LabelFault(NamedTuple):
         """Return what is wrong with two or more markers, as a sentence without its end."""
         if self.cycle:
             return f"{join_words(self.markers)} look exchanged: {self.places}"
-        names = self.markers[:-1]
-        wrong = "have labels of other markers" if names[1:] else "has the label of another marker"
-        return f"{join_words(names)} {wrong}: {self.places}, which is hidden"
+        names = join_words(self.markers[:-1])
+        ends = f"{self.places}, which is hidden"
+        if len(self.markers) == 2:
+            return f"{names} has the label of another marker: {ends}"
+        return f"{names} have labels of other markers: {ends}"
 
 
 class LabelFinding(NamedTuple):
