@@ -133,7 +133,10 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
         JOINTFIT_COMPILED=str(int(is_compiled)),
     )  # fmt: skip
     wheel = next(scratch.glob("jointfitd-*.whl"))
-    platforms = [word for name in PLATFORMS[architecture] for word in ("--platform", name)]
+    names = PLATFORMS[architecture]
+    if is_compiled:  # for this machine: such a wheel names no manylinux
+        names = (f"linux_{platform.machine()}", *names)
+    platforms = [word for name in names for word in ("--platform", name)]
     _run(
         [
             *pip, "install", "--quiet", "--target", site, "--only-binary=:all:", "--no-compile",
