@@ -133,9 +133,9 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
         JOINTFIT_COMPILED=str(int(is_compiled)),
     )  # fmt: skip
     wheel = next(scratch.glob("jointfitd-*.whl"))
-    names = PLATFORMS[architecture]
+    names = list(PLATFORMS[architecture])
     if is_compiled:  # for this machine: such a wheel names no manylinux
-        names = (f"linux_{platform.machine()}", *names)
+        names.append(f"linux_{platform.machine()}")
     platforms = [word for name in names for word in ("--platform", name)]
     _run(
         [

@@ -47,8 +47,10 @@ PARTS = ("parallel", "alone", "experiments", "experiments-alone")
 """Which tests run together: by the markers `experiment` and `alone`."""
 ONLY_EXPERIMENTS = re.compile(r"^pytestmark = .*\bmark\.experiment\b", re.MULTILINE)
 """Line of a file whose tests are all experiments."""
-GRACE_S = 1.0
-"""How long a descriptor may take to close: executors and child processes end a little later."""
+GRACE_S = 1.5
+"""How long descriptors and tasks may take to close: executors, child processes and the task of an
+MQTT client that checks its connection every second end a little later.
+"""
 BEGUN = pytest.StashKey[bool]()
 """Whether this worker has begun a test."""
 QUEUES_THAT_WAIT = 2
@@ -238,6 +240,8 @@ async def tasks_at_the_end() -> AsyncIterator[None]:
     yield
     await asyncio.sleep(0)
     left = asyncio.all_tasks() - {asyncio.current_task()}
+    if left:
+        _, left = await asyncio.wait(left, timeout=GRACE_S)
     if left:
         pytest.fail(f"tasks left running: {sorted(task.get_name() for task in left)}")
 
