@@ -82,7 +82,7 @@ def test_a_real_trial_through_the_driver_equals_the_package_run_directly(
         optical = np.asarray(trial["opt_quat"], dtype=np.float64)
     kinds = (Item.RATE_OF_TURN, Item.ACCELERATION, Item.MAGNETIC_FIELD)
     wires = [
-        message(k, 35 * k, *zip(kinds, rows, strict=True))
+        message(k, 35 * k, *zip(kinds, (tuple(row.tolist()) for row in rows), strict=True))
         for k, rows in enumerate(zip(*felt, strict=True))
     ]
     said = orientations(decoded(wires, rate_hz=286, magnetometer=True))
