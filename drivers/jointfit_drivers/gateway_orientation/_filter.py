@@ -40,11 +40,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from jointfit_daemon.kinematics.rotation import rotate
+from jointfit_daemon.kinematics.rotation_scalar import multiply_one
 from jointfit_drivers.gateway_orientation._start_estimator import (
     GRAVITY,
     StartEstimator,
     StartReading,
-    multiply,
 )
 
 if TYPE_CHECKING:
@@ -332,14 +333,14 @@ class GatewayOrientation:
         # The mean of the accelerometer begins as if it had always been the estimated vertical.
         vqf, state = self._filter, self._filter.state
         q = estimator.q_world_gyro
-        up = _rotated(np.array([(q[0], -q[1], -q[2], -q[3])]), np.array([(0.0, 0.0, GRAVITY)]))[0]
+        up = rotate(np.array([(q[0], -q[1], -q[2], -q[3])]), np.array([(0.0, 0.0, GRAVITY)]))[0]
         low_pass = [np.array(vqf.coeffs[name]) for name in ("accLpB", "accLpA")]
         initial = [vqf.filterInitialState(float(value), *low_pass) for value in up]
         state["lastAccLp"], state["accLpState"] = up.tolist(), np.concatenate(initial).tolist()
 
         # VQF's own frame retains its heading: its bias estimator contains means in it.
         w, _, _, z = _heading_between(tuple(state["accQuat"]), q)
-        state["accQuat"] = list(multiply((w, 0.0, 0.0, -z), q))
+        state["accQuat"] = list(multiply_one((w, 0.0, 0.0, -z), q))
         state["delta"] = remainder(2.0 * atan2(z, w), tau)
         state["bias"] = estimator.bias.tolist()
         # (0.01 deg/s)^2
@@ -352,7 +353,7 @@ class GatewayOrientation:
         """Return the present orientation, and the rate of a reading without bias."""
         vqf = self._filter
         if self._estimator is not None:
-            w, i, j, k = multiply(self._estimator.q_world_gyro, tuple(vqf.getQuat3D().tolist()))
+            w, i, j, k = multiply_one(self._estimator.q_world_gyro, tuple(vqf.getQuat3D().tolist()))
         else:
             w, i, j, k = (vqf.getQuat9D() if self._magnetic else vqf.getQuat6D()).tolist()
         if not follows and not self._magnetic:
@@ -396,7 +397,7 @@ def _field_delay(
     known &= (strength < FIELD_RATIO * usual) & (strength > usual / FIELD_RATIO)
     q, rates, fields = q[known], rates[known], fields[known]
 
-    world, moved = (_rotated(q, v) for v in (fields, np.cross(rates, fields)))
+    world, moved = (rotate(q, v) for v in (fields, np.cross(rates, fields)))
     world, moved = world - world.mean(axis=0), moved - moved.mean(axis=0)
     ridge = RIDGE_RATE**2 * float(np.sum(fields**2))
     turned = float(np.sum(moved**2))
@@ -404,12 +405,6 @@ def _field_delay(
         return None
     delay_s = float(np.sum(world * moved)) / (turned + ridge)
     return min(max(delay_s, 0.0), MOST_DELAY_S)
-
-
-def _rotated(q: NDArray[np.float64], v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return vectors rotated by quaternions."""
-    twice = 2.0 * np.cross(q[:, 1:], v)
-    return np.asarray(v + q[:, :1] * twice + np.cross(q[:, 1:], twice))
 
 
 def _ahead(field: Vector, rate: Vector, delay_s: float) -> Vector:

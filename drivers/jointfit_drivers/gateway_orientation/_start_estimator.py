@@ -32,6 +32,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jointfit_daemon.kinematics.rotation import skew, to_matrix
+from jointfit_daemon.kinematics.rotation_scalar import multiply_one, normalize_one
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -116,7 +119,7 @@ class StartEstimator:
 
         # vertical: mean specific force in the frame of the gyroscope
         q, force, field = (np.array([part[kind] for part in readings]) for kind in (0, 2, 3))
-        matrices = _matrices(q)
+        matrices = to_matrix(q)
         up = np.einsum("nij,nj->i", matrices, force)
         self.q_world_gyro = _shortest_rotation(up / np.linalg.norm(up))
 
@@ -124,9 +127,9 @@ class StartEstimator:
         known = field.any(axis=1)
         self._strength = float(np.median(np.linalg.norm(field[known], axis=1)))
         usual = np.median(np.einsum("nij,nj->ni", matrices[known], field[known]), axis=0)
-        east, north, up_part = _matrix(self.q_world_gyro) @ usual
+        east, north, up_part = to_matrix(self.q_world_gyro) @ usual
         half = 0.5 * float(np.arctan2(east, north))
-        self.q_world_gyro = multiply((cos(half), 0.0, 0.0, sin(half)), self.q_world_gyro)
+        self.q_world_gyro = multiply_one((cos(half), 0.0, 0.0, sin(half)), self.q_world_gyro)
         self._field = np.array((np.hypot(east, north), up_part))
 
         # The second pass knows from the first how fast the sensor moves.
@@ -178,7 +181,7 @@ class StartEstimator:
         """Update with the readings of one step, whose orientations assume a bias."""
         q, rate, force, field = (np.array(kind) for kind in zip(*readings, strict=True))
         duration_s = len(readings) * self._period_s
-        matrices = _matrix(self.q_world_gyro) @ _matrices(q)
+        matrices = to_matrix(self.q_world_gyro) @ to_matrix(q)
 
         # prediction
         turn = matrices.sum(axis=0) * self._period_s
@@ -190,7 +193,7 @@ class StartEstimator:
 
         transition = np.eye(_SIZE)
         transition[_PHI, _BIAS] = -turn
-        transition[_VELOCITY, _PHI] = -_skew(impulse)
+        transition[_VELOCITY, _PHI] = -skew(impulse)
         covariance = transition @ self.covariance @ transition.T
         squared_rate = float(np.mean(np.sum(rate**2, axis=1)))
         angle_variance = SCALE_SD**2 * squared_rate * REVERSAL_S + RATE_NOISE**2
@@ -208,7 +211,7 @@ class StartEstimator:
         variances[:3] = self.speed_sd**2 * LASTING_S / duration_s
         if has_field:
             world = np.array((0.0, *self._field))
-            observed[3:, _PHI] = _skew(world)
+            observed[3:, _PHI] = skew(world)
             observed[3:, _FIELD] = np.eye(3)[:, 1:]
             mean = np.einsum("nij,nj->i", matrices[known], field[known]) / np.sum(known)
             innovation[3:] = mean - world - observed[3:, _PHI] @ error[_PHI]
@@ -229,14 +232,14 @@ class StartEstimator:
     def _correct(self, error: NDArray[np.float64], duration_s: float) -> None:
         """Move an estimated error into the estimates."""
         x, y, z = (0.5 * error[_PHI]).tolist()
-        self.q_world_gyro = multiply((1.0, x, y, z), self.q_world_gyro)
+        self.q_world_gyro = normalize_one(multiply_one((1.0, x, y, z), self.q_world_gyro))
         self.bias += error[_BIAS]
         self._velocity += error[_VELOCITY]
         self._field += error[_FIELD]
 
         # A first heading that was wrong by more than a right angle: half a turn about the vertical.
         if self._field[0] < 0.0:
-            self.q_world_gyro = multiply((0.0, 0.0, 0.0, 1.0), self.q_world_gyro)
+            self.q_world_gyro = multiply_one((0.0, 0.0, 0.0, 1.0), self.q_world_gyro)
             self._velocity[:2] *= -1.0
             self._field[0] *= -1.0
             self.covariance *= np.outer(_HALF_TURN, _HALF_TURN)
@@ -257,42 +260,6 @@ def _first_covariance(
     variances[_VELOCITY] = speed_sd**2
     variances[_FIELD] = strength**2
     return np.diag(variances)
-
-
-def multiply(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Return the Hamilton product of norm 1."""
-    a, b, c, d = p
-    w, x, y, z = q
-    r = (
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    )
-    scale = 1.0 / sqrt(r[0] ** 2 + r[1] ** 2 + r[2] ** 2 + r[3] ** 2)
-    return (scale * r[0], scale * r[1], scale * r[2], scale * r[3])
-
-
-def _matrices(q: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rotation matrices, shape (n, 3, 3), of quaternions, shape (n, 4)."""
-    w, x, y, z = q.T
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return np.moveaxis(np.array(rows), 2, 0)
-
-
-def _matrix(q: Quaternion) -> NDArray[np.float64]:
-    """Return the rotation matrix of a quaternion."""
-    return np.asarray(_matrices(np.array([q]))[0])
-
-
-def _skew(v: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrix of the cross product with a vector."""
-    x, y, z = v.tolist()
-    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
 
 
 def _shortest_rotation(up: NDArray[np.float64]) -> Quaternion:
