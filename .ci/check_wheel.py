@@ -1,7 +1,7 @@
 """Build wheels and sdist, check them, install each as a user would: `check_wheel.py [FOLDER]`.
 
-All into empty environments: the wheels by pip, the sdist by pipx. With FOLDER what was built is
-kept there. The compiled wheel is made if this machine has a C compiler and the headers of Python.
+All into empty environments: the wheels by pip, the sdist by pipx. FOLDER receives the archives. The
+compiled wheel is made if this machine has a C compiler and the headers of Python.
 """
 
 import hashlib

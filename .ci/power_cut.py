@@ -1,14 +1,15 @@
 #!/usr/bin/env python3
-"""Cut the power of a virtual machine that records to ext4, and read what its disk contains.
+"""Cut the power of a virtual machine that records to ext4, and read the recordings on its disk.
 
     .ci/power_cut.py [--cuts N] [--seed N] [--time-limit S]
 
 The light virtual machine records four sensors of 400 Hz to a disk of its own. At N random moments
-it is stopped for an instant, and its disk is copied; at the last one it is killed. Such a disk has
-what the guest wrote, and nothing of the pages that it had not yet written. A second machine mounts
-these disks, which replays their journals, and copies the recordings to the host.
+it is stopped for an instant, and its disk is copied; at the last one it is killed. The disk
+contains the data that the guest had written, without the pages that were still in its memory. A
+second machine mounts these disks, which replays their journals, and copies the recordings to the
+host.
 
-Law: every recording opens, lacks at most its last second, and nothing before it.
+Invariant: every recording opens, lacks at most its last second, and nothing before it.
 
 Exit status: 0; 1 if a recording lacks more; otherwise as of ``light_vm.py``.
 """
@@ -118,7 +119,7 @@ class RecordingMachine:
 
 
 def is_traced(process: int) -> bool:
-    """Whether a process is one of the guest: its tracer, the kernel of the guest, runs it."""
+    """Return whether a process belongs to the guest, whose kernel traces it."""
     status = Path(f"/proc/{process}/status").read_text(encoding="ascii")
     return "\nTracerPid:\t0\n" not in status
 
@@ -197,7 +198,7 @@ def hand_over(work: Path, disks: list[Path], limit_s: float) -> int:
 
 
 def judge(folder: Path, cut: CutDisk) -> bool:
-    """Whether the recording of a disk is complete up to its last second; print what it has."""
+    """Print the extent of a recording; return whether it is complete up to its last second."""
     recording = open_recording(folder)
     messages = list(recording.messages())
     found = [one for one in messages if isinstance(one, RecordedMessage)]

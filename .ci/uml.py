@@ -1,7 +1,8 @@
 """A Linux kernel as an ordinary process: Debian's user-mode-linux, started and ended cleanly.
 
-Law: nothing of a machine outlives the script that booted it; a result is believed only if the guest
-wrote it. Used by ``light_vm.py`` (the host's own files) and ``full_vm.py`` (an image with systemd).
+Invariant: nothing of a machine outlives the script that booted it; a result is believed only if the
+guest wrote it. Used by ``light_vm.py`` (the host's own files) and ``full_vm.py`` (an image with
+systemd).
 """
 
 from __future__ import annotations

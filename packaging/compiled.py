@@ -38,7 +38,7 @@ PACKAGES = (
 VARIANT = "jointfit_variant.py"
 STAMP = ".digest"
 REQUIREMENTS = ["mypy[mypyc]>=2.4,<3", "setuptools>=65", "numpy>=1.26", "typing-extensions>=4.4"]
-"""What compiling needs, numpy for its types."""
+"""Packages for the compilation; numpy for its types."""
 MYPY = """\
 [mypy]
 explicit_package_bases = true
@@ -165,7 +165,7 @@ class CompiledBuildHook(BuildHookInterface):  # type: ignore[type-arg]
     """Build hook of hatchling that adds the extension modules to a wheel."""
 
     def dependencies(self) -> list[str]:  # type: ignore[explicit-override]  # standard library only
-        """Return what the build environment must contain."""
+        """Return the packages of the build environment."""
         return REQUIREMENTS if self._active("standard") else []
 
     def initialize(  # type: ignore[explicit-override]
