@@ -189,7 +189,7 @@ def test_no_markers_make_an_instant_evaluate_its_errors_often(
     y = hostile(noisy(model, swing(model, 40)))[fault]
     options = LiveOptions(steps=6, huber_m=huber_m, restart_interval=1)
     counts = [pose.evaluations for pose in followed(model, y, options)]
-    assert max(counts) <= MOST_EVALUATIONS
+    assert max(counts) <= MOST_EVALUATIONS <= 16
     assert all(np.isfinite(pose.rotations).all() for pose in followed(model, y, options))
 
 
