@@ -13,9 +13,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, MocapFrame, TickClock
+from jointfit_drivers.motion_capture import FrameContinuity, binding_events, wanted_names
 from jointfit_drivers.natnet._binding import bind_model
 from jointfit_drivers.natnet._bitstream import FRAME_START, BitstreamTracker
-from jointfit_drivers.natnet._continuity import NatNetContinuity
 from jointfit_drivers.natnet._frame_time import FrameTime
 from jointfit_drivers.natnet._poses import PoseConverter
 from jointfit_drivers.natnet._server_checks import bitstream_response, same_instance, usable_hz
@@ -34,8 +34,6 @@ _NAMED_UNKNOWN = 16
 """Unknown ids that are listed in warnings; further ones are only counted."""
 _MOST_SECONDS = 2**63 // 10**9
 """Largest plausible stamp, s: its nanoseconds still fit 64 bits."""
-_MOST_LISTED = 200
-"""Names of markers or bodies that an event lists; the count in its text is exact."""
 _ANNOUNCED = {
     natnet.FRAME_MODEL_CHANGED: "the model list changed",
     natnet.FRAME_BITSTREAM_CHANGED: "the bitstream version changed",
@@ -55,13 +53,9 @@ class NatNetDecoder:
         self._bitstream = BitstreamTracker(settings.wanted_version)
         self._latency_ms = settings.latency_ms
         self._time = FrameTime(settings)
-        self._wanted_markers = {
-            name: f"markers.{part}" for part, names in settings.markers.items() for name in names
-        }
-        bodies = {name: f"rigid_body.{part}" for part, name in settings.rigid_body.items()}
-        self._wanted_bodies = bodies | ({settings.plate: "plate"} if settings.plate else {})
+        self._wanted_markers, self._wanted_bodies = wanted_names(settings)
         self._poses = PoseConverter(settings.up_axis)
-        self._continuity = NatNetContinuity()
+        self._continuity = FrameContinuity()
         self._info: natnet.ServerInfo | None = None
         self._hz: int | None = None
         self._binding: Binding | None = None
@@ -186,26 +180,18 @@ class NatNetDecoder:
         """Bind the columns to a model; append its changes and the warnings about it."""
         binding = bind_model(model, self._wanted_markers, self._wanted_bodies)
         before = self._binding
-        if before is not None and before.layout == binding.layout:
-            binding = replace(binding, layout=before.layout)
+        out += binding_events(
+            None if before is None else before.columns, binding.columns, self.unpublished
+        )
+        if before is not None and before.columns.layout == binding.columns.layout:
+            columns = replace(binding.columns, layout=before.columns.layout)
+            binding = replace(binding, columns=columns)
         self._binding = binding
         self._named_unknown.clear()
-
-        layout = binding.layout
-        listed = list(layout.markers[:_MOST_LISTED])
-        if before is None or before.layout is not layout:
-            text = f"{len(layout.markers)} markers, {len(layout.bodies)} bodies"
-            bodies = list(layout.bodies[:_MOST_LISTED])
-            data = {"markers": listed, "bodies": bodies, "unpublished": self.unpublished}
-            out.append(DeviceEvent("info", text, data))
 
         if not model.complete:
             text = "the model list ends at a description of unknown type"
             out.append(DeviceEvent("warning", text))
-
-        if before is None or before.warnings != binding.warnings:
-            unknown = {"unknown": list(binding.unknown), "known": listed}
-            out += [DeviceEvent("warning", text, unknown) for text in binding.warnings]
 
     # --- time ---------------------------------------------------------------------------------
 
@@ -257,7 +243,7 @@ class NatNetDecoder:
                 chunk.t_ns,
                 frame.number,
                 ticks,
-                binding.layout,
+                binding.columns.layout,
                 found.markers,
                 found.body_positions,
                 found.body_orientations,

@@ -7,17 +7,14 @@ live decoder.
 
 from __future__ import annotations
 
-import asyncio
-import socket
 from typing import TYPE_CHECKING, ClassVar
 
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.motion_capture import find_route
 from jointfit_drivers.natnet._decoder import NatNetDecoder
 from jointfit_drivers.natnet._diagnosis import diagnose
 from jointfit_drivers.natnet._server_search import find_servers
 from jointfit_drivers.natnet._session import NatNetSession
 from jointfit_drivers.natnet._settings import NatNetSettings
-from jointfit_drivers.ports.udp_socket import local_address
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -64,28 +61,7 @@ class NatNetMocap:
             The host is no NatNet server, its bitstream is not supported, or the network card is
             unknown.
         """
-        name, interface = self._settings.server, self._settings.interface
-        loop = asyncio.get_running_loop()
-        try:
-            found = await loop.getaddrinfo(name, None, family=socket.AF_INET)
-        except (OSError, UnicodeError) as error:
-            raise DeviceLostError(
-                f"NatNet server {name}: no such host: correct server, or enter its IPv4 address"
-            ) from error
-        host = str(found[0][4][0])
-
-        try:
-            local = local_address(host, interface)
-        except OSError as error:
-            if interface is None:
-                raise DeviceLostError(
-                    f"NatNet server {host}: {error.strerror or error}: check network cable, "
-                    "address of the network card, and server"
-                ) from error
-            raise DeviceMisconfiguredError(
-                f"mocap.interface = {interface!r}: no network card with this name or IPv4 address: "
-                "correct it (`ip address` lists them), or remove it"
-            ) from error
+        host, local = await find_route("NatNet", self._settings)
         session = NatNetSession(self._settings, host, local, emit, after_silence=self._silent)
         try:
             await session.run()

@@ -7,32 +7,29 @@ set is (0, 0, 0). A usable marker is not occluded **and** point-cloud solved.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
+import numpy as np  # noqa: TC002 - mypyc evaluates the types of fields
 from numpy.typing import NDArray  # noqa: TC002 - mypyc evaluates the types of fields
 
+from jointfit_drivers.motion_capture import (
+    ABSENT,
+    FARTHEST_M,
+    NO_POSITION,
+    is_near,
+    rows_array,
+    unit_quaternion,
+    world_rotation,
+)
 from jointfit_drivers.natnet._binding import body_key
 from jointfit_protocols.natnet import BODY_TRACKED, MARKER_OCCLUDED, MARKER_POINT_CLOUD_SOLVED
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from jointfit_daemon.model import Quaternion, Vector
-    from jointfit_drivers.natnet._binding import Binding, Key
+    from jointfit_drivers.motion_capture import ColumnKey
+    from jointfit_drivers.natnet._binding import Binding
     from jointfit_protocols.natnet import FrameOfData
 
-    Place = Callable[[float, float, float], Vector]
-    Turn = Callable[[float, float, float, float], Quaternion]
-
-_HALF = math.sqrt(0.5)
-_NO_POSITION: Vector = (math.nan, math.nan, math.nan)
-_NO_ORIENTATION: Quaternion = (math.nan, math.nan, math.nan, math.nan)
-_NORM_TOLERANCE = 1e-3
-"""Largest deviation of a quaternion's norm from 1."""
-_FARTHEST_M = 10_000.0
-"""Largest plausible coordinate, m; NaN compares as larger."""
 _QUALITY_BITS = MARKER_OCCLUDED | MARKER_POINT_CLOUD_SOLVED
 
 
@@ -60,7 +57,7 @@ class PoseConverter:
     """
 
     def __init__(self, up_axis: str) -> None:
-        self._place, self._turn = _WORLDS[up_axis]
+        self._place, self._turn = world_rotation(up_axis)
 
     def columns(self, frame: FrameOfData, binding: Binding) -> FrameColumns:
         """Return `frame` in the columns of `binding`."""
@@ -70,37 +67,37 @@ class PoseConverter:
         seen = self._labeled(frame, binding.known, unknown)
         for asset in frame.assets:
             for number, x, y, z, _, params, _ in asset.markers:
-                if params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED and _near(x, y, z):
+                if params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED and is_near(x, y, z):
                     seen.setdefault(body_key(asset.id, number), place(x, y, z))
 
         for marker_set in frame.marker_sets:
             if marker_set.name in binding.loose_sets:
                 for i, (x, y, z) in enumerate(marker_set.positions):
-                    if (x or y or z) and _near(x, y, z):
+                    if (x or y or z) and is_near(x, y, z):
                         seen[marker_set.name, i] = place(x, y, z)
 
         bodies, suspicious = self._bodies(frame, binding, unknown)
-        places = [bodies.get(key, _ABSENT) for key in binding.bodies]
+        places = [bodies.get(key, ABSENT) for key in binding.columns.bodies]
 
         return FrameColumns(
-            _array([seen.get(key, _NO_POSITION) for key in binding.markers], 3),
-            _array([place for place, _ in places], 3),
-            _array([turn for _, turn in places], 4),
+            rows_array([seen.get(key, NO_POSITION) for key in binding.columns.markers], 3),
+            rows_array([place for place, _ in places], 3),
+            rows_array([turn for _, turn in places], 4),
             suspicious,
             tuple(unknown),
         )
 
     def _labeled(
-        self, frame: FrameOfData, known: frozenset[Key], unknown: list[int]
-    ) -> dict[Key, Vector]:
-        place, far = self._place, _FARTHEST_M
-        seen: dict[Key, Vector] = {}
+        self, frame: FrameOfData, known: frozenset[ColumnKey], unknown: list[int]
+    ) -> dict[ColumnKey, Vector]:
+        place, far = self._place, FARTHEST_M
+        seen: dict[ColumnKey, Vector] = {}
         twice: set[int] = set()
         for number, x, y, z, _, params, _ in frame.markers:
             if number not in known:
                 if number >> 16:  # model 0: a marker without a model
                     unknown.append(number)
-            # as _near, which would take a third of the time of this loop
+            # as is_near, which would take a third of the time of this loop
             elif (
                 params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED
                 and -far <= x <= far
@@ -117,8 +114,8 @@ class PoseConverter:
 
     def _bodies(
         self, frame: FrameOfData, binding: Binding, unknown: list[int]
-    ) -> tuple[dict[Key, tuple[Vector, Quaternion]], int]:
-        seen: dict[Key, tuple[Vector, Quaternion]] = {}
+    ) -> tuple[dict[ColumnKey, tuple[Vector, Quaternion]], int]:
+        seen: dict[ColumnKey, tuple[Vector, Quaternion]] = {}
         met: set[int] = set()
         suspicious = 0
         found = [(body.id, body) for body in frame.bodies]
@@ -133,39 +130,10 @@ class PoseConverter:
             elif key in met:
                 seen.pop(key, None)  # two bodies with one id cannot be distinguished
             elif params & BODY_TRACKED:
-                norm = math.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-                if abs(norm - 1.0) <= _NORM_TOLERANCE and _near(x, y, z):
-                    turned = self._turn(qw / norm, qx / norm, qy / norm, qz / norm)
-                    seen[key] = (self._place(x, y, z), turned)
+                q = unit_quaternion(qw, qx, qy, qz)
+                if q is not None and is_near(x, y, z):
+                    seen[key] = (self._place(x, y, z), self._turn(*q))
                 else:
                     suspicious += 1
             met.add(key)
         return seen, suspicious
-
-
-_ABSENT = (_NO_POSITION, _NO_ORIENTATION)
-
-
-def _near(x: float, y: float, z: float) -> bool:
-    """Return whether a position is finite and plausible."""
-    return abs(x) <= _FARTHEST_M and abs(y) <= _FARTHEST_M and abs(z) <= _FARTHEST_M
-
-
-def _array(rows: list[Vector] | list[Quaternion], width: int) -> NDArray[np.float64]:
-    return np.array(rows, dtype=np.float64).reshape(len(rows), width)
-
-
-_WORLDS: dict[str, tuple[Place, Turn]] = {
-    "x": (
-        lambda x, y, z: (-z, y, x),
-        lambda w, x, y, z: (_HALF * (w + y), _HALF * (x - z), _HALF * (y - w), _HALF * (z + x)),
-    ),
-    "y": (
-        lambda x, y, z: (x, -z, y),
-        lambda w, x, y, z: (_HALF * (w - x), _HALF * (x + w), _HALF * (y - z), _HALF * (z + y)),
-    ),
-    "z": (lambda x, y, z: (x, y, z), lambda w, x, y, z: (w, x, y, z)),
-}
-"""Rotation of the world that makes z up, for each up axis: -90 deg about y for x, +90 deg about x
-for y; applied to positions, and from the left to quaternions.
-"""

@@ -137,7 +137,7 @@ def _found(local: str, answers: _Answers) -> list[FoundServer]:
     found = []
     for address, info in answers.servers.items():
         model = answers.models.get(address)
-        layout = None if model is None else bind_model(model, {}, {}).layout
+        layout = None if model is None else bind_model(model, {}, {}).columns.layout
         found.append(
             FoundServer(
                 driver="natnet",

@@ -2,39 +2,17 @@
 
 from __future__ import annotations
 
-import re
-from ipaddress import IPv4Address
 from typing import Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from jointfit_daemon.driver import (
-    INTERFACE_NAME_EXPECTED,
-    MocapSettings,
-    host_fault,
-    is_interface_name,
-)
-
-_DOTTED = re.compile(r"\d+(\.\d+){2,}")
-"""Numbers that are meant as an IPv4 address."""
+from jointfit_drivers.motion_capture import ServerSettings
 
 
-def _address(text: str) -> IPv4Address | None:
-    try:
-        return IPv4Address(text)
-    except ValueError:
-        return None
-
-
-class NatNetSettings(MocapSettings):
+class NatNetSettings(ServerSettings):
     """The ``[mocap]`` table for OptiTrack Motive and other servers of NatNet 3 or 4."""
 
     server: str = Field(description="address or name of the PC that runs Motive")
-    interface: str | None = Field(
-        None,
-        description="IPv4 address or name of this host's network card towards the cameras;"
-        " default: the card that routes to the server",
-    )
     transport: Literal["auto", "unicast", "multicast"] = Field(
         "auto", description="transport of the frames; `auto` follows the announcement of the server"
     )
@@ -61,31 +39,6 @@ class NatNetSettings(MocapSettings):
     tai_minus_utc_s: int = Field(
         37, ge=0, le=100, description="leap seconds by which PTP time is ahead of UTC"
     )
-    silence_s: float = Field(5.0, gt=0, description="no frame for this long is a lost server, s")
-
-    @field_validator("server")
-    @classmethod
-    def _server_with_a_name(cls, server: str) -> str:
-        """Refuse text that is neither an address nor a host name."""
-        if ":" in server:
-            raise ValueError("expected an IPv4 address or a name, without port")
-        if (fault := host_fault(server)) is not None:
-            raise ValueError(fault)
-        if (address := _address(server)) is not None and (
-            address.is_multicast or address.is_unspecified
-        ):
-            raise ValueError(f"{server} is the address of no host: expected that of the server")
-        return server
-
-    @field_validator("interface")
-    @classmethod
-    def _interface_that_can_exist(cls, interface: str | None) -> str | None:
-        """Refuse a value that is neither an address nor a name that the kernel allows."""
-        if interface is not None and not is_interface_name(interface):
-            raise ValueError(f"{INTERFACE_NAME_EXPECTED}; or an IPv4 address")
-        if interface is not None and _DOTTED.fullmatch(interface) and not _address(interface):
-            raise ValueError("expected four numbers from 0 to 255, such as 192.168.1.2")
-        return interface
 
     @property
     def wanted_version(self) -> tuple[int, int] | None:

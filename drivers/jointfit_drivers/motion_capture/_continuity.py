@@ -18,7 +18,7 @@ _LATE_RUN = 10
 """Consecutive late frames that are no reordering but a short loop of a recording."""
 
 
-class NatNetStep(NamedTuple):
+class FrameStep(NamedTuple):
     """Classification of one frame."""
 
     use: bool = True
@@ -26,10 +26,10 @@ class NatNetStep(NamedTuple):
     restarted: bool = False
 
 
-_NEXT, _DROP, _RESTART = NatNetStep(), NatNetStep(use=False), NatNetStep(restarted=True)
+_NEXT, _DROP, _RESTART = FrameStep(), FrameStep(use=False), FrameStep(restarted=True)
 
 
-class NatNetContinuity:
+class FrameContinuity:
     """Classifies each frame by its number and its stamp."""
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class NatNetContinuity:
         """Start again with the next frame."""
         self._number = None
 
-    def frame(self, number: int, ticks: int, arrival_ns: int) -> NatNetStep:
+    def frame(self, number: int, ticks: int, arrival_ns: int) -> FrameStep:
         """Return the step for one frame.
 
         Parameters
@@ -69,7 +69,7 @@ class NatNetContinuity:
                 if ticks < self._ticks or ahead > _BURST + elapsed_ns * _FASTEST_HZ // 10**9:
                     step = _RESTART
                 elif ahead > 1:
-                    step = NatNetStep(lost=ahead - 1)
+                    step = FrameStep(lost=ahead - 1)
             else:
                 self._late_run += 1
                 if ahead > -_REORDERED and self._late_run < _LATE_RUN:

@@ -1,0 +1,53 @@
+"""What drivers of motion capture share: columns by name, poses in SI units, continuity, route."""
+
+from jointfit_drivers.motion_capture._binding import (
+    MOST_NAMED,
+    ColumnBinding,
+    ColumnKey,
+    ModelEntry,
+    bind_columns,
+    binding_events,
+    wanted_names,
+)
+from jointfit_drivers.motion_capture._continuity import FrameContinuity, FrameStep
+from jointfit_drivers.motion_capture._route import Route, find_route
+from jointfit_drivers.motion_capture._settings import ServerSettings
+from jointfit_drivers.motion_capture._world import (
+    ABSENT,
+    FARTHEST_M,
+    NO_ORIENTATION,
+    NO_POSITION,
+    NORM_TOLERANCE,
+    UpAxis,
+    is_near,
+    matrix_quaternion,
+    rows_array,
+    unit_quaternion,
+    world_rotation,
+)
+
+__all__ = [
+    "ABSENT",
+    "FARTHEST_M",
+    "MOST_NAMED",
+    "NORM_TOLERANCE",
+    "NO_ORIENTATION",
+    "NO_POSITION",
+    "ColumnBinding",
+    "ColumnKey",
+    "FrameContinuity",
+    "FrameStep",
+    "ModelEntry",
+    "Route",
+    "ServerSettings",
+    "UpAxis",
+    "bind_columns",
+    "binding_events",
+    "find_route",
+    "is_near",
+    "matrix_quaternion",
+    "rows_array",
+    "unit_quaternion",
+    "wanted_names",
+    "world_rotation",
+]

@@ -1,0 +1,217 @@
+"""Binding of the columns of frames to the names in rig.toml.
+
+The plain marker name (``T1``) is sufficient where only one model has that name. A name with its
+model is always possible: ``Thigh/T1``, ``Thigh:T1``, ``Thigh_T1``, or ``Thigh_1`` with the number
+of the marker. The same holds for bones, and for bodies inside an asset. A column has the
+name in rig.toml, otherwise the plain name if it is unique, otherwise ``Thigh/T1``.
+
+Invariant: pure; only names matter, not ids and orders. The time grows linearly with the model, and
+the number of columns is bounded, because a model of one datagram can contain 65 000 markers.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+from itertools import islice
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.model import DeviceEvent, MocapLayout
+from jointfit_daemon.nearest_name import nearest_name
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from jointfit_daemon.driver import MocapSettings
+
+ColumnKey = int | tuple[str, int]
+"""Identity of a marker or body in the frames of a server: a number, or a name and a number."""
+
+_MOST_COLUMNS = 2000
+"""Columns besides those named in rig.toml. Further ones are dropped, because each costs time in
+every frame, and no camera system labels as many.
+"""
+MOST_NAMED = 50
+"""Names of the server that a warning lists."""
+_MOST_COMPARED = 500
+"""Names of the server that are compared with a misspelt one."""
+_MOST_SUGGESTED = 3
+"""Misspelt names for which a similar one is suggested."""
+_MOST_LISTED = 200
+"""Names of markers or bodies that an event lists; the count in its text is exact."""
+
+
+class ModelEntry(NamedTuple):
+    """One marker or body of the server's model."""
+
+    key: ColumnKey
+    """Identity in the frames of the server."""
+    owner: str
+    """Its model or set; empty for a rigid body."""
+    name: str
+    member: int
+    """Number in its owner, from 1."""
+
+    @property
+    def aliases(self) -> tuple[str, ...]:
+        """Spellings besides the plain name."""
+        if not self.owner:
+            return ()
+        joined = tuple(f"{self.owner}{mark}{self.name}" for mark in "/:_")
+        return (*joined, f"{self.owner}_{self.member}")
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnBinding:
+    """Columns of the frames, until the model changes."""
+
+    layout: MocapLayout
+    markers: tuple[ColumnKey, ...]
+    """Key of each marker column."""
+    bodies: tuple[ColumnKey, ...]
+    """Key of each body column."""
+    warnings: tuple[str, ...]
+    """Warnings: unknown names of rig.toml, and names that are ambiguous."""
+    unknown: tuple[str, ...]
+    """Names of rig.toml without a column."""
+
+
+def wanted_names(settings: MocapSettings) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the markers and the bodies that rig.toml names, and the key of each."""
+    markers = {
+        name: f"markers.{part}" for part, names in settings.markers.items() for name in names
+    }
+    bodies = {name: f"rigid_body.{part}" for part, name in settings.rigid_body.items()}
+    return markers, bodies | ({settings.plate: "plate"} if settings.plate else {})
+
+
+def bind_columns(
+    markers: Sequence[ModelEntry],
+    bodies: Sequence[ModelEntry],
+    wanted_markers: Mapping[str, str],
+    wanted_bodies: Mapping[str, str],
+) -> ColumnBinding:
+    """Return the columns for the markers and bodies of a model.
+
+    Parameters
+    ----------
+    markers, bodies : sequence of ModelEntry
+        Content of the server's latest description.
+    wanted_markers, wanted_bodies : mapping of str to str
+        Names in rig.toml, and the key of each.
+    """
+    of_markers = _columns("marker", markers, wanted_markers)
+    of_bodies = _columns("rigid body", bodies, wanted_bodies)
+    return ColumnBinding(
+        MocapLayout(tuple(of_markers.names), tuple(of_bodies.names)),
+        tuple(of_markers.keys),
+        tuple(of_bodies.keys),
+        (*of_markers.warnings, *of_bodies.warnings),
+        (*of_markers.unknown, *of_bodies.unknown),
+    )
+
+
+def binding_events(
+    before: ColumnBinding | None, binding: ColumnBinding, unpublished: int
+) -> list[DeviceEvent]:
+    """Return the events of a new binding: its columns if they changed, and new warnings.
+
+    Parameters
+    ----------
+    before : ColumnBinding, optional
+        The binding in force until now.
+    binding : ColumnBinding
+        The binding from now on.
+    unpublished : int
+        Frames that arrived before the first model.
+    """
+    layout = binding.layout
+    listed = list(layout.markers[:_MOST_LISTED])
+    events = []
+    if before is None or before.layout != layout:
+        text = f"{len(layout.markers)} markers, {len(layout.bodies)} bodies"
+        bodies = list(layout.bodies[:_MOST_LISTED])
+        data = {"markers": listed, "bodies": bodies, "unpublished": unpublished}
+        events.append(DeviceEvent("info", text, data))
+
+    if before is None or before.warnings != binding.warnings:
+        unknown = {"unknown": list(binding.unknown), "known": listed}
+        events += [DeviceEvent("warning", text, unknown) for text in binding.warnings]
+    return events
+
+
+# --- names of the columns ---------------------------------------------------------------------
+
+
+class _Columns(NamedTuple):
+    names: list[str]
+    keys: list[ColumnKey]
+    warnings: list[str]
+    unknown: list[str]
+
+
+def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]) -> _Columns:
+    found = _Columns([], [], [], [])
+    plain: defaultdict[str, list[ModelEntry]] = defaultdict(list)
+    alias: defaultdict[str, list[ModelEntry]] = defaultdict(list)
+    for entry in entries:
+        plain[entry.name].append(entry)
+        for spelling in entry.aliases:
+            alias[spelling].append(entry)
+
+    # Entries that rig.toml uses already are no suggestion for another name.
+    used_by_rig = {
+        entry.name for name in wanted for entry in plain.get(name) or alias.get(name) or []
+    }
+    free_entries = {name: found for name, found in plain.items() if name not in used_by_rig}
+    taken: set[ColumnKey] = set()
+    problems: list[str] = []
+    for name, key in wanted.items():
+        fitting = plain.get(name) or alias.get(name) or []
+        if len(fitting) == 1:
+            found.names.append(name)
+            found.keys.append(fitting[0].key)
+            taken.add(fitting[0].key)
+        else:
+            found.unknown.append(name)
+            known = free_entries if len(problems) < _MOST_SUGGESTED else {}
+            near = None if fitting else nearest_name(name, islice(known, _MOST_COMPARED))
+            free_entries.pop(near or "", None)  # two names in rig.toml are not one marker
+            problems.append(f"{what} {name!r} (mocap.{key}) {_problem(fitting, near)}")
+
+    used = set(found.names)
+    most = _MOST_COLUMNS + len(used)
+    for entry in entries:
+        if len(used) >= most:
+            text = f"the server has {len(entries)} columns ({what}); {len(used)} are used"
+            found.warnings.append(text)
+            break
+        free = None if entry.key in taken else _unused_name(entry, plain, used)
+        if free is not None:  # otherwise its id occurs twice, and frames with it are refused
+            found.names.append(free)
+            found.keys.append(entry.key)
+            used.add(free)
+            taken.add(entry.key)
+
+    if problems:
+        server = ", ".join(sorted(plain)[:MOST_NAMED]) or "none"
+        more = f" and {len(plain) - MOST_NAMED} more" if len(plain) > MOST_NAMED else ""
+        found.warnings.append(f"{' '.join(problems)} The server has: {server}{more}")
+    return found
+
+
+def _problem(fitting: list[ModelEntry], near: str | None) -> str:
+    if fitting:
+        choices = [repr(next(iter(e.aliases), e.name)) for e in fitting[:MOST_NAMED]]
+        return f"is ambiguous: write {' or '.join(choices)}."
+    return "is not in the stream" + (f"; did you mean {near!r}?" if near else ".")
+
+
+def _unused_name(
+    entry: ModelEntry, plain: Mapping[str, list[ModelEntry]], used: set[str]
+) -> str | None:
+    """Return the plain name if it is unique, otherwise one with its owner; None if all are used."""
+    full = f"{entry.owner}/{entry.name}" if entry.owner else entry.name
+    choices = [entry.name] if len(plain[entry.name]) == 1 else []
+    choices += [full, f"{full}#{entry.member}", f"{full}#{entry.key}"]
+    return next((name for name in choices if name not in used), None)

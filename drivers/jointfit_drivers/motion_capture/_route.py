@@ -1,0 +1,60 @@
+"""Address of a server, and the network card towards it."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.ports.udp_socket import local_address
+
+if TYPE_CHECKING:
+    from jointfit_drivers.motion_capture._settings import ServerSettings
+
+
+class Route(NamedTuple):
+    """Numeric addresses of a server and of this host's network card."""
+
+    host: str
+    local: str
+
+
+async def find_route(kind: str, settings: ServerSettings) -> Route:
+    """Return the route to the server of a ``[mocap]`` table.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the family for messages, such as ``NatNet``.
+    settings : ServerSettings
+        The table.
+
+    Raises
+    ------
+    DeviceLostError
+        The host is unknown, or there is no route to it.
+    DeviceMisconfiguredError
+        The network card is unknown.
+    """
+    name, interface = settings.server, settings.interface
+    try:
+        found = await asyncio.get_running_loop().getaddrinfo(name, None, family=socket.AF_INET)
+    except (OSError, UnicodeError) as error:
+        raise DeviceLostError(
+            f"{kind} server {name}: no such host: correct server, or enter its IPv4 address"
+        ) from error
+    host = str(found[0][4][0])
+
+    try:
+        return Route(host, local_address(host, interface))
+    except OSError as error:
+        if interface is None:
+            raise DeviceLostError(
+                f"{kind} server {host}: {error.strerror or error}: check network cable, "
+                "address of the network card, and server"
+            ) from error
+        raise DeviceMisconfiguredError(
+            f"mocap.interface = {interface!r}: no network card with this name or IPv4 address: "
+            "correct it (`ip address` lists them), or remove it"
+        ) from error
