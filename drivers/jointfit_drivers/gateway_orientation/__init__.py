@@ -11,7 +11,9 @@ from jointfit_drivers.gateway_orientation._filter import (
     RawReading,
     is_installed,
     is_plausible,
+    turned_field,
 )
+from jointfit_drivers.gateway_orientation._raw_samples import RawSamples, RawStamp
 
 __all__ = [
     "LONGEST_SETTLE_S",
@@ -22,6 +24,9 @@ __all__ = [
     "FilterStep",
     "GatewayOrientation",
     "RawReading",
+    "RawSamples",
+    "RawStamp",
     "is_installed",
     "is_plausible",
+    "turned_field",
 ]

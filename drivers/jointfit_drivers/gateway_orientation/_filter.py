@@ -266,7 +266,7 @@ class GatewayOrientation:
         fed = (x * scale, y * scale, z * scale)
         field = reading.magnetic if self._magnetic else None
         if field is not None and self._delay_s != 0.0:
-            field = _ahead(field, reading.rate, self._delay_s)
+            field = turned_field(field, reading.rate, self._delay_s)
 
         self._rate[:], self._force[:] = fed, reading.force
         if field is None:
@@ -309,7 +309,8 @@ class GatewayOrientation:
         found_s = _field_delay(q, rates, fields)
         self._delay_s = self._delay_s if found_s is None else found_s
         parts = [
-            part._replace(field=_ahead(part.field, part.rate, self._delay_s)) for part in withheld
+            part._replace(field=turned_field(part.field, part.rate, self._delay_s))
+            for part in withheld
         ]
 
         # At rest the mean rate is the bias.
@@ -407,7 +408,7 @@ def _field_delay(
     return min(max(delay_s, 0.0), MOST_DELAY_S)
 
 
-def _ahead(field: Vector, rate: Vector, delay_s: float) -> Vector:
+def turned_field(field: Vector, rate: Vector, delay_s: float) -> Vector:
     """Return the field that a sensor with this angular rate measures `delay_s` later."""
     x, y, z = field
     a, b, c = (-0.5 * delay_s * value for value in rate)

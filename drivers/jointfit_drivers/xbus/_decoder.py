@@ -13,8 +13,9 @@ from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types o
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
+from jointfit_drivers.gateway_orientation import RawStamp
 from jointfit_drivers.xbus._continuity import XbusContinuity, XbusStep
-from jointfit_drivers.xbus._raw_orientation import RAW, RawMessage
+from jointfit_drivers.xbus._raw_orientation import RAW
 from jointfit_drivers.xbus._sync_lines import describe_entry
 from jointfit_protocols.orientation import OrientationGate, Quaternion, canonical
 from jointfit_protocols.xbus import (
@@ -239,7 +240,7 @@ class XbusDecoder:
         counter: int | None = values.get(_COUNTER)
 
         if self._raw is not None and ticks is not None:
-            fields = RawMessage(arrived_ns, ticks, counter, values.get(_STATUS_WORD))
+            fields = RawStamp(arrived_ns, ticks, counter, values.get(_STATUS_WORD))
             modulus = self.tick_clock.modulus or setup.WRAP_32_BIT
             found = self._raw.samples(fields, values, modulus)
             if found is None:

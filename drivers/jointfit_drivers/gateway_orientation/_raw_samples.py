@@ -1,0 +1,165 @@
+"""Samples of an IMU whose orientation the gateway computes from raw measurements.
+
+`RawSamples` contains the orientation filter and reports its state, gaps and saturation as device
+events. Drivers convert the measurements of their devices to a `RawReading` and its `RawStamp`.
+
+Invariant: the output depends only on the readings fed; no clock and no port is read.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.model import DeviceEvent, ImuSample
+from jointfit_drivers.gateway_orientation._filter import (
+    LONGEST_SETTLE_S,
+    FilterOutput,
+    GatewayOrientation,
+    RawReading,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Decoded, Vector
+
+_REPORT_NS, _SOON_NS = 10_000_000_000, 1_000_000_000
+"""Period, ns, of the filter's state events: in general, and after a change."""
+FAST = 5.0
+"""Angular rate, rad/s, below which no gyroscope saturates."""
+_NEW_HEADING = (
+    "orientation from gyroscope and accelerometer started with an arbitrary heading: "
+    "repeat the static pose"
+)
+
+
+class RawStamp(NamedTuple):
+    """Fields of a raw message besides its measurements."""
+
+    arrival_ns: int
+    ticks: int
+    counter: int | None = None
+    status: int | None = None
+
+
+class RawSamples:
+    """Computes samples from raw readings.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Nominal rate, Hz.
+    magnetometer : bool
+        Whether heading comes from the magnetometer.
+    settle_s : float
+        Longest time without output after the start of the filter, s.
+    """
+
+    def __init__(
+        self, rate_hz: float, *, magnetometer: bool, settle_s: float = LONGEST_SETTLE_S
+    ) -> None:
+        self.magnetometer = magnetometer
+        """Whether heading comes from the magnetometer."""
+        self._filter = GatewayOrientation(rate_hz, magnetometer=magnetometer, settle_s=settle_s)
+        self._waiting: tuple[RawStamp, RawReading] | None = None
+        self._t_ns = 0
+        self._reported_ns, self._reported = -_REPORT_NS, (False, False, False)
+        self._clipped_ns = -_REPORT_NS
+        self._rate: Vector = (0.0, 0.0, 0.0)
+        self._started = False
+
+    @property
+    def period_ns(self) -> float:
+        """Mean interval of the readings so far, ns."""
+        return self._filter.period_ns
+
+    def take(self, stamp: RawStamp, reading: RawReading, *, clipped: bool = False) -> list[Decoded]:
+        """Return the warnings and samples that a plausible reading completes.
+
+        Parameters
+        ----------
+        stamp
+            Arrival, device time and status of the message.
+        reading
+            Its measurements, at a later time than those of the reading before it.
+        clipped
+            Whether the device reported that a measurement is out of range.
+        """
+        self._t_ns = reading.t_ns
+        step = self._filter.take(reading)
+        out = self._warnings(
+            stamp, reading, clipped=clipped, restarted=step.restarted, missing=step.missing
+        )
+
+        first, self._waiting = self._waiting, (stamp, reading)
+        if len(step.oriented) > 1 and first is not None:
+            out.append(_sample(*first, step.oriented[0]))
+        if step.oriented:
+            out += self._state_events()
+            out.append(_sample(stamp, reading, step.oriented[-1]))
+        return out
+
+    def _warnings(
+        self, stamp: RawStamp, reading: RawReading, *, clipped: bool, restarted: bool, missing: int
+    ) -> list[Decoded]:
+        """Return warnings about missing measurements and saturation."""
+        out: list[Decoded] = []
+        if restarted:
+            text = (
+                f"{missing} measurements missing: orientation filter restarted, heading uncertain"
+            )
+            out.append(DeviceEvent("warning", text, {"missing": missing}))
+
+        # A device need not report saturation. It is therefore also detected by repetition: because
+        # of noise, a high rate repeats exactly only at the end of the gyroscope's range.
+        before, self._rate = self._rate, reading.rate
+        pairs = zip(self._rate, before, strict=True)
+        clipped |= any(now == then and abs(now) > FAST for now, then in pairs)
+        if clipped and self._t_ns - self._clipped_ns >= _REPORT_NS:
+            self._clipped_ns = self._t_ns
+            text = "a measurement was out of range: heading is uncertain until the next static pose"
+            out.append(DeviceEvent("warning", text, {"status": stamp.status}))
+        return out
+
+    def _state_events(self) -> list[Decoded]:
+        """Return the filter's state if it is due."""
+        out: list[Decoded] = []
+        if not self._started and not self.magnetometer:
+            out.append(DeviceEvent("warning", _NEW_HEADING))
+        self._started = True
+
+        since_ns = self._t_ns - self._reported_ns
+        if since_ns < _SOON_NS:
+            return out
+
+        state = self._filter.state
+        if state is None or (
+            since_ns < _REPORT_NS
+            and (state.rest, state.disturbed, state.converging) == self._reported
+        ):
+            return out
+        self._reported_ns = self._t_ns
+        self._reported = (state.rest, state.disturbed, state.converging)
+
+        data: dict[str, object] = {
+            "rest": state.rest,
+            "bias_rad_s": [round(value, 7) for value in state.bias],
+            "bias_sd_rad_s": round(state.bias_sd, 7),
+            "magnetometer": self.magnetometer,
+            "disturbed": state.disturbed,
+            "settled": not self._filter.settling,
+            "converging": state.converging,
+            "period_ms": round(self._filter.period_ns * 1e-6, 6),
+        }
+        out.append(DeviceEvent("info", "orientation filter", {"orientation_filter": data}))
+        return out
+
+
+def _sample(
+    stamp: RawStamp,
+    reading: RawReading,
+    oriented: FilterOutput,
+) -> ImuSample:
+    q = oriented.q_world_sensor
+    arrival_ns, ticks, counter, status = stamp
+    # The device sends the mean rate since the previous sample, not the present one.
+    rate, force, field = None, reading.force, reading.magnetic
+    return ImuSample(arrival_ns, q, q, ticks, counter, status, rate, force, field)
