@@ -17,6 +17,7 @@ from jointfit_daemon.config import Rig, parse_rig
 from jointfit_daemon.tools.__main__ import app
 
 ROOT = Path(__file__).resolve().parents[1]
+DEVICES = ROOT / "docs" / "devices.md"
 PAGES = [
     *sorted(ROOT.glob("*.md")),
     *sorted((ROOT / "docs").rglob("*.md")),
@@ -100,6 +101,14 @@ def test_the_readme_shows_a_rig() -> None:
 def test_the_parts_of_the_rig_guide_are_one_rig() -> None:
     rig = load("\n".join(blocks(ROOT / "docs" / "rig.md", "toml")))
     assert {source.id for source in rig.sources} == {"S1", "S3", "mocap"}
+
+
+def test_every_driver_has_a_page_and_a_row_in_the_list_of_devices() -> None:
+    rows = set(re.findall(r"^\| \[`([\w-]+)`\]\(devices/", text_of(DEVICES), re.MULTILINE))
+    pages = {page.stem for page in DEVICES.with_suffix("").glob("*.md")}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    drivers = set(project["entry-points"]["jointfit.drivers"])
+    assert rows == pages == drivers
 
 
 @every_page

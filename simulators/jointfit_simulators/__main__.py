@@ -102,6 +102,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     _add_play_options(play)
+    _add_hardware_options(play)
     return parser
 
 
@@ -116,14 +117,12 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--perfect", action="store_true", help="no errors except those of --set")
     play.add_argument("--rate", type=float, help="IMU samples per second")
     play.add_argument("--seed", type=int, help="random seed")
-    play.add_argument("--no-mocap", action="store_true", help="no optical system")
     play.add_argument("--command-port", type=int, metavar="PORT",
                       help="UDP port of the motion-capture server (default: that of the previous "
                       "run in this directory, otherwise any free port)")  # fmt: skip
     play.add_argument("--follow", action="store_true",
                       help="select the motion by the daemon's calibration phase: align, static, "
                       "functional (over MQTT, broker and base as in rig.toml)")  # fmt: skip
-    play.add_argument("--can", default="slcan", help="slcan, or INTERFACE:CHANNEL of python-can")
     play.add_argument("--motion", action="append", default=[], metavar="NAME=FILE",
                       help="add a motion from joint angles: TOML, NPZ or OpenSim .mot")  # fmt: skip
     play.add_argument("--clock", action="append", default=[], metavar="ID=PPM[,UP_S]",
@@ -157,6 +156,16 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
             default=field.default,
             help=f"value written to rig.toml (default {field.default})",
         )
+
+
+def _add_hardware_options(play: argparse.ArgumentParser) -> None:
+    play.add_argument("--imu", action="append", default=[], metavar="ID=DRIVER",
+                      help="driver of the IMU that a sensor simulates, such as S2=xbus; by default "
+                      "xbus and xcdi in turn")  # fmt: skip
+    play.add_argument("--mocap", default="natnet", metavar="DRIVER",
+                      help="driver of the motion-capture server (default natnet)")  # fmt: skip
+    play.add_argument("--no-mocap", action="store_true", help="no optical system")
+    play.add_argument("--can", default="slcan", help="slcan, or INTERFACE:CHANNEL of python-can")
 
 
 def _knobs(options: argparse.Namespace) -> Knobs:
@@ -271,7 +280,8 @@ async def _play(options: argparse.Namespace) -> None:
     )
     hardware = SceneOptions(
         options.directory.absolute(),
-        mocap=not options.no_mocap,
+        mocap=None if options.no_mocap else options.mocap,
+        wires=dict(_pairs("--imu", options.imu)),
         can=options.can,
         rig=rig,
         clocks=_clocks(options.clock),
@@ -295,7 +305,7 @@ async def _play(options: argparse.Namespace) -> None:
     subject = _subject(options, knobs)
 
     with play_directory(hardware.directory) as directory:
-        if hardware.mocap:
+        if hardware.mocap is not None:
             port = directory.command_port(options.command_port)
             hardware = dataclasses.replace(hardware, command_port=port)
         now_ns = time.monotonic_ns() // ORIGIN_NS * ORIGIN_NS

@@ -53,6 +53,28 @@ def scene(folder: Path, **options: Any) -> Scene:
     return Scene(knobs, subject, SceneOptions(folder, **options), now_ns=now_ns)
 
 
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [
+        ({"wires": {"S9": "xbus"}}, "no sensor 'S9'; there are: S1"),
+        ({"wires": {"S1": "nobus"}}, "no simulated IMU of driver 'nobus'; there are: .*xbus"),
+        ({"mocap": "nocams"}, "no simulated cameras of driver 'nocams'; there are: .*natnet"),
+    ],
+)
+def test_unknown_sensors_and_drivers_are_rejected(
+    tmp_path: Path, options: dict[str, Any], names: str
+) -> None:
+    with pytest.raises(InvalidCommandError, match=names):
+        scene(tmp_path, **options)
+
+
+def test_a_sensor_has_the_chosen_driver_and_the_others_keep_theirs(tmp_path: Path) -> None:
+    one = scene(tmp_path, wires={"S2": "xbus"}, mocap=None)
+    assert set(one.ports) == {"S1", "S2", "S3", "S4", "can0"}
+    assert one.ports["S2"] == str(tmp_path / "ttyS2")
+    one.close()
+
+
 def test_unknown_clocks_are_rejected(tmp_path: Path) -> None:
     with pytest.raises(InvalidCommandError, match=r"S9.*there are: S1"):
         scene(tmp_path, clocks={"S9": ClockFault(1.0)})

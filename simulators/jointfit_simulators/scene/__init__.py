@@ -1,6 +1,6 @@
 """A whole scene in real time: a subject, its devices, their streams, and the ground truth."""
 
-from jointfit_simulators.scene._hardware import ids_toml
+from jointfit_simulators.scene._imu_families import ids_toml
 from jointfit_simulators.scene._phase_follower import PhaseFollower
 from jointfit_simulators.scene._play_directory import play_directory
 from jointfit_simulators.scene._rig_file import RigOptions, rig_toml

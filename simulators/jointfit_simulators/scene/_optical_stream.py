@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_simulators.body import Observation
-    from jointfit_simulators.devices import Bodies, Cameras, Markers, NatNetServer, SampleTiming
+    from jointfit_simulators.devices import Bodies, Cameras, Markers, SampleTiming
+    from jointfit_simulators.scene._mocap_families import MocapServer
     from jointfit_simulators.scene._streams import SampleCallback
     from jointfit_simulators.settings import Knobs
 
@@ -40,7 +41,7 @@ class OpticalStream:
     """
 
     def __init__(
-        self, knobs: Knobs, cameras: Cameras, timing: SampleTiming, server: NatNetServer | None
+        self, knobs: Knobs, cameras: Cameras, timing: SampleTiming, server: MocapServer | None
     ) -> None:
         self.cameras = cameras
         self.on_sample: SampleCallback | None = None

@@ -18,13 +18,9 @@ from jointfit_simulators.body import (
     to_wxyz,
 )
 from jointfit_simulators.devices import NS, Cameras, SampleTiming
-from jointfit_simulators.scene._hardware import (
-    BUS,
-    WIRES,
-    create_hardware,
-    mocap_table,
-    optical_server,
-)
+from jointfit_simulators.scene._hardware import WIRES, create_hardware
+from jointfit_simulators.scene._imu_families import BUS, IMU_FAMILIES
+from jointfit_simulators.scene._mocap_families import MOCAP_FAMILIES, CameraPlace
 from jointfit_simulators.scene._optical_stream import OpticalStream
 from jointfit_simulators.scene._player import ScenePlayer
 from jointfit_simulators.scene._rig_file import RigOptions, rig_toml
@@ -36,7 +32,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_simulators.body import InstrumentedSubject
-    from jointfit_simulators.devices import ClockFault, NatNetServer
+    from jointfit_simulators.devices import ClockFault
+    from jointfit_simulators.scene._mocap_families import MocapServer
     from jointfit_simulators.scene._player import PlannedStream
     from jointfit_simulators.scene._streams import ImuStream
     from jointfit_simulators.settings import Knobs
@@ -62,9 +59,11 @@ class SceneOptions:
     """Hardware, clock faults and scheduled commands of a scene."""
 
     directory: Path
-    mocap: bool = True
+    mocap: str | None = "natnet"
+    """Driver of the motion-capture server; None without cameras."""
     can: str = "slcan"
-    wires: Mapping[str, str] = dataclasses.field(default_factory=lambda: WIRES)
+    wires: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    """Driver by sensor; the others have their default."""
     rig: RigOptions = dataclasses.field(default_factory=RigOptions)
     clocks: Mapping[str, ClockFault] = dataclasses.field(default_factory=dict)
     """Prescribed clock errors by sensor or ``mocap``; others are random."""
@@ -108,13 +107,14 @@ class Scene:
     ) -> None:
         self._options, self._subject = options, subject
         _check_clocks(options.clocks, (*subject.sensors, OPTICAL))
+        _check_families(options, subject.sensors)
         options.directory.mkdir(parents=True, exist_ok=True)
         self._knobs = knobs
         self._hardware = create_hardware(
             knobs,
             {} if options.planar else subject.sensors,
             options.directory,
-            wires=options.wires,
+            wires={**WIRES, **options.wires},
             can=options.can,
             now_ns=now_ns,
             sync_line=options.sync_line,
@@ -127,16 +127,10 @@ class Scene:
             self._timings[name].set_fault(fault, now_ns)
 
         cameras = Cameras(knobs, subject, rate_hz=knobs.mocap_hz)
-        self._server: NatNetServer | None = None
-        if options.mocap:
-            self._server = optical_server(
-                knobs,
-                subject.clusters,
-                cameras.bodies,
-                timing,
-                ptp=options.ptp,
-                command_port=options.command_port,
-            )
+        self._server, self._mocap_lines = _create_cameras(
+            options, CameraPlace(knobs, subject.clusters, cameras.bodies, timing, options.ptp,
+                                 options.command_port),
+        )  # fmt: skip
         self._optical = OpticalStream(knobs, cameras, timing, self._server)
 
         samples = SampleLog(options.directory / SAMPLES_FILE) if options.sample_log else None
@@ -214,15 +208,14 @@ class Scene:
                     for name, stream in self._hardware.streams.items()
                 ]
                 if self._server is not None:
-                    serving.append(tasks.create_task(self._server.run(), name="natnet"))
+                    serving.append(tasks.create_task(self._server.run(), name="mocap"))
                     await self._server.ready.wait()
 
                 rig = self._write_rig()
                 playing = tasks.create_task(self._player.run(), name="player")
                 following = tasks.create_task(self._follow_script(report), name="script")
                 truth = self._options.directory / TRUTH_FILE
-                ports = self._hardware.ports
-                report({"ready": True, "rig": str(rig), "truth": str(truth), "ports": ports})
+                report({"ready": True, "rig": str(rig), "truth": str(truth), "ports": self.ports})
 
                 await self._quit.wait()
                 playing.cancel()
@@ -260,12 +253,12 @@ class Scene:
             self._server.unplug()
 
     def _write_rig(self) -> Path:
-        server, planar = self._server, self._options.planar
+        planar = self._options.planar
         path = self._options.directory / RIG_FILE
         text = rig_toml(
             self._options.rig,
             devices=self._hardware.tables,
-            mocap=mocap_table(server, sync_line=self._options.sync_line) if server else "",
+            mocap="\n".join(self._mocap_lines),
             clusters=PLANAR_MARKERS if planar else self._subject.clusters,
             bones=self._subject.visible_bones,
             plate="plate" in self._subject.templates and not planar,
@@ -287,6 +280,11 @@ class Scene:
         text = model_toml(parts, markers)
         (self._options.directory / MODEL_FILE).write_text(text, encoding="utf-8")
         return MODEL_FILE
+
+    @property
+    def ports(self) -> Mapping[str, str]:
+        """Port of each device or bus."""
+        return self._hardware.ports
 
     @property
     def command_port(self) -> int | None:
@@ -393,6 +391,33 @@ def _check_clocks(clocks: Iterable[str], known: tuple[str, ...]) -> None:
     for name in clocks:
         if name not in known:
             raise InvalidCommandError(f"no clock {name!r}; there are: {', '.join(known)}")
+
+
+def _check_families(options: SceneOptions, sensors: Mapping[str, str]) -> None:
+    if unknown := [name for name in options.wires if name not in sensors]:
+        raise InvalidCommandError(f"no sensor {unknown[0]!r}; there are: {', '.join(sensors)}")
+    for driver in options.wires.values():
+        if driver not in IMU_FAMILIES:
+            raise InvalidCommandError(
+                f"no simulated IMU of driver {driver!r}; there are: {', '.join(IMU_FAMILIES)}"
+            )
+    if options.mocap is not None and options.mocap not in MOCAP_FAMILIES:
+        raise InvalidCommandError(
+            f"no simulated cameras of driver {options.mocap!r}; there are: "
+            f"{', '.join(MOCAP_FAMILIES)}"
+        )
+
+
+def _create_cameras(
+    options: SceneOptions, place: CameraPlace
+) -> tuple[MocapServer | None, list[str]]:
+    """Return the motion-capture server and the lines of its table in rig.toml."""
+    if options.mocap is None:
+        return None, []
+    family = MOCAP_FAMILIES[options.mocap]
+    server, lines = family.create(place)
+    sync = ["sync_line = 0"] if options.sync_line and family.sync_line else []
+    return server, ["[mocap]", f'driver = "{options.mocap}"', *lines, *sync]
 
 
 def _marker(cameras: Cameras, name: str) -> str:

@@ -1,0 +1,138 @@
+"""Families of IMUs that a scene can create, by the name of their driver.
+
+A new family is one function and one entry of `IMU_FAMILIES`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from jointfit_protocols.xbus.configuration import SyncSetting
+from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_protocols.xbus.sync_lines import IN1, Polarity, SyncFunction
+from jointfit_protocols.xcdi import XcdiIds
+from jointfit_simulators.devices import (
+    XbusDevice,
+    XbusDeviceOptions,
+    XcdiDevice,
+    XcdiDeviceOptions,
+)
+from jointfit_simulators.wires import line_noise
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from jointfit_simulators.scene._streams import SceneImuDevice
+    from jointfit_simulators.settings import Knobs
+    from jointfit_simulators.wires import CanWire
+
+BUS = "can0"
+"""Name of the CAN bus in rig.toml and in commands."""
+_EVERY_MESSAGE = 0xFFFF
+"""Output rate of items in every message."""
+_SKIPPED_EDGES = 11
+"""Exposures without a reported sync edge in between: ten edges per second at 120 Hz."""
+_SYNC = (SyncSetting(SyncFunction.TRIGGER_INDICATION, IN1, Polarity.RISING, 0, 0, _SKIPPED_EDGES),)
+_SYNC_TOML = (
+    f'sync = [{{ function = "trigger_indication", line = "in1", skip_factor = {_SKIPPED_EDGES} }}]'
+)
+_ID_BLOCK = 0x100
+"""Number of CAN identifiers for each sensor."""
+_WIDE_BLOCKS = 7
+"""Largest number of sensors whose blocks have 11-bit identifiers."""
+_NARROW_BLOCK = 0x40
+"""Number of CAN identifiers for each of more sensors."""
+
+
+@dataclass(frozen=True, slots=True)
+class SensorPlace:
+    """Where a scene connects one sensor."""
+
+    knobs: Knobs
+    """Error magnitudes and sample rate."""
+    name: str
+    """Id of the sensor."""
+    number: int
+    """Number of the sensor in the scene, from 1."""
+    sensors: int
+    """Number of sensors in the scene."""
+    sync_line: bool
+    """Whether a sync line is connected, whose edges the device reports if it can."""
+
+    @property
+    def first_can_id(self) -> int:
+        """First of the 11-bit CAN identifiers that belong to this sensor, at least 64."""
+        return (_ID_BLOCK if self.sensors <= _WIDE_BLOCKS else _NARROW_BLOCK) * self.number
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectedImu:
+    """A device, and how rig.toml describes it."""
+
+    device: SceneImuDevice
+    keys: list[str]
+    """Lines of its ``[[imu]]`` table, without id, segment, driver and rate_hz."""
+    label: str
+    """Its port, or its bus and identifier."""
+
+
+@dataclass(frozen=True, slots=True)
+class UartFamily:
+    """Devices of one driver, each on a pty of its own."""
+
+    create: Callable[[SensorPlace, Path], ConnectedImu]
+    """Return the device whose pty is linked at the path."""
+
+
+@dataclass(frozen=True, slots=True)
+class CanFamily:
+    """Devices of one driver, all on the CAN bus of the scene."""
+
+    create: Callable[[SensorPlace, CanWire], ConnectedImu]
+    """Return a device on the bus."""
+
+
+def _xbus(place: SensorPlace, port: Path) -> ConnectedImu:
+    sync = _SYNC if place.sync_line else ()
+    outputs = (
+        (Item.PACKET_COUNTER, _EVERY_MESSAGE),
+        (Item.SAMPLE_TIME_FINE, _EVERY_MESSAGE),
+        (Item.STATUS_WORD, _EVERY_MESSAGE),
+        (Item.QUATERNION, round(place.knobs.rate_hz)),
+        *(((Item.TRIGGER_IN1, _EVERY_MESSAGE),) if sync else ()),
+    )
+    device = XbusDevice(
+        port,
+        options=XbusDeviceOptions(
+            device_id=bytes([0x03, 0x60, 0xA1, *place.name.encode()[-1:]]),
+            outputs=outputs,
+            sync=sync,
+        ),
+        wire_noise=line_noise(place.knobs, place.name),
+    )
+    keys = [f'port = "{port}"', "baud = 921600", *([_SYNC_TOML] if sync else [])]
+    return ConnectedImu(device, keys, str(port))
+
+
+def _xcdi(place: SensorPlace, bus: CanWire) -> ConnectedImu:
+    first = place.first_can_id
+    ids = XcdiIds(first + 0x05, first + 0x06, first + 0x21, status_word=None, error=None)
+    device = XcdiDevice(bus, XcdiDeviceOptions(ids=ids, rate_hz=place.knobs.rate_hz))
+    return ConnectedImu(device, [f'can = "{BUS}"', ids_toml(ids)], f"{BUS}:{ids.quaternion:#05x}")
+
+
+def ids_toml(ids: XcdiIds) -> str:
+    """Return the line of rig.toml with the CAN identifiers of a sensor."""
+    return (
+        f"ids = {{ sample_time = {ids.sample_time:#05x}, group_counter = {ids.group_counter:#05x},"
+        f" quaternion = {ids.quaternion:#05x} }}"
+    )
+
+
+IMU_FAMILIES: dict[str, UartFamily | CanFamily] = {
+    "xbus": UartFamily(_xbus),
+    "xcdi": CanFamily(_xcdi),
+}
+"""Families by driver."""

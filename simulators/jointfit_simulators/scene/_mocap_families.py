@@ -1,0 +1,131 @@
+"""Families of motion-capture servers that a scene can create, by the name of their driver.
+
+A new family is one function and one entry of `MOCAP_FAMILIES`.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol
+
+from jointfit_simulators.devices import (
+    NS,
+    NatNetServer,
+    NatNetServerOptions,
+    RigidBodyAsset,
+)
+
+if TYPE_CHECKING:
+    import asyncio
+    from collections.abc import Callable, Mapping, Sequence
+
+    from jointfit_simulators.devices import Bodies, Markers, SampleTiming
+    from jointfit_simulators.settings import Knobs
+
+_TAI_MINUS_UTC_S = 37
+
+
+class MocapServer(Protocol):
+    """Virtual motion-capture server on loopback, whose port is open from the start."""
+
+    ready: asyncio.Event
+    """Set while `run` answers."""
+    number: int
+    """Number of the next frame."""
+    command_port: int
+    """Port at which clients connect."""
+
+    @property
+    def sent(self) -> int:
+        """Number of frames sent, summed over clients."""
+
+    def push(self, exposure_host_ns: int, markers: Markers, bodies: Bodies) -> None:
+        """Send one frame now.
+
+        Parameters
+        ----------
+        exposure_host_ns : int
+            Exposure time, host CLOCK_MONOTONIC, ns; independent of the time of sending.
+        markers : mapping of str to (x, y, z) or None
+            World z up, m; None if occluded.
+        bodies : mapping of str to (position, quaternion) or None
+            World z up, m, q_world_body (w, x, y, z); None if untracked.
+        """
+
+    async def run(self) -> None:
+        """Answer until cancelled."""
+
+    def unplug(self) -> None:
+        """Close the port and disconnect all clients."""
+
+    def restart(self) -> None:
+        """Close and open the server; frame numbers restart."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPlace:
+    """What a scene streams through a server."""
+
+    knobs: Knobs
+    """Camera rate and random seed."""
+    clusters: Mapping[str, tuple[str, ...]]
+    """Marker names of each body part."""
+    bodies: Sequence[str]
+    """Tracked rigid bodies; those without markers are last."""
+    timing: SampleTiming
+    """Clock of the server."""
+    ptp: bool
+    """Whether cameras and host are synchronized by PTP, for families that report its time."""
+    command_port: int
+    """Port on loopback at which clients connect; 0 selects a free port."""
+
+    @property
+    def markers_by_body(self) -> dict[str, tuple[str, ...]]:
+        """Markers of each rigid body, without those for bodies that have none of their own."""
+        owned = {part.capitalize(): names for part, names in self.clusters.items()}
+        return owned | {body: () for body in self.bodies if body not in owned}
+
+
+@dataclass(frozen=True, slots=True)
+class MocapFamily:
+    """How a scene creates the server of one driver."""
+
+    create: Callable[[CameraPlace], tuple[MocapServer, list[str]]]
+    """Server, and the lines of the ``[mocap]`` table after its driver."""
+    sync_line: bool = False
+    """Whether ``sync_line`` may be set: its frames tell which exposures cause an edge."""
+
+
+def _natnet(place: CameraPlace) -> tuple[NatNetServer, list[str]]:
+    options = NatNetServerOptions(
+        bodies=tuple(
+            RigidBodyAsset(body, names, number)
+            for number, (body, names) in enumerate(place.markers_by_body.items(), 1)
+        ),
+        command_port=place.command_port,
+        rate_hz=place.knobs.mocap_hz,
+        device_ns=place.timing.device_ns,
+        seed=place.knobs.seed,
+    )
+    if place.ptp:
+        # PTP counts TAI; its offset from the host clock is measured once
+        offset_ns = time.time_ns() - time.monotonic_ns() + _TAI_MINUS_UTC_S * NS
+        options = replace(
+            options, bitstream=(4, 1), precision_ns=lambda host_ns: host_ns + offset_ns
+        )
+
+    server = NatNetServer(options)
+    lines = [
+        'server = "127.0.0.1"',
+        f"command_port = {server.command_port}",
+        f'up_axis = "{options.up_axis}"',
+        *(['time = "ptp"'] if place.ptp else []),
+    ]
+    return server, lines
+
+
+MOCAP_FAMILIES = {
+    "natnet": MocapFamily(_natnet, sync_line=True),
+}
+"""Families by driver."""
