@@ -1,0 +1,175 @@
+"""TCP connections whose data carry their arrival time.
+
+The kernel stamps segments on arrival (SO_TIMESTAMPNS) in CLOCK_REALTIME; `WallClock` converts the
+stamps to CLOCK_MONOTONIC. asyncio's streams do not return ancillary data, so this module reads its
+sockets itself.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import socket
+import struct
+import time
+from typing import NamedTuple
+
+from jointfit_drivers.ports._wall_clock import WallClock
+
+READ_BYTES = 1 << 16
+"""Most bytes of one read."""
+RECEIVE_BUFFER = 1 << 20
+"""Requested receive buffer, bytes: half a second of large frames while the host is busy."""
+IDLE_S, PROBE_S, PROBES = 5, 2, 3
+"""A peer without power or cable is detected after 5 s of silence and three unanswered probes, 2 s
+apart."""
+
+_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
+"""Socket option of the kernel stamps; the same number on x86-64 and ARM."""
+_STAMP = struct.Struct("@ll")
+_ANCILLARY = socket.CMSG_SPACE(_STAMP.size)
+
+
+class Segment(NamedTuple):
+    """Bytes of one read."""
+
+    t_ns: int
+    """CLOCK_MONOTONIC at which the last of them arrived in the kernel, ns."""
+    data: bytes
+
+
+class TcpConnection:
+    """A non-blocking TCP connection whose data carry their arrival time.
+
+    Parameters
+    ----------
+    connected : socket.socket
+        Connected stream socket; closed by `close`.
+    """
+
+    def __init__(self, connected: socket.socket) -> None:
+        self._socket = connected
+        connected.setblocking(False)
+        connected.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
+        connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, IDLE_S)
+        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, PROBE_S)
+        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, PROBES)
+        self._wall = WallClock()
+
+    @classmethod
+    async def open(cls, host: str, port: int, *, local: str, within_s: float) -> TcpConnection:
+        """Connect to a server.
+
+        Parameters
+        ----------
+        host, port : str, int
+            Numeric address and port of the server.
+        local : str
+            Address of this host's network card.
+        within_s : float
+            Longest wait for the answer, s.
+
+        Raises
+        ------
+        OSError
+            The server refuses or cannot be reached; TimeoutError if it does not answer.
+        """
+        opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            opened.setblocking(False)
+            opened.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+            opened.bind((local, 0))
+            async with asyncio.timeout(within_s):
+                await asyncio.get_running_loop().sock_connect(opened, (host, port))
+            return cls(opened)
+        except BaseException:
+            opened.close()
+            raise
+
+    def fileno(self) -> int:
+        """Return the file descriptor, for ``loop.add_reader``."""
+        return self._socket.fileno()
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+    def send(self, data: bytes) -> None:
+        """Send a request.
+
+        Raises
+        ------
+        OSError
+            The connection is lost, or the server does not read.
+        """
+        sent = self._socket.send(data)
+        if sent != len(data):  # requests are short: a full buffer means that nobody reads it
+            raise OSError(errno.ENOBUFS, "the server does not read its requests")
+
+    def receive(self) -> Segment | None:
+        """Return the bytes that have arrived; None if there are none.
+
+        Raises
+        ------
+        OSError
+            The connection is lost; ConnectionResetError also if the server closed it.
+        """
+        self._wall.pair()
+        try:
+            data, ancillary, _, _ = self._socket.recvmsg(READ_BYTES, _ANCILLARY)
+        except BlockingIOError:
+            return None
+        if not data:
+            raise ConnectionResetError(errno.ECONNRESET, "closed by the server")
+
+        now_ns = time.monotonic_ns()
+        for level, kind, value in ancillary:
+            if level == socket.SOL_SOCKET and kind == _TIMESTAMPNS and len(value) == _STAMP.size:
+                seconds, ns = _STAMP.unpack(value)
+                return Segment(self._wall.monotonic(seconds * 10**9 + ns, now_ns), data)
+        return Segment(now_ns, data)
+
+
+class TcpListener:
+    """Waits for one connection from a known host.
+
+    Parameters
+    ----------
+    local : str
+        Address of this host's network card.
+    """
+
+    def __init__(self, local: str) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        try:
+            self._socket.setblocking(False)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+            self._socket.bind((local, 0))
+            self._socket.listen(1)
+        except OSError:
+            self._socket.close()
+            raise
+
+    @property
+    def port(self) -> int:
+        """Port on which it listens."""
+        return int(self._socket.getsockname()[1])
+
+    async def accept(self, host: str, within_s: float) -> TcpConnection | None:
+        """Return the connection from `host`; None if there is none within `within_s`."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(within_s):
+                while True:
+                    loop = asyncio.get_running_loop()
+                    connected, address = await loop.sock_accept(self._socket)
+                    if address[0] == host:
+                        return TcpConnection(connected)
+                    connected.close()
+        return None
+
+    def close(self) -> None:
+        """Stop listening; the accepted connection remains."""
+        self._socket.close()
