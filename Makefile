@@ -44,7 +44,7 @@ test-compiled: compiled  ## the tests of the core, on the compiled modules
 	  tests/pipeline/test_core.py tests/timing/alignment tests/timing/clock tests/drivers/xbus tests/drivers/xcdi tests/packaging/test_variants.py \
 	  -m "not experiment and not system and not alone"
 
-test-cpu: $(STAMP)  ## the numerical tests six times, as on other processors
+test-cpu: $(STAMP)  ## the numerical tests as on other processors (ARGS=--all: all combinations)
 	@$(BIN)/python .ci/cpu_features.py $(ARGS)
 
 test-root:  ## the tests and the demo on a fresh minimal Debian, as a user without root (mmdebstrap; root or sudo)

@@ -1,12 +1,13 @@
 """Run the numerical tests as on other processors: `make test-cpu`.
 
-    .ci/cpu_features.py [PYTEST ARGUMENTS]
+    .ci/cpu_features.py [--all] [PYTEST ARGUMENTS]
 
 Kernels of OpenBLAS and loops of numpy round differently on each processor. A decision that
 depends on last bits shows itself by a test that passes in one of these runs and fails in another.
-Four runs have the kernels (``OPENBLAS_CORETYPE``) and the loops (``NPY_DISABLE_CPU_FEATURES``) of
-one processor, two combine the oldest with the newest. A run that this processor cannot execute is
-skipped with its reason.
+A run has the kernels (``OPENBLAS_CORETYPE``) and the loops (``NPY_DISABLE_CPU_FEATURES``) of one
+processor. The newest one is left out where `make test` runs on it anyway, and one that this
+processor cannot execute is skipped with its reason. After a failure, or with ``--all``, two more
+runs combine the oldest with the newest: they tell whether kernels or loops are the cause.
 
 Exit status: 0 if every run passed, 1 otherwise.
 """
@@ -51,42 +52,55 @@ PROCESSORS = (
     Processor("Haswell", "avx2", 1),
     Processor("Zen", "avx2", 1),
     Processor("SkylakeX", "avx512f", None),
-    Processor("Nehalem", "sse4_2", None),
-    Processor("SkylakeX", "avx512f", 0),
 )
-"""Each kernel and each kind of loop occurs in one of them; the last two are no real processors, but
-show whether kernels or loops cause a difference."""
+"""Each kernel and each kind of loop occurs in one of them."""
+MIXED = (Processor("Nehalem", "sse4_2", None), Processor("SkylakeX", "avx512f", 0))
+"""No real processors: kernels of one, loops of another."""
 
 
 def main(arguments: list[str]) -> int:
     """Run all; print a line for each; return the exit status."""
+    wants_all = "--all" in arguments
+    tests = [word for word in arguments if word != "--all"] or TESTS
     flags = Path("/proc/cpuinfo").read_text(encoding="utf-8").split()
-    steps = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
+
     failed = 0
     for processor in PROCESSORS:
         if processor.flag not in flags:
             print(f"{processor.core_type}: skipped, this one lacks {processor.flag}", flush=True)
-            continue
-        disabled = [] if processor.steps is None else steps[processor.steps :]
-        name = processor.core_type + (f" without {','.join(disabled)}" if disabled else "")
-        began = time.monotonic()
-        command = [
-            sys.executable, "-m", "pytest", "-q", "-n", str(len(os.sched_getaffinity(0))),
-            "--dist", "worksteal", "--part", "parallel",
-            *(arguments or TESTS),
-        ]  # fmt: skip
-        environment = os.environ | {
-            "OPENBLAS_CORETYPE": processor.core_type,
-            "NPY_DISABLE_CPU_FEATURES": ",".join(disabled),
-            "HYPOTHESIS_PROFILE": "few",  # `make test` draws more
-        }
-        status = subprocess.run(  # noqa: S603 - our own command
-            command, check=False, env=environment
-        ).returncode
-        failed += status != 0
-        outcome = "passed" if status == 0 else f"FAILED with {status}"
-        print(f"{name}: {outcome} in {time.monotonic() - began:.0f} s", flush=True)
+        elif processor.steps is None and not wants_all:
+            print(f"{processor.core_type}: this one, on which `make test` runs", flush=True)
+        else:
+            failed += not _passes(processor, tests)
+
+    if failed or wants_all:
+        for processor in MIXED:
+            if processor.flag in flags:
+                failed += not _passes(processor, tests)
     return 1 if failed else 0
+
+
+def _passes(processor: Processor, tests: list[str]) -> bool:
+    """Run the tests as on a processor, and report it; return whether all passed."""
+    steps = [name for name in umath.__cpu_dispatch__ if umath.__cpu_features__[name]]
+    disabled = [] if processor.steps is None else steps[processor.steps :]
+    name = processor.core_type + (f" without {','.join(disabled)}" if disabled else "")
+
+    began = time.monotonic()
+    command = [
+        sys.executable, "-m", "pytest", "-q", "-n", str(len(os.sched_getaffinity(0))),
+        "--dist", "worksteal", "--part", "parallel", *tests,
+    ]  # fmt: skip
+    environment = os.environ | {
+        "OPENBLAS_CORETYPE": processor.core_type,
+        "NPY_DISABLE_CPU_FEATURES": ",".join(disabled),
+        "HYPOTHESIS_PROFILE": "few",  # `make test` draws more
+    }
+    status = subprocess.run(command, check=False, env=environment).returncode  # noqa: S603 - ours
+
+    outcome = "passed" if status == 0 else f"FAILED with {status}"
+    print(f"{name}: {outcome} in {time.monotonic() - began:.0f} s", flush=True)
+    return status == 0
 
 
 if __name__ == "__main__":
