@@ -23,12 +23,18 @@ from jointfit_simulators.devices._natnet_port import LOOPBACK, Address, NatNetPo
 from jointfit_simulators.devices._natnet_server import NatNetServer
 from jointfit_simulators.devices._orientation_sensor import OrientationSensor
 from jointfit_simulators.devices._sensor_faults import SensorFaults
+from jointfit_simulators.devices._witmotion_device import (
+    WITH_QUATERNION,
+    WitMotionDevice,
+    WitMotionDeviceOptions,
+)
 from jointfit_simulators.devices._xbus_device import XbusDevice, XbusDeviceOptions
 from jointfit_simulators.devices._xcdi_device import XcdiDevice, XcdiDeviceOptions
 
 __all__ = [
     "LOOPBACK",
     "NS",
+    "WITH_QUATERNION",
     "Address",
     "Bodies",
     "CameraFrames",
@@ -48,6 +54,8 @@ __all__ = [
     "SensorFaults",
     "SimulatedClock",
     "Vector",
+    "WitMotionDevice",
+    "WitMotionDeviceOptions",
     "XbusDevice",
     "XbusDeviceOptions",
     "XcdiDevice",
