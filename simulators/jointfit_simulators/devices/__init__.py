@@ -8,6 +8,7 @@ from jointfit_simulators.devices._clocks import (
     SampleTiming,
     SimulatedClock,
 )
+from jointfit_simulators.devices._mip_device import MipDevice, MipDeviceOptions
 from jointfit_simulators.devices._natnet_frames import (
     Bodies,
     FrameStamps,
@@ -42,6 +43,8 @@ __all__ = [
     "ClockFault",
     "FrameStamps",
     "Markers",
+    "MipDevice",
+    "MipDeviceOptions",
     "NatNetFrameBuilder",
     "NatNetPort",
     "NatNetServer",
