@@ -17,7 +17,8 @@ from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClosed, SourceOpened
 from jointfit_daemon.pipeline.sources import SourceState
 from jointfit_drivers.natnet._open_requests import OpenRequests
-from jointfit_drivers.witmotion import WitMotionImu, WitMotionSettings
+from jointfit_drivers.qtm import QtmDecoder, QtmSettings
+from jointfit_protocols import qtm
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
 from jointfit_protocols.can.slcan import SlcanCodec
 from jointfit_protocols.can.slcan import encode_frame as encode_slcan
@@ -25,12 +26,12 @@ from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet import HEADER, Bare, NatNetMessageId, decode
 from jointfit_protocols.natnet import encode as encode_natnet
 from jointfit_protocols.natnet._frame_encode import encode_frame
-from jointfit_protocols.witmotion import FRAME_BYTES, WitMotionCodec, WitMotionFrame
-from jointfit_protocols.witmotion import encode as encode_witmotion
 from jointfit_protocols.xbus import XbusCodec, XbusMessage
 from jointfit_protocols.xbus import encode as encode_xbus
 from jointfit_protocols.xbus._framing import MAX_DATA
 from tests.drivers.natnet.feeder import INFO, MODEL, frame, marker
+from tests.drivers.qtm.feeder import frame as qtm_frame
+from tests.drivers.qtm.feeder import xml as qtm_xml
 from tests.fuzz.target import Target, UnaccountedError
 from tests.pipeline.core_feed import (
     BEGIN_NS,
@@ -176,37 +177,6 @@ def seeds_xbus_records() -> list[bytes]:
     return [packed, packed + b"".join(kinds), b"".join(kinds)]
 
 
-def run_witmotion_bytes(data: bytes) -> None:
-    """Decode WitMotion bytes in pieces; every byte belongs to a frame or is counted."""
-    codec, found = WitMotionCodec(), []
-    for piece in cut(data):
-        found += codec.feed(piece)
-    found += codec.flush()
-    used = sum(
-        FRAME_BYTES if isinstance(item, WitMotionFrame) else item.discarded for item in found
-    )
-    if used != len(data):
-        raise UnaccountedError(f"{len(data)} bytes, {used} in frames or discarded")
-
-    for driver in (WitMotionImu(_witmotion()), WitMotionImu(_witmotion(device_time=True))):
-        decoder = driver.decoder()
-        for number, piece in enumerate(cut(data)):
-            decoder.feed(Chunk(BEGIN_NS + number * _MS, piece))
-        decoder.flush()
-
-
-def _witmotion(**more: bool) -> WitMotionSettings:
-    return WitMotionSettings.model_validate(
-        {"id": "S1", "segment": "thigh", "driver": "witmotion", "port": "p", **more}
-    )
-
-
-def seeds_witmotion() -> list[bytes]:
-    """Return frames of all kinds, and of the variant 55 61."""
-    frames = [encode_witmotion(kind, bytes(range(8))) for kind in range(0x50, 0x60)]
-    return [b"".join(frames), frames[9] * 3, (b"\x55\x61" + bytes(18)) * 4]
-
-
 def run_slcan(data: bytes) -> None:
     """Decode the bytes of an SLCAN adapter in pieces, then its frames through the core."""
     decoder = SlcanCodec(115_200)
@@ -329,17 +299,59 @@ def seeds_natnet_core() -> list[bytes]:
     return [b"".join(packed), *packed]
 
 
+# --- packets of QTM ---------------------------------------------------------------------------
+
+
+def run_qtm_stream(data: bytes) -> None:
+    """Split a stream of QTM in packets; every byte belongs to a packet or is counted."""
+    stream = qtm.QtmStream()
+    found: list[bytes | CorruptBytes] = []
+    for piece in cut(data):
+        found += stream.feed(piece)
+    found += stream.flush()
+    used = sum(item.discarded if isinstance(item, CorruptBytes) else len(item) for item in found)
+    if used != len(data):
+        raise UnaccountedError(f"{len(data)} bytes, {used} in packets or discarded")
+
+
+def run_qtm_decoder(data: bytes) -> None:
+    """Put records of 16-bit length into packets and take them through the decoder of QTM."""
+    decoder = QtmDecoder(QtmSettings(driver="qtm", server="x"))
+    at = 0
+    for packet in seeds_qtm()[:1]:
+        decoder.feed(Chunk(BEGIN_NS, packet))
+    while at + 3 <= len(data):
+        kind, size = struct.unpack_from("<BH", data, at)
+        payload = data[at + 3 : at + 3 + size]
+        packet = qtm.HEADER.pack(qtm.HEADER.size + len(payload), kind) + payload
+        decoder.feed(Chunk(BEGIN_NS + at, packet))
+        at += 3 + size
+
+
+def seeds_qtm() -> list[bytes]:
+    """Return settings and frames of QTM."""
+    settings = qtm.encode(qtm.SettingsReply(qtm_xml()))
+    return [settings, *(qtm.encode(qtm_frame(n)) for n in (1, 2, 5))]
+
+
+def seeds_qtm_records() -> list[bytes]:
+    """Return a session of QTM as records."""
+    packed = [struct.pack("<BH", data[4], len(data) - 8) + data[8:] for data in seeds_qtm()]
+    return [b"".join(packed), *packed]
+
+
 TARGETS = (
     Target("xbus-bytes", run_xbus_bytes, seeds_xbus, share=40),
     Target("xbus-source", run_xbus_source, seeds_xbus_records, share=4),
     Target("xbus-core", run_xbus_core, seeds_xbus_records, share=1),
     Target("serial-core", run_serial_core, seeds_xbus, share=1),
     Target("slcan-source", run_slcan, seeds_slcan, share=4),
-    Target("witmotion-bytes", run_witmotion_bytes, seeds_witmotion, share=4),
     Target("can-records", run_can_records, seeds_can_records, share=3),
     Target("can-source", run_can_source, seeds_can_core, share=4),
     Target("can-core", run_can_core, seeds_can_core, share=1),
     Target("natnet-codec", run_natnet_codec, seeds_natnet, share=30, longest=1500),
     Target("natnet-source", run_natnet_source, seeds_natnet_core, share=2, longest=1500),
     Target("natnet-core", run_natnet_core, seeds_natnet_core, share=1, longest=1500),
+    Target("qtm-stream", run_qtm_stream, seeds_qtm, share=10, longest=1500),
+    Target("qtm-decoder", run_qtm_decoder, seeds_qtm_records, share=4, longest=1500),
 )

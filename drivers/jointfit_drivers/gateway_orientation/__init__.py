@@ -14,7 +14,6 @@ from jointfit_drivers.gateway_orientation._filter import (
     turned_field,
 )
 from jointfit_drivers.gateway_orientation._raw_samples import RawSamples, RawStamp
-from jointfit_drivers.gateway_orientation._settings import GatewaySettings
 
 __all__ = [
     "LONGEST_SETTLE_S",
@@ -24,7 +23,6 @@ __all__ = [
     "FilterState",
     "FilterStep",
     "GatewayOrientation",
-    "GatewaySettings",
     "RawReading",
     "RawSamples",
     "RawStamp",

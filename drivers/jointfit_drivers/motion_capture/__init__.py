@@ -10,8 +10,10 @@ from jointfit_drivers.motion_capture._binding import (
     wanted_names,
 )
 from jointfit_drivers.motion_capture._continuity import FrameContinuity, FrameStep
+from jointfit_drivers.motion_capture._reception import CHECK, Reception, content_findings
 from jointfit_drivers.motion_capture._route import Route, find_route
 from jointfit_drivers.motion_capture._settings import ServerSettings
+from jointfit_drivers.motion_capture._tcp_link import TcpLink
 from jointfit_drivers.motion_capture._world import (
     ABSENT,
     FARTHEST_M,
@@ -28,6 +30,7 @@ from jointfit_drivers.motion_capture._world import (
 
 __all__ = [
     "ABSENT",
+    "CHECK",
     "FARTHEST_M",
     "MOST_NAMED",
     "NORM_TOLERANCE",
@@ -38,11 +41,14 @@ __all__ = [
     "FrameContinuity",
     "FrameStep",
     "ModelEntry",
+    "Reception",
     "Route",
     "ServerSettings",
+    "TcpLink",
     "UpAxis",
     "bind_columns",
     "binding_events",
+    "content_findings",
     "find_route",
     "is_near",
     "matrix_quaternion",

@@ -8,7 +8,6 @@ from jointfit_simulators.devices._clocks import (
     SampleTiming,
     SimulatedClock,
 )
-from jointfit_simulators.devices._mip_device import MipDevice, MipDeviceOptions
 from jointfit_simulators.devices._natnet_frames import (
     Bodies,
     FrameStamps,
@@ -23,19 +22,15 @@ from jointfit_simulators.devices._natnet_options import NatNetServerOptions
 from jointfit_simulators.devices._natnet_port import LOOPBACK, Address, NatNetPort
 from jointfit_simulators.devices._natnet_server import NatNetServer
 from jointfit_simulators.devices._orientation_sensor import OrientationSensor
+from jointfit_simulators.devices._qtm_server import QtmServer, QtmServerOptions
 from jointfit_simulators.devices._sensor_faults import SensorFaults
-from jointfit_simulators.devices._witmotion_device import (
-    WITH_QUATERNION,
-    WitMotionDevice,
-    WitMotionDeviceOptions,
-)
+from jointfit_simulators.devices._tcp_port import TcpClient, TcpPort, TextServer
 from jointfit_simulators.devices._xbus_device import XbusDevice, XbusDeviceOptions
 from jointfit_simulators.devices._xcdi_device import XcdiDevice, XcdiDeviceOptions
 
 __all__ = [
     "LOOPBACK",
     "NS",
-    "WITH_QUATERNION",
     "Address",
     "Bodies",
     "CameraFrames",
@@ -43,8 +38,6 @@ __all__ = [
     "ClockFault",
     "FrameStamps",
     "Markers",
-    "MipDevice",
-    "MipDeviceOptions",
     "NatNetFrameBuilder",
     "NatNetPort",
     "NatNetServer",
@@ -52,13 +45,16 @@ __all__ = [
     "OrientationSensor",
     "PlannedSamples",
     "Pose",
+    "QtmServer",
+    "QtmServerOptions",
     "RigidBodyAsset",
     "SampleTiming",
     "SensorFaults",
     "SimulatedClock",
+    "TcpClient",
+    "TcpPort",
+    "TextServer",
     "Vector",
-    "WitMotionDevice",
-    "WitMotionDeviceOptions",
     "XbusDevice",
     "XbusDeviceOptions",
     "XcdiDevice",

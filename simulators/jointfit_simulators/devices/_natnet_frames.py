@@ -85,6 +85,11 @@ class FrameStamps:
     params: int
 
 
+def axes_from_z_up(up_axis: Axis) -> tuple[Callable[..., Vector], Callable[..., Quaternion]]:
+    """Return the conversion of positions and orientations from z up to a server's up axis."""
+    return _AXES[up_axis]
+
+
 def model_definition(bodies: tuple[RigidBodyAsset, ...], version: Version) -> ModelDefinition:
     """Return the descriptions of `bodies` in the order of Motive.
 
@@ -118,7 +123,7 @@ class NatNetFrameBuilder:
     def __init__(self, bodies: tuple[RigidBodyAsset, ...], up_axis: Axis, hiding: Hiding) -> None:
         self.bodies = bodies
         self._filled = hiding == "filled"
-        self._place, self._turn = _AXES[up_axis]
+        self._place, self._turn = axes_from_z_up(up_axis)
         self._poses: dict[str, Pose] = {}
         self._markers: dict[str, Vector] = {}
 

@@ -13,6 +13,8 @@ from jointfit_simulators.devices import (
     NS,
     NatNetServer,
     NatNetServerOptions,
+    QtmServer,
+    QtmServerOptions,
     RigidBodyAsset,
 )
 
@@ -125,7 +127,24 @@ def _natnet(place: CameraPlace) -> tuple[NatNetServer, list[str]]:
     return server, lines
 
 
+def _qtm(place: CameraPlace) -> tuple[QtmServer, list[str]]:
+    server = QtmServer(
+        QtmServerOptions(
+            bodies=tuple(
+                RigidBodyAsset(body, names, number)
+                for number, (body, names) in enumerate(place.markers_by_body.items(), 1)
+            ),
+            command_port=place.command_port,
+            rate_hz=place.knobs.mocap_hz,
+            device_ns=place.timing.device_ns,
+            seed=place.knobs.seed,
+        )
+    )
+    return server, ['server = "127.0.0.1"', f"command_port = {server.command_port}"]
+
+
 MOCAP_FAMILIES = {
     "natnet": MocapFamily(_natnet, sync_line=True),
+    "qtm": MocapFamily(_qtm),
 }
 """Families by driver."""

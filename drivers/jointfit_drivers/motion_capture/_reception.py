@@ -1,0 +1,132 @@
+"""Reception of frames for a diagnosis, and findings about their content."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.device_search import Finding
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.model import DeviceEvent, MocapFrame
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Coroutine
+    from typing import Any
+
+    from jointfit_daemon.driver import Decoder, Emit, MocapSettings
+    from jointfit_daemon.model import Chunk
+
+    Connect = Callable[[Emit], Coroutine[Any, Any, None]]
+
+CHECK = "mocap"
+"""Subject of the findings."""
+FRAMES_S = 1.0
+"""Time to receive after the first frame, s."""
+
+
+class Reception:
+    """Everything that a server sent, decoded.
+
+    Parameters
+    ----------
+    decoder : Decoder
+        A new decoder.
+    connect : callable
+        Connects as the driver does, and passes every chunk to its argument.
+    """
+
+    def __init__(self, decoder: Decoder, connect: Connect) -> None:
+        self._decoder = decoder
+        self._connect = connect
+        self.events: list[DeviceEvent] = []
+        self.frames: list[MocapFrame] = []
+        self.failure: DeviceLostError | DeviceMisconfiguredError | None = None
+        """Error that ended the connection."""
+        self._arrived = asyncio.Event()
+
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings of the decoder, each once."""
+        texts = [event.text for event in self.events if event.kind in ("warning", "error")]
+        return list(dict.fromkeys(texts))
+
+    @property
+    def facts(self) -> dict[str, object]:
+        """Description of the server."""
+        found: dict[str, object] = {}
+        for event in self.events:
+            found |= event.data if event.kind == "info" else {}
+        return found
+
+    async def receive(self, limit_s: float) -> None:
+        """Receive until `FRAMES_S` after the first frame, at most for `limit_s`."""
+        running = asyncio.create_task(self._connect(self._take), name="diagnosis")
+        first = asyncio.create_task(self._arrived.wait(), name="first frame")
+        try:
+            await asyncio.wait(
+                {running, first}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED
+            )
+            if self.frames:
+                await asyncio.sleep(FRAMES_S)
+        finally:
+            running.cancel()
+            first.cancel()
+            await asyncio.wait({running, first})
+        error = None if running.cancelled() else running.exception()
+        if isinstance(error, DeviceLostError | DeviceMisconfiguredError):
+            self.failure = error
+        elif error is not None:
+            raise error
+
+    def _take(self, chunk: Chunk) -> None:
+        for item in self._decoder.feed(chunk):
+            if isinstance(item, MocapFrame):
+                self.frames.append(item)
+                self._arrived.set()
+            elif isinstance(item, DeviceEvent):
+                self.events.append(item)
+
+
+def content_findings(
+    settings: MocapSettings, reception: Reception, name: str, remedy: str
+) -> list[Finding]:
+    """Return the findings about the content of a stream of frames.
+
+    Parameters
+    ----------
+    settings : MocapSettings
+        The ``[mocap]`` table.
+    reception : Reception
+        At least one frame.
+    name : str
+        Name of the server.
+    remedy : str
+        Where the camera software selects the streamed markers and bodies.
+    """
+    frames = reception.frames
+    layout = frames[-1].layout
+    findings = [
+        Finding(CHECK, name, "warning", text, "correct [mocap], or the camera software")
+        for text in reception.warnings
+    ]
+    if not layout.bodies and not layout.markers:
+        text = "the stream has no rigid body and no labeled marker"
+        findings.append(Finding(CHECK, name, "error", text, remedy))
+    if not frames[-1].live:
+        text = "the frames are those of a recording, not of the cameras"
+        findings.append(Finding(CHECK, name, "warning", text, "switch to live measurement"))
+
+    for segment, body in settings.rigid_body.items():
+        if body in layout.bodies:
+            column = layout.bodies.index(body)
+            if all(np.isnan(frame.body_positions[column]).any() for frame in frames):
+                text = f"rigid body {body!r} of {segment} was not tracked in {len(frames)} frames"
+                remedy = "put it in view of the cameras, and check its definition"
+                findings.append(Finding(CHECK, name, "warning", text, remedy))
+
+    span_s = (frames[-1].arrival_ns - frames[0].arrival_ns) / 1e9
+    rate = f"{(len(frames) - 1) / span_s:.0f} frames a second, " if span_s > 0 else ""
+    content = f"{rate}{len(layout.bodies)} rigid bodies, {len(layout.markers)} markers"
+    return findings or [Finding(CHECK, name, "ok", content)]

@@ -1,0 +1,81 @@
+"""Order of the frames of one QTM server, by their time stamps.
+
+Frame numbers are not trusted: they can stay at 1 in live preview, and the real-time rate can be a
+part of the camera rate. Losses are counted in units of the usual step of the number.
+
+Invariant: pure. A stamp that decreases by more than reordering explains is a restart: each
+measurement, and each loop of a recording, begins at 0.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from jointfit_drivers.motion_capture import FrameStep
+
+_REORDERED_US = 200_000
+"""Largest decrease of the stamp in a reordered datagram, µs."""
+_LATE_RUN = 10
+"""Consecutive late frames that are no reordering but a short loop of a recording."""
+_STEPS = 20
+"""Last steps of the frame number, the smallest of which is the usual one."""
+_MOST_LOST = 100_000
+"""Largest plausible loss, frames: more is due to a number that jumped."""
+
+_NEXT, _DROP, _RESTART = FrameStep(), FrameStep(use=False), FrameStep(restarted=True)
+
+
+class TimestampContinuity:
+    """Classifies each frame by its time stamp."""
+
+    def __init__(self) -> None:
+        self._stamp_us: int | None = None
+        self._number = 0
+        self.number = 0
+        """Number of the last accepted frame, which advances even if that of QTM does not."""
+        self._late_run = 0
+        self._steps: deque[int] = deque(maxlen=_STEPS)
+        self._intervals_us: deque[int] = deque(maxlen=_STEPS)
+        self.duplicates = 0
+        """Frames dropped because their stamp was that of the last one."""
+        self.late = 0
+        """Frames dropped because a later one had arrived."""
+
+    @property
+    def began(self) -> bool:
+        """Whether there was a frame since the start."""
+        return self._stamp_us is not None
+
+    def forget(self) -> None:
+        """Start again with the next frame."""
+        self._stamp_us = None
+        self._steps.clear()
+        self._intervals_us.clear()
+
+    def frame(self, stamp_us: int, number: int) -> FrameStep:
+        """Return the step for one frame, from its stamp, µs, and its number."""
+        before, step = self._stamp_us, _NEXT
+        advanced = number - self._number
+        if before is None:
+            self.number = number
+        elif stamp_us == before:
+            self.duplicates += 1
+            return _DROP
+        elif stamp_us < before:
+            self._late_run += 1
+            if before - stamp_us < _REORDERED_US and self._late_run < _LATE_RUN:
+                self.late += 1
+                return _DROP
+            self.forget()
+            self.number, step = number, _RESTART
+        elif advanced > 0:
+            self._steps.append(advanced)
+            self.number += advanced
+            lost = advanced // min(self._steps) - 1
+            step = FrameStep(lost=lost) if 0 < lost < _MOST_LOST else _NEXT
+        else:
+            interval_us = stamp_us - before
+            self._intervals_us.append(interval_us)
+            self.number += max(1, round(interval_us / min(self._intervals_us)))
+        self._stamp_us, self._number, self._late_run = stamp_us, number, 0
+        return step

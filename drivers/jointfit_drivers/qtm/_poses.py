@@ -1,0 +1,127 @@
+"""Conversion of the components of one QTM frame to columns: SI units, world z up, NaN if missing.
+
+Positions are millimetres, rotation matrices column-major. All bits of the numbers of a missing
+marker or body are set; every position that is not finite counts as missing.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_drivers.motion_capture import (
+    ABSENT,
+    FARTHEST_M,
+    is_near,
+    matrix_quaternion,
+    rows_array,
+    unit_quaternion,
+    world_rotation,
+)
+from jointfit_drivers.qtm._binding import segment_key
+from jointfit_protocols.qtm import ComponentType, ItemsComponent, SkeletonComponent
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.model import Quaternion, Vector
+    from jointfit_drivers.qtm._binding import QtmBinding
+    from jointfit_protocols.qtm import Component
+
+_MM = 1e-3
+_ROTATION = slice(3, 12)
+
+
+class QtmColumns(NamedTuple):
+    """Arrays of one `MocapFrame`."""
+
+    markers: Array
+    body_positions: Array
+    body_orientations: Array
+    suspicious: int
+    """Bodies with a position whose rotation is none."""
+
+
+class QtmPoseConverter:
+    """Converts frames of one server to columns.
+
+    Parameters
+    ----------
+    up_axis : UpAxis
+        The stream's axis that points up.
+    """
+
+    def __init__(self, up_axis: str) -> None:
+        self._place, self._turn = world_rotation(up_axis)
+        units = [self._place(*axis) for axis in np.eye(3).tolist()]
+        self._rotation = np.array(units)
+
+    def columns(
+        self, components: Mapping[int, Component], binding: QtmBinding
+    ) -> QtmColumns | None:
+        """Return the frame in the columns of `binding`; None if it does not fit the settings."""
+        markers = components.get(ComponentType.MARKERS_RESIDUAL)
+        count = len(markers.items) if isinstance(markers, ItemsComponent) else None
+        if count is not None and count != binding.labels:
+            return None
+
+        poses: dict[int, tuple[Vector, Quaternion]] = {}
+        suspicious = 0
+        bodies = components.get(ComponentType.BODIES_RESIDUAL)
+        if isinstance(bodies, ItemsComponent):
+            places = binding.body_places(len(bodies.items))
+            if places is None:
+                return None
+            for place, item in zip(places, bodies.items, strict=True):
+                x, y, z = item[0] * _MM, item[1] * _MM, item[2] * _MM
+                if not is_near(x, y, z):
+                    continue
+                r = item[_ROTATION]  # column-major
+                q = matrix_quaternion((r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
+                if q is None:
+                    suspicious += 1
+                else:
+                    poses[place] = self._place(x, y, z), self._turn(*q)
+
+        skeletons = components.get(ComponentType.SKELETON)
+        if isinstance(skeletons, SkeletonComponent):
+            if len(skeletons.skeletons) != binding.skeletons:
+                return None
+            suspicious += self._segments(skeletons, poses)
+
+        rows = [poses.get(key, ABSENT) for key in binding.body_keys]
+        items = markers.items if isinstance(markers, ItemsComponent) else ()
+        return QtmColumns(
+            self._markers(items, binding.marker_places),
+            rows_array([place for place, _ in rows], 3),
+            rows_array([turn for _, turn in rows], 4),
+            suspicious,
+        )
+
+    def _markers(self, items: tuple[tuple[float, ...], ...], keys: Sequence[int]) -> Array:
+        if not items:
+            return np.full((len(keys), 3), np.nan)
+        found = np.array(items, dtype=np.float64)[:, :3] * _MM
+        found[~(np.abs(found) <= FARTHEST_M).all(axis=1)] = np.nan
+        columns: Array = found[keys] @ self._rotation
+        return columns
+
+    def _segments(
+        self, component: SkeletonComponent, poses: dict[int, tuple[Vector, Quaternion]]
+    ) -> int:
+        """Add the segments of skeletons to `poses`; return the number of suspicious ones."""
+        suspicious = 0
+        for number, segments in enumerate(component.skeletons):
+            for segment in segments:
+                x, y, z = segment.x * _MM, segment.y * _MM, segment.z * _MM
+                if not is_near(x, y, z):
+                    continue
+                q = unit_quaternion(segment.qw, segment.qx, segment.qy, segment.qz)
+                if q is None:
+                    suspicious += 1
+                else:
+                    key = segment_key(number, segment.id)
+                    poses[key] = self._place(x, y, z), self._turn(*q)
+        return suspicious

@@ -1,0 +1,155 @@
+"""Search for QTM servers: discovery in a network by UDP, connection to a named host by TCP.
+
+A named host is also asked for its settings, so that the names of its rigid bodies and markers are
+known.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from typing_extensions import override
+
+from jointfit_daemon.device_search import FoundServer
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.motion_capture import Route, find_route
+from jointfit_drivers.ports.network_cards import network_cards
+from jointfit_drivers.qtm._binding import bind_settings
+from jointfit_drivers.qtm._session import QtmSession
+from jointfit_drivers.qtm._settings import PORT, QtmSettings
+from jointfit_protocols import qtm
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.model import Chunk
+
+DISCOVERY_PORT = 22226
+"""UDP port at which QTM answers to discovery."""
+_TRIES = 3
+"""Requests to a network, because a datagram may be lost."""
+_LOOPBACK = "127.0.0.1"
+
+
+class _Announcements(asyncio.DatagramProtocol):
+    """Answers at one local address, by the server that sent them."""
+
+    def __init__(self) -> None:
+        self.servers: dict[str, qtm.ServerAnnouncement] = {}
+
+    @override
+    def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+        found = qtm.decode_announcement(data)
+        if isinstance(found, qtm.ServerAnnouncement):
+            self.servers[addr[0]] = found
+
+    @override
+    def error_received(self, exc: Exception) -> None:
+        """Ignore refusals: the host does not answer."""
+
+
+async def find_servers(
+    hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
+) -> list[FoundServer]:
+    """Return the QTM servers that answer; see `ServerSearch.find_servers`."""
+    tables = []
+    for host in hosts:
+        settings = QtmSettings(
+            driver="qtm", server=host, command_port=port or PORT, transport="tcp"
+        )
+        try:
+            tables.append((settings, await find_route("QTM", settings)))
+        except DeviceLostError as error:
+            raise OSError(str(error)) from None
+
+    networks: list[tuple[str, str]] = []
+    if broadcast:
+        cards = [(card.address, card.broadcast) for card in network_cards()]
+        networks = [(_LOOPBACK, _LOOPBACK), *((local, to) for local, to in cards if to is not None)]
+
+    async with asyncio.TaskGroup() as group:
+        named = [group.create_task(_ask_host(*table, wait_s)) for table in tables]
+        searched = [group.create_task(_ask_network(*network, wait_s)) for network in networks]
+    # A named host also answers the broadcast; the first answer has its names.
+    found = [server for task in (*named, *searched) for server in task.result()]
+    unique = {(server.server, server.port): server for server in reversed(found)}
+    return sorted(unique.values(), key=lambda server: (server.server, server.port))
+
+
+async def _ask_host(settings: QtmSettings, route: Route, wait_s: float) -> list[FoundServer]:
+    """Return the server at an address with the names in its settings; empty without an answer."""
+    described = asyncio.Event()
+    found: list[qtm.QtmSettingsXml] = []
+
+    def take(chunk: Chunk) -> None:
+        message = qtm.decode(chunk.data)
+        if isinstance(message, qtm.SettingsReply):
+            settings_xml = qtm.parse_settings(message.xml)
+            found.extend([settings_xml] if settings_xml is not None else [])
+            described.set()
+
+    session = QtmSession(settings, route, take)
+    running = asyncio.create_task(session.run(), name="qtm search")
+    waiting = asyncio.create_task(described.wait(), name="qtm settings")
+    try:
+        await asyncio.wait({running, waiting}, timeout=wait_s, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        running.cancel()
+        waiting.cancel()
+        await asyncio.wait({running, waiting})
+    error = None if running.cancelled() else running.exception()
+    if error is not None and not isinstance(error, DeviceLostError | DeviceMisconfiguredError):
+        raise error
+    if session.version is None:
+        return []
+
+    layout = bind_settings(found[-1], {}, {}).columns.layout if found else None
+    return [
+        FoundServer(
+            driver="qtm",
+            server=route.host,
+            port=settings.command_port,
+            interface=route.local,
+            application="QTM",
+            version="",
+            protocol=f"QTM RT {session.version}",
+            transport="unicast",
+            bodies=() if layout is None else layout.bodies,
+            markers=() if layout is None else layout.markers,
+        )
+    ]
+
+
+async def _ask_network(local: str, address: str, wait_s: float) -> list[FoundServer]:
+    """Return the servers in the network of one card."""
+    loop = asyncio.get_running_loop()
+    transport, answers = await loop.create_datagram_endpoint(
+        _Announcements, local_addr=(local, 0), allow_broadcast=True
+    )
+    try:
+        port = transport.get_extra_info("sockname")[1]
+        for _ in range(_TRIES):
+            transport.sendto(qtm.encode(qtm.Discover(port)), (address, DISCOVERY_PORT))
+            await asyncio.sleep(wait_s / _TRIES)
+    finally:
+        transport.close()
+
+    found = []
+    for host, announced in answers.servers.items():
+        # ``HOST, QTM 2.5 (build 568), 5 cameras``
+        parts = [part.strip() for part in announced.text.split(",")]
+        version = next((part for part in parts if part.startswith("QTM")), "QTM")
+        found.append(
+            FoundServer(
+                driver="qtm",
+                server=host,
+                port=announced.base_port + 1,
+                interface=local,
+                application="QTM",
+                version=version.removeprefix("QTM").strip(),
+                protocol="QTM RT",
+                transport="unicast",
+            )
+        )
+    return found

@@ -1,0 +1,326 @@
+"""One connection to a QTM server, from its greeting to silence.
+
+1. Greeting, then ``Version``, from 1.25 down to 1.19.
+2. ``GetState``, and ``GetParameters`` every second until QTM has parameters.
+3. ``StreamFrames``, which has no answer: frames follow, or "no more data" while QTM waits.
+
+Every packet is emitted, in order of arrival, so that a replay has the same input. The receiver of
+the chunks decodes the frames. This module decodes one frame a second, to check that it fits the
+settings.
+
+Invariant: one command awaits its answer at a time. Events, errors and frames may arrive before it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.model import Chunk
+from jointfit_drivers.motion_capture import TcpLink
+from jointfit_drivers.ports.udp_socket import UdpSocket
+from jointfit_protocols import qtm
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.qtm import ComponentType, PacketType, QtmEvent
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit
+    from jointfit_drivers.motion_capture import Route
+    from jointfit_drivers.ports.tcp_connection import Segment
+    from jointfit_drivers.qtm._settings import QtmSettings
+
+ANSWER_S = 3.0
+"""Longest wait for the answer to a command, s."""
+RETRY_S = 1.0
+"""Interval between requests for parameters, and between checks of a whole frame, s."""
+RESUME_S = 2.0
+"""Time after the start of a measurement without frames, s, before they are requested again."""
+VERSIONS = tuple(f"1.{minor}" for minor in range(25, 18, -1))
+"""Versions of the protocol that the driver requests, the first one preferably."""
+GREETING = "QTM RT Interface connected"
+START = "start QTM, and a new measurement or the preview"
+_DATA_TYPES = {PacketType.DATA, PacketType.NO_MORE_DATA}
+_SETTINGS_EVENTS = {
+    QtmEvent.CAPTURE_STARTED, QtmEvent.CAPTURE_STOPPED, QtmEvent.CALIBRATION_STARTED,
+    QtmEvent.CALIBRATION_STOPPED, QtmEvent.RT_FROM_FILE_STARTED, QtmEvent.RT_FROM_FILE_STOPPED,
+    QtmEvent.CAMERA_SETTINGS_CHANGED,
+}  # fmt: skip
+_STARTING_EVENTS = {QtmEvent.CAPTURE_STARTED, QtmEvent.RT_FROM_FILE_STARTED}
+
+
+class QtmSession:
+    """One connection; after a loss, a new one is made.
+
+    Parameters
+    ----------
+    settings : QtmSettings
+        The ``[mocap]`` table.
+    route : Route
+        Addresses of the server and of this host's network card.
+    emit : Emit
+        Receives every packet of the server.
+    after_silence : bool
+        Whether the last connection ended without frames. The answers of the server are then
+        emitted with the first frame, because a server that only answers is still lost.
+    """
+
+    def __init__(
+        self, settings: QtmSettings, route: Route, emit: Emit, *, after_silence: bool = False
+    ) -> None:
+        self._settings = settings
+        self._route = route
+        self._emit = emit
+        self.silent = after_silence
+        """Whether frames have stopped and none has arrived since, in any connection."""
+        self.version: str | None = None
+        """Version of the protocol in use."""
+        self._name = f"QTM server {settings.server}:{settings.command_port}"
+        self._link = TcpLink(self._name, f"{START}, and check command_port", self._read)
+        self._stream = qtm.QtmStream()
+        self._held: list[Chunk] = []
+        self._answers: list[qtm.Message] = []
+        self._greeted = False
+        self._described: qtm.QtmSettingsXml | None = None
+        self._parameters_wanted = True
+        self._waiting = False
+        self._started_ns: int | None = None
+        self._frame_ns = self._next_check_ns = 0
+
+    async def run(self) -> None:
+        """Connect and read until cancelled; raises the errors of `QtmMocap.run`."""
+        loop = asyncio.get_running_loop()
+        udp: UdpSocket | None = None
+        try:
+            # The data port is bound before QTM is told to send there.
+            if self._settings.transport == "udp":
+                udp = self._open_udp()
+                loop.add_reader(udp, self._read_udp, udp)
+            with self._link as link:
+                await link.open(self._route, self._settings.command_port)
+                await self._greet()
+                await self._negotiate()
+                await self._ask("GetState", qtm.Event)
+                await self._stream_frames(None if udp is None else udp.port)
+        finally:
+            if udp is not None:
+                loop.remove_reader(udp)
+                udp.close()
+
+    def _open_udp(self) -> UdpSocket:
+        port = self._settings.data_port or 0
+        try:
+            return UdpSocket(self._route.local, port, sender=self._route.host)
+        except OSError as error:
+            raise DeviceLostError(
+                f"{self._name}: cannot receive at UDP port {port} ({error.strerror or error}): "
+                "another program uses it; remove data_port"
+            ) from error
+
+    # --- received packets ---------------------------------------------------------------------
+
+    def _read(self, segment: Segment) -> None:
+        for packet in self._stream.feed(segment.data):
+            if isinstance(packet, CorruptBytes):
+                self._link.fail(self._unreadable(segment.data))
+                return
+            self._take(Chunk(segment.t_ns, packet))
+
+    def _unreadable(self, data: bytes) -> Exception:
+        """Return the error for a stream that contains no packets."""
+        if self._greeted:
+            return DeviceLostError(f"{self._name}: invalid packet size: connecting again")
+        port = self._settings.command_port
+        if GREETING.encode() in data:
+            return DeviceMisconfiguredError(
+                f"{self._name}: this port sends big-endian: set command_port = {port - 1}, the "
+                "little-endian one (base port of QTM plus 1)"
+            )
+        return _not_qtm(self._name)
+
+    def _read_udp(self, udp: UdpSocket) -> None:
+        try:
+            for arrival in udp.receive():
+                if arrival.host == self._route.host and _packet_type(arrival.data) in _DATA_TYPES:
+                    self._take(Chunk(arrival.t_ns, arrival.data))
+        except OSError:  # an ICMP refusal: nothing is sent from this socket
+            return
+        except Exception as error:  # noqa: BLE001 - a callback passes its error to the coroutine
+            self._link.fail(error)
+
+    def _take(self, chunk: Chunk) -> None:
+        kind = _packet_type(chunk.data)
+        if kind == PacketType.DATA:
+            self.silent = self._waiting = False
+            self._started_ns = None
+            while self._held:
+                self._emit(self._held.pop(0))
+            self._emit(chunk)
+            self._check_frame(chunk)
+            return
+
+        if self.silent:
+            self._held.append(chunk)
+        else:
+            self._emit(chunk)
+        match qtm.decode(chunk.data):
+            case qtm.NoMoreData():
+                self._waiting = True
+            case qtm.Event(number) as event:
+                self._parameters_wanted |= number in _SETTINGS_EVENTS
+                if number in _STARTING_EVENTS:
+                    self._started_ns = chunk.t_ns
+                self._answers.append(event)
+                if number == QtmEvent.SHUTTING_DOWN:
+                    self._link.fail(DeviceLostError(f"{self._name}: QTM shuts down: {START}"))
+            case qtm.SettingsReply(xml) as reply:
+                self._described = qtm.parse_settings(xml)
+                self._answers.append(reply)
+            case qtm.Command() | qtm.ErrorReply() as reply:
+                self._answers.append(reply)
+            case _:
+                return
+        self._link.wake()
+
+    def _check_frame(self, chunk: Chunk) -> None:
+        """Decode one frame a second; request the settings that it does not fit."""
+        self._frame_ns = chunk.t_ns
+        described = self._described
+        if chunk.t_ns < self._next_check_ns or described is None:
+            return
+        self._next_check_ns = chunk.t_ns + int(RETRY_S * 1e9)
+        frame = qtm.decode(chunk.data)
+        if not isinstance(frame, qtm.DataFrame):
+            return
+        bodies = described.bodies or ()
+        counts = {
+            ComponentType.MARKERS_RESIDUAL: {len(described.labels or ())},
+            ComponentType.BODIES_RESIDUAL: {len(bodies), sum(body.enabled for body in bodies)},
+        }
+        self._parameters_wanted |= any(
+            isinstance(part, qtm.ItemsComponent)
+            and len(part.items) not in counts.get(ComponentType(part.type), {len(part.items)})
+            for part in frame.components
+        )
+
+    # --- commands -----------------------------------------------------------------------------
+
+    async def _greet(self) -> None:
+        try:
+            greeting = await self._answer((qtm.Command, qtm.ErrorReply), GREETING)
+        except DeviceLostError as error:
+            raise DeviceLostError(
+                f"{self._name}: connected, but no greeting: check server and command_port (QTM: "
+                "Project Options, Real-Time Output, base port plus 1)"
+            ) from error
+        if isinstance(greeting, qtm.ErrorReply):
+            raise DeviceLostError(
+                f"{self._name} refuses the connection: {greeting.text!r}: close other clients"
+            )
+        if not isinstance(greeting, qtm.Command) or not greeting.text.startswith(GREETING):
+            raise _not_qtm(self._name)
+        self._greeted = True
+
+    async def _negotiate(self) -> None:
+        for version in VERSIONS:
+            answer = await self._ask(f"Version {version}", qtm.Command, qtm.ErrorReply)
+            if isinstance(answer, qtm.Command) and answer.text.lower().startswith("version set"):
+                self.version = version
+                return
+        raise DeviceMisconfiguredError(
+            f"{self._name} supports none of the protocol versions {VERSIONS[-1]} to {VERSIONS[0]}: "
+            "a newer QTM is required (2019 or later), and command_port must be its base port plus 1"
+        )
+
+    async def _ask(self, command: str, *kinds: type) -> qtm.Message:
+        """Send a command and return its answer, the first message of one of these types."""
+        self._answers.clear()
+        self._link.send(qtm.encode(qtm.Command(command)))
+        return await self._answer(kinds, command)
+
+    async def _answer(self, kinds: tuple[type, ...], command: str) -> qtm.Message:
+        until = time.monotonic() + ANSWER_S
+        while True:
+            while self._answers:
+                answer = self._answers.pop(0)
+                if isinstance(answer, kinds):
+                    return answer
+            if time.monotonic() >= until:
+                raise DeviceLostError(
+                    f"{self._name}: no answer to {command!r} within {ANSWER_S:g} s: restart the "
+                    "real-time output of QTM"
+                )
+            try:
+                await self._link.pause(until - time.monotonic())
+            except DeviceLostError:
+                if not self._answers:  # a refusal arrives before the end of the connection
+                    raise
+
+    async def _request_parameters(self) -> bool:
+        """Request the settings; return whether QTM has any."""
+        parts = "General 3D 6D" + " Skeleton:global" * self._settings.skeleton
+        answer = await self._ask(f"GetParameters {parts}", qtm.SettingsReply, qtm.ErrorReply)
+        return isinstance(answer, qtm.SettingsReply)
+
+    def _request_frames(self, udp_port: int | None) -> None:
+        # Frames follow, or "no more data", or an error: there is no answer.
+        to = "" if udp_port is None else f"UDP:{udp_port} "
+        parts = "6DRes 3DRes Timecode" + " Skeleton:global" * self._settings.skeleton
+        self._link.send(qtm.encode(qtm.Command(f"StreamFrames AllFrames {to}{parts}")))
+
+    async def _stream_frames(self, udp_port: int | None) -> None:
+        began_ns = time.monotonic_ns()
+        ask_at, requested = 0.0, False
+        self._answers.clear()
+        while True:
+            now_ns, now = time.monotonic_ns(), time.monotonic()
+            if self._parameters_wanted and now >= ask_at:
+                self._parameters_wanted = False
+                if not await self._request_parameters():
+                    self._parameters_wanted, self._waiting = True, True
+                ask_at = time.monotonic() + RETRY_S
+            if not requested and self._described is not None:
+                self._request_frames(udp_port)
+                requested, began_ns = True, time.monotonic_ns()
+
+            started_ns = self._started_ns
+            if started_ns is not None and now_ns - started_ns > RESUME_S * 1e9:
+                self._started_ns = now_ns
+                self._request_frames(udp_port)
+
+            self._check_errors()
+            self._check_alive(max(self._frame_ns, began_ns), udp_port)
+            wait_s = self._settings.silence_s / 4
+            await self._link.pause(min(wait_s, RETRY_S / 2) if self._parameters_wanted else wait_s)
+
+    def _check_errors(self) -> None:
+        """Raise DeviceMisconfiguredError if QTM refuses to stream."""
+        refusals = [a.text for a in self._answers if isinstance(a, qtm.ErrorReply)]
+        self._answers.clear()
+        if refusals and not self._frame_ns:
+            raise DeviceMisconfiguredError(
+                f"{self._name} refuses to stream: {refusals[0]!r}: check its version and options"
+            )
+
+    def _check_alive(self, heard_ns: int, udp_port: int | None) -> None:
+        """Raise DeviceLostError without frames, except while QTM waits for a measurement."""
+        if self._waiting or (time.monotonic_ns() - heard_ns) / 1e9 < self._settings.silence_s:
+            return
+        self.silent = True
+        hint = "" if udp_port is None else ", and allow UDP in firewalls or set transport = 'tcp'"
+        raise DeviceLostError(
+            f"{self._name}: no frame for {self._settings.silence_s:g} s: {START}{hint}; `jointfit "
+            "doctor` names the cause"
+        )
+
+
+def _packet_type(packet: bytes) -> int | None:
+    return qtm.HEADER.unpack_from(packet)[1] if len(packet) >= qtm.HEADER.size else None
+
+
+def _not_qtm(name: str) -> DeviceMisconfiguredError:
+    return DeviceMisconfiguredError(
+        f"{name}: the program that answers is not QTM: check server and command_port (QTM: Project "
+        "Options, Real-Time Output, base port plus 1)"
+    )
