@@ -328,7 +328,8 @@ def test_the_check_prints_no_message_of_python_can(capfd: pytest.CaptureFixture[
 
 @pytest.mark.parametrize("line", ["", 'driver = "natnet"', 'driver = "other"', "driver = xbus"])
 def test_a_wrong_driver_does_not_hide_the_faults_of_other_keys(tmp_path: Path, line: str) -> None:
-    slow = RIG.replace('port = "/dev/ttyUSB0"', 'port = "/dev/ttyUSB0"\nbaud = 9600')
+    own = "reset_if_stuck = false"  # a key that no other driver has
+    slow = RIG.replace('port = "/dev/ttyUSB0"', f'port = "/dev/ttyUSB0"\nbaud = 9600\n{own}')
     result = check(tmp_path, slow.replace('driver = "xbus"', line))
     assert "the line carries 9600" in result.stderr
 

@@ -53,11 +53,11 @@ def python(environment: dict[str, str], *arguments: str) -> str:
     return done.stdout
 
 
-FIND = "from jointfit_daemon.driver import find_driver; print(find_driver('wit').__qualname__)"
+FIND = "from jointfit_daemon.driver import find_driver; print(find_driver('board').__qualname__)"
 
 
 def test_it_is_found_by_name_once_it_is_installed(installed: dict[str, str]) -> None:
-    assert python(installed, "-c", FIND).strip() == "WitImu"
+    assert python(installed, "-c", FIND).strip() == "BoardImu"
 
 
 @pytest.mark.timeout(100)
@@ -76,7 +76,7 @@ def test_pip_installs_it(tmp_path: Path) -> None:
         dict(os.environ), "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation",
         "--no-index", "--target", str(tmp_path), str(EXAMPLE),
     )  # fmt: skip
-    assert python(seeing(tmp_path), "-c", FIND).strip() == "WitImu"
+    assert python(seeing(tmp_path), "-c", FIND).strip() == "BoardImu"
 
 
 def test_the_guide_names_the_files_that_are_there() -> None:

@@ -18,6 +18,7 @@ from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClos
 from jointfit_daemon.pipeline.sources import SourceState
 from jointfit_drivers.natnet._open_requests import OpenRequests
 from jointfit_drivers.qtm import QtmDecoder, QtmSettings
+from jointfit_drivers.witmotion import WitMotionImu, WitMotionSettings
 from jointfit_protocols import qtm
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
 from jointfit_protocols.can.slcan import SlcanCodec
@@ -26,6 +27,8 @@ from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet import HEADER, Bare, NatNetMessageId, decode
 from jointfit_protocols.natnet import encode as encode_natnet
 from jointfit_protocols.natnet._frame_encode import encode_frame
+from jointfit_protocols.witmotion import FRAME_BYTES, WitMotionCodec, WitMotionFrame
+from jointfit_protocols.witmotion import encode as encode_witmotion
 from jointfit_protocols.xbus import XbusCodec, XbusMessage
 from jointfit_protocols.xbus import encode as encode_xbus
 from jointfit_protocols.xbus._framing import MAX_DATA
@@ -175,6 +178,37 @@ def seeds_xbus_records() -> list[bytes]:
     packed = b"".join(bytes((data[2], data[3])) + data[4:-1] for data in samples)
     kinds = [bytes((kind, 6)) + b"\x07MTi-30"[:6] for kind in ANSWERS]
     return [packed, packed + b"".join(kinds), b"".join(kinds)]
+
+
+def run_witmotion_bytes(data: bytes) -> None:
+    """Decode WitMotion bytes in pieces; every byte belongs to a frame or is counted."""
+    codec, found = WitMotionCodec(), []
+    for piece in cut(data):
+        found += codec.feed(piece)
+    found += codec.flush()
+    used = sum(
+        FRAME_BYTES if isinstance(item, WitMotionFrame) else item.discarded for item in found
+    )
+    if used != len(data):
+        raise UnaccountedError(f"{len(data)} bytes, {used} in frames or discarded")
+
+    for driver in (WitMotionImu(_witmotion()), WitMotionImu(_witmotion(device_time=True))):
+        decoder = driver.decoder()
+        for number, piece in enumerate(cut(data)):
+            decoder.feed(Chunk(BEGIN_NS + number * _MS, piece))
+        decoder.flush()
+
+
+def _witmotion(**more: bool) -> WitMotionSettings:
+    return WitMotionSettings.model_validate(
+        {"id": "S1", "segment": "thigh", "driver": "witmotion", "port": "p", **more}
+    )
+
+
+def seeds_witmotion() -> list[bytes]:
+    """Return frames of all kinds, and of the variant 55 61."""
+    frames = [encode_witmotion(kind, bytes(range(8))) for kind in range(0x50, 0x60)]
+    return [b"".join(frames), frames[9] * 3, (b"\x55\x61" + bytes(18)) * 4]
 
 
 def run_slcan(data: bytes) -> None:
@@ -346,6 +380,7 @@ TARGETS = (
     Target("xbus-core", run_xbus_core, seeds_xbus_records, share=1),
     Target("serial-core", run_serial_core, seeds_xbus, share=1),
     Target("slcan-source", run_slcan, seeds_slcan, share=4),
+    Target("witmotion-bytes", run_witmotion_bytes, seeds_witmotion, share=4),
     Target("can-records", run_can_records, seeds_can_records, share=3),
     Target("can-source", run_can_source, seeds_can_core, share=4),
     Target("can-core", run_can_core, seeds_can_core, share=1),

@@ -14,6 +14,7 @@ from jointfit_drivers.gateway_orientation._filter import (
     turned_field,
 )
 from jointfit_drivers.gateway_orientation._raw_samples import RawSamples, RawStamp
+from jointfit_drivers.gateway_orientation._settings import GatewaySettings
 
 __all__ = [
     "LONGEST_SETTLE_S",
@@ -23,6 +24,7 @@ __all__ = [
     "FilterState",
     "FilterStep",
     "GatewayOrientation",
+    "GatewaySettings",
     "RawReading",
     "RawSamples",
     "RawStamp",

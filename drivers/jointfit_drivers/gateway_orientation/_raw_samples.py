@@ -35,7 +35,7 @@ class RawStamp(NamedTuple):
     """Fields of a raw message besides its measurements."""
 
     arrival_ns: int
-    ticks: int
+    ticks: int | None
     counter: int | None = None
     status: int | None = None
 

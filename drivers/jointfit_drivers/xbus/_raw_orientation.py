@@ -72,7 +72,10 @@ class RawOrientation:
         self, stamp: RawStamp, values: Mapping[int, object], modulus: int
     ) -> list[Decoded] | None:
         """Return warnings and samples of a complete message; None if it is not plausible."""
-        passed = 0 if self._ticks is None else (stamp.ticks - self._ticks) % modulus
+        ticks = stamp.ticks
+        if ticks is None or ticks == self._ticks:
+            return None
+        passed = 0 if self._ticks is None else (ticks - self._ticks) % modulus
         period_s = self._samples.period_ns * 1e-9
 
         # Increments are divided by the interval; both forms are in sensor axes.
@@ -85,10 +88,10 @@ class RawOrientation:
         field = values.get(FIELD) if self._samples.magnetometer else None
         vectors = (cast("Vector", rate), cast("Vector", force), cast("Vector | None", field))
         reading = RawReading(self._t_ns + passed * TICK_NS, *vectors)
-        if stamp.ticks == self._ticks or not is_plausible(reading):
+        if not is_plausible(reading):
             return None
 
-        self._ticks, self._t_ns = stamp.ticks, reading.t_ns
+        self._ticks, self._t_ns = ticks, reading.t_ns
         clipped = stamp.status is not None and bool(stamp.status & CLIPPING)
         return self._samples.take(stamp, reading, clipped=clipped)
 

@@ -8,6 +8,7 @@ from jointfit_simulators.devices._clocks import (
     SampleTiming,
     SimulatedClock,
 )
+from jointfit_simulators.devices._mip_device import MipDevice, MipDeviceOptions
 from jointfit_simulators.devices._natnet_frames import (
     Bodies,
     FrameStamps,
@@ -25,12 +26,18 @@ from jointfit_simulators.devices._orientation_sensor import OrientationSensor
 from jointfit_simulators.devices._qtm_server import QtmServer, QtmServerOptions
 from jointfit_simulators.devices._sensor_faults import SensorFaults
 from jointfit_simulators.devices._tcp_port import TcpClient, TcpPort, TextServer
+from jointfit_simulators.devices._witmotion_device import (
+    WITH_QUATERNION,
+    WitMotionDevice,
+    WitMotionDeviceOptions,
+)
 from jointfit_simulators.devices._xbus_device import XbusDevice, XbusDeviceOptions
 from jointfit_simulators.devices._xcdi_device import XcdiDevice, XcdiDeviceOptions
 
 __all__ = [
     "LOOPBACK",
     "NS",
+    "WITH_QUATERNION",
     "Address",
     "Bodies",
     "CameraFrames",
@@ -38,6 +45,8 @@ __all__ = [
     "ClockFault",
     "FrameStamps",
     "Markers",
+    "MipDevice",
+    "MipDeviceOptions",
     "NatNetFrameBuilder",
     "NatNetPort",
     "NatNetServer",
@@ -55,6 +64,8 @@ __all__ = [
     "TcpPort",
     "TextServer",
     "Vector",
+    "WitMotionDevice",
+    "WitMotionDeviceOptions",
     "XbusDevice",
     "XbusDeviceOptions",
     "XcdiDevice",

@@ -45,25 +45,42 @@ class InertialSignals:
             self._step_s = (device_ns - at_ns) * 1e-9
         self._last, self._q = (device_ns, q_world_sensor), q_world_sensor
 
+    @property
+    def rate(self) -> Vector:
+        """Angular rate over the last interval, sensor axes, rad/s; 0 before the second instant."""
+        x, y, z = self._turn
+        step_s = self._step_s
+        return (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)
+
+    @property
+    def force(self) -> Vector:
+        """Specific force, sensor axes, m/s^2."""
+        return _to_sensor(self._q, (0.0, 0.0, GRAVITY))
+
+    @property
+    def field(self) -> Vector:
+        """Magnetic field, sensor axes, of magnitude 1."""
+        return _to_sensor(self._q, (0.0, cos(DIP_RAD), -sin(DIP_RAD)))
+
     def value(self, item: int) -> tuple[float, ...] | None:
-        """Return an item for the last interval; None for items that are not inertial signals."""
+        """Return an Xbus item for the last interval; None if it is not an inertial signal."""
         x, y, z = self._turn
         step_s = self._step_s
 
         match item:
             case Item.RATE_OF_TURN:
-                return (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)
+                return self.rate
             case Item.DELTA_Q:
                 angle = sqrt(x * x + y * y + z * z)
                 scale = sin(angle / 2.0) / angle if angle > _TINY else 0.5
                 return (cos(angle / 2.0), scale * x, scale * y, scale * z)
             case Item.ACCELERATION:
-                return _to_sensor(self._q, (0.0, 0.0, GRAVITY))
+                return self.force
             case Item.DELTA_V:
-                x, y, z = _to_sensor(self._q, (0.0, 0.0, GRAVITY))
+                x, y, z = self.force
                 return (x * step_s, y * step_s, z * step_s)
             case Item.MAGNETIC_FIELD:
-                return _to_sensor(self._q, (0.0, cos(DIP_RAD), -sin(DIP_RAD)))
+                return self.field
             case _:
                 return None
 

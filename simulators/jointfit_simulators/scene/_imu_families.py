@@ -8,11 +8,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from jointfit_protocols.mip.data import DataSet, FilterField, SharedField
+from jointfit_protocols.witmotion import RATE_CODES
 from jointfit_protocols.xbus.configuration import SyncSetting
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_protocols.xbus.sync_lines import IN1, Polarity, SyncFunction
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.devices import (
+    WITH_QUATERNION,
+    MipDevice,
+    MipDeviceOptions,
+    WitMotionDevice,
+    WitMotionDeviceOptions,
     XbusDevice,
     XbusDeviceOptions,
     XcdiDevice,
@@ -94,6 +101,28 @@ class CanFamily:
     """Return a device on the bus."""
 
 
+def _mip(place: SensorPlace, port: Path) -> ConnectedImu:
+    outputs = ((SharedField.REFERENCE_TIME, 1), (FilterField.QUATERNION, 1))
+    device = MipDevice(
+        port,
+        options=MipDeviceOptions(
+            base_rates_hz=((DataSet.FILTER, round(place.knobs.rate_hz)),),
+            formats=((DataSet.FILTER, outputs),),
+            streams=(DataSet.FILTER,),
+        ),
+        wire_noise=line_noise(place.knobs, place.name),
+    )
+    return ConnectedImu(device, [f'port = "{port}"', "baud = 921600"], str(port))
+
+
+def _witmotion(place: SensorPlace, port: Path) -> ConnectedImu:
+    rate_hz = max((rate for rate in RATE_CODES if rate <= place.knobs.rate_hz), default=10)
+    options = WitMotionDeviceOptions(content=WITH_QUATERNION, rate_hz=rate_hz)
+    noise = line_noise(place.knobs, place.name)
+    device = WitMotionDevice(port, options=options, wire_noise=noise)
+    return ConnectedImu(device, [f'port = "{port}"', "baud = 921600"], str(port))
+
+
 def _xbus(place: SensorPlace, port: Path) -> ConnectedImu:
     sync = _SYNC if place.sync_line else ()
     outputs = (
@@ -132,6 +161,8 @@ def ids_toml(ids: XcdiIds) -> str:
 
 
 IMU_FAMILIES: dict[str, UartFamily | CanFamily] = {
+    "mip": UartFamily(_mip),
+    "witmotion": UartFamily(_witmotion),
     "xbus": UartFamily(_xbus),
     "xcdi": CanFamily(_xcdi),
 }

@@ -1,0 +1,98 @@
+"""Replies of a MIP device as events: model, firmware, settings read back, and refused commands."""
+
+from __future__ import annotations
+
+from math import cos, sin
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.kinematics.rotation_scalar import multiply_one
+from jointfit_daemon.model import DeviceEvent
+from jointfit_protocols.mip import commands
+from jointfit_protocols.mip.commands import Base, CommandSet, FilterSetup, Setup
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from jointfit_daemon.model import Decoded, Quaternion
+    from jointfit_protocols.mip import MipPacket
+
+_SMALL = 1e-4
+"""Vector part of a rotation that counts as none: 0.01 degrees."""
+_FORMATS = {
+    Setup.FORMAT_REPLY: None,
+    Setup.IMU_FORMAT_REPLY: 0x80,
+    Setup.FILTER_FORMAT_REPLY: 0x82,
+}
+"""Data set of a message format; None if the reply contains it."""
+
+
+def reply_events(packet: MipPacket) -> list[Decoded]:
+    """Return the events of a reply; fields of another size or unknown fields are ignored."""
+    out: list[Decoded] = []
+    for descriptor, data in packet.fields:
+        # An unknown command is a property of the model: the driver asks for several.
+        if descriptor == commands.REPLY and len(data) == commands.REPLY_BYTES:
+            if data[1] not in {commands.OK, commands.UNKNOWN_COMMAND}:
+                name = f"command 0x{packet.descriptor_set:02X},0x{data[0]:02X}"
+                text = f"{name} refused: {commands.code_text(data[1])}"
+                out.append(DeviceEvent("warning", text, {"code": data[1]}))
+            continue
+        out += _events_of(packet.descriptor_set, descriptor, data)
+    return out
+
+
+def _events_of(command_set: int, descriptor: int, data: bytes) -> Iterator[Decoded]:
+    known: dict[str, object] = {}
+    if command_set == CommandSet.BASE and descriptor == Base.DEVICE_INFO_REPLY:
+        info = commands.decode_info(data)
+        if info is not None:
+            known = {"model": info.model_name, "model_number": info.model_number}
+            known |= {"serial": info.serial, "firmware": info.version, "options": info.options}
+    elif command_set == CommandSet.SETUP and descriptor in _FORMATS:
+        known = _format(_FORMATS[Setup(descriptor)], data)
+    if known:
+        yield DeviceEvent(
+            "info", ", ".join(f"{key} {value}" for key, value in known.items()), known
+        )
+
+    turn = _transform(command_set, descriptor, data)
+    if turn is not None:
+        yield from _transform_events(turn)
+
+
+def _format(data_set: int | None, data: bytes) -> dict[str, object]:
+    prefix = data[:1] if data_set is None else b""
+    outputs = commands.decode_outputs(prefix, data)
+    if outputs is None:
+        return {}
+    number = data[0] if data_set is None else data_set
+    return {f"outputs_0x{number:02X}": {f"0x{one.field:02X}": one.decimation for one in outputs}}
+
+
+def _transform(command_set: int, descriptor: int, data: bytes) -> Quaternion | None:
+    """Return the sensor-to-vehicle rotation in a reply."""
+    if (command_set, descriptor) == (CommandSet.SETUP, Setup.TRANSFORM_REPLY):
+        found = commands.decode_floats(data, 4)
+        return None if found is None else (found[0], found[1], found[2], found[3])
+
+    if (command_set, descriptor) == (CommandSet.FILTER, FilterSetup.ROTATION_REPLY):
+        angles = commands.decode_floats(data, 3)
+        if angles is not None:  # q_z(yaw) q_y(pitch) q_x(roll)
+            roll, pitch, yaw = (angle / 2.0 for angle in angles)
+            about_z = (cos(yaw), 0.0, 0.0, sin(yaw))
+            about_y = (cos(pitch), 0.0, sin(pitch), 0.0)
+            about_x = (cos(roll), sin(roll), 0.0, 0.0)
+            return multiply_one(multiply_one(about_z, about_y), about_x)
+    return None
+
+
+def _transform_events(turn: Quaternion) -> Iterator[Decoded]:
+    data = {"sensor_to_vehicle": [round(value, 6) for value in turn]}
+    yield DeviceEvent("info", f"sensor_to_vehicle {data['sensor_to_vehicle']}", data)
+    if not max(map(abs, turn[1:])) <= _SMALL:  # NaN compares false
+        text = (
+            f"a sensor-to-vehicle transform is stored (w x y z = {data['sensor_to_vehicle']}): "
+            "sensor axes are those of the vehicle, not the printed ones. Remove it with the "
+            "vendor's tool before calibration, or leave it as it is"
+        )
+        yield DeviceEvent("warning", text, data)

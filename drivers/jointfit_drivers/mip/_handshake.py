@@ -1,0 +1,301 @@
+"""From an open port to a streaming MIP device, or to the error that explains the failure.
+
+Settings are read and compared, and written only where they differ. They are volatile: without
+``persist`` the device returns to its own at the next power-up. A fault that may clear by itself
+raises `DeviceLostError`, any other `DeviceMisconfiguredError`; the device then streams as before.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, NoReturn
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.mip._conversation import MipConversation, MipReply
+from jointfit_protocols.mip import commands
+from jointfit_protocols.mip.commands import Base, CommandSet, FilterSetup, Function, Output, Setup
+from jointfit_protocols.mip.data import DataSet
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit
+    from jointfit_drivers.mip._settings import MipSettings
+    from jointfit_drivers.ports.serial_port import SerialPort
+    from jointfit_protocols.mip.commands import Family, StreamCommands
+
+log = logging.getLogger(__name__)
+
+LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600)
+"""Line speeds to search, bit/s: factory setting and common choices first."""
+_LISTEN_S = 0.15
+"""Time at each speed of the search, s."""
+_SAVE_S = 3.0
+"""Longest wait for settings to be saved, s."""
+_READ = bytes((Function.READ,))
+_FORMAT_OF_ANY_SET = CommandSet.SETUP << 8 | Setup.FORMAT
+_LEGACY_SERIES = ("GX3", "GX4", "GX5", "CX5", "CV5", "RQ1", "GQ4")
+"""Parts of the names of legacy models."""
+_RATES_SHOWN = 12
+"""Rates that a message lists."""
+
+
+class MipHandshake:
+    """Brings one device into streaming.
+
+    Parameters
+    ----------
+    port, emit : SerialPort, Emit
+        Open port, and the receiver of the device's bytes.
+    settings : MipSettings
+        Its table of rig.toml.
+    hunt : bool
+        Whether to search for a silent device at other speeds. A device whose bytes cannot be
+        decoded is always searched for.
+    """
+
+    def __init__(
+        self, port: SerialPort, emit: Emit, settings: MipSettings, *, hunt: bool = True
+    ) -> None:
+        self._port = port
+        self._settings = settings
+        self._hunt = hunt
+        self._conversation = MipConversation(port, emit)
+        self._who = settings.port
+        self._model = "the device"
+        self._required = settings.required
+
+    async def ensure_streaming(self) -> None:
+        """Return when the device streams according to the settings.
+
+        Raises
+        ------
+        DeviceLostError
+            The device is silent, unplugged, or stopped answering.
+        DeviceMisconfiguredError
+            The speed is another, the device is of another kind, or it cannot send the orientation
+            at this rate.
+        """
+        settings = self._settings
+        needs = settings.serial_bits_per_s
+        if needs is not None and needs > settings.baud:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
+                f"{settings.baud}: lower `rate_hz`, or raise the speed of the device and `baud`"
+            )
+
+        self._conversation.reset()
+        if await self._conversation.command(CommandSet.BASE, Base.IDLE) is None:
+            await self._explain_silence()
+
+        try:
+            await self._configure()
+        except DeviceMisconfiguredError:  # it streams as before
+            await self._conversation.command(CommandSet.BASE, Base.RESUME, tries=1)
+            raise
+        self._refuse(await self._answer(CommandSet.BASE, Base.RESUME), "refuses to resume")
+
+    async def _configure(self) -> None:
+        """Write the settings that differ, while the device is idle."""
+        reply = await self._answer(CommandSet.BASE, Base.DEVICE_INFO)
+        info = commands.decode_info(reply.data(Base.DEVICE_INFO_REPLY))
+        if info is not None and info.model_name:
+            self._model = info.model_name
+
+        supported = await self._descriptors()
+        family = self._family(supported)
+        fields = self._required.with_time(family)
+        self._refuse_missing(fields, supported)
+
+        # The decoder reports a stored transform. Models without the command refuse it.
+        if family == "current":
+            await self._answer(CommandSet.SETUP, Setup.TRANSFORM, _READ)
+        else:
+            await self._answer(CommandSet.FILTER, FilterSetup.ROTATION, _READ)
+
+        stream = commands.stream_commands(family, self._required.data_set)
+        wanted = await self._outputs(stream, fields)
+        changed = await self._ensure_format(stream, wanted)
+        changed |= await self._ensure_stream(stream)
+        if changed and self._settings.persist:
+            save = bytes((Function.SAVE,))
+            saved = await self._conversation.command(
+                CommandSet.SETUP, Setup.STARTUP_SETTINGS, save, wait_s=_SAVE_S
+            )
+            if saved is None:
+                self._lose()
+            self._refuse(saved, "refuses to save its settings", "persist = false")
+
+    async def _descriptors(self) -> frozenset[int]:
+        """Return the commands and fields that the device names; empty if it names none."""
+        found: frozenset[int] = frozenset()
+        for command, reply in (
+            (Base.DESCRIPTORS, Base.DESCRIPTORS_REPLY),
+            (Base.MORE_DESCRIPTORS, Base.MORE_DESCRIPTORS_REPLY),
+        ):
+            answer = await self._answer(CommandSet.BASE, command)
+            if answer.is_ok:
+                found |= commands.decode_descriptors(answer.data(reply))
+        return found
+
+    def _family(self, supported: frozenset[int]) -> Family:
+        """Return the family: as set, by the commands of the device, or by its model."""
+        if self._settings.family != "auto":
+            return self._settings.family
+        if supported:
+            return "current" if _FORMAT_OF_ANY_SET in supported else "legacy"
+        return "legacy" if any(name in self._model for name in _LEGACY_SERIES) else "current"
+
+    def _refuse_missing(self, fields: tuple[int, ...], supported: frozenset[int]) -> None:
+        """Raise if the device names its fields, but not all required ones."""
+        data_set = self._required.data_set
+        missing = [field for field in fields if data_set << 8 | field not in supported]
+        if not missing or not any(one >> 8 >= DataSet.SENSOR for one in supported):
+            return
+        names = ", ".join(f"0x{data_set:02X},0x{field:02X}" for field in missing)
+        raise DeviceMisconfiguredError(
+            f"{self._who}: {self._model} does not measure {names}: set {self._alternatives()}"
+        )
+
+    def _alternatives(self) -> str:
+        """Return the settings that need other fields."""
+        settings = self._settings
+        if settings.orientation == "gateway":
+            return "magnetometer = false" if settings.magnetometer else 'orientation = "device"'
+        other = "sensor" if settings.estimator == "filter" else "filter"
+        return f'estimator = "{other}" or orientation = "gateway"'
+
+    async def _outputs(self, stream: StreamCommands, fields: tuple[int, ...]) -> tuple[Output, ...]:
+        """Return the required message format at the requested rate."""
+        reply = await self._answer(CommandSet.SETUP, stream.base_rate, stream.prefix)
+        self._refuse(reply, "does not report its base rate", self._alternatives())
+        base_hz = commands.decode_rate(stream.prefix, reply.data(stream.base_rate_reply))
+        if not base_hz:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {self._model} has no outputs in data set "
+                f"0x{self._required.data_set:02X}: set {self._alternatives()}"
+            )
+
+        rate_hz = self._settings.rate_hz
+        decimation = round(base_hz / rate_hz)
+        if decimation < 1 or abs(base_hz / decimation - rate_hz) > 1e-3 * rate_hz:
+            rates = [base_hz / k for k in range(1, base_hz + 1) if base_hz % k == 0]
+            shown = ", ".join(f"{rate:g}" for rate in rates[:_RATES_SHOWN])
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {rate_hz:g} Hz is no whole fraction of the {base_hz} Hz of "
+                f"{self._model}: set rate_hz to one of {shown}"
+            )
+        return tuple(Output(field, decimation) for field in fields)
+
+    async def _ensure_format(self, stream: StreamCommands, wanted: tuple[Output, ...]) -> bool:
+        """Make the device send `wanted`; return whether it was written.
+
+        Further fields may remain, as long as the line can take them: their decimation matters only
+        for the load.
+        """
+        found = await self._format(stream)
+        if set(wanted) <= set(found):
+            return False
+        log.warning(
+            "%s: writing its message format of set 0x%02X: %s instead of %s",
+            self._settings.id,
+            self._required.data_set,
+            _describe(wanted),
+            _describe(found),
+        )
+
+        data = bytes((Function.WRITE,)) + commands.encode_outputs(stream.prefix, wanted)
+        reply = await self._answer(CommandSet.SETUP, stream.format, data)
+        self._refuse(
+            reply,
+            f"refuses the fields {_describe(wanted)}",
+            f"`rate_hz`, or {self._alternatives()}",
+        )
+        left = await self._format(stream)
+        if not set(wanted) <= set(left):
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {self._model} sends {_describe(left)}, expected "
+                f"{_describe(wanted)}: correct `rate_hz`, or update the firmware of the device"
+            )
+        return True
+
+    async def _format(self, stream: StreamCommands) -> tuple[Output, ...]:
+        reply = await self._answer(CommandSet.SETUP, stream.format, _READ + stream.prefix)
+        return commands.decode_outputs(stream.prefix, reply.data(stream.format_reply)) or ()
+
+    async def _ensure_stream(self, stream: StreamCommands) -> bool:
+        """Switch the stream on if it is off; return whether it was."""
+        selector = bytes((stream.selector,))
+        reply = await self._answer(CommandSet.SETUP, Setup.STREAM, _READ + selector)
+        if reply.data(Setup.STREAM_REPLY) == selector + b"\x01":
+            return False
+        log.warning("%s: switching its stream on", self._settings.id)
+        data = bytes((Function.WRITE,)) + selector + b"\x01"
+        reply = await self._answer(CommandSet.SETUP, Setup.STREAM, data)
+        self._refuse(reply, "refuses to stream", self._alternatives())
+        return True
+
+    async def _answer(self, command_set: int, command: int, data: bytes = b"") -> MipReply:
+        """Return the reply to a command that the device must answer; it may be a refusal."""
+        reply = await self._conversation.command(command_set, command, data)
+        if reply is None:
+            self._lose()
+        return reply
+
+    def _lose(self) -> NoReturn:
+        raise DeviceLostError(
+            f"{self._who}: stopped answering during configuration: check its power and cable"
+        )
+
+    def _refuse(self, reply: MipReply, what: str, change: str = "`family`") -> None:
+        if not reply.is_ok:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {self._model} {what} ({commands.code_text(reply.code)}): "
+                f"set or change {change}"
+            )
+
+    async def _explain_silence(self) -> NoReturn:
+        """Raise the error for a device that does not answer."""
+        conversation = self._conversation
+        received = conversation.received
+        if conversation.understood:
+            raise DeviceLostError(
+                f"{self._who}: streams but does not answer: check the wire from host to device"
+            )
+
+        speed = await self._other_speed() if self._hunt or received else None
+        if speed is not None:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {self._settings.baud} baud, but no packet can be decoded; "
+                f"the device answers at {speed}: set baud = {speed}"
+            )
+        if not received:
+            raise DeviceLostError(
+                f"{self._who}: silent: check its power, and that TX and RX are not swapped"
+            )
+        raise DeviceMisconfiguredError(
+            f"{self._who}: the device on this port does not use MIP: it sends bytes, none of them "
+            "MIP at any common speed: correct `port` or `driver`"
+        )
+
+    async def _other_speed(self) -> int | None:
+        """Return the speed at which the device answers; it continues to stream as before."""
+        for baud in LINE_SPEEDS:
+            if baud == self._settings.baud:
+                continue
+            try:
+                self._port.set_baud(baud)
+            except DeviceMisconfiguredError:  # the port does not support it
+                continue
+            self._conversation.reset()
+            answered = await self._conversation.command(
+                CommandSet.BASE, Base.IDLE, tries=1, wait_s=_LISTEN_S
+            )
+            if answered is not None:  # wait for the reply: closing the port discards unsent bytes
+                await self._conversation.command(CommandSet.BASE, Base.RESUME, tries=1)
+            if answered is not None or self._conversation.understood:
+                return baud
+        return None
+
+
+def _describe(outputs: tuple[Output, ...]) -> str:
+    """Return fields with their decimations."""
+    return ", ".join(f"0x{one.field:02X}/{one.decimation}" for one in outputs) or "nothing"

@@ -1,0 +1,148 @@
+"""Requests to a device on a serial line and its replies, while its bytes are passed on.
+
+Bytes before the first reply are old or foreign and are discarded. From this reply on, every byte is
+emitted once, so that the decoder also receives the device's replies.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+
+from jointfit_daemon.model import Chunk
+from jointfit_protocols.corrupt import CorruptBytes
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from jointfit_daemon.driver import Emit
+    from jointfit_drivers.ports.serial_port import SerialPort
+
+log = logging.getLogger(__name__)
+
+_QUIET_S = 0.1
+"""Pause, s, after which the rest of a message with a corrupt length is no longer expected."""
+_KEPT = 8192
+"""Bytes stored before the first reply: more than one message and the data behind it."""
+_LOGGED = 20
+"""Chunks that are logged at the debug level, so that a new device can be judged from a log."""
+
+
+class WireMessage(Protocol):
+    """Message of a codec."""
+
+    @property
+    def size(self) -> int:
+        """Bytes on the wire."""
+
+    @property
+    def end(self) -> int:
+        """Bytes fed to the codec up to and including its last one."""
+
+
+Message = TypeVar("Message", bound=WireMessage)
+Found_co = TypeVar("Found_co", bound=WireMessage, covariant=True)
+
+
+class StreamCodec(Protocol[Found_co]):
+    """Codec of a byte stream."""
+
+    fed: int
+
+    @property
+    def pending(self) -> int:
+        """Bytes of an incomplete message."""
+
+    def feed(self, data: bytes) -> Sequence[Found_co | CorruptBytes]:
+        """Return the messages that `data` completed."""
+
+    def flush(self) -> Sequence[Found_co | CorruptBytes]:
+        """Return messages hidden in the pending bytes."""
+
+
+class SerialConversation(Generic[Message]):
+    """Requests and replies of one device on one port.
+
+    Parameters
+    ----------
+    port : SerialPort
+        Open port.
+    emit : Emit
+        Receives all bytes from the first reply on.
+    make_codec : callable
+        Returns a new codec.
+    """
+
+    def __init__(
+        self, port: SerialPort, emit: Emit, make_codec: Callable[[], StreamCodec[Message]]
+    ) -> None:
+        self._port, self._emit, self._make_codec = port, emit, make_codec
+        self._codec = make_codec()
+        self._emitting = False
+        self._recent = b""
+        self._logged = 0
+        self.received = 0
+        """Bytes received so far."""
+        self.understood = 0
+        """Messages received so far."""
+
+    def reset(self) -> None:
+        """Discard received bytes, here and in the port: for another speed or a new start."""
+        self._port.flush_input()
+        self._codec, self._recent = self._make_codec(), b""
+        self.received = self.understood = 0
+
+    async def send(self, request: bytes) -> None:
+        """Send one request."""
+        await self._port.write(request)
+
+    async def ask(
+        self, request: bytes, is_reply: Callable[[Message], bool], *, tries: int, wait_s: float
+    ) -> Message | None:
+        """Send a request until its reply arrives; return None if it does not."""
+        for _ in range(tries):
+            await self.send(request)
+            reply = await self.receive(is_reply, wait_s)
+            if reply is not None:
+                return reply
+        return None
+
+    async def receive(self, is_reply: Callable[[Message], bool], wait_s: float) -> Message | None:
+        """Return the first message that `is_reply` accepts, or None after `wait_s` seconds."""
+        loop = asyncio.get_running_loop()
+        until = loop.time() + wait_s
+        while (left := until - loop.time()) > 0:
+            chunk = await self._port.receive(min(left, _QUIET_S))
+            if chunk is None:
+                found = self._codec.flush() if self._codec.pending else []
+            else:
+                found = self._take(chunk)
+
+            messages = [one for one in found if not isinstance(one, CorruptBytes)]
+            self.understood += len(messages)
+            for message in messages:
+                if is_reply(message):
+                    self._begin(message, 0 if chunk is None else chunk.t_ns)
+                    return message
+        return None
+
+    def _take(self, chunk: Chunk) -> Sequence[Message | CorruptBytes]:
+        self.received += len(chunk.data)
+        if self._logged < _LOGGED:
+            self._logged += 1
+            log.debug("%s: received %s", self._port.path, chunk.data.hex(" "))
+        if self._emitting:
+            self._emit(chunk)
+        else:
+            self._recent = (self._recent + chunk.data)[-_KEPT:]
+        return self._codec.feed(chunk.data)
+
+    def _begin(self, first: Message, t_ns: int) -> None:
+        """Emit the first reply and the bytes behind it; all later bytes follow."""
+        if self._emitting:
+            return
+        since = self._codec.fed - first.end + first.size
+        data, self._recent = self._recent[-since:], b""
+        self._emitting = True
+        self._emit(Chunk(t_ns, data))

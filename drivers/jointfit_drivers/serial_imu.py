@@ -1,0 +1,81 @@
+"""Parts that drivers of IMUs on a serial line share: connection keys and stamps of messages."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator
+
+from jointfit_daemon.driver import FASTEST_BAUD, SLOWEST_BAUD, ImuSettings, port_path_fault
+
+_BITS = 10
+"""Bits of one byte on the line, 8N1."""
+_SILENCE_FLOOR_NS = 250_000_000
+"""Lower bound, ns, of the silence after which a pending message is discarded.
+
+At high speed the duration of 1.5 messages is so short that a host that reads late would look like a
+silent line.
+"""
+
+
+class SerialImuSettings(ImuSettings):
+    """Connection of an IMU on a serial port or USB."""
+
+    port: str = Field(description="serial port, preferably a link under /dev/serial/by-id")
+    baud: int = Field(
+        115_200, ge=SLOWEST_BAUD, le=FASTEST_BAUD, description="speed the device runs at, baud"
+    )
+    transport: Literal["uart", "usb"] = Field(
+        "uart",
+        description="`uart`: a line at `baud`, also behind a USB bridge; stamps are back-dated by "
+        "the bytes that came. `usb`: the device's own USB port, where bytes take no time",
+    )
+
+    @property
+    def line_baud(self) -> int | None:
+        """Speed that delays bytes, baud; None for USB."""
+        return self.baud if self.transport == "uart" else None
+
+    @field_validator("port")
+    @classmethod
+    def _port_with_a_name(cls, port: str) -> str:
+        if (fault := port_path_fault(port)) is not None:
+            raise ValueError(fault)
+        return port
+
+
+class ArrivalStamps:
+    """Arrival of the first byte of each message on a serial line.
+
+    A message is stamped with the arrival of its chunk minus the duration of the message and of the
+    bytes behind it, at ten bits per byte.
+
+    Parameters
+    ----------
+    baud : int, optional
+        Line speed, bit/s; None for USB, whose bytes take no time.
+    most_bytes : int
+        Size of the largest message.
+    """
+
+    def __init__(self, baud: int | None, most_bytes: int) -> None:
+        self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
+        self._silence_ns = max(1.5 * most_bytes * self._byte_ns, _SILENCE_FLOOR_NS)
+        self._chunk_ns = self._stamp_ns = 0
+
+    def is_silent_before(self, t_ns: int, size: int) -> bool:
+        """Return whether the line was silent before a chunk: the rest of a message was lost."""
+        return t_ns - self._chunk_ns - size * self._byte_ns > self._silence_ns
+
+    def start_chunk(self, t_ns: int) -> None:
+        """Stamp messages by a chunk that arrived at `t_ns` from now on."""
+        self._chunk_ns = t_ns
+
+    def stamp(self, bytes_since: int) -> int:
+        """Return the arrival, monotonic ns, of a byte `bytes_since` bytes before the chunk's end.
+
+        USB devices and ptys are faster than the configured speed: stamps never decrease.
+        """
+        at_ns = self._chunk_ns - round(bytes_since * self._byte_ns)
+        self._stamp_ns = max(self._stamp_ns, at_ns)
+        return self._stamp_ns

@@ -1,0 +1,76 @@
+"""Calendar time of a WitMotion device as a continuous time.
+
+The clock starts at an arbitrary date and may glitch: a time that contradicts the arrivals is not
+used. If the next times follow it, the clock was set, and they are used again.
+
+Invariant: a function of the times and arrivals fed.
+"""
+
+from __future__ import annotations
+
+from jointfit_protocols.witmotion import TICK_NS
+
+_SLACK_NS = 1_000_000_000
+"""Largest difference, ns, of elapsed device and arrival time without a glitch: longer than the
+delay of buffered bytes."""
+_CONFIRMED = 3
+"""Consecutive times that follow each other after a step, and are therefore of a clock that was
+set."""
+
+
+class CalendarTime:
+    """Calendar time of one device."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, int] | None = None  # accepted ticks and their arrival
+        self._doubted: tuple[int, int] | None = None
+        self._confirmed = 0
+        self._reading: int | None = None
+        self._reading_ns = 0
+
+    def accept(self, ticks: int | None, arrival_ns: int) -> int | None:
+        """Return the time of a sample, ms since 2000; None if it is a glitch.
+
+        Parameters
+        ----------
+        ticks
+            Time as sent; None if it is no time.
+        arrival_ns
+            Its arrival, monotonic ns.
+        """
+        if ticks is None:
+            return None
+        if self._last is None or _follows(self._last, ticks, arrival_ns):
+            self._last, self._doubted, self._confirmed = (ticks, arrival_ns), None, 0
+            return ticks
+
+        follows = self._doubted is not None and _follows(self._doubted, ticks, arrival_ns)
+        self._confirmed = self._confirmed + 1 if follows else 0
+        self._doubted = (ticks, arrival_ns)
+        if self._confirmed < _CONFIRMED:
+            return None
+        self._last, self._doubted, self._confirmed = (ticks, arrival_ns), None, 0
+        return ticks
+
+    def reading_ns(self, ticks: int | None, period_ns: float) -> int:
+        """Return the time of a raw reading, ns from the first one.
+
+        Parameters
+        ----------
+        ticks
+            Its accepted time, ms; None after a glitch.
+        period_ns
+            Mean interval of the readings, ns, in place of a missing or implausible one.
+        """
+        passed_ns = round(period_ns)
+        if ticks is not None and self._reading is not None and ticks > self._reading:
+            passed_ns = (ticks - self._reading) * TICK_NS
+        self._reading_ns += passed_ns
+        self._reading = ticks
+        return self._reading_ns
+
+
+def _follows(last: tuple[int, int], ticks: int, arrival_ns: int) -> bool:
+    """Return whether device time advanced like the arrivals."""
+    advance_ns = (ticks - last[0]) * TICK_NS
+    return advance_ns >= 0 and abs(advance_ns - (arrival_ns - last[1])) <= _SLACK_NS

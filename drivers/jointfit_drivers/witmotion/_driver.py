@@ -1,0 +1,67 @@
+"""Driver of WitMotion IMUs (WT901, JY901, HWT905 and relatives) on a serial port.
+
+`WitMotionDecoder` is the pure part. `WitMotionImu.run` opens the port, makes the device send the
+required frames and reads until cancelled. The two share only chunks.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from jointfit_drivers.gateway_orientation import RawSamples
+from jointfit_drivers.ports.serial_port import SerialPort
+from jointfit_drivers.witmotion._decoder import WitMotionDecoder
+from jointfit_drivers.witmotion._handshake import LINE_SPEEDS, WitMotionHandshake
+from jointfit_drivers.witmotion._settings import WitMotionSettings
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit, Wire
+
+_PERIODS_OF_SILENCE = 3
+"""Smallest number of sample periods without data after which a device counts as silent."""
+
+
+class WitMotionImu:
+    """One WitMotion device: orientation, stamped on arrival or with the device's calendar time."""
+
+    Settings: ClassVar[type[WitMotionSettings]] = WitMotionSettings
+    wire: ClassVar[Wire] = "stream"
+    usual_bauds: ClassVar[tuple[int, ...]] = LINE_SPEEDS
+
+    def __init__(self, settings: WitMotionSettings) -> None:
+        self._settings = settings
+
+    def decoder(self) -> WitMotionDecoder:
+        """Return the decoder from chunks to samples, for live data and replay."""
+        settings = self._settings
+        raw = None
+        if settings.orientation == "gateway":
+            raw = RawSamples(
+                settings.rate_hz,
+                magnetometer=settings.magnetometer,
+                settle_s=settings.settle_s,
+            )
+        return WitMotionDecoder(
+            settings.line_baud,
+            settings.world,
+            inverse=settings.direction == "world_to_sensor",
+            device_time=settings.device_time,
+            raw=raw,
+        )
+
+    async def run(self, emit: Emit) -> None:
+        """Open the port, make the device send the required frames, and read until cancelled.
+
+        Raises
+        ------
+        DeviceLostError
+            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+        DeviceMisconfiguredError
+            The file is no serial port, the speed is another, no WitMotion device answers, or it
+            does not send the required frames even on request.
+        """
+        settings = self._settings
+        with SerialPort(settings.port, settings.baud) as port:
+            await WitMotionHandshake(port, emit, settings).ensure_streaming()
+            silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
+            await port.pump(emit, silence_s)

@@ -1,0 +1,66 @@
+"""The ``[[imu]]`` table of a WitMotion device."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, field_validator
+from typing_extensions import override
+
+from jointfit_drivers.gateway_orientation import GatewaySettings
+from jointfit_drivers.serial_imu import SerialImuSettings
+from jointfit_protocols.witmotion import FRAME_BYTES, RATE_CODES, WitMotionFrameKind
+
+_BITS = 10
+"""Bits of one byte on the line, 8N1."""
+
+
+class WitMotionSettings(SerialImuSettings, GatewaySettings):
+    """One WitMotion IMU on a serial port."""
+
+    world: Literal["ENU", "NED", "NWU"] = Field(
+        "ENU", description="world of its quaternion, which the vendor does not document"
+    )
+    direction: Literal["sensor_to_world", "world_to_sensor"] = Field(
+        "sensor_to_world", description="direction of its quaternion, which is not documented either"
+    )
+    device_time: bool = Field(
+        False,
+        description="use the calendar time of the device, which it sends with every sample; "
+        "default: arrival",
+    )
+    persist: bool = Field(
+        False,
+        description="store changed settings in the device's flash; also allows the change of its "
+        "speed to `baud`",
+    )
+
+    @property
+    def kinds(self) -> tuple[WitMotionFrameKind, ...]:
+        """Frames of one sample, in the order in which the device sends them."""
+        if self.orientation == "gateway":
+            kinds = (
+                WitMotionFrameKind.TIME,
+                WitMotionFrameKind.ACCELERATION,
+                WitMotionFrameKind.RATE,
+            )
+            return (*kinds, WitMotionFrameKind.MAGNETIC_FIELD) if self.magnetometer else kinds
+        if self.device_time:
+            return (WitMotionFrameKind.TIME, WitMotionFrameKind.QUATERNION)
+        return (WitMotionFrameKind.QUATERNION,)
+
+    @property
+    @override
+    def serial_bits_per_s(self) -> float | None:
+        if self.transport == "usb":
+            return None
+        return self.rate_hz * _BITS * FRAME_BYTES * len(self.kinds)
+
+    @field_validator("rate_hz")
+    @classmethod
+    def _rate_with_a_code(cls, rate_hz: float) -> float:
+        """Refuse rates for which the device has no setting."""
+        if rate_hz not in RATE_CODES:
+            known = ", ".join(map(str, RATE_CODES))
+            raise ValueError(f"expected one of {known} Hz, found {rate_hz:g}")
+        return rate_hz

@@ -1,1 +1,0 @@
-"""Driver for WitMotion IMUs, as an example of a driver in a package of its own."""

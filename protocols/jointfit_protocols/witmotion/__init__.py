@@ -1,0 +1,61 @@
+"""WitMotion 0x55 frames on a UART: framing, register commands and the content of frames."""
+
+from jointfit_protocols.witmotion._content import (
+    FULL_SCALE,
+    TICK_NS,
+    acceleration_of,
+    counts_of,
+    encode_counts,
+    encode_time,
+    rate_of,
+    registers_of,
+    time_of,
+)
+from jointfit_protocols.witmotion._framing import (
+    FRAME_BYTES,
+    WitMotionCodec,
+    WitMotionFrame,
+    WitMotionFrameKind,
+    encode,
+)
+from jointfit_protocols.witmotion._registers import (
+    BAUD_CODES,
+    COMMAND_BYTES,
+    RATE_CODES,
+    SAVE,
+    UNLOCK,
+    WitMotionCommand,
+    WitMotionRegister,
+    content_bits,
+    decode_command,
+    read_register,
+    write_register,
+)
+
+__all__ = [
+    "BAUD_CODES",
+    "COMMAND_BYTES",
+    "FRAME_BYTES",
+    "FULL_SCALE",
+    "RATE_CODES",
+    "SAVE",
+    "TICK_NS",
+    "UNLOCK",
+    "WitMotionCodec",
+    "WitMotionCommand",
+    "WitMotionFrame",
+    "WitMotionFrameKind",
+    "WitMotionRegister",
+    "acceleration_of",
+    "content_bits",
+    "counts_of",
+    "decode_command",
+    "encode",
+    "encode_counts",
+    "encode_time",
+    "rate_of",
+    "read_register",
+    "registers_of",
+    "time_of",
+    "write_register",
+]

@@ -1,0 +1,273 @@
+"""Virtual WitMotion device on a pty, with the behaviour and faults of real devices.
+
+Invariant: the device sends no quaternion until it is configured, acknowledges nothing, accepts
+writes for 10 s after the unlock command, and loses them at power-off unless they were saved.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from dataclasses import dataclass
+from math import atan2, degrees, radians
+from typing import TYPE_CHECKING
+
+from jointfit_protocols.orientation import native_of
+from jointfit_protocols.witmotion import (
+    BAUD_CODES,
+    COMMAND_BYTES,
+    FULL_SCALE,
+    RATE_CODES,
+    TICK_NS,
+    WitMotionCommand,
+    WitMotionFrameKind,
+    WitMotionRegister,
+    content_bits,
+    decode_command,
+    encode,
+    encode_counts,
+    encode_time,
+)
+from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_simulators.devices._inertial_signals import InertialSignals
+from jointfit_simulators.imu_device import clean_wire
+from jointfit_simulators.wires import PtyLine
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from jointfit_protocols.orientation import World
+    from jointfit_simulators.imu_device import Quaternion, WireNoise
+
+UNLOCKED_S = 10.0
+"""Time after the unlock command in which writes are accepted, s."""
+FACTORY_CONTENT = content_bits(
+    WitMotionFrameKind.ACCELERATION,
+    WitMotionFrameKind.RATE,
+    WitMotionFrameKind.ANGLE,
+    WitMotionFrameKind.MAGNETIC_FIELD,
+)
+"""Frames that a new device sends."""
+WITH_QUATERNION = content_bits(WitMotionFrameKind.QUATERNION)
+_UNLOCK = 0xB588
+_FIRST_KIND = int(WitMotionFrameKind.TIME)
+_KINDS = 16
+_G = 9.8
+_FULL_RATE = radians(2000.0)
+_EPOCH_MS = 475_372_800_000
+"""Date of the clock at power-up, ms since 2000: an arbitrary one, 24 January 2015."""
+_FIELD_COUNTS = 500
+"""Counts of the magnitude of the magnetic field."""
+_GLITCH_MS = 3_600_000
+_BITS = 10
+_OTHER_FRAME = struct.Struct("<BB9h")
+
+
+@dataclass(frozen=True, slots=True)
+class WitMotionDeviceOptions:
+    """Settings in flash, and faults of a device."""
+
+    content: int = FACTORY_CONTENT
+    """Register CONTENT."""
+    rate_hz: int = 10
+    baud: int | None = None
+    """Speed of the device, bit/s; at another speed both sides receive garbage. None: any."""
+    world: World = "ENU"
+    world_to_sensor: bool = False
+    answers_reads: bool = True
+    """Whether the firmware answers read commands."""
+    ignores_commands: bool = False
+    """Whether the wire from the host is broken."""
+    bluetooth: bool = False
+    """Whether the device sends 55 61 frames, like Bluetooth models."""
+    time_glitch_every: int = 0
+    """Samples between two glitches of the calendar time; 0: none."""
+
+
+class WitMotionDevice:
+    """`ImuDevice` on a pty.
+
+    Parameters
+    ----------
+    link
+        Symbolic link to the host's port.
+    options
+        Settings and faults.
+    wire_noise
+        Noise applied to each sample to the host.
+    now_s
+        Clock of the lock, s.
+    """
+
+    streaming = True  # from power-on, independent of the host
+
+    def __init__(
+        self,
+        link: Path,
+        *,
+        options: WitMotionDeviceOptions | None = None,
+        wire_noise: WireNoise = clean_wire,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._options = options = options or WitMotionDeviceOptions()
+        self._line, self._noise, self._now_s = PtyLine(link), wire_noise, now_s
+        self._inertial = InertialSignals()
+        self.flash = {
+            int(WitMotionRegister.CONTENT): options.content,
+            int(WitMotionRegister.RATE): RATE_CODES[options.rate_hz],
+        }
+        if options.baud is not None:
+            self.flash[WitMotionRegister.BAUD] = BAUD_CODES[options.baud]
+        self.registers = dict(self.flash)
+        """Registers in force; `flash` contains those that survive power-off."""
+        self._unlocked_until_s = 0.0
+        self._rest = b""
+        self._to_lose = self.sent = 0
+        self.counter = 0
+        """Number of the next sample; the device does not send it."""
+        self.saved = 0
+        """Number of commands that stored the registers in flash."""
+        self.unplug, self.plug = self._line.unplug, self._line.plug
+
+    # --- control by the simulation ------------------------------------------------------------
+
+    @property
+    def rate_hz(self) -> float:
+        """Configured samples per second."""
+        codes = {code: rate for rate, code in RATE_CODES.items()}
+        return float(codes.get(self.registers[WitMotionRegister.RATE], 10))
+
+    @property
+    def line_ns(self) -> int:
+        """Transmission time of a sample at the speed of the host's port, ns."""
+        baud = self._line.host_baud
+        size = len(self._frames(0, (1.0, 0.0, 0.0, 0.0)))
+        return size * _BITS * 1_000_000_000 // baud if baud else 0
+
+    def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
+        """Send one sample now, as described in `ImuDevice.push`."""
+        self._inertial.update(device_ns, q_world_sensor)
+        self.counter += 1
+        if self._to_lose:
+            self._to_lose -= 1
+        elif self._options.bluetooth:
+            self._write(self._other_frame(q_world_sensor))
+        elif self._write(self._frames(device_ns, q_world_sensor)):
+            self.sent += 1
+
+    def lose(self, count: int) -> None:
+        """Lose the next `count` samples: they are not sent."""
+        self._to_lose += count
+
+    def edge(self, device_ns: int) -> None:
+        """Ignore an edge: the device has no sync input."""
+
+    def power_cycle(self) -> None:
+        """Interrupt the power supply: settings that were not saved are lost."""
+        self.counter = 0
+        self.registers = dict(self.flash)
+        self._unlocked_until_s = 0.0
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        await self._line.serve(self._receive)
+
+    # --- commands of the host -----------------------------------------------------------------
+
+    def _receive(self, data: bytes) -> None:
+        if self._options.ignores_commands or not self._same_speed:
+            return
+        self._rest += data
+        while len(self._rest) >= COMMAND_BYTES:
+            command = decode_command(self._rest[:COMMAND_BYTES])
+            self._rest = self._rest[COMMAND_BYTES if command else 1 :]
+            if command is not None:
+                self._execute(command)
+
+    def _execute(self, command: WitMotionCommand) -> None:
+        register, value = command
+        if register == WitMotionRegister.READ:
+            if self._options.answers_reads:
+                values = [self.registers.get(value + k, 0) for k in range(4)]
+                data = struct.pack("<4H", *values)
+                self._write(encode(WitMotionFrameKind.REGISTERS, data))
+        elif register == WitMotionRegister.KEY:
+            if value == _UNLOCK:
+                self._unlocked_until_s = self._now_s() + UNLOCKED_S
+        elif self._now_s() >= self._unlocked_until_s:
+            return
+        elif register == WitMotionRegister.SAVE:
+            self.flash = dict(self.registers)
+            self.saved += 1
+        else:
+            self.registers[register] = value
+
+    # --- frames to the host -------------------------------------------------------------------
+
+    @property
+    def _same_speed(self) -> bool:
+        code = self.registers.get(WitMotionRegister.BAUD)
+        host = self._line.host_baud
+        return code is None or (host is not None and BAUD_CODES.get(host) == code)
+
+    def _write(self, wire: bytes) -> bool:
+        if not self._same_speed:  # the same number of bytes, none of them correct
+            wire = bytes((byte * 7 + 1) & 0x4A for byte in wire)
+        return self._line.write(self._noise(wire))
+
+    def _frames(self, device_ns: int, q: Quaternion) -> bytes:
+        """Return the frames of one sample, in the order of their kinds."""
+        content = self.registers[WitMotionRegister.CONTENT]
+        kinds = [_FIRST_KIND + bit for bit in range(_KINDS) if content >> bit & 1]
+        return b"".join(encode(kind, self._data(kind, device_ns, q)) for kind in kinds)
+
+    def _data(self, kind: int, device_ns: int, q: Quaternion) -> bytes:
+        if kind == WitMotionFrameKind.TIME:
+            every = self._options.time_glitch_every
+            glitch = every and self.counter % every == every - 1
+            return encode_time(_EPOCH_MS + device_ns // TICK_NS + _GLITCH_MS * bool(glitch))
+        return _encode_reals(self._values(kind, q))
+
+    def _values(self, kind: int, q: Quaternion) -> list[float]:
+        """Return the values of a frame in units of full scale; none for other kinds."""
+        match kind:
+            case WitMotionFrameKind.ACCELERATION:
+                return self._signal(Item.ACCELERATION, 16.0 * _G)
+            case WitMotionFrameKind.RATE:
+                return self._signal(Item.RATE_OF_TURN, _FULL_RATE)
+            case WitMotionFrameKind.MAGNETIC_FIELD:
+                return self._signal(Item.MAGNETIC_FIELD, FULL_SCALE / _FIELD_COUNTS)
+            case WitMotionFrameKind.ANGLE:
+                return [angle / 180.0 for angle in _euler_deg(q)]
+            case WitMotionFrameKind.QUATERNION:
+                w, x, y, z = native_of(q, self._options.world)
+                sign = -1.0 if self._options.world_to_sensor else 1.0
+                return [w, sign * x, sign * y, sign * z]
+            case _:
+                return []
+
+    def _signal(self, item: Item, full: float) -> list[float]:
+        return [value / full for value in self._inertial.value(item) or ()]
+
+    def _other_frame(self, q: Quaternion) -> bytes:
+        """Return a frame of the variant 55 61: acceleration, rate and angle, no checksum."""
+        angles = [round(angle / 180.0 * FULL_SCALE) for angle in _euler_deg(q)]
+        limited = [max(-FULL_SCALE, min(FULL_SCALE - 1, angle)) for angle in angles]
+        return _OTHER_FRAME.pack(0x55, 0x61, 0, 0, 2048, 0, 0, 0, *limited)
+
+
+def _encode_reals(values: list[float]) -> bytes:
+    """Return the data of a frame with values in units of full scale; missing ones are 0."""
+    w, x, y, z = (round(value * FULL_SCALE) for value in [*values, 0.0, 0.0, 0.0, 0.0][:4])
+    return encode_counts((w, x, y, z))
+
+
+def _euler_deg(q: Quaternion) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw, degrees."""
+    w, x, y, z = q
+    roll = atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
+    pitch = atan2(sine, (1.0 - sine * sine) ** 0.5)
+    yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return degrees(roll), degrees(pitch), degrees(yaw)

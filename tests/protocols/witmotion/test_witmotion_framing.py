@@ -1,0 +1,197 @@
+"""WitMotion frames: documented bytes, any cut, every byte accounted for."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import struct
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.orientation import OrientationGate, canonical
+from jointfit_protocols.witmotion import (
+    FRAME_BYTES,
+    FULL_SCALE,
+    SAVE,
+    UNLOCK,
+    WitMotionCodec,
+    WitMotionFrame,
+    WitMotionFrameKind,
+    WitMotionRegister,
+    acceleration_of,
+    content_bits,
+    counts_of,
+    decode_command,
+    encode,
+    encode_counts,
+    encode_time,
+    rate_of,
+    read_register,
+    time_of,
+    write_register,
+)
+
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "imu"
+VECTORS: dict[str, dict[str, Any]] = (
+    {
+        entry["id"]: entry
+        for entry in json.loads((SHARED / "vectors.json").read_text(encoding="utf-8"))
+        if entry["protocol"] == "witmotion-0x55"
+    }
+    if SHARED.is_dir()
+    else {}
+)
+EPOCH = datetime(2000, 1, 1)  # noqa: DTZ001 - the device has no time zone
+
+counts = st.integers(-(2**15), 2**15 - 1)
+frames = st.builds(encode, st.integers(0x50, 0x5F), st.binary(min_size=8, max_size=8))
+false_heads = st.sampled_from([b"U", b"UY", b"UUU", b"Ua", b"\x55\x59\x00\x40"])
+wires = st.lists(frames | st.binary(max_size=30) | false_heads, max_size=10).map(b"".join)
+
+
+def decode(pieces: list[bytes]) -> tuple[list[WitMotionFrame | CorruptBytes], WitMotionCodec]:
+    codec = WitMotionCodec()
+    found = [event for piece in pieces for event in codec.feed(piece)]
+    return found + codec.flush(), codec
+
+
+@given(wires, st.lists(st.integers(0, 300), max_size=6))
+def test_frames_do_not_depend_on_the_cut_and_every_byte_is_counted(
+    wire: bytes, cuts: list[int]
+) -> None:
+    whole, codec = decode([wire])
+    at = sorted({0, len(wire), *(place % (len(wire) + 1) for place in cuts)})
+    assert decode([wire[a:b] for a, b in itertools.pairwise(at)])[0] == whole
+    assert decode([bytes([byte]) for byte in wire])[0] == whole
+    used = sum(
+        FRAME_BYTES if isinstance(item, WitMotionFrame) else item.discarded for item in whole
+    )
+    assert used == len(wire) == codec.frames * FRAME_BYTES + codec.discarded
+
+
+@given(st.lists(frames, min_size=1, max_size=5), st.integers(1, 10))
+def test_a_frame_after_a_cut_off_one_is_found(sent: list[bytes], missing: int) -> None:
+    wire = sent[0][missing:] + b"".join(sent)
+    found, _ = decode([wire])
+    assert found[-1] == WitMotionFrame(sent[-1][1], sent[-1][2:10], len(wire))
+
+
+def test_a_valid_frame_inside_a_corrupt_candidate_is_found() -> None:
+    true = encode(0x59, encode_counts((1, 2, 3, 4)))
+    found, codec = decode([b"\x55\x59\x01" + true])
+    assert found == [CorruptBytes(3, "checksum"), WitMotionFrame(0x59, true[2:10], 14)]
+    assert codec.checksum_failures == 1
+
+
+def test_long_noise_is_reported_in_bounded_runs() -> None:
+    found, codec = decode([bytes(5000)])
+    assert [item.discarded for item in found if isinstance(item, CorruptBytes)] == [1024] * 4 + [
+        904
+    ]
+    assert codec.pending == 0
+
+
+@pytest.mark.parametrize("size", [20, 28])
+def test_the_variant_55_61_is_recognized_and_not_decoded(size: int) -> None:
+    frame = struct.pack("<BB", 0x55, 0x61) + bytes(range(1, size - 1))
+    found, codec = decode([frame * 10])
+    assert codec.other_frames >= 8
+    assert not any(isinstance(item, WitMotionFrame) for item in found)
+
+
+def test_encode_refuses_what_the_format_does_not_allow() -> None:
+    with pytest.raises(ValueError, match="0x61"):
+        encode(0x61, bytes(8))
+    with pytest.raises(ValueError, match="7 bytes"):
+        encode(0x59, bytes(7))
+
+
+@given(counts, counts, counts, counts)
+def test_counts_survive_both_directions(w: int, x: int, y: int, z: int) -> None:
+    assert counts_of(encode_counts((w, x, y, z))) == (w, x, y, z)
+
+
+@given(st.integers(0, 36_525 * 86_400_000 - 1))
+def test_calendar_time_agrees_with_the_calendar_of_python(ticks: int) -> None:
+    data = encode_time(ticks)
+    date = EPOCH + timedelta(milliseconds=ticks)
+    wanted = (date.year - 2000, date.month, date.day, date.hour, date.minute, date.second)
+    assert tuple(data[:6]) == wanted
+    assert time_of(data) == ticks
+
+
+def test_a_clock_that_was_never_set_is_accepted_and_impossible_times_are_not() -> None:
+    assert time_of(bytes(8)) == 0
+    for data in ("1a0d04050607", "1a0320050607", "1a0304180607", "1a0304053c07", "1a030405063c"):
+        assert time_of(bytes.fromhex(data) + bytes(2)) is None
+    assert time_of(bytes.fromhex("1a0304050607e803")) is None
+
+
+@pytest.mark.skipif(not VECTORS, reason="the shared vectors are not there")
+@pytest.mark.parametrize("name", sorted(VECTORS))
+def test_vectors(name: str) -> None:
+    vector = VECTORS[name]
+    wire = bytes.fromhex(vector["hex"])
+    if name.startswith("wit-cmd"):
+        commands = {
+            "wit-cmd-unlock": UNLOCK,
+            "wit-cmd-rsw-time-quat": write_register(
+                WitMotionRegister.CONTENT,
+                content_bits(WitMotionFrameKind.TIME, WitMotionFrameKind.QUATERNION),
+            ),
+            "wit-cmd-rate-100": write_register(WitMotionRegister.RATE, 0x09),
+            "wit-cmd-baud-115200": write_register(WitMotionRegister.BAUD, 0x06),
+            "wit-cmd-save": SAVE,
+        }
+        assert commands[name] == wire
+        command = decode_command(wire)
+        assert command is not None
+        assert write_register(*command) == wire
+        return
+    (found,), codec = decode([wire])
+    if not vector["valid"]:
+        assert isinstance(found, CorruptBytes)
+        assert codec.checksum_failures == 1
+        return
+    assert isinstance(found, WitMotionFrame)
+    assert encode(found.kind, found.data) == wire
+    expected = vector["decoded"]
+    if "time" in expected:
+        ticks = time_of(found.data)
+        assert ticks is not None
+        assert EPOCH + timedelta(milliseconds=ticks) == datetime.fromisoformat(expected["time"])
+    elif expected["native_wxyz"] is not None:
+        assert list(counts_of(found.data)) == expected["raw"]
+        native = tuple(count / FULL_SCALE for count in counts_of(found.data))
+        assert native == pytest.approx(expected["native_wxyz"])
+        q = OrientationGate().admit(canonical(native, "ENU"))  # type: ignore[arg-type]
+        assert q == pytest.approx(expected["canonical_wxyz"], abs=1e-8)
+    else:
+        assert found.kind != WitMotionFrameKind.QUATERNION
+
+
+def test_a_read_command_is_a_write_to_the_register_read() -> None:
+    assert read_register(WitMotionRegister.CONTENT).hex() == "ffaa270200"
+    assert decode_command(b"\xff\xab\x02\x00\x00") is None
+
+
+@given(counts, counts, counts, counts)
+def test_the_witmotion_package_reads_the_same_values(w: int, x: int, y: int, z: int) -> None:
+    """Its quaternion, acceleration and rate; its epoch of time differs from the vendor's page."""
+    oracle = pytest.importorskip("witmotion.protocol")
+    data = encode_counts((w, x, y, z))
+    assert oracle.QuaternionMessage.compute_checksum(data) == encode(0x59, data)[-1]
+    assert tuple(oracle.QuaternionMessage.parse(data).q) == (
+        w / 32768, x / 32768, y / 32768, z / 32768,
+    )  # fmt: skip
+    assert acceleration_of(data) == pytest.approx(oracle.AccelerationMessage.parse(data).a)
+    theirs = [
+        value * 3.141592653589793 / 180 for value in oracle.AngularVelocityMessage.parse(data).w
+    ]
+    assert rate_of(data) == pytest.approx(theirs)
