@@ -164,3 +164,13 @@ def from_matrix_one(rows: Sequence[Sequence[float]]) -> Quaternion:
             q = (d - b, c + g, f + h, 1.0 + i - a - e)
     w, x, y, z = normalize_one(q)
     return (-w, -x, -y, -z) if w < 0.0 else (w, x, y, z)
+
+
+def to_matrix_one(q: Quaternion) -> tuple[Vector, Vector, Vector]:
+    """Return the rows of the rotation matrix of a unit quaternion."""
+    w, x, y, z = q
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )

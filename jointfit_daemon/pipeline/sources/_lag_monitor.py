@@ -33,9 +33,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration, MarkerCluster
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
-    from jointfit_daemon.timing.lag import TrackedLag
-
-    Track = tuple[NDArray[np.int64], NDArray[np.float64]]
+    from jointfit_daemon.timing.lag import Rates, TrackedLag
 
 WINDOW_NS = 10_000_000_000
 """Length of the window of one estimate, ns."""
@@ -84,6 +82,17 @@ class _Window(NamedTuple):
     sensor: str
     center_ns: int
     work: Generator[None, None, LagEstimate]
+
+
+class _SegmentTrack(NamedTuple):
+    """Orientations of a segment from its markers in one window, shared by its sensors."""
+
+    end_ns: int
+    """End of the window."""
+    t_ns: NDArray[np.int64]
+    q: NDArray[np.float64]
+    rates: Rates | None = None
+    """Angular rates, computed for the first sensor."""
 
 
 class _SensorLag:
@@ -143,8 +152,8 @@ class LagMonitor:
         self._window: _Window | None = None
         self._next_ns: int | None = None
         self._mocap_epoch: int | None = None
-        self._tracks: dict[str, tuple[int, Track]] = {}
-        """End of the window, and orientations from the markers, by segment."""
+        self._tracks: dict[str, _SegmentTrack] = {}
+        """Track of the last window by segment; the next window continues it."""
         for name, old in ({} if before is None else before.sensors).items():
             lag = self.sensors.get(name)
             if lag is not None:
@@ -177,11 +186,13 @@ class LagMonitor:
         frames = self._frames
         if self._mocap_epoch not in (None, epoch):  # their clock restarted
             frames.clear()
+            self._tracks.clear()
             self._next_ns = None
             for lag in self.sensors.values():
                 lag.tracker.widen(RESTART_SD_NS)
-        elif frames and frames[-1][1].layout != frame.layout:
+        elif frames and (last := frames[-1][1].layout) is not frame.layout and last != frame.layout:
             frames.clear()
+            self._tracks.clear()
         self._mocap_epoch = epoch
         if frames and t_ns <= frames[-1][0]:
             return
@@ -223,13 +234,14 @@ class LagMonitor:
             )
 
         # Orientations of the segment, shared by its sensors.
-        if self._tracks.get(segment, (0, None))[0] != end_ns:
+        track = self._tracks.get(segment)
+        if track is None or track.end_ns != end_ns:
             rows = [row for row in self._frames if start_ns <= row[0] <= end_ns]
             if len(rows) < _MIN_FRAMES:
                 return _no_estimate("too few mocap frames: check that the system streams")
-            track = yield from _orientations(self._clusters[segment], rows)
-            self._tracks[segment] = end_ns, track
-        t_ref, q_ref = self._tracks[segment][1]
+            t_ref, q_ref = yield from _orientations(self._clusters[segment], rows, track)
+            track = _SegmentTrack(end_ns, t_ref, q_ref)
+            self._tracks[segment] = track
 
         # Samples of the sensor, with a margin for the lag.
         low, high = start_ns - MARGIN_NS, end_ns + MARGIN_NS
@@ -241,7 +253,8 @@ class LagMonitor:
         yield
         imu = rates_from_orientations(t_imu, q_imu, start_ns)
         yield
-        ref = rates_from_orientations(t_ref, q_ref, start_ns)
+        ref = track.rates or rates_from_orientations(track.t_ns, track.q, start_ns)
+        self._tracks[segment] = track._replace(rates=ref)
         yield
         return (yield from estimate_in_steps(imu, ref, LagSettings(low_r2=_LOW_R2)))
 
@@ -323,25 +336,35 @@ class LagMonitor:
 
 
 def _orientations(
-    cluster: MarkerCluster, rows: list[tuple[int, MocapFrame]]
-) -> Generator[None, None, Track]:
-    """Return the orientations of a segment from its markers, in steps of a few frames."""
+    cluster: MarkerCluster, rows: list[tuple[int, MocapFrame]], before: _SegmentTrack | None
+) -> Generator[None, None, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Return the orientations of a segment from its markers, in steps of a few frames.
+
+    Windows overlap: frames of the window `before` are not fitted again.
+    """
+    t_ns = np.array([t for t, _ in rows], dtype=np.int64)
     layout = rows[0][1].layout
-    parts = []
     if cluster.body is not None:
         column = layout.bodies.index(cluster.body) if cluster.body in layout.bodies else None
-        for _, frame in rows:
-            q = np.full(4, np.nan) if column is None else frame.body_orientations[column]
-            parts.append(q[None])
-    else:
-        columns = [layout.markers.index(m) if m in layout.markers else -1 for m in cluster.markers]
-        for start in range(0, len(rows), _FRAMES_PER_STEP):
-            seen = np.stack([frame.markers for _, frame in rows[start : start + _FRAMES_PER_STEP]])
+        missing = np.full(4, np.nan)
+        return t_ns, np.array(
+            [missing if column is None else frame.body_orientations[column] for _, frame in rows]
+        )
+
+    columns = [layout.markers.index(m) if m in layout.markers else -1 for m in cluster.markers]
+    parts, fitted = [], 0
+    if before is not None:
+        fitted = int(np.searchsorted(t_ns, before.t_ns[-1], side="right"))
+        parts.append(before.q[len(before.q) - fitted :])
+    for start in range(0, len(rows), _FRAMES_PER_STEP):
+        new = rows[max(start, fitted) : start + _FRAMES_PER_STEP]
+        if new:
+            seen = np.stack([frame.markers for _, frame in new])
             absent = np.full((len(seen), 1, 3), np.nan)  # column -1: not part of the stream
             positions = np.concatenate((seen, absent), axis=1).take(columns, axis=1)
             parts.append(rigid_fit(cluster.template, positions)[0])
-            yield
-    return np.array([t for t, _ in rows], dtype=np.int64), np.concatenate(parts)
+        yield  # also after frames of `before`: the instants of the results depend on the steps
+    return t_ns, np.concatenate(parts)
 
 
 def _no_estimate(refused: str) -> LagEstimate:

@@ -359,22 +359,23 @@ def _correlations(imu: Rates, ref: Rates, step: float, reach: int) -> Floats:
     a, a_ok = _magnitude(ref, grid)
     b, b_ok = _magnitude(imu, wide)
 
-    least = _LEAST_OVERLAP * a_ok.sum()
     scores = np.full(2 * reach + 1, -inf)
-    whole = bool(a_ok.all() and b_ok.all() and grid.size > 2)  # noqa: PLR2004 - as below
-    centered = a - a.mean() if whole else a
-    power = centered @ centered
-    for shift in range(scores.size):
-        y = b[shift : shift + grid.size]
-        x = centered
-        if not whole:
-            both = a_ok & b_ok[shift : shift + grid.size]
-            if both.sum() <= max(2.0, least):
-                continue
-            x, y = a[both] - a[both].mean(), y[both]
-            power = x @ x
-        y = y - y.mean()
-        scores[shift] = (x @ y) / np.sqrt(max(power * (y @ y), 1e-300))
+    if not (a_ok.any() and b_ok.any()):
+        return scores
+
+    # Sums over the common instants of every lag. Subtracting the means before limits rounding.
+    a, b = (np.where(ok, x - x[ok].mean(), 0.0) for x, ok in ((a, a_ok), (b, b_ok)))
+    a_on, b_on = a_ok.astype(np.float64), b_ok.astype(np.float64)
+    count = np.correlate(b_on, a_on, "valid")
+    enough = count > max(2.0, _LEAST_OVERLAP * a_ok.sum())
+    n = np.maximum(count, 1.0)
+    sum_a, sum_b = np.correlate(b_on, a, "valid"), np.correlate(b, a_on, "valid")
+    power_a = np.correlate(b_on, a * a, "valid") - sum_a * sum_a / n
+    power_b = np.correlate(b * b, a_on, "valid") - sum_b * sum_b / n
+
+    product = np.correlate(b, a, "valid") - sum_a * sum_b / n
+    found = product / np.sqrt(np.maximum(power_a * power_b, 1e-300))
+    scores[enough] = found[enough]
     return scores
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.kinematics.rotation_scalar import exp_one, to_matrix_one
 from jointfit_daemon.timing.lag._angular_rates import KERNEL_HALF_S, Interpolant
 from jointfit_daemon.timing.lag._standard_deviation import RIDGE, LinearizedLag, lag_sigma
 
@@ -167,22 +167,33 @@ def _linearize(
     # Derivatives by rotation (the matrix of the cross product), bias and lag.
     x, y, z = turned.T
     jacobian = np.zeros((len(r), 3, 7))
-    jacobian[:, 0, 1], jacobian[:, 0, 2] = -z, y
-    jacobian[:, 1, 0], jacobian[:, 1, 2] = z, -x
-    jacobian[:, 2, 0], jacobian[:, 2, 1] = -y, x
+    jacobian[:, 0, 2], jacobian[:, 1, 0], jacobian[:, 2, 1] = y, z, x
+    np.negative(z, out=jacobian[:, 0, 1])
+    np.negative(x, out=jacobian[:, 1, 2])
+    np.negative(y, out=jacobian[:, 2, 0])
     jacobian[:, :, 3:6] = _BY_BIAS
     jacobian[:, :, 6] = slope
     return LinearizedLag(jacobian, r, weight, (weight < 1.0).astype(np.float64), omega, t_s)
 
 
 def _norms(vectors: Floats) -> Floats:
-    norms: Floats = np.sqrt(np.add.reduce(vectors * vectors, axis=1))
+    x, y, z = vectors.T  # by columns: a sum over an axis of three elements takes twice the time
+    norms: Floats = np.sqrt(x * x + y * y + z * z)
     return norms
 
 
 def _scale(norm: Floats) -> float:
     """Return the robust standard deviation per axis of residuals of these norms."""
-    return max(float(np.median(norm)), _TINY) / MEDIAN_NORM
+    return max(_median(norm), _TINY) / MEDIAN_NORM
+
+
+def _median(values: Floats) -> float:
+    """Return the median of finite values, in half the time of ``np.median``."""
+    middle = values.size // 2
+    if values.size % 2:
+        return float(np.partition(values, middle)[middle])
+    ordered = np.partition(values, (middle - 1, middle))
+    return 0.5 * float(ordered[middle - 1] + ordered[middle])
 
 
 def _clipped(norm: Floats, clip: float) -> Floats:
@@ -198,7 +209,8 @@ def _best_clip(linear: LinearizedLag) -> float:
     """
     norm = _norms(linear.residual)
     scale = _scale(norm)
-    information = np.sum(linear.jacobian[:, :, 6] ** 2, axis=1)
+    x, y, z = linear.jacobian[:, :, 6].T
+    information = x * x + y * y + z * z
 
     def variance(clip: float) -> float:
         weight = _clipped(norm, clip)
@@ -211,9 +223,10 @@ def _best_clip(linear: LinearizedLag) -> float:
 
 def _step(linear: LinearizedLag, state: _State) -> tuple[_State, float]:
     """Return the next state and the change of the lag, s."""
-    weighted = linear.jacobian * linear.weight[:, None, None]
-    normal = np.einsum("nij,nik->jk", weighted, linear.jacobian)
-    gradient = np.einsum("nij,ni->j", weighted, linear.residual)
+    rows = linear.jacobian.reshape(-1, 7)
+    weighted = (linear.jacobian * linear.weight[:, None, None]).reshape(-1, 7).T
+    normal = weighted @ rows
+    gradient = weighted @ linear.residual.reshape(-1)
 
     ridge = RIDGE * max(normal[0, 0] + normal[1, 1] + normal[2, 2], _TINY)
     for axis in range(3):
@@ -222,5 +235,6 @@ def _step(linear: LinearizedLag, state: _State) -> tuple[_State, float]:
 
     move = -np.linalg.solve(normal, gradient)
     tau = float(min(max(move[6], -STEP_S), STEP_S))
-    rot = rotation.to_matrix(rotation.exp(move[:3])) @ state.rot
+    x, y, z, *_ = move.tolist()
+    rot = np.array(to_matrix_one(exp_one((x, y, z)))) @ state.rot
     return _State(state.tau + tau, rot, state.bias + move[3:6]), abs(tau)

@@ -101,7 +101,7 @@ def lag_sigma(solved: LinearizedLag, memory_s: float, stamp_sd_s: float = 0.0) -
     whole[np.arange(3), np.arange(3)] += RIDGE * max(np.trace(whole[:3, :3]), _TINY)
     share = np.append(-np.linalg.solve(whole[:6, :6], whole[:6, 6]), 1.0)
     own = solved.jacobian @ share
-    information = np.einsum("i,nij,j->n", share, normal, share)
+    information = (normal @ share) @ share
     if information.sum() <= _TINY:
         return float("inf")
 
@@ -141,8 +141,9 @@ def _curvature(solved: LinearizedLag) -> tuple[Floats, Floats]:
     weighted = jacobian * weight[:, None, None]
     gradient = np.einsum("nij,ni->nj", weighted, residual)
     along = gradient / np.maximum(weight * np.linalg.norm(residual, axis=1), _TINY)[:, None]
-    normal = np.einsum("nij,nik->njk", weighted, jacobian)
-    return normal - np.einsum("n,nj,nk->njk", weight * give, along, along), gradient
+    normal = np.swapaxes(weighted, 1, 2) @ jacobian
+    clipped = (weight * give)[:, None] * along
+    return normal - clipped[:, :, None] * along[:, None, :], gradient
 
 
 def _widest(table: Floats, block: NDArray[np.int64], whole: Floats, free: float) -> float:

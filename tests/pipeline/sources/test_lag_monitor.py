@@ -10,7 +10,7 @@ import pytest
 
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.kinematics.rotation_scalar import IDENTITY_ONE, as_quaternion
-from jointfit_daemon.limb_model import Calibration, SensorCalibration, StoredCluster
+from jointfit_daemon.limb_model import Calibration, SensorCalibration, StoredCluster, rigid_fit
 from jointfit_daemon.model import Chain, MocapFrame, MocapLayout
 from jointfit_daemon.outputs.payloads._health_encoding import lag_payload
 from jointfit_daemon.pipeline.sources import LagMonitor
@@ -105,6 +105,17 @@ def test_lag_is_estimated_during_movement() -> None:
     assert found["tracked_refused"] is None
     kept = LagMonitor(CHAIN, replace(CALIBRATION, notes=("new",)), monitor)
     assert lag_payload(kept.health()["S1"])["tracked_ms"] == found["tracked_ms"]
+
+
+def test_orientations_of_overlapping_windows_equal_those_fitted_anew() -> None:
+    monitor = LagMonitor(CHAIN, CALIBRATION)
+    play(monitor, 24.0, 4.0)
+    track = monitor._tracks["thigh"]
+    rows = [row for row in monitor._frames if row[0] <= track.end_ns]  # the first are discarded
+    seen = np.stack([frame.markers for _, frame in rows])
+    assert len(rows) > 1000
+    assert track.t_ns[-len(rows) :].tolist() == [t_ns for t_ns, _ in rows]
+    assert np.array_equal(track.q[-len(rows) :], rigid_fit(np.array(PLACES), seen)[0])
 
 
 def test_lag_step_is_reported_once_within_20_s_as_a_calibration_warning() -> None:
