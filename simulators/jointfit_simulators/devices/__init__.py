@@ -8,6 +8,8 @@ from jointfit_simulators.devices._clocks import (
     SampleTiming,
     SimulatedClock,
 )
+from jointfit_simulators.devices._lpms_can_device import LpmsCanDevice, LpmsCanDeviceOptions
+from jointfit_simulators.devices._lpms_device import LpmsDevice, LpmsDeviceOptions
 from jointfit_simulators.devices._mip_device import MipDevice, MipDeviceOptions
 from jointfit_simulators.devices._natnet_frames import (
     Bodies,
@@ -44,6 +46,10 @@ __all__ = [
     "Cameras",
     "ClockFault",
     "FrameStamps",
+    "LpmsCanDevice",
+    "LpmsCanDeviceOptions",
+    "LpmsDevice",
+    "LpmsDeviceOptions",
     "Markers",
     "MipDevice",
     "MipDeviceOptions",

@@ -8,6 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from jointfit_protocols.lpms.channels import sequential_ids, tpdo_ids
+from jointfit_protocols.lpms.configuration import GENERATION_3, Generation
 from jointfit_protocols.mip.data import DataSet, FilterField, SharedField
 from jointfit_protocols.witmotion import RATE_CODES
 from jointfit_protocols.xbus.configuration import SyncSetting
@@ -16,6 +18,10 @@ from jointfit_protocols.xbus.sync_lines import IN1, Polarity, SyncFunction
 from jointfit_protocols.xcdi import XcdiIds
 from jointfit_simulators.devices import (
     WITH_QUATERNION,
+    LpmsCanDevice,
+    LpmsCanDeviceOptions,
+    LpmsDevice,
+    LpmsDeviceOptions,
     MipDevice,
     MipDeviceOptions,
     WitMotionDevice,
@@ -101,6 +107,34 @@ class CanFamily:
     """Return a device on the bus."""
 
 
+def _lpms(place: SensorPlace, port: Path) -> ConnectedImu:
+    generation: Generation = 3 if int(place.knobs.rate_hz) in GENERATION_3.rates_hz else 1
+    options = LpmsDeviceOptions(generation=generation)
+    device = LpmsDevice(port, options=options, wire_noise=line_noise(place.knobs, place.name))
+    keys = [f'port = "{port}"', "baud = 921600", f"generation = {generation}"]
+    return ConnectedImu(device, keys, str(port))
+
+
+def _lpms_can(place: SensorPlace, bus: CanWire) -> ConnectedImu:
+    """Return a sensor in CANopen style, or, for the first one, in sequential mode."""
+    is_first = place.number == 1
+    numbers = sequential_ids(1, spaced=True) if is_first else tpdo_ids(place.number)
+    options = LpmsCanDeviceOptions(
+        mode="sequential" if is_first else "canopen",
+        node=place.number,
+        ids=numbers,
+        rate_hz=place.knobs.rate_hz,
+    )
+    frames = ", ".join(f"frame{k} = {number:#05x}" for k, number in enumerate(numbers, 1))
+    keys = [
+        f'can = "{BUS}"',
+        f'mode = "{options.mode}"',
+        f"ids = {{ {frames} }}",
+        f'precision = "{options.precision}"',
+    ]
+    return ConnectedImu(LpmsCanDevice(bus, options), keys, f"{BUS}:{numbers[0]:#05x}")
+
+
 def _mip(place: SensorPlace, port: Path) -> ConnectedImu:
     outputs = ((SharedField.REFERENCE_TIME, 1), (FilterField.QUATERNION, 1))
     device = MipDevice(
@@ -161,6 +195,8 @@ def ids_toml(ids: XcdiIds) -> str:
 
 
 IMU_FAMILIES: dict[str, UartFamily | CanFamily] = {
+    "lpms": UartFamily(_lpms),
+    "lpms-can": CanFamily(_lpms_can),
     "mip": UartFamily(_mip),
     "witmotion": UartFamily(_witmotion),
     "xbus": UartFamily(_xbus),

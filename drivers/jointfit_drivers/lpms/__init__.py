@@ -1,0 +1,18 @@
+"""Drivers for LP-Research LPMS sensors: LP-BUS on a serial port or USB, and channels on CAN."""
+
+from jointfit_drivers.lpms._can_decoder import LpmsCanDecoder
+from jointfit_drivers.lpms._can_driver import LpmsCanImu
+from jointfit_drivers.lpms._can_settings import LpmsCanIdSettings, LpmsCanSettings
+from jointfit_drivers.lpms._decoder import LpmsDecoder
+from jointfit_drivers.lpms._driver import LpmsImu
+from jointfit_drivers.lpms._settings import LpmsSettings
+
+__all__ = [
+    "LpmsCanDecoder",
+    "LpmsCanIdSettings",
+    "LpmsCanImu",
+    "LpmsCanSettings",
+    "LpmsDecoder",
+    "LpmsImu",
+    "LpmsSettings",
+]

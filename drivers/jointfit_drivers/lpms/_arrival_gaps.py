@@ -1,0 +1,89 @@
+"""Losses in a stream without time and counter, from the arrivals alone.
+
+A lost frame delays all later arrivals by a whole period for good, a busy bus or host delays some of
+them for a while. The least delay of every ten samples, relative to a line with the nominal rate,
+separates the two.
+
+Invariant: pure arithmetic on arrival stamps.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+_SAMPLES = 10
+"""Samples of a window."""
+_LOST = 0.75
+"""Increase of the least delay, periods, that proves a loss."""
+_DRIFT = 0.1
+"""Largest increase of the least delay, periods, by a difference of the two clocks."""
+_WRONG_RATE = 0.2
+"""Relative difference of the mean interval from the period that shows another rate."""
+_WINDOWS = 3
+"""Consecutive windows that prove another rate."""
+_NS = 1e9
+
+
+class ArrivalStep(NamedTuple):
+    """Finding of a window."""
+
+    lost: int = 0
+    """Number of samples lost."""
+    rate_hz: float | None = None
+    """Measured rate, Hz, if it is another than the nominal one; reported once."""
+
+
+_CONTINUES = ArrivalStep()
+
+
+class ArrivalGaps:
+    """Finds losses in the arrivals of one sensor.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Nominal rate, Hz.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._period_ns = _NS / rate_hz
+        self._due_ns: float | None = None
+        self._base_ns: float | None = None
+        self._least_ns = float("inf")
+        self._count = self._wrong = 0
+        self._since_ns = 0
+
+    def add(self, t_ns: int) -> ArrivalStep:
+        """Add a sample that arrived at `t_ns`."""
+        if self._due_ns is None:
+            self._due_ns, self._since_ns = float(t_ns), t_ns
+            self._least_ns = 0.0
+            return _CONTINUES
+
+        self._due_ns += self._period_ns
+        self._least_ns = min(self._least_ns, t_ns - self._due_ns)
+        self._count += 1
+        return _CONTINUES if self._count < _SAMPLES else self._end_window(t_ns)
+
+    def _end_window(self, t_ns: int) -> ArrivalStep:
+        mean_ns = (t_ns - self._since_ns) / self._count
+        least_ns, base_ns = self._least_ns, self._base_ns
+        self._since_ns, self._count, self._least_ns = t_ns, 0, float("inf")
+
+        is_wrong = abs(mean_ns / self._period_ns - 1) > _WRONG_RATE
+        self._wrong = self._wrong + 1 if is_wrong else 0
+        if self._wrong >= _WINDOWS and mean_ns > 0:
+            self._period_ns, self._due_ns = mean_ns, float(t_ns)
+            self._base_ns, self._wrong = 0.0, 0
+            return ArrivalStep(rate_hz=_NS / mean_ns)
+
+        if base_ns is None:
+            self._base_ns = least_ns
+            return _CONTINUES
+        delay = (least_ns - base_ns) / self._period_ns
+        if delay > _LOST:
+            self._base_ns = least_ns
+            return ArrivalStep(round(delay))
+        # a window in which the loss happened also contains a few delays from before
+        self._base_ns = min(least_ns, base_ns + _DRIFT * self._period_ns)
+        return _CONTINUES

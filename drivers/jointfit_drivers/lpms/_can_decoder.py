@@ -1,0 +1,186 @@
+"""Decoder of the driver of LPMS sensors on CAN: records of CAN frames in, samples out.
+
+The sensor sends no time and no sequence number. A sample is stamped with the kernel's receive time
+of its first frame, and losses are found in the arrivals.
+
+Every record of 24 bytes is a message of this sensor, a foreign frame, a note of the host, or
+discarded.
+
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no bus.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
+from jointfit_drivers.lpms._arrival_gaps import ArrivalGaps
+from jointfit_drivers.lpms._orientation import LpmsConvention, LpmsOrientation
+from jointfit_protocols import can
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.lpms.channels import (
+    BOOTED,
+    OPERATIONAL,
+    ChannelQuaternion,
+    Heartbeat,
+    LpmsCanCodec,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Chunk, Decoded, DeviceEventKind
+    from jointfit_drivers.lpms._can_settings import LpmsCanSettings
+
+_NS = 1_000_000_000
+_REPEAT_NS = 1_000_000_000
+"""Shortest interval, ns, between reports of the same error."""
+_TORN = 20
+"""Frames of incomplete quaternions in a row after which the order of the frames is reported."""
+
+
+class LpmsCanDecoder:
+    """Decoder of one LPMS sensor on CAN.
+
+    Parameters
+    ----------
+    settings : LpmsCanSettings
+        Its table of rig.toml.
+    """
+
+    tick_clock = None
+    """The sensor sends no time."""
+
+    def __init__(self, settings: LpmsCanSettings) -> None:
+        self._codec = LpmsCanCodec(
+            settings.channel_ids,
+            settings.precision,
+            settings.mapping,
+            longest_ns=round(_NS / settings.rate_hz / 2),
+        )
+        self._floats = settings.precision == "float32"
+        self._rate_hz = settings.rate_hz
+        self._gaps = ArrivalGaps(settings.rate_hz)
+        self._orientation = LpmsOrientation(LpmsConvention.of(settings), _NORM_REMEDY)
+        self._incomplete = self._torn = self._refused = self._reported_ns = 0
+        self._state: int | None = None
+        self._error_text = ""
+        self.discarded_bytes = 0
+        """Bytes of rejected records, and of lost lines of an adapter."""
+
+    @property
+    def messages(self) -> int:
+        """Well-formed frames of this sensor so far."""
+        return self._codec.messages - self._refused
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return the content that `chunk` completed, in wire order; never raises."""
+        out: list[Decoded] = []
+        for item in can.unpack_frames(chunk.data):
+            if not isinstance(item, can.CanFrame):
+                out.append(self._lose(item.discarded, item.reason))
+            elif item.error:
+                out += self._error_frame_events(item)
+            else:
+                self._take(item, out)
+        return out
+
+    def flush(self) -> list[Decoded]:
+        """Discard an incomplete quaternion."""
+        self._codec.flush()
+        out: list[Decoded] = []
+        self._report_incomplete(out)
+        return out
+
+    def _take(self, frame: can.CanFrame, out: list[Decoded]) -> None:
+        """Append the content that a frame completed."""
+        found = self._codec.feed(frame)
+        if self._codec.incomplete != self._incomplete:
+            self._report_incomplete(out)
+
+        if isinstance(found, ChannelQuaternion):
+            self._torn = 0
+            self._sample(found, out)
+        elif isinstance(found, Heartbeat):
+            self._heartbeat(found, out)
+        elif isinstance(found, CorruptBytes):
+            out.append(self._lose(can.RECORD_BYTES, found.reason))
+
+    def _sample(self, quaternion: ChannelQuaternion, out: list[Decoded]) -> None:
+        """Append the sample of a complete quaternion."""
+        step = self._gaps.add(quaternion.t_ns)
+        if step.rate_hz is not None:
+            text = (
+                f"sends at {step.rate_hz:.4g} Hz, expected {self._rate_hz:g}: set `rate_hz`, or "
+                "change the rate of the sensor with the vendor's tool"
+            )
+            out.append(DeviceEvent("warning", text, {"rate_hz": round(step.rate_hz, 2)}))
+        if step.lost:
+            out.append(DeviceEvent("gap", f"{step.lost} samples lost", {"lost": step.lost}))
+
+        converted = self._orientation.convert(quaternion.values, floats=self._floats)
+        if self._orientation.events:
+            out += self._orientation.events
+            self._orientation.events = []
+        if converted is None:
+            self._refused += 1
+            out.append(self._lose(can.RECORD_BYTES, "quaternion norm is not 1"))
+            return
+        native, q = converted
+        out.append(ImuSample(quaternion.t_ns, q, native, None, None))
+
+    def _heartbeat(self, beat: Heartbeat, out: list[Decoded]) -> None:
+        """Append the event of a changed state."""
+        before, self._state = self._state, beat.state
+        if beat.state == before:
+            return
+        if beat.state == BOOTED:
+            self._orientation.forget()
+            out.append(DeviceEvent("restart", "device restarted (its heartbeat reports a start)"))
+        elif beat.state != OPERATIONAL:
+            text = (
+                f"its heartbeat reports state {beat.state}, expected {OPERATIONAL} (operational): "
+                "switch its CAN output on with the vendor's tool"
+            )
+            out.append(DeviceEvent("warning", text, {"state": beat.state}))
+
+    def _report_incomplete(self, out: list[Decoded]) -> None:
+        """Append the loss of frames whose quaternion is not complete."""
+        count = self._codec.incomplete - self._incomplete
+        self._incomplete += count
+        if not count:
+            return
+        self._refused += count
+        out.append(self._lose(count * can.RECORD_BYTES, "frame without the others of its sample"))
+
+        before, self._torn = self._torn, self._torn + count
+        if before < _TORN <= self._torn:
+            out.append(DeviceEvent("warning", _OUT_OF_ORDER))
+
+    def _error_frame_events(self, frame: can.CanFrame) -> list[Decoded]:
+        """Return the events of an error frame of the controller, its driver or the host."""
+        if frame.can_id in {can.HOST_CORRUPT, can.HOST_DROPPED}:
+            # frames may be missing here: halves before and after are of different samples
+            out = self.flush()
+            count = can.host_count(frame)
+            if frame.can_id == can.HOST_CORRUPT:
+                return [*out, self._lose(count, "no SLCAN line")]
+            text = f"this host was too slow: the kernel dropped {count} CAN frames"
+            return [*out, DeviceEvent("warning", text, {"dropped_frames": count})]
+
+        text, serious = can.describe_error(frame)
+        if text == self._error_text and 0 <= frame.t_ns - self._reported_ns < _REPEAT_NS:
+            return []
+        self._error_text, self._reported_ns = text, frame.t_ns
+        kind: DeviceEventKind = "error" if serious else "warning"
+        return [DeviceEvent(kind, text)]
+
+    def _lose(self, count: int, reason: str) -> Corrupt:
+        self.discarded_bytes += count
+        return Corrupt(count, reason)
+
+
+_NORM_REMEDY = "change `precision` or `mapping`, and remove `scale`"
+_OUT_OF_ORDER = (
+    "the frames of a quaternion do not follow each other within half a period: change `rate_hz` to "
+    "that of the sensor, and give it ascending identifiers (with the vendor's tool) and `ids`; "
+    'precision = "int16" needs one frame only'
+)

@@ -1,0 +1,135 @@
+"""Driver of LP-Research LPMS sensors on CAN.
+
+This driver only receives. The sensor is configured once over its UART or USB with the vendor's
+tool: identifiers, precision, and the quantity of each channel.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from jointfit_drivers.lpms._can_decoder import LpmsCanDecoder
+from jointfit_drivers.lpms._can_settings import LpmsCanSettings
+from jointfit_drivers.ports.can_bus import shared_bus
+from jointfit_protocols.can import unpack_frames
+from jointfit_protocols.lpms import UNITS, unit_of
+from jointfit_protocols.lpms.channels import (
+    FRAME_BYTES,
+    FRAMES,
+    TPDO,
+    decode_frame,
+    frames_of,
+    tpdo_ids,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from jointfit_daemon.driver import Emit, Wire
+    from jointfit_daemon.model import Chunk
+
+log = logging.getLogger(__name__)
+
+_LONGEST_SILENCE_S = 30.0
+"""Longest wait, s, for the first frame of a sensor that is lost; the wait doubles with every
+attempt. The sensor stays subscribed meanwhile, so its first frame is received at once."""
+_RAW_FRAMES = 20
+"""Frames logged at debug level, so that the log contains raw data of a sensor."""
+_MOST = 1.01
+"""Largest component of a quaternion."""
+_LEAST = 1e-12
+"""Smallest component that is not 0: smaller floats are integers that were read as floats."""
+
+
+class LpmsCanImu:
+    """LPMS sensor on a CAN bus: orientation in one or two frames, without time."""
+
+    Settings: ClassVar[type[LpmsCanSettings]] = LpmsCanSettings
+    wire: ClassVar[Wire] = "can"
+
+    @classmethod
+    def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterator[dict[str, Any]]:
+        """Yield the settings of sensors that may send what was received.
+
+        A candidate has a first frame of 8 bytes: of a node in CANopen style, or the first of four
+        consecutive ones. Both precisions are candidates. See `jointfit_daemon.device_search`.
+        """
+        full = {number for (number, long), size in seen.items() if size == FRAME_BYTES and not long}
+        for number in sorted(full):
+            node = number - TPDO[0]
+            tables: list[tuple[str, tuple[int, ...]]] = []
+            if 0 < node < TPDO[1] - TPDO[0]:
+                tables.append(("canopen", tpdo_ids(node)))
+            consecutive = tuple(range(number, number + FRAMES))
+            if full.issuperset(consecutive):
+                tables.append(("sequential", consecutive))
+
+            for mode, numbers in tables:
+                ids = {f"frame{k}": each for k, each in enumerate(numbers, 1)}
+                yield {"mode": mode, "ids": ids, "precision": "int16"}
+                if numbers[1] in full:
+                    yield {"mode": mode, "ids": ids, "precision": "float32"}
+
+    def __init__(self, settings: LpmsCanSettings) -> None:
+        self._settings = settings
+        self._worked = False
+        self._first_s = settings.silence_s  # waiting is cheap; opening the bus again is not
+
+    def decoder(self) -> LpmsCanDecoder:
+        """Return the decoder from chunks to samples, for live data and replay."""
+        return LpmsCanDecoder(self._settings)
+
+    async def run(self, emit: Emit) -> None:
+        """Read the bus until cancelled.
+
+        Raises
+        ------
+        DeviceLostError
+            The bus is absent or down, the adapter unplugged, or this sensor silent for `silence_s`.
+        DeviceMisconfiguredError
+            This kind of bus is not available, or another sensor of the rig uses the same
+            identifiers.
+        """
+        settings = self._settings
+        numbers, heartbeat = settings.channel_ids
+        ids = {(number, False): f"frame{k}" for k, number in enumerate(numbers, 1)}
+        if heartbeat is not None:
+            ids[heartbeat, False] = "heartbeat"
+        last = frames_of(settings.mapping, settings.precision)[-1]
+
+        left = _RAW_FRAMES if log.isEnabledFor(logging.DEBUG) else 0
+
+        def emit_frames(chunk: Chunk) -> None:
+            nonlocal left
+            if left:
+                for frame in unpack_frames(chunk.data)[:left]:
+                    left -= 1
+                    log.debug("%s: %s", settings.id, frame)
+            self._first_s = settings.silence_s
+            self._worked = True
+            emit(chunk)
+
+        first_s = self._first_s
+        self._first_s = min(2 * first_s, max(settings.silence_s, _LONGEST_SILENCE_S))
+        async with shared_bus(settings.can) as bus:
+            await bus.pump(
+                settings.id,
+                ids,
+                emit_frames,
+                settings.silence_s,
+                needed=(numbers[last], False),
+                first_s=first_s,
+                resembles=self._resembles,
+                worked=self._worked,
+            )
+
+    def _resembles(self, data: bytes) -> bool:
+        """Whether the data of a frame could be those of a quaternion, or of its half."""
+        values = decode_frame(data, self._settings.precision)
+        if values is None:
+            return False
+        if self._settings.precision == "int16":
+            return unit_of(values) in UNITS
+        sizes = [abs(value) for value in values]
+        return max(sizes) <= _MOST and any(size > _LEAST for size in sizes)

@@ -1,0 +1,123 @@
+"""LP-BUS commands to a sensor and its replies."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from typing_extensions import override
+
+from jointfit_drivers.serial_conversation import SerialConversation
+from jointfit_protocols.lpms import LpBusCodec, LpBusMessage, encode
+from jointfit_protocols.lpms.configuration import LpmsCommand
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
+    from jointfit_daemon.driver import Emit
+    from jointfit_daemon.model import Chunk
+    from jointfit_drivers.ports.serial_port import SerialPort
+    from jointfit_protocols.corrupt import CorruptBytes
+
+MODE_S = 1.0
+"""Longest wait for the acknowledgement of command mode, s: a sensor first sends its queue."""
+REPLY_S = 0.5
+"""Longest wait for any other reply, s."""
+_KEPT = 512
+"""Last bytes stored for the recognition of text."""
+_ACKNOWLEDGEMENTS = frozenset({LpmsCommand.ACK, LpmsCommand.NACK})
+
+
+class LpBusConversation(SerialConversation[LpBusMessage]):
+    """Commands and replies of one sensor on one port.
+
+    Parameters
+    ----------
+    port : SerialPort
+        Open port.
+    emit : Emit
+        Receives all bytes from the first reply on.
+    sensor_id : int
+        Address of the sensor.
+    """
+
+    def __init__(self, port: SerialPort, emit: Emit, sensor_id: int) -> None:
+        super().__init__(port, emit, LpBusCodec)
+        self._sensor_id = sensor_id
+        self.last_bytes = b""
+        """Last bytes received."""
+        self.ids: set[int] = set()
+        """Addresses in the messages received."""
+
+    @override
+    def reset(self) -> None:
+        super().reset()
+        self.last_bytes = b""
+        self.ids.clear()
+
+    async def enter_command_mode(self, *, tries: int = 3, wait_s: float | None = None) -> bool:
+        """Stop the stream; return whether the sensor replied.
+
+        Old firmware does not acknowledge. A reply to a read, which is one in both generations, then
+        shows that the sensor is in command mode.
+
+        Parameters
+        ----------
+        tries
+            Largest number of requests.
+        wait_s
+            Wait for each acknowledgement, s; default: `MODE_S`.
+        """
+        wait_s = MODE_S if wait_s is None else wait_s
+        for _ in range(tries):
+            if await self._exchange(LpmsCommand.COMMAND_MODE, {LpmsCommand.ACK}, wait_s=wait_s):
+                return True
+        replies = {LpmsCommand.IDENTIFY, LpmsCommand.NACK}
+        wait_s = min(wait_s, REPLY_S)
+        return await self._exchange(LpmsCommand.IDENTIFY, replies, wait_s=wait_s) is not None
+
+    async def read(self, command: int) -> bytes | None:
+        """Return the data of the reply to a read; None if it is refused, or none arrives."""
+        for _ in range(2):
+            reply = await self._exchange(command, {command, LpmsCommand.NACK})
+            if reply is not None:
+                return None if reply.command == LpmsCommand.NACK else reply.data
+        return None
+
+    async def write(
+        self, command: int, data: bytes = b"", *, wait_s: float = REPLY_S
+    ) -> bool | None:
+        """Send a command; return whether it was acknowledged, or None without any reply."""
+        reply = await self._exchange(command, _ACKNOWLEDGEMENTS, data, wait_s=wait_s)
+        return None if reply is None else reply.command == LpmsCommand.ACK
+
+    async def start_stream(self) -> bool | None:
+        """Start the stream; return whether it was acknowledged or data arrive, None if neither."""
+        for _ in range(3):
+            replies = _ACKNOWLEDGEMENTS | {LpmsCommand.DATA}
+            reply = await self._exchange(LpmsCommand.STREAM_MODE, replies)
+            if reply is not None:
+                return reply.command != LpmsCommand.NACK
+        return None
+
+    async def wait_for_data(self, wait_s: float) -> bool:
+        """Return whether a data packet arrives within `wait_s` seconds."""
+        return await self._wait_for({LpmsCommand.DATA}, wait_s) is not None
+
+    async def _exchange(
+        self, command: int, replies: Collection[int], data: bytes = b"", *, wait_s: float = REPLY_S
+    ) -> LpBusMessage | None:
+        """Send a command and return the first message with one of `replies`."""
+        await self.send(encode(command, data, self._sensor_id))
+        return await self._wait_for(replies, wait_s)
+
+    async def _wait_for(self, commands: Collection[int], wait_s: float) -> LpBusMessage | None:
+        def is_reply(message: LpBusMessage) -> bool:
+            self.ids.add(message.sensor_id)
+            return message.command in commands
+
+        return await self.receive(is_reply, wait_s)
+
+    @override
+    def _take(self, chunk: Chunk) -> Sequence[LpBusMessage | CorruptBytes]:
+        self.last_bytes = (self.last_bytes + chunk.data)[-_KEPT:]
+        return super()._take(chunk)

@@ -1,0 +1,297 @@
+"""Decoder of the driver of LPMS sensors on a serial line: chunks in, samples out.
+
+A data packet does not name its outputs. The driver reads their mask before the stream begins, and
+the reply is part of the recorded bytes: the decoder takes the mask from there.
+
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, TickClock
+from jointfit_drivers.lpms._orientation import LpmsConvention, LpmsOrientation
+from jointfit_drivers.lpms._tick_rate import TickRateCheck
+from jointfit_drivers.serial_imu import ArrivalStamps
+from jointfit_drivers.time_continuity import TimeContinuity
+from jointfit_protocols.lpms import MAX_MESSAGE, LpBusCodec, LpBusMessage
+from jointfit_protocols.lpms.configuration import (
+    LpmsCommand,
+    LpmsConfiguration,
+    decode_configuration,
+    decode_firmware,
+    decode_text,
+    identify_generation,
+    sends_seconds,
+)
+from jointfit_protocols.lpms.measurement import TICK_MODULUS, PacketLayout, seconds_of
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_drivers.lpms._settings import LpmsSettings
+    from jointfit_protocols.corrupt import CorruptBytes
+    from jointfit_protocols.lpms.measurement import LpmsMeasurement
+
+_NS = 1_000_000_000
+_SECONDS_CLOCK = TickClock(1_000, None)
+"""Device time of firmware that sends seconds: converted to microseconds."""
+_MOST_SECONDS = 1e9
+_DATA = int(LpmsCommand.DATA)
+_TEXT_BYTES = 256
+"""Bytes without a message after which they are examined for text."""
+_HALF = TICK_MODULUS // 2
+
+
+class _Packet(NamedTuple):
+    """A data packet that has not been accepted yet."""
+
+    message: LpBusMessage
+    arrival_ns: int
+    ticks: int
+    measurement: LpmsMeasurement
+
+
+class LpmsDecoder:
+    """Decoder of one LPMS sensor.
+
+    Parameters
+    ----------
+    settings : LpmsSettings
+        Its table of rig.toml.
+    """
+
+    def __init__(self, settings: LpmsSettings) -> None:
+        self._table = settings.table
+        self._sensor_id = settings.sensor_id
+        self._lpbus = LpBusCodec()
+        self._stamps = ArrivalStamps(settings.line_baud, MAX_MESSAGE)
+        self._continuity = TimeContinuity()
+        self._orientation = LpmsOrientation(LpmsConvention.of(settings), _NORM_REMEDY)
+        self._layout = PacketLayout(self._table, self._table.quaternion)
+        self._configuration = LpmsConfiguration()
+        self._held: _Packet | None = None
+        self._ticks_per_s = settings.ticks_per_s
+        self._ticks_clock = TickClock(0, TICK_MODULUS, ticks_per_s=self._ticks_per_s)
+        self._auto_time = settings.device_time == "auto"
+        self._is_seconds = settings.device_time == "seconds"
+        self._check = self._new_check()
+        self._last_tick = self._unwrapped = 0
+        self._refused = self._refused_bytes = 0
+        self._reported: set[str] = set()
+        self._sizes: set[int] = set()
+        self._noise = b""
+
+    @property
+    def tick_clock(self) -> TickClock:
+        """Unit and modulus of the device time."""
+        return _SECONDS_CLOCK if self._is_seconds else self._ticks_clock
+
+    @property
+    def messages(self) -> int:
+        """Well-formed messages so far."""
+        return self._lpbus.messages - self._refused
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes so far that belong to no message, or to a message that was rejected."""
+        return self._lpbus.discarded + self._refused_bytes
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return the content that `chunk` completed, in wire order; never raises."""
+        out: list[Decoded] = []
+        if self._lpbus.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
+            out = self._take(self._lpbus.flush())  # the rest of the pending message was lost
+        self._stamps.start_chunk(chunk.t_ns)
+        if not self._lpbus.messages:
+            out += self._text_warning(chunk.data)
+        found = self._lpbus.feed(chunk.data)
+        return out + self._take(found) if found else out
+
+    def flush(self) -> list[Decoded]:
+        """Discard a pending message and a packet that waits for confirmation."""
+        return self._take(self._lpbus.flush()) + self._drop_held()
+
+    def _take(self, found: list[LpBusMessage | CorruptBytes]) -> list[Decoded]:
+        out: list[Decoded] = []
+        for event in found:
+            if not isinstance(event, LpBusMessage):
+                out.append(Corrupt(event.discarded, event.reason))
+            elif event.command == _DATA and event.data:
+                out += self._decode_packet(event)
+            else:
+                out += self._property_events(event)
+        return out
+
+    def _decode_packet(self, message: LpBusMessage) -> list[Decoded]:
+        """Return the content of a data packet after the check of its time."""
+        measurement = self._layout.decode(message.data)
+        if measurement is None or "quaternion" not in self._layout.places:
+            return [*self._length_warning(message), self._refuse(message, "unexpected length")]
+
+        arrival_ns = self._stamps.stamp(self._lpbus.fed - message.end + message.size)
+        out: list[Decoded] = []
+        if not self._check.done:
+            out += self._time_warning(measurement.tick, arrival_ns)
+        out += self._id_warning(message.sensor_id)
+
+        ticks = self._device_ticks(measurement.tick)
+        if ticks is None:
+            return [*out, self._refuse(message, "device time is not a number of seconds")]
+        device_ns = ticks * 1_000 if self._is_seconds else ticks * _NS // self._ticks_per_s
+        step = self._continuity.add(device_ns, arrival_ns)
+        packet = _Packet(message, arrival_ns, ticks, measurement)
+
+        held = self._held
+        if not step.restarted:
+            out += self._drop_held()
+        self._held = packet if step.held else None
+        if step.held:
+            return out
+
+        if step.restarted and held is not None:
+            self._orientation.forget()
+            text = f"device clock restarted at {held.measurement.tick} ticks"
+            out += [DeviceEvent("restart", text), *self._sample(held)]
+        if step.lost:
+            out.append(DeviceEvent("gap", f"{step.lost} messages lost", {"lost": step.lost}))
+        return out + self._sample(packet)
+
+    def _device_ticks(self, tick: int) -> int | None:
+        """Return the device time in units of `tick_clock`, without wraps; None if it has none."""
+        if self._is_seconds:
+            seconds = seconds_of(tick)
+            is_time = isfinite(seconds) and 0 <= seconds < _MOST_SECONDS
+            return round(seconds * 1e6) if is_time else None
+
+        step = (tick - self._last_tick + _HALF) % TICK_MODULUS - _HALF
+        self._last_tick = tick
+        self._unwrapped += step
+        return self._unwrapped
+
+    def _sample(self, packet: _Packet) -> list[Decoded]:
+        """Return the sample of an accepted packet."""
+        measurement = packet.measurement
+        values = measurement.values[self._layout.places["quaternion"]]
+        converted = self._orientation.convert(values, floats=measurement.floats)
+        out, self._orientation.events = self._orientation.events, []
+
+        if converted is None:
+            return [*out, self._refuse(packet.message, "quaternion norm is not 1")]
+        native, q = converted
+        ticks = packet.ticks if self._is_seconds else measurement.tick
+        return [*out, ImuSample(packet.arrival_ns, q, native, ticks, None)]
+
+    def _property_events(self, message: LpBusMessage) -> list[Decoded]:
+        """Return the events of a reply; it may change the layout of the data packets."""
+        command, data = message.command, message.data
+        part = decode_configuration(self._table, command, data)
+        if part is not None:
+            self._configuration = self._configuration.updated(part)
+            mask, rate_hz, floats = self._configuration
+            if part.outputs is not None:
+                self._layout = PacketLayout(self._table, part.outputs)
+            known: dict[str, object] = {}
+            if mask is not None:
+                known["outputs"] = self._table.names(mask)
+            if rate_hz is not None:
+                known["rate_hz"] = rate_hz
+            if floats is not None:
+                known["precision"] = "float32" if floats else "int16"
+        elif command == self._table.read_firmware and data:
+            known = self._take_firmware(data)
+        elif command == LpmsCommand.IDENTIFY and identify_generation(data) == 1:
+            known = {"model": decode_text(data)}
+        else:
+            known = {}
+        text = ", ".join(f"{key} {value}" for key, value in known.items())
+        return [DeviceEvent("info", text, known)] if known else []
+
+    def _take_firmware(self, data: bytes) -> dict[str, object]:
+        """Return the firmware version, and set the form of the device time that it sends."""
+        version = decode_firmware(self._table, data)
+        if version is None:
+            return {}
+        if self._auto_time and self._table.generation == 1:
+            self._is_seconds = sends_seconds(version)
+            self._check = self._new_check()
+        return {"firmware": version}
+
+    def _new_check(self) -> TickRateCheck:
+        return TickRateCheck(self._ticks_per_s, is_seconds=self._is_seconds)
+
+    # --- findings in the stream ---------------------------------------------------------------
+
+    def _time_warning(self, tick: int, arrival_ns: int) -> list[Decoded]:
+        """Return a warning if device time has another unit than configured."""
+        fault = self._check.feed(tick, arrival_ns)
+        if fault is None:
+            return []
+        if fault.is_seconds:
+            text = 'device time is float seconds, not ticks: set device_time = "seconds"'
+        elif self._is_seconds:
+            text = 'device time is no float seconds: set device_time = "ticks"'
+        else:
+            hz = fault.usual_hz
+            remedy = f"set tick_hz = {hz}" if hz else "set `tick_hz`, and check `rate_hz`"
+            text = (
+                f"device time counts {fault.ticks_per_s:.4g} ticks a second, expected "
+                f"{self._ticks_per_s}: {remedy}"
+            )
+        return [DeviceEvent("warning", text, {"ticks_per_s": round(fault.ticks_per_s, 1)})]
+
+    def _length_warning(self, message: LpBusMessage) -> list[Decoded]:
+        """Return a warning about packets of a length that does not fit the outputs, once each."""
+        size = len(message.data)
+        if size in self._sizes:
+            return []
+        self._sizes.add(size)
+        floats, shorts = self._layout.sizes
+        names = " + ".join(self._layout.places) or "no output"
+        text = (
+            f"data packets of {size} bytes, expected {floats} (32 bit) or {shorts} (16 bit) of "
+            f"{names}: its outputs were changed, or its firmware is newer than this version: let "
+            "the driver connect again, or enable the quaternion alone"
+        )
+        return [DeviceEvent("warning", text, {"data_bytes": size})]
+
+    def _id_warning(self, sensor_id: int) -> list[Decoded]:
+        if sensor_id == self._sensor_id or "id" in self._reported:
+            return []
+        self._reported.add("id")
+        text = f"sends as sensor id {sensor_id}, expected {self._sensor_id}: set `sensor_id`"
+        return [DeviceEvent("warning", text, {"sensor_id": sensor_id})]
+
+    def _text_warning(self, data: bytes) -> list[Decoded]:
+        """Return a warning if the device sends text in place of messages, once."""
+        if len(self._noise) >= _TEXT_BYTES:
+            return []
+        self._noise += data[:_TEXT_BYTES]
+        if len(self._noise) < _TEXT_BYTES or not is_text(self._noise):
+            return []
+        return [DeviceEvent("warning", f"it sends text: {TEXT_REMEDY}")]
+
+    def _refuse(self, message: LpBusMessage, reason: str) -> Corrupt:
+        self._refused += 1
+        self._refused_bytes += message.size
+        return Corrupt(message.size, reason)
+
+    def _drop_held(self) -> list[Decoded]:
+        """Reject a packet that no later one confirmed."""
+        held, self._held = self._held, None
+        if held is None:
+            return []
+        return [self._refuse(held.message, "device time disagrees with the other messages")]
+
+
+def is_text(data: bytes) -> bool:
+    """Return whether `data` are lines of printable ASCII, as in the text format of a sensor."""
+    printable = sum(0x20 <= byte < 0x7F or byte in b"\r\n\t" for byte in data)  # noqa: PLR2004 - a generation, or ASCII
+    return bool(data) and printable >= _TEXT_SHARE * len(data)
+
+
+_TEXT_SHARE = 0.95
+"""Least share of printable bytes in text; the first line may be cut."""
+TEXT_REMEDY = "set its output format to LP-BUS (binary) with the vendor's tool, then restart it"
+_NORM_REMEDY = "remove `scale`, and check with the vendor's tool that the quaternion is enabled"

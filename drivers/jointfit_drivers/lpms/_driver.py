@@ -1,0 +1,60 @@
+"""Driver of LP-Research LPMS sensors that use LP-BUS on a serial port or USB.
+
+`LpmsDecoder` is the pure part. `LpmsImu.run` opens the port, brings the sensor into stream mode and
+reads until cancelled. The two share only chunks.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from jointfit_drivers.lpms._decoder import LpmsDecoder
+from jointfit_drivers.lpms._handshake import LINE_SPEEDS, LpmsHandshake
+from jointfit_drivers.lpms._settings import LpmsSettings
+from jointfit_drivers.ports.serial_port import SerialPort
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit, Wire
+
+_PERIODS_OF_SILENCE = 3
+"""Smallest number of sample periods without data after which a sensor counts as silent."""
+_HUNT_EVERY = 10
+"""Number of attempts to connect per search at other speeds, which takes longer than an attempt."""
+
+
+class LpmsImu:
+    """One LPMS sensor: orientation, and device time in ticks of its filter."""
+
+    Settings: ClassVar[type[LpmsSettings]] = LpmsSettings
+    wire: ClassVar[Wire] = "stream"
+    usual_bauds: ClassVar[tuple[int, ...]] = LINE_SPEEDS
+
+    def __init__(self, settings: LpmsSettings) -> None:
+        self._settings = settings
+        self._attempts = 0
+
+    def decoder(self) -> LpmsDecoder:
+        """Return the decoder from chunks to samples, for live data and replay."""
+        return LpmsDecoder(self._settings)
+
+    async def run(self, emit: Emit) -> None:
+        """Open the port, bring the sensor into stream mode, and read until cancelled.
+
+        Raises
+        ------
+        DeviceLostError
+            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+        DeviceMisconfiguredError
+            The file is no serial port, no LPMS sensor answers, its speed, generation or address are
+            others, or it does not accept the settings.
+        """
+        settings = self._settings
+
+        with SerialPort(settings.port, settings.baud) as port:
+            hunt = self._attempts % _HUNT_EVERY == 0
+            self._attempts += 1
+            await LpmsHandshake(port, emit, settings, hunt=hunt).ensure_streaming()
+            self._attempts = 0
+
+            silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
+            await port.pump(emit, silence_s)

@@ -1,0 +1,256 @@
+"""From an open port to a streaming LPMS sensor, or to the error that explains the failure.
+
+The settings of the sensor are read and compared. Only those that differ are set, and read again,
+because old firmware acknowledges nothing. They are stored in flash only with ``persist``.
+
+Before any command whose meaning depends on the generation, the sensor is asked for a text or number
+that both generations answer without an effect, and each in its own way.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, NoReturn
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.lpms._conversation import LpBusConversation
+from jointfit_drivers.lpms._decoder import TEXT_REMEDY, is_text
+from jointfit_protocols.lpms.configuration import (
+    TABLES,
+    LpmsCommand,
+    LpmsConfiguration,
+    decode_configuration,
+    identify_generation,
+    set_command,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit
+    from jointfit_drivers.lpms._settings import LpmsSettings
+    from jointfit_drivers.ports.serial_port import SerialPort
+
+log = logging.getLogger(__name__)
+
+LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600)
+"""Line speeds to search, bit/s: factory settings and common choices first."""
+_LISTEN_S = 0.15
+"""Time at each speed of the search, s."""
+_STORE_S = 3.0
+"""Longest wait for the acknowledgement of a flash write, s."""
+_FIRST_S, _FIRST_PERIODS = 1.0, 5
+"""Longest wait for the first data packet, s, and in periods of a slow sensor."""
+
+
+class LpmsHandshake:
+    """Brings one sensor into stream mode.
+
+    Parameters
+    ----------
+    port, emit : SerialPort, Emit
+        Open port, and the receiver of the sensor's bytes.
+    settings : LpmsSettings
+        Its table of rig.toml.
+    hunt : bool
+        Whether to search for a silent sensor at other speeds. A sensor whose bytes cannot be
+        decoded is always searched for.
+    """
+
+    def __init__(
+        self, port: SerialPort, emit: Emit, settings: LpmsSettings, *, hunt: bool = True
+    ) -> None:
+        self._port = port
+        self._settings = settings
+        self._table = settings.table
+        self._hunt = hunt
+        self._conversation = LpBusConversation(port, emit, settings.sensor_id)
+        self._who = settings.port
+
+    async def ensure_streaming(self) -> None:
+        """Return when the sensor streams according to the settings.
+
+        Raises
+        ------
+        DeviceLostError
+            The sensor is silent, unplugged, or stopped answering.
+        DeviceMisconfiguredError
+            Speed, generation or address are others, the device is of another kind, or it does not
+            accept the settings.
+        """
+        settings = self._settings
+        needs = settings.serial_bits_per_s
+        if needs is not None and needs > settings.baud:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
+                f"{settings.baud}: lower `rate_hz`, or raise the speed of the sensor and `baud`"
+            )
+
+        self._conversation.reset()
+        if not await self._conversation.enter_command_mode():
+            await self._explain_silence()
+        await self._ensure_generation()
+        await self._conversation.read(self._table.read_firmware)  # for the decoder
+        await self._ensure_configuration()
+        await self._start()
+
+    async def _ensure_generation(self) -> None:
+        """Refuse a sensor of the other generation before any command that could harm it."""
+        reply = await self._conversation.read(LpmsCommand.IDENTIFY)
+        found = None if reply is None else identify_generation(reply)
+        if found is None:
+            log.warning(
+                "%s: does not identify its generation; using generation = %d as configured",
+                self._settings.id,
+                self._table.generation,
+            )
+        elif found != self._table.generation:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: a sensor of generation {found} ({TABLES[found].models}), expected "
+                f"generation {self._table.generation}: set generation = {found}. Nothing was "
+                "written: the commands of one generation erase settings of the other"
+            )
+
+    async def _ensure_configuration(self) -> None:
+        """Set outputs, rate and precision where they differ."""
+        settings = self._settings
+        wanted = LpmsConfiguration(
+            self._table.quaternion, int(settings.rate_hz), settings.precision == "float32"
+        )
+
+        part = _differing(await self._read_configuration(), wanted)
+        if part == LpmsConfiguration():
+            return
+        log.info("%s: setting %s", settings.id, self._describe(part))
+        for command, data in set_command(self._table, part):
+            if await self._conversation.write(command, data) is False:
+                raise DeviceMisconfiguredError(
+                    f"{self._who}: refuses {self._describe(part)} (command 0x{command:02X}): "
+                    "change `rate_hz` or `precision`, or update its firmware"
+                )
+
+        left = _differing(await self._read_configuration(), wanted)
+        if left.outputs is not None or left.rate_hz is not None:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: does not accept {self._describe(left)}: change `rate_hz`, or update "
+                "its firmware"
+            )
+        if settings.persist:
+            log.warning("%s: storing its settings in flash", settings.id)
+            await self._conversation.write(self._table.store, wait_s=_STORE_S)
+
+    async def _read_configuration(self) -> LpmsConfiguration:
+        """Return the settings of the sensor; a precision that cannot be read is unknown."""
+        found = LpmsConfiguration()
+        for command in self._table.reads:
+            data = await self._conversation.read(command)
+            part = None if data is None else decode_configuration(self._table, command, data)
+            if part is not None:
+                found = found.updated(part)
+        if found.outputs is None or found.rate_hz is None:
+            raise DeviceLostError(
+                f"{self._who}: does not answer the reads of generation {self._table.generation}: "
+                "check `generation` and the wire from host to sensor"
+            )
+        return found
+
+    def _describe(self, part: LpmsConfiguration) -> str:
+        """Return the known settings of `part` as text."""
+        texts = []
+        if part.outputs is not None:
+            texts.append(f"outputs {' + '.join(self._table.names(part.outputs))}")
+        if part.rate_hz is not None:
+            texts.append(f"{part.rate_hz} Hz")
+        if part.floats is not None:
+            texts.append("float32" if part.floats else "int16")
+        return ", ".join(texts)
+
+    async def _start(self) -> None:
+        """Start the stream and wait for its first data packet."""
+        started = await self._conversation.start_stream()
+        if started is None:
+            raise DeviceLostError(
+                f"{self._who}: stopped answering during configuration: check its power and cable"
+            )
+        if not started:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: refuses to stream: change `rate_hz` or `baud`"
+            )
+        self._conversation.last_bytes = b""
+        wait_s = max(_FIRST_S, _FIRST_PERIODS / self._settings.rate_hz)
+        if await self._conversation.wait_for_data(wait_s):
+            return
+        if is_text(self._conversation.last_bytes):
+            raise DeviceMisconfiguredError(f"{self._who}: sends text: {TEXT_REMEDY}")
+        raise DeviceLostError(
+            f"{self._who}: accepts the settings but sends no data: check it with the vendor's tool"
+        )
+
+    async def _explain_silence(self) -> NoReturn:
+        """Raise the error for a device that does not enter command mode."""
+        conversation, settings = self._conversation, self._settings
+        others = sorted(conversation.ids - {settings.sensor_id})
+        if others:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: sends as sensor id {others[0]}, expected {settings.sensor_id}: set "
+                f"sensor_id = {others[0]}"
+            )
+        if conversation.ids:
+            raise DeviceLostError(
+                f"{self._who}: streams but does not answer: check the wire from host to sensor"
+            )
+        received, sends_text = conversation.received, is_text(conversation.last_bytes)
+
+        speed = await self._other_speed() if self._hunt or received else None
+        if speed is not None:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {settings.baud} baud, but no message can be decoded; the sensor "
+                f"answers at {speed}: set baud = {speed}"
+            )
+        if not received:
+            raise DeviceLostError(
+                f"{self._who}: silent: check its power, and that TX and RX are not swapped. A "
+                "sensor of generation 1 that was put to sleep needs a power cycle"
+            )
+        if sends_text:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: sends text: correct `port` or `driver`, or, if it is an LPMS "
+                f"sensor, {TEXT_REMEDY}"
+            )
+
+        self._port.set_baud(settings.baud)
+        conversation.reset()
+        await conversation.wait_for_data(_LISTEN_S)
+        if not conversation.received:
+            raise DeviceLostError(
+                f"{self._who}: some bytes of noise, then silence: check its power and cable, and "
+                "`port`"
+            )
+        raise DeviceMisconfiguredError(
+            f"{self._who}: the device on this port is not LPMS: it sends bytes, none of them "
+            "LP-BUS at any common speed: correct `port` or `driver`"
+        )
+
+    async def _other_speed(self) -> int | None:
+        """Return the speed at which the sensor answers; it continues to stream as before."""
+        for baud in LINE_SPEEDS:
+            if baud == self._settings.baud:
+                continue
+            try:
+                self._port.set_baud(baud)
+            except DeviceMisconfiguredError:  # the port does not support it
+                continue
+            self._conversation.reset()
+            if await self._conversation.enter_command_mode(tries=1, wait_s=_LISTEN_S):
+                await self._conversation.start_stream()
+                return baud
+            if self._conversation.ids:
+                return baud
+        return None
+
+
+def _differing(found: LpmsConfiguration, wanted: LpmsConfiguration) -> LpmsConfiguration:
+    """Return the settings of `wanted` that `found` has not, or that are unknown."""
+    return LpmsConfiguration(
+        wanted.outputs if found.outputs != wanted.outputs else None,
+        wanted.rate_hz if found.rate_hz != wanted.rate_hz else None,
+        wanted.floats if found.floats != wanted.floats else None,
+    )

@@ -1,0 +1,84 @@
+"""Check of the configured unit of device time against the arrivals.
+
+Nobody has measured on hardware how many ticks a second each model counts, and old firmware sends
+seconds in place of ticks. Arrivals over spans of seconds show both.
+
+Invariant: pure arithmetic on ticks and arrival stamps.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from jointfit_protocols.lpms.measurement import TICK_MODULUS, seconds_of
+
+_SPAN_NS = 3_000_000_000
+"""Least span of arrivals that measures the rate, ns."""
+_CONTRADICTIONS = 2
+"""Consecutive spans that prove another unit."""
+_NEAR = 0.05
+"""Largest relative deviation of a measured rate."""
+_USUAL_HZ = (400, 500, 800, 1000)
+_NS = 1e9
+
+
+class TimeUnitFault(NamedTuple):
+    """Finding that device time has another unit than configured."""
+
+    ticks_per_s: float
+    """Measured rate of the number sent, 1/s."""
+    usual_hz: int | None
+    """Usual tick rate near it; None if there is none."""
+    is_seconds: bool
+    """Whether the device sends float32 seconds."""
+
+
+class TickRateCheck:
+    """Compares the device time of one sensor with its arrivals, until it is checked.
+
+    Parameters
+    ----------
+    ticks_per_s : int
+        Configured rate; 1 for seconds.
+    is_seconds : bool
+        Whether float32 seconds are configured.
+    """
+
+    def __init__(self, ticks_per_s: int, *, is_seconds: bool) -> None:
+        self._ticks_per_s, self._is_seconds = ticks_per_s, is_seconds
+        self._since: tuple[int, int] | None = None
+        self._contradictions = 0
+        self.done = False
+        """Whether the unit was reported wrong, or found right."""
+
+    def feed(self, tick: int, arrival_ns: int) -> TimeUnitFault | None:
+        """Add a data packet; return the fault once, as soon as it is certain.
+
+        Parameters
+        ----------
+        tick : int
+            Device time as sent, 32 bits.
+        arrival_ns : int
+            Its arrival, ns.
+        """
+        if self._since is None:
+            self._since = (tick, arrival_ns)
+        first, since_ns = self._since
+        if arrival_ns - since_ns < _SPAN_NS:
+            return None
+        self._since = (tick, arrival_ns)
+
+        elapsed_s = (arrival_ns - since_ns) / _NS
+        seconds = (seconds_of(tick) - seconds_of(first)) / elapsed_s
+        ticks = (tick - first) % TICK_MODULUS / elapsed_s
+        if abs(seconds - 1 if self._is_seconds else ticks / self._ticks_per_s - 1) <= _NEAR:
+            self.done = True
+            return None
+
+        # a restart of the device, or a pause of this host, falsifies one span
+        self._contradictions += 1
+        if self._contradictions < _CONTRADICTIONS:
+            return None
+        self.done = True
+        near = (hz for hz in _USUAL_HZ if abs(ticks / hz - 1) <= _NEAR)
+        return TimeUnitFault(ticks, next(near, None), abs(seconds - 1) <= _NEAR)

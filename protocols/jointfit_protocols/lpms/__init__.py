@@ -1,0 +1,24 @@
+"""LP-Research LPMS: LP-BUS on a serial line, in two generations, and channels on CAN."""
+
+from jointfit_protocols.lpms._framing import (
+    MAX_DATA,
+    MAX_MESSAGE,
+    OVERHEAD,
+    LpBusCodec,
+    LpBusMessage,
+    encode,
+)
+from jointfit_protocols.lpms._quaternion_scale import COARSE, UNITS, QuaternionScale, unit_of
+
+__all__ = [
+    "COARSE",
+    "MAX_DATA",
+    "MAX_MESSAGE",
+    "OVERHEAD",
+    "UNITS",
+    "LpBusCodec",
+    "LpBusMessage",
+    "QuaternionScale",
+    "encode",
+    "unit_of",
+]

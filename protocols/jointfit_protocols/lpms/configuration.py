@@ -1,0 +1,278 @@
+"""Commands and settings of LPMS sensors, by generation.
+
+Both generations use the same messages, and the same numbers for different commands. A read of one
+generation is a write of the other:
+
+| purpose               | generation 1                       | generation 3                     |
+|-----------------------|------------------------------------|----------------------------------|
+| models                | B2, CU2, URS2, CURS2, AL2, ME1     | LPMS3, IG1, BE1, NAV3            |
+| command / stream mode | 06 / 07                            | 06 / 07                          |
+| data packet           | 09                                 | 09                               |
+| outputs               | set 0A, read 04                    | set 1E, read 1F                  |
+| rate, Hz              | set 0B, read 04 (a code)           | set 22, read 23                  |
+| precision             | set 4B (1: 16 bit), read 04 bit 22 | set 88 (1: 32 bit), read 89      |
+| store in flash        | 0F                                 | 04                               |
+| factory reset         | 10                                 | 05                               |
+| firmware              | 2F: patch, minor, major            | 15: text                         |
+| 5B                    | device name, text                  | filter mode, U4                  |
+
+Settings are lost with power unless stored: the firmware of 2013 writes its registers in memory.
+
+Source: the vendor's register headers (OpenMAT), protocol pages and firmware source of 2013. Nobody
+has tested 5B on hardware; both headers list it as a read.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal, NamedTuple
+
+Generation = Literal[1, 3]
+
+_WORD = struct.Struct("<I")
+_VERSION = struct.Struct("<3I")
+_SIXTEEN_BIT = 1 << 22
+"""Bit of the configuration word of generation 1: data are int16."""
+_RATE_CODE = 0x7
+"""Bits of the configuration word of generation 1 with the code of the rate."""
+SECONDS_UP_TO = (1, 3, 4)
+"""Last firmware of generation 1 whose device time is float32 seconds."""
+
+
+class LpmsCommand(IntEnum):
+    """Commands of both generations."""
+
+    ACK = 0x00
+    NACK = 0x01
+    COMMAND_MODE = 0x06
+    STREAM_MODE = 0x07
+    DATA = 0x09
+    IDENTIFY = 0x5B
+    """Device name of generation 1, filter mode of generation 3: a read of both."""
+
+
+class LpmsOutput(NamedTuple):
+    """One quantity of a data packet."""
+
+    name: str
+    bit: int
+    """Bit of the mask that enables it."""
+    values: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class CommandTable:
+    """Commands and outputs of one generation."""
+
+    generation: Generation
+    models: str
+    outputs: tuple[LpmsOutput, ...]
+    """In the order of a data packet."""
+    rates_hz: tuple[int, ...]
+    tick_hz: int
+    """Usual unit of the device time, 1/s."""
+    set_outputs: int
+    set_rate: int
+    set_precision: int
+    store: int
+    factory_reset: int
+    read_firmware: int
+    reads: tuple[int, ...]
+    """Commands that read outputs, rate and precision."""
+
+    @property
+    def quaternion(self) -> int:
+        """Mask of the quaternion alone."""
+        return self.mask("quaternion")
+
+    def mask(self, *names: str) -> int:
+        """Return the mask of the named outputs."""
+        return sum(1 << output.bit for output in self.outputs if output.name in names)
+
+    def names(self, mask: int) -> list[str]:
+        """Return the names of the outputs in `mask`."""
+        return [output.name for output in self.outputs if mask >> output.bit & 1]
+
+
+GENERATION_1 = CommandTable(
+    generation=1,
+    models="B2, CU2, URS2, CURS2, AL2, ME1",
+    outputs=(
+        LpmsOutput("gyro_raw", 12),
+        LpmsOutput("accelerometer_raw", 11),
+        LpmsOutput("magnetometer_raw", 10),
+        LpmsOutput("angular_velocity", 16),
+        LpmsOutput("quaternion", 18, 4),
+        LpmsOutput("euler", 17),
+        LpmsOutput("linear_acceleration", 21),
+        LpmsOutput("pressure", 9, 1),
+        LpmsOutput("altitude", 19, 1),
+        LpmsOutput("temperature", 13, 1),
+        LpmsOutput("heave", 14, 1),
+    ),
+    rates_hz=(5, 10, 25, 50, 100, 200, 400),
+    tick_hz=400,
+    set_outputs=0x0A,
+    set_rate=0x0B,
+    set_precision=0x4B,
+    store=0x0F,
+    factory_reset=0x10,
+    read_firmware=0x2F,
+    reads=(0x04,),
+)
+GENERATION_3 = CommandTable(
+    generation=3,
+    models="LPMS3, IG1, BE1, NAV3",
+    outputs=(
+        LpmsOutput("accelerometer_raw", 0),
+        LpmsOutput("accelerometer", 1),
+        LpmsOutput("gyro0_raw", 2),
+        LpmsOutput("gyro1_raw", 3),
+        LpmsOutput("gyro0_bias_calibrated", 4),
+        LpmsOutput("gyro1_bias_calibrated", 5),
+        LpmsOutput("gyro0", 6),
+        LpmsOutput("gyro1", 7),
+        LpmsOutput("magnetometer_raw", 8),
+        LpmsOutput("magnetometer", 9),
+        LpmsOutput("angular_velocity", 10),
+        LpmsOutput("quaternion", 11, 4),
+        LpmsOutput("euler", 12),
+        LpmsOutput("linear_acceleration", 13),
+        LpmsOutput("pressure", 14, 1),
+        LpmsOutput("altitude", 15, 1),
+        LpmsOutput("temperature", 16, 1),
+    ),
+    rates_hz=(5, 10, 50, 100, 250, 500, 1000),
+    tick_hz=500,
+    set_outputs=0x1E,
+    set_rate=0x22,
+    set_precision=0x88,
+    store=0x04,
+    factory_reset=0x05,
+    read_firmware=0x15,
+    reads=(0x1F, 0x23, 0x89),
+)
+TABLES: dict[int, CommandTable] = {1: GENERATION_1, 3: GENERATION_3}
+
+
+class LpmsConfiguration(NamedTuple):
+    """Settings that determine the data packets; None: not known."""
+
+    outputs: int | None = None
+    """Mask of the outputs."""
+    rate_hz: int | None = None
+    floats: bool | None = None
+    """Whether values are float32; otherwise they are int16."""
+
+    def updated(self, part: LpmsConfiguration) -> LpmsConfiguration:
+        """Return these settings with the known ones of `part`."""
+        known = {key: value for key, value in part._asdict().items() if value is not None}
+        return self._replace(**known)
+
+
+def decode_configuration(
+    table: CommandTable, command: int, data: bytes
+) -> LpmsConfiguration | None:
+    """Return the settings in the reply to one of `table.reads`; None if it is no such reply."""
+    if command not in table.reads or len(data) != _WORD.size:
+        return None
+    (word,) = _WORD.unpack(data)
+
+    if table.generation == 1:
+        mask = sum(1 << output.bit for output in table.outputs) & word
+        code = word & _RATE_CODE
+        rate_hz = table.rates_hz[code] if code < len(table.rates_hz) else None
+        return LpmsConfiguration(mask, rate_hz, not word & _SIXTEEN_BIT)
+
+    outputs, rate, _ = table.reads
+    if command == outputs:
+        return LpmsConfiguration(outputs=word)
+    if command == rate:
+        return LpmsConfiguration(rate_hz=word)
+    return LpmsConfiguration(floats=bool(word))
+
+
+def encode_configuration(
+    table: CommandTable, command: int, configuration: LpmsConfiguration
+) -> bytes:
+    """Return the data of the reply to one of `table.reads`, as a device sends it.
+
+    Raises
+    ------
+    ValueError
+        A setting is None, or not one of the generation.
+    """
+    mask, rate_hz, floats = configuration
+    if mask is None or rate_hz is None or floats is None:
+        raise ValueError(f"{configuration}: every setting must be known")
+    if table.generation == 1:
+        code = table.rates_hz.index(rate_hz)
+        return _WORD.pack(mask | code | (0 if floats else _SIXTEEN_BIT))
+    return _WORD.pack((mask, rate_hz, int(floats))[table.reads.index(command)])
+
+
+def set_command(table: CommandTable, part: LpmsConfiguration) -> list[tuple[int, bytes]]:
+    """Return the commands, with their data, that set the known settings of `part`."""
+    commands = []
+    if part.outputs is not None:
+        commands.append((table.set_outputs, _WORD.pack(part.outputs)))
+    if part.rate_hz is not None:
+        commands.append((table.set_rate, _WORD.pack(part.rate_hz)))
+    if part.floats is not None:
+        # the two generations count in opposite senses
+        value = part.floats if table.generation == 3 else not part.floats  # noqa: PLR2004 - a generation, or ASCII
+        commands.append((table.set_precision, _WORD.pack(int(value))))
+    return commands
+
+
+def decode_set(table: CommandTable, command: int, data: bytes) -> LpmsConfiguration | None:
+    """Return the setting that a command makes; None if it is no such command."""
+    if len(data) != _WORD.size:
+        return None
+    (word,) = _WORD.unpack(data)
+    if command == table.set_outputs:
+        return LpmsConfiguration(outputs=word)
+    if command == table.set_rate:
+        return LpmsConfiguration(rate_hz=word)
+    if command == table.set_precision:
+        return LpmsConfiguration(floats=bool(word) == (table.generation == 3))  # noqa: PLR2004 - a generation, or ASCII
+    return None
+
+
+def decode_firmware(table: CommandTable, data: bytes) -> str | None:
+    """Return the firmware version; None if `data` contains none."""
+    if table.generation == 1:
+        if len(data) != _VERSION.size:
+            return None
+        patch, minor, major = _VERSION.unpack(data)
+        return f"{major}.{minor}.{patch}"
+    return decode_text(data) or None
+
+
+def encode_firmware(table: CommandTable, version: str) -> bytes:
+    """Return the data of the reply with the firmware version, as a device sends it."""
+    if table.generation == 1:
+        major, minor, patch = map(int, version.split("."))
+        return _VERSION.pack(patch, minor, major)
+    return version.encode("ascii").ljust(24, b"\0")
+
+
+def sends_seconds(version: str) -> bool:
+    """Return whether firmware `version` of generation 1 sends its time as float32 seconds."""
+    parts = tuple(int(part) if part.isdigit() else 0 for part in version.split("."))
+    return parts <= SECONDS_UP_TO
+
+
+def identify_generation(data: bytes) -> Generation | None:
+    """Return the generation that answers `LpmsCommand.IDENTIFY` with `data`; None if unclear."""
+    if len(data) == _WORD.size and data[1:] == bytes(3):
+        return 3
+    text = data.rstrip(b"\0")
+    return 1 if text and all(0x20 <= byte < 0x7F for byte in text) else None  # noqa: PLR2004 - a generation, or ASCII
+
+
+def decode_text(data: bytes) -> str:
+    """Return a text: ASCII, padded with spaces or zeros."""
+    return data.decode("ascii", "replace").strip(" \0\r\n")

@@ -1,0 +1,96 @@
+"""Data packets of LPMS sensors: device time, then the enabled outputs in a fixed order.
+
+    | tick U4 | value ... |      each value float32, or int16
+
+The packet does not name its outputs. Their mask, which is read from the device, determines the
+order, and the length of the packet shows whether the values have 32 or 16 bits.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_protocols.lpms.configuration import CommandTable
+
+TICK_MODULUS = 1 << 32
+"""Ticks after which device time wraps."""
+_TICK = struct.Struct("<I")
+_SECONDS = struct.Struct("<f")
+
+
+class LpmsMeasurement(NamedTuple):
+    """Content of one data packet, as sent."""
+
+    tick: int
+    values: tuple[float, ...]
+    """Values in the order of the packet; integers if `floats` is false."""
+    floats: bool
+
+
+class PacketLayout:
+    """Positions of the outputs in the data packets of one mask.
+
+    Parameters
+    ----------
+    table : CommandTable
+        Generation of the device.
+    mask : int
+        Enabled outputs.
+    """
+
+    def __init__(self, table: CommandTable, mask: int) -> None:
+        self.places: dict[str, slice] = {}
+        """Positions of each output among the values, by its name."""
+        count = 0
+        for name, bit, values in table.outputs:
+            if mask >> bit & 1:
+                self.places[name] = slice(count, count + values)
+                count += values
+        self.values = count
+        """Number of values of a packet."""
+        self._floats = struct.Struct(f"<I{count}f")
+        self._shorts = struct.Struct(f"<I{count}h")
+        self.sizes = (self._floats.size, self._shorts.size)
+        """Lengths of a packet with 32-bit and with 16-bit values, bytes."""
+
+    def decode(self, data: bytes) -> LpmsMeasurement | None:
+        """Return the content of a data packet; None if its length is not that of these outputs."""
+        size = len(data)
+        if size == self._floats.size:
+            tick, *values = self._floats.unpack(data)
+            return LpmsMeasurement(tick, tuple(values), True)
+        if size == self._shorts.size:
+            tick, *values = self._shorts.unpack(data)
+            return LpmsMeasurement(tick, tuple(values), False)
+        return None
+
+    def encode(self, tick: int, values: Sequence[float], *, floats: bool) -> bytes:
+        """Return the data of a packet; integers are limited to 16 bits.
+
+        Raises
+        ------
+        ValueError
+            The number of values is not that of these outputs.
+        """
+        if len(values) != self.values:
+            raise ValueError(f"{len(values)} values: these outputs have {self.values}")
+        if floats:
+            return self._floats.pack(tick % TICK_MODULUS, *values)
+        counts = (max(-0x8000, min(0x7FFF, round(value))) for value in values)
+        return self._shorts.pack(tick % TICK_MODULUS, *counts)
+
+
+def seconds_of(tick: int) -> float:
+    """Return the device time of old firmware, which sends float32 seconds in place of ticks."""
+    (seconds,) = _SECONDS.unpack(_TICK.pack(tick))
+    return float(seconds)
+
+
+def tick_of(seconds: float) -> int:
+    """Return what old firmware sends for a device time in seconds."""
+    (tick,) = _TICK.unpack(_SECONDS.pack(seconds))
+    return int(tick)

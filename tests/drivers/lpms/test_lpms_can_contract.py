@@ -1,0 +1,114 @@
+"""The driver of LPMS sensors on CAN against the conformance suite, over SLCAN."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from typing_extensions import override
+
+from jointfit_daemon.driver import CanBusSettings
+from jointfit_drivers.lpms import LpmsCanIdSettings, LpmsCanImu, LpmsCanSettings
+from jointfit_protocols.lpms.channels import sequential_ids, tpdo_ids
+from jointfit_simulators._contract_fixtures import orientation
+from jointfit_simulators.devices import LpmsCanDevice, LpmsCanDeviceOptions
+from jointfit_simulators.driver_contract import DriverContract
+from jointfit_simulators.wires import PythonCanWire, SlcanAdapter
+from tests.drivers.driver_run import TextDevice
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.driver import Driver
+    from jointfit_simulators.imu_device import WireNoise
+
+pytestmark = pytest.mark.real_time
+
+
+def settings(
+    interface: str, channel: str, numbers: tuple[int, ...], mode: str, precision: str, **more: Any
+) -> LpmsCanSettings:
+    ids = LpmsCanIdSettings(**{f"frame{k}": number for k, number in enumerate(numbers, 1)})
+    table = {"id": "S3", "segment": "shank", "driver": "lpms-can", "silence_s": 0.4, "ids": ids}
+    bus = CanBusSettings(interface=interface, channel=channel)
+    return LpmsCanSettings.model_validate(
+        {**table, "can": bus, "mode": mode, "precision": precision, **more}
+    )
+
+
+class TestLpmsInCanopenStyle(DriverContract):
+    """16 bits, all four frames, heartbeat."""
+
+    registered_as = "lpms-can"
+    numbers = tpdo_ids(1)
+    mode, precision = "canopen", "int16"
+
+    @property
+    def options(self) -> LpmsCanDeviceOptions:
+        return LpmsCanDeviceOptions()
+
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> LpmsCanDevice:
+        adapter = SlcanAdapter(folder / "adapter", wire_noise=wire_noise)
+        return LpmsCanDevice(adapter, self.options)
+
+    @override
+    def make_driver(self, folder: Path) -> Driver:
+        path = str(folder / "adapter")
+        # the suite sends every 2 ms: halves of neighbouring samples are further apart than 1 ms
+        more = {"rate_hz": 500}
+        return LpmsCanImu(settings("slcan", path, self.numbers, self.mode, self.precision, **more))
+
+    @override
+    def make_wrong_device(self, folder: Path) -> TextDevice:
+        return TextDevice(folder / "adapter")
+
+
+class TestLpmsInSequentialMode(TestLpmsInCanopenStyle):
+    """32 bits, one rule of identifiers, without idle frames."""
+
+    numbers = sequential_ids(1, spaced=False)
+    mode, precision = "sequential", "float32"
+
+    @property
+    @override
+    def options(self) -> LpmsCanDeviceOptions:
+        return LpmsCanDeviceOptions(
+            mode="sequential", ids=sequential_ids(1, spaced=False), precision="float32",
+            sends_idle_frames=False,
+        )  # fmt: skip
+
+    test_wrong_device_raises_device_misconfigured = None  # type: ignore[assignment]
+
+    @override
+    def matches(self, number: int, measurement: Any) -> bool:
+        """Return whether `measurement` is a sample, within 0.09 rad.
+
+        The line of an adapter has no checksum: a wrong digit of a small component changes the norm
+        by less than the gate's 1 %, and the orientation by less than the distance of two samples.
+        """
+        products = zip(orientation(number), measurement.q_world_sensor, strict=True)
+        return bool(abs(sum(a * b for a, b in products)) > 1 - 1e-3)
+
+
+class TestLpmsOfOldFirmwareOnABusWithoutDescriptor(DriverContract):
+    """Thousandths, the other rule of identifiers, in one process."""
+
+    registered_as = "lpms-can"
+    has_noise = False
+    ids = sequential_ids(2, spaced=True)
+
+    @override
+    def make_device(self, folder: Path, wire_noise: WireNoise) -> LpmsCanDevice:
+        options = LpmsCanDeviceOptions(
+            mode="sequential", ids=self.ids, unit=1_000, mapping=(8, 5, 6, 7)
+        )
+        return LpmsCanDevice(PythonCanWire("virtual", str(folder)), options)
+
+    @override
+    def make_driver(self, folder: Path) -> Driver:
+        more = {"mapping": (8, 5, 6, 7)}
+        return LpmsCanImu(settings("virtual", str(folder), self.ids, "sequential", "int16", **more))
+
+    test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
+    test_wrong_device_raises_device_misconfigured = None  # type: ignore[assignment]
