@@ -61,7 +61,7 @@ SECTIONS = (
 def load_rig(path: Path) -> Rig:
     """Read and check the rig.toml at `path`.
 
-    File names in ``[mqtt]`` and ``[chain]`` are relative to the folder of `path`.
+    File names in ``[mqtt]``, ``[chain]`` and ``[[imu]]`` are relative to the folder of `path`.
 
     Raises
     ------
@@ -71,6 +71,7 @@ def load_rig(path: Path) -> Rig:
     table, syntax = read_table(path)
     mqtt, folder = table.get("mqtt"), path.absolute().parent
     _anchor(table.get("chain"), ("model",), folder)
+    _anchor(table.get("imu"), ("dbc",), folder)
     calibration = table.get("calibration")
     if isinstance(calibration, dict):
         _anchor(calibration.get("chain_refinement"), ("weights",), folder)
@@ -112,11 +113,12 @@ def _rig_of(table: dict[str, Any], source: str, syntax: Sequence[Fault]) -> Rig:
 
 
 def _anchor(part: object, keys: Sequence[str], folder: Path) -> None:
-    """Make the file names of a table absolute."""
-    if isinstance(part, dict):
-        for key in keys:
-            if isinstance(part.get(key), str):
-                part[key] = str(folder / part[key])
+    """Make the file names of a table, or of an array of tables, absolute."""
+    tables: list[Any] = part if isinstance(part, list) else [part]
+    for table in tables:
+        for key in keys if isinstance(table, dict) else ():
+            if isinstance(table.get(key), str):
+                table[key] = str(folder / table[key])
 
 
 class _RigReader:

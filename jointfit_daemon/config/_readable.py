@@ -57,6 +57,8 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
 
 def _readable(value: Any, annotation: Any, wrong: _Locations) -> Any:
     """Return the readable part of `value`; None without one."""
+    if isinstance(value, dict) and get_origin(annotation) is tuple:
+        value = [value]  # a driver that accepts one table instead of an array of tables
     if not wrong:
         return _valid(value, annotation)
     if isinstance(value, dict) and UNREADABLE in value:

@@ -154,6 +154,7 @@ class SharedBus:
         first_s: float | None = None,
         resembles: Callable[[bytes], bool] = lambda _: False,
         worked: bool = False,
+        configured_by: str = "over UART, Xsens MT Manager",
     ) -> None:
         """Emit every frame with one of `ids`, in chunks of packed frames, until cancelled.
 
@@ -181,6 +182,8 @@ class SharedBus:
             message.
         worked : bool
             Whether the device has sent measurements before: its settings are correct.
+        configured_by : str
+            How its identifiers and outputs are changed, for error messages.
 
         Raises
         ------
@@ -195,7 +198,7 @@ class SharedBus:
                 raise DeviceMisconfiguredError(
                     f"{self.channel}: CAN identifier {_hex(key)} ({carries}) is also "
                     f"that of {other.name} ({other.ids[key]}): give each sensor a block of its own "
-                    "(over UART, Xsens MT Manager) and set `ids` of both"
+                    f"({configured_by}) and set `ids` of both"
                 )
 
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -215,7 +218,7 @@ class SharedBus:
         except TimeoutError as error:
             if not limit.expired():  # raised by emit: a bug, not silence
                 raise
-            text = self._explain_silence(subscriber, resembles, worked=worked)
+            text = self._explain_silence(subscriber, resembles, configured_by, worked=worked)
             raise DeviceLostError(text) from error
         finally:
             self._subscribers.remove(subscriber)
@@ -224,7 +227,12 @@ class SharedBus:
                 ended.exception()  # mark as retrieved, in case a cancellation came first
 
     def _explain_silence(
-        self, subscriber: _Subscriber, resembles: Callable[[bytes], bool], *, worked: bool
+        self,
+        subscriber: _Subscriber,
+        resembles: Callable[[bytes], bool],
+        configured_by: str,
+        *,
+        worked: bool,
     ) -> str:
         """Return the missing identifier of a silent device, and those that arrive instead.
 
@@ -261,7 +269,7 @@ class SharedBus:
             return f"{text}; {_advise_id(needed, twin if twin in unclaimed else alike[0], what)}"
 
         if found or unclaimed:
-            return f"{text}: set `ids`, or switch this output on (over UART, Xsens MT Manager)"
+            return f"{text}: set `ids`, or switch this output on ({configured_by})"
         if self._others > subscriber.others:
             return f"{text}, while other sensors send: check its power and wiring, and `ids`"
         return f"{text}, and nothing else on the bus: check power, wiring and bit rate"

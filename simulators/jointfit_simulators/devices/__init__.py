@@ -27,6 +27,12 @@ from jointfit_simulators.devices._natnet_server import NatNetServer
 from jointfit_simulators.devices._orientation_sensor import OrientationSensor
 from jointfit_simulators.devices._qtm_server import QtmServer, QtmServerOptions
 from jointfit_simulators.devices._sensor_faults import SensorFaults
+from jointfit_simulators.devices._table_device import (
+    CanTablePort,
+    SerialTablePort,
+    TableDevice,
+    TableDeviceOptions,
+)
 from jointfit_simulators.devices._tcp_port import TcpClient, TcpPort, TextServer
 from jointfit_simulators.devices._witmotion_device import (
     WITH_QUATERNION,
@@ -44,6 +50,7 @@ __all__ = [
     "Bodies",
     "CameraFrames",
     "Cameras",
+    "CanTablePort",
     "ClockFault",
     "FrameStamps",
     "LpmsCanDevice",
@@ -65,7 +72,10 @@ __all__ = [
     "RigidBodyAsset",
     "SampleTiming",
     "SensorFaults",
+    "SerialTablePort",
     "SimulatedClock",
+    "TableDevice",
+    "TableDeviceOptions",
     "TcpClient",
     "TcpPort",
     "TextServer",

@@ -1,0 +1,234 @@
+"""The ``[[imu]]`` table of a CAN device that it describes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field, field_validator
+from typing_extensions import override
+
+from jointfit_daemon.driver import CanBusError, CanBusSettings, Settings
+from jointfit_drivers.can_table._dbc import read_signals
+from jointfit_drivers.ports.can_bus import bus_faults
+from jointfit_drivers.table_samples import (
+    UNITS,
+    AsParts,
+    FieldFaultError,
+    FieldSettings,
+    SampleForm,
+    TableForm,
+    TableImuSettings,
+    binary_place,
+    orientation_faults,
+    overlap_faults,
+    place_fields,
+    sample_form,
+)
+from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX
+from jointfit_protocols.table import MEASURED, CanTable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from jointfit_protocols.table import Quantity, TableField
+
+_FRAME_BYTES = 8
+_SHARE_OF_PERIOD = 0.5
+"""Most time between the frames of a sample, in nominal periods."""
+
+
+class CanFieldSettings(FieldSettings):
+    """One quantity of the frames, or some of its components."""
+
+    frame: str | None = Field(
+        None,
+        description="name in `ids` of the frame that contains it; default: the one with the name "
+        "of the quantity, or the only one",
+    )
+    signals: tuple[str, ...] | None = Field(
+        None,
+        description="signals of the `dbc` file, SIGNAL or MESSAGE.SIGNAL, in the order of `order`; "
+        "instead of `offset` and `type`",
+    )
+
+
+Parts = Annotated[tuple[CanFieldSettings, ...], AsParts]
+
+
+class CanFields(Settings):
+    """Quantities of the frames."""
+
+    quaternion: Parts = Field((), description="orientation")
+    rate: Parts = Field((), description="rate of turn, sensor axes")
+    acceleration: Parts = Field((), description="specific force, sensor axes; upwards at rest")
+    magnetic: Parts = Field((), description="magnetic field, sensor axes, any unit")
+    time: Parts = Field((), description="device time of the measurement")
+    counter: Parts = Field((), description="number of the sample")
+    valid: Parts = Field((), description="status bits; samples without them are dropped")
+
+
+class CanTableSettings(TableImuSettings):
+    """One IMU on a CAN bus whose frames this table describes."""
+
+    can: CanBusSettings = Field(description="name of the [can.NAME] table of its bus")
+    ids: dict[str, Annotated[int, Field(ge=0, le=EXTENDED_MAX)]] = Field(
+        description="identifier of each frame, by a name of your choice",
+        examples=[{"quaternion": 0x131}],
+    )
+    extended_ids: bool = Field(
+        False, description="29-bit identifiers even where the numbers would fit 11 bits"
+    )
+    sequence: tuple[str, ...] = Field(
+        (),
+        description="names of `ids` in the order in which the device sends the frames of a sample; "
+        "default: the lowest identifier first",
+    )
+    dbc: str | None = Field(None, description="DBC file with the `signals` of the fields")
+    fields: CanFields = Field(description="place, scale and unit of each quantity")
+
+    @field_validator("can")
+    @classmethod
+    def _bus_that_exists_here(cls, can: CanBusSettings) -> CanBusSettings:
+        if faults := bus_faults(can):
+            raise CanBusError(faults)
+        return can
+
+    @field_validator("ids")
+    @classmethod
+    def _frames(cls, ids: dict[str, int]) -> dict[str, int]:
+        if not ids:
+            raise ValueError("must not be empty: expected a frame, such as { quaternion = 0x131 }")
+        return ids
+
+    @property
+    @override
+    def can_frames(self) -> tuple[tuple[int, bool], ...]:
+        fields = self.places().fields.values()
+        return tuple(
+            (max(each.end for each in fields if each.frame == number), extended)
+            for number, (_, extended) in enumerate(self.keys())
+            if any(each.frame == number for each in fields)
+        )
+
+    @override
+    def contradictions(self) -> Iterator[tuple[str, str]]:
+        """Refuse tables whose fields do not fit their frames."""
+        if not self._is_readable():
+            return  # reported; nothing can be placed
+        faults = list(self._id_faults())
+        yield from faults
+        if faults:
+            return
+        form = self.places()
+        yield from form.faults
+        sizes = dict.fromkeys(range(len(self.ids)), _FRAME_BYTES)
+        yield from overlap_faults(form, {}, sizes)
+        if form.faults:
+            return
+        unused = [
+            name
+            for number, name in enumerate(self.order())
+            if not any(each.frame == number for each in form.fields.values())
+        ]
+        for name in unused:
+            yield f"ids.{name}", f"no field is in this frame: give a field frame = {name!r}"
+        last = len(self.ids) - 1
+        if not unused and not any(
+            each.frame == last for slot, each in form.fields.items() if slot < MEASURED
+        ):
+            text = "the last frame of a sample needs measurements: correct the order"
+            yield "sequence" if self.sequence else "ids", text
+        yield from orientation_faults(form, self, timed=False)
+
+    def order(self) -> tuple[str, ...]:
+        """Return the names of the frames in the order of sending."""
+        return self.sequence or tuple(sorted(self.ids, key=self.ids.__getitem__))
+
+    def keys(self) -> tuple[tuple[int, bool], ...]:
+        """Return identifier, and whether it has 29 bits, in the order of sending."""
+        numbers = [self.ids[name] for name in self.order()]
+        return tuple((number, self.extended_ids or number > STANDARD_MAX) for number in numbers)
+
+    def places(self) -> TableForm:
+        """Return the place of every number."""
+        quantities: Any = dict(self.fields)
+        return place_fields(quantities, self._place)
+
+    def sample_form(self) -> SampleForm:
+        """Return the meaning of the numbers."""
+        return sample_form(self.places(), self, is_text=False)
+
+    def can_table(self) -> CanTable:
+        """Return the description of the frames for their codec."""
+        longest_ns = round(_SHARE_OF_PERIOD * 1e9 / self.rate_hz)
+        return CanTable(self.keys(), self.places().fields, longest_ns, self.order())
+
+    def _place(self, name: Quantity, part: FieldSettings, count: int) -> list[TableField]:
+        """Return the places of a part, by offset or from the DBC file."""
+        signals = getattr(part, "signals", None)
+        if signals is None:
+            return binary_place(part, count, self.byte_order, self._frame(name, part))
+
+        if self.dbc is None:
+            raise FieldFaultError("signals", "needs a file: set `dbc`, or give `offset` and `type`")
+        for key in ("offset", "type", "byte_order"):
+            if getattr(part, key) is not None:
+                raise FieldFaultError(key, "is in the DBC file: remove it")
+        if len(signals) != count:
+            text = f"{len(signals)} signals for {count} components: expected one of each"
+            raise FieldFaultError("signals", text)
+        keys = self.keys()
+        placed = []
+        for found in read_signals(self.dbc, signals):
+            if found.key not in keys:
+                number = f"{found.key[0]:#x}" + (" (29 bits)" if found.key[1] else "")
+                text = f"are in the frame {number}, which is not in `ids`: add it"
+                raise FieldFaultError("signals", text)
+            si = 1.0 if part.unit else UNITS.get(name, {}).get(found.unit or "", 1.0)
+            place = found.place
+            placed.append(
+                place._replace(
+                    frame=keys.index(found.key), scale=place.scale * si, zero=place.zero * si
+                )
+            )
+        return placed
+
+    def _frame(self, name: Quantity, part: FieldSettings) -> int:
+        """Return the number of the frame that contains a part."""
+        order = self.order()
+        frame = getattr(part, "frame", None)
+        if frame is None:
+            if len(order) == 1:
+                return 0
+            if name not in order:
+                text = f"missing: expected the name of its frame: {', '.join(order)}"
+                raise FieldFaultError("frame", text)
+            frame = name
+        if frame not in order:
+            text = f"{frame!r} is no frame of `ids`: expected one of {', '.join(order)}"
+            raise FieldFaultError("frame", text)
+        return order.index(frame)
+
+    def _id_faults(self) -> Iterator[tuple[str, str]]:
+        owners: dict[int, str] = {}
+        for name, number in self.ids.items():
+            if (owner := owners.setdefault(number, name)) != name:
+                yield f"ids.{name}", f"0x{number:X} is that of {owner} already: give each its own"
+            if number > STANDARD_MAX and self.extended_ids is False:
+                yield (
+                    "extended_ids",
+                    f"ids.{name} = 0x{number:X} is above 0x{STANDARD_MAX:X}, the greatest 11-bit "
+                    "identifier: correct it, or set extended_ids = true if the sensor sends 29-bit "
+                    "identifiers",
+                )
+        if self.sequence and sorted(self.sequence) != sorted(self.ids):
+            yield "sequence", f"expected each name of `ids` once: {', '.join(self.ids)}"
+
+    def _is_readable(self) -> bool:
+        """Return whether no key that places fields had a fault; such keys are None."""
+        ids: Any = self.ids
+        keys: list[Any] = [self.extended_ids, self.sequence, self.byte_order, self.rate_hz]
+        fields: Any = self.fields
+        if None in [ids, fields, *keys] or None in ids.values():
+            return False
+        return not any(parts is None or None in parts for _, parts in fields)

@@ -1,0 +1,95 @@
+"""Driver of IMUs on a serial port that rig.toml describes.
+
+The driver only receives: a table does not describe how a device is configured. Data in which no
+message is found are a fault of the table or of the speed, and are reported with what was found.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, ClassVar
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.ports.serial_port import SerialPort
+from jointfit_drivers.serial_table._decoder import SerialTableDecoder, open_codec
+from jointfit_drivers.serial_table._findings import explain_bytes
+from jointfit_drivers.serial_table._settings import SerialTableSettings
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit, Wire
+    from jointfit_daemon.model import Chunk
+
+log = logging.getLogger(__name__)
+
+_PERIODS_OF_SILENCE = 3
+"""Smallest number of sample periods without data after which a device counts as silent."""
+_UNKNOWN_BYTES = 4096
+"""Bytes without a message after which the table does not fit."""
+_UNKNOWN_S = 2.0
+"""Time, s, of received bytes without a message after which the table does not fit."""
+_RAW_CHUNKS = 20
+"""Chunks logged at debug level, so that the log contains raw data of a device."""
+
+
+class SerialTableImu:
+    """One device that sends frames or lines as its table describes."""
+
+    Settings: ClassVar[type[SerialTableSettings]] = SerialTableSettings
+    wire: ClassVar[Wire] = "stream"
+
+    def __init__(self, settings: SerialTableSettings) -> None:
+        self._settings = settings
+
+    def decoder(self) -> SerialTableDecoder:
+        """Return the decoder from chunks to samples, for live data and replay."""
+        settings = self._settings
+        return SerialTableDecoder(
+            settings.wire_format(), settings.sample_form(), settings.line_baud
+        )
+
+    async def run(self, emit: Emit) -> None:
+        """Open the port and read until cancelled.
+
+        Raises
+        ------
+        DeviceLostError
+            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+        DeviceMisconfiguredError
+            The file is no serial port, or the received bytes contain no message of the table.
+        """
+        settings = self._settings
+        silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
+        with SerialPort(settings.port, settings.baud) as port:
+            port.flush_input()
+            for chunk in await self._first_message(port, silence_s):
+                emit(chunk)
+            await port.pump(emit, silence_s)
+
+    async def _first_message(self, port: SerialPort, silence_s: float) -> list[Chunk]:
+        """Return the chunks up to the first message with measurements."""
+        wire = self._settings.wire_format()
+        codec, chunks = open_codec(wire), []
+        received = 0
+        while codec.messages == codec.skipped:
+            chunk = await port.receive(silence_s)
+            if chunk is None:
+                raise DeviceLostError(
+                    f"{port.path}: silent for {silence_s:g} s: check power and cable, and that the "
+                    "device sends without being asked"
+                )
+            chunks.append(chunk)
+            received += len(chunk.data)
+            if len(chunks) <= _RAW_CHUNKS:
+                log.debug("%s: %s", self._settings.id, chunk.data.hex(" "))
+            codec.feed(chunk.data)
+
+            waited_s = (chunk.t_ns - chunks[0].t_ns) * 1e-9
+            unknown = codec.messages == 0 and received >= _UNKNOWN_BYTES
+            if codec.messages == codec.skipped and (unknown or waited_s >= _UNKNOWN_S):
+                data = b"".join(each.data for each in chunks)
+                found = explain_bytes(data, wire)
+                raise DeviceMisconfiguredError(
+                    f"{port.path}: {received} bytes at {self._settings.baud} baud, and no message "
+                    f"of the table: {found}"
+                )
+        return chunks

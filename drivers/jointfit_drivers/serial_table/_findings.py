@@ -1,0 +1,200 @@
+"""Differences between received bytes and the table that describes them, with the remedy.
+
+Invariant: a pure function of bytes; every input yields a text.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from jointfit_protocols.table import (
+    WIDTHS,
+    Checksum,
+    FieldReader,
+    FrameFormat,
+    LineFormat,
+    compile_checksum,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from jointfit_protocols.table import ByteOrder
+
+_SHARE = 0.5
+"""Share of the sync bytes, or lines, that a finding must explain."""
+_FEW = 3
+"""Number of frames that is needed for a finding."""
+_PRINTABLE = 0.95
+"""Share of printable characters in text."""
+_NAMED = 8
+"""Types of frames listed in a message."""
+_SHOWN = 24
+"""Bytes shown in a message."""
+
+
+def explain_bytes(data: bytes, wire: FrameFormat | LineFormat) -> str:
+    """Return why `data` contains no message of `wire`, with the key to change."""
+    is_text = sum(32 <= byte < 127 or byte in b"\r\n\t" for byte in data) >= _PRINTABLE * len(data)  # noqa: PLR2004 - ASCII
+    if isinstance(wire, LineFormat):
+        return _explain_lines(data, wire) if is_text else _NOT_TEXT.format(_shown(data))
+    if is_text:
+        return f"they are text, such as {data[:_SHOWN]!r}: describe it with `text`, not `frame`"
+    return _explain_frames(data, wire)
+
+
+def _explain_lines(data: bytes, wire: LineFormat) -> str:
+    lines = [line.rstrip(b"\r") for line in data.split(b"\n")[1:-1] if line.strip()]
+    if not lines:
+        return "no line ends: expected LF at the end of a line; check `baud`"
+    example = repr(lines[-1][:60].decode("ascii", "replace"))
+    wanted = [line for line in lines if line.startswith(wire.prefix)]
+    if not wanted:
+        prefix = wire.prefix.decode("ascii", "replace")
+        return f"no line begins with {prefix!r}, such as {example}: correct `text.prefix`"
+
+    separator = _likely_separator(wanted, wire)
+    if separator is not None:
+        return f"lines such as {example} have another separator: set `text.separator` = {separator}"
+    found = Counter(len(_cells(line, wire)) for line in wanted).most_common(1)[0][0]
+    needed = wire.width or max(wire.columns.values()) + 1
+    if found < needed or (wire.width is not None and found != needed):
+        remedy = "correct `text.columns` and `column` of the fields"
+        return f"lines such as {example} have {found} columns, expected {needed}: {remedy}"
+    if wire.checksum is not None:
+        return f"no line has a valid checksum, such as {example}: correct `text.checksum`"
+    return f"a column is no number in lines such as {example}: correct `column` of the fields"
+
+
+def _likely_separator(lines: Sequence[bytes], wire: LineFormat) -> str | None:
+    """Return the separator of most lines if the configured one is in none of them."""
+    if any(len(_cells(line, wire)) > 1 for line in lines):
+        return None
+    for separator in (",", ";", "\t", " "):
+        if sum(separator.encode() in line for line in lines) >= _SHARE * len(lines):
+            return repr(separator)
+    return None
+
+
+def _cells(line: bytes, wire: LineFormat) -> list[bytes]:
+    return line[len(wire.prefix) :].split(wire.separator or None)
+
+
+def _explain_frames(data: bytes, wire: FrameFormat) -> str:
+    sync = wire.sync.hex(" ").upper()
+    starts = list(_starts(data, wire.sync))
+    if len(starts) < _FEW:
+        shown = _shown(data)
+        return f"sync bytes {sync} hardly occur in {shown}: check `baud` and `frame.sync`"
+
+    distances = Counter(after - before for before, after in pairwise(starts))
+    spacing, times = distances.most_common(1)[0]
+    regular = times >= _SHARE * len(starts)
+    if regular:
+        finding = _length_finding(data, starts, spacing, wire)
+        if finding is not None:
+            return finding
+    frames = [data[a:b] for a, b in pairwise(starts) if b - a == spacing]
+    if wire.checksum is not None and not any(
+        _is_valid(frame, wire.checksum, wire) for frame in frames
+    ):
+        fitting = _fitting_checksum(frames, wire)
+        known = "" if fitting is None else f"; the data fit {fitting}"
+        return (
+            f"no checksum of frames with {spacing} bytes is valid{known}: correct `frame.checksum`"
+        )
+    if wire.message is not None:
+        read = FieldReader([wire.message[0]])
+        values = {int(read.read(frame, 0)[0]) for frame in frames if len(frame) >= read.size}
+        if values and wire.message[1] not in values:
+            shown = ", ".join(map(str, sorted(values)[:_NAMED]))
+            expected = f"expected {wire.message[1]}"
+            return f"frames have the type {shown}, {expected}: correct `frame.message.equals`"
+    return f"no frame follows another one after {spacing} bytes: correct `frame.sync` and length"
+
+
+def _length_finding(
+    data: bytes, starts: Sequence[int], spacing: int, wire: FrameFormat
+) -> str | None:
+    """Return the difference between the length of the table and that of the frames."""
+    if isinstance(wire.length, int):
+        if spacing == wire.length:
+            return None
+        found = f"sync bytes follow each other after {spacing} bytes, expected {wire.length}"
+        return f"{found}: set `frame.length` = {spacing}"
+
+    read = FieldReader([wire.length])
+    whole = [at for at in starts if at + read.size <= len(data)]
+    lengths = Counter(int(read.read(data, at)[0]) for at in whole)
+    value, count = lengths.most_common(1)[0]
+    if count < _SHARE * len(whole) or value + wire.length_adds == spacing:
+        return None
+    remedy = f"set `frame.length_field.adds` = {spacing - value}"
+    return f"frames of {spacing} bytes have the length {value}: {remedy}"
+
+
+def _fitting_checksum(frames: list[bytes], wire: FrameFormat) -> str | None:
+    """Return the parameters of a usual checksum that all frames have."""
+    if len(frames) < _FEW:
+        return None
+    for checksum in _usual_checksums(len(wire.sync)):
+        if all(_is_valid(frame, checksum, wire) for frame in frames):
+            return _described(checksum)
+    return None
+
+
+def _is_valid(frame: bytes, checksum: Checksum, wire: FrameFormat) -> bool:
+    """Return whether a frame ends in this checksum."""
+    stop = len(frame) - len(wire.end)
+    checked = stop - checksum.width
+    sent = int.from_bytes(frame[checked:stop], checksum.byte_order)
+    return compile_checksum(checksum)(frame[checksum.first : checked]) == sent
+
+
+def _usual_checksums(sync: int) -> Iterator[Checksum]:
+    """Yield the checksums that many devices have."""
+    for first in dict.fromkeys((0, sync, 1, 2, 3)):
+        for kind, width in WIDTHS.items():
+            orders: tuple[ByteOrder, ...] = ("little", "big") if width > 1 else ("little",)
+            for order in orders:
+                base = Checksum(kind, first, order)
+                yield base
+                if kind == "sum8":
+                    yield base._replace(init=0xFF, xor_out=0xFF)
+                    yield base._replace(xor_out=0xFF)
+                if kind == "fletcher16":
+                    yield base._replace(modulus=255)
+                if kind == "crc16":
+                    yield base._replace(init=0xFFFF)
+                    yield base._replace(polynomial=0x8005, init=0xFFFF, reflected=True)
+                    yield base._replace(polynomial=0x8005, reflected=True)
+                    yield base._replace(reflected=True)
+
+
+def _described(checksum: Checksum) -> str:
+    """Return the keys of a checksum that differ from their defaults."""
+    plain = Checksum(checksum.kind)
+    keys = [f'kind = "{checksum.kind}"']
+    for name, value in checksum._asdict().items():
+        if name == "kind" or value == getattr(plain, name):
+            continue
+        shown = f'"{value}"' if isinstance(value, str) else f"0x{value:X}"
+        shown = str(value).lower() if isinstance(value, bool) else shown
+        keys.append(f"{name} = {value if name == 'first' else shown}")
+    return ", ".join(keys)
+
+
+def _starts(data: bytes, sync: bytes) -> Iterator[int]:
+    at = data.find(sync)
+    while at >= 0:
+        yield at
+        at = data.find(sync, at + 1)
+
+
+def _shown(data: bytes) -> str:
+    return data[:_SHOWN].hex(" ").upper()
+
+
+_NOT_TEXT = "they are no text, such as {}: check `baud`, or describe them with `frame`, not `text`"

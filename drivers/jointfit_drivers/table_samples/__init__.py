@@ -1,0 +1,40 @@
+"""Samples of devices that a table of rig.toml describes: keys, places, units and plausibility."""
+
+from jointfit_drivers.table_samples._field_settings import (
+    AsParts,
+    ChecksumSettings,
+    FieldSettings,
+    TableImuSettings,
+)
+from jointfit_drivers.table_samples._record_samples import RecordSamples
+from jointfit_drivers.table_samples._records import SampleForm, TableRecord
+from jointfit_drivers.table_samples._table_form import (
+    Faults,
+    FieldFaultError,
+    TableForm,
+    binary_place,
+    orientation_faults,
+    overlap_faults,
+    place_fields,
+    sample_form,
+)
+from jointfit_drivers.table_samples._units import UNITS
+
+__all__ = [
+    "UNITS",
+    "AsParts",
+    "ChecksumSettings",
+    "Faults",
+    "FieldFaultError",
+    "FieldSettings",
+    "RecordSamples",
+    "SampleForm",
+    "TableForm",
+    "TableImuSettings",
+    "TableRecord",
+    "binary_place",
+    "orientation_faults",
+    "overlap_faults",
+    "place_fields",
+    "sample_form",
+]

@@ -1,0 +1,130 @@
+"""Keys of ``fields`` in the ``[[imu]]`` table of a self-described device."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field
+
+from jointfit_daemon.driver import Settings
+from jointfit_drivers.gateway_orientation import GatewaySettings
+from jointfit_protocols.table import WIDTHS, Checksum, ChecksumKind
+
+_MOST_BYTES = 4095
+"""Largest offset in a frame."""
+
+
+class FieldSettings(Settings):
+    """One quantity, or some of its components: place, type, scale and unit."""
+
+    order: str | None = Field(
+        None,
+        description='components in the order of sending; default: "wxyz", or "xyz" for vectors',
+        examples=["wxyz"],
+    )
+    offset: Annotated[int, Field(ge=0, le=_MOST_BYTES)] | tuple[int, ...] | None = Field(
+        None,
+        description="first byte in the frame, from 0; components follow each other, or a list "
+        "with the byte of each",
+    )
+    bit: int = Field(
+        0,
+        ge=0,
+        le=63,
+        description="first bit after `offset`: from the least significant one if little-endian, "
+        "from the most significant one if big-endian",
+    )
+    type: str | None = Field(
+        None,
+        description="u8 to u64, i8 to i64 (any number of bits), f16, f32 or f64",
+        examples=["i16"],
+    )
+    byte_order: Literal["little", "big"] | None = Field(
+        None, description="default: `byte_order` of the table"
+    )
+    scale: float | None = Field(
+        None, description="value of one count, in `unit`; default: 1", examples=[0.0001]
+    )
+    divisor: float | None = Field(None, gt=0, description="counts per unit, instead of `scale`")
+    zero: float = Field(0.0, description="value of the count 0, in `unit`")
+    unit: str | None = Field(
+        None,
+        description="of rate: rad/s, deg/s, mdeg/s, mrad/s; of acceleration: m/s2, g, mg; of "
+        "time: s, ms, 100us, us, ns",
+    )
+    modulus: int | None = Field(
+        None,
+        gt=1,
+        description="of time and counter: number of values before they begin at 0 again; default: "
+        "all values of the type",
+    )
+    mask: int | None = Field(None, gt=0, description="of valid: bits that are evaluated")
+    equals: int | None = Field(
+        None, description="of valid: value of these bits in a valid sample; default: any but 0"
+    )
+
+
+def as_parts(value: Any) -> Any:
+    """Return an array for a table: a quantity may be sent in several parts.
+
+    Arrays become tuples, because pydantic no longer sees that they were JSON.
+    """
+    if isinstance(value, (list, tuple)):
+        return tuple(as_parts(each)[0] if isinstance(each, dict) else each for each in value)
+    if not isinstance(value, dict):
+        return value
+    part = {key: tuple(each) if isinstance(each, list) else each for key, each in value.items()}
+    return (part,)
+
+
+AsParts = BeforeValidator(as_parts)
+
+
+class ChecksumSettings(Settings):
+    """Checksum of a frame or line."""
+
+    kind: ChecksumKind = Field(description=f"one of {', '.join(WIDTHS)}", examples=["sum8"])
+    first: int = Field(
+        0, ge=0, description="first byte that it includes; it includes all up to itself"
+    )
+    byte_order: Literal["little", "big"] | None = Field(
+        None,
+        description="default: `byte_order` of the table; of fletcher16, little: plain sum first",
+    )
+    polynomial: int | None = Field(
+        None, gt=0, description="of a CRC, not reflected; default: 0x07, 0x1021 or 0x04C11DB7"
+    )
+    init: int = Field(0, ge=0, description="initial value")
+    reflected: bool = Field(False, description="of a CRC: least significant bit first")
+    xor_out: int = Field(0, ge=0, description="XOR of the result")
+    modulus: Literal[255, 256] = Field(256, description="of fletcher16")
+
+    def checksum(self, byte_order: Literal["little", "big"]) -> Checksum:
+        """Return the parameters, with `byte_order` unless the table has one."""
+        keys = self.model_dump()
+        return Checksum(**keys | {"byte_order": self.byte_order or byte_order})
+
+    def faults(self) -> list[tuple[str, str]]:
+        """Return values that exceed the width of the checksum."""
+        if None in (self.kind, self.init, self.xor_out):
+            return []
+        most = 1 << 8 * WIDTHS[self.kind]
+        return [
+            (name, f"0x{value:X} does not fit {self.kind}: expected less than 0x{most:X}")
+            for name in ("polynomial", "init", "xor_out")
+            if (value := getattr(self, name)) is not None and value >= most
+        ]
+
+
+class TableImuSettings(GatewaySettings):
+    """Common keys of devices that a table describes."""
+
+    byte_order: Literal["little", "big"] = Field(
+        "little", description="byte order of fields that name none"
+    )
+    world: Literal["ENU", "NED", "NWU"] = Field(
+        "ENU", description="world of the quaternion: first, second and third axis"
+    )
+    direction: Literal["sensor_to_world", "world_to_sensor"] = Field(
+        "sensor_to_world", description="direction in which the quaternion rotates vectors"
+    )

@@ -1,0 +1,135 @@
+r"""Settings of a table that fit the data, if the configured ones do not.
+
+Quaternions have norm 1, and specific forces have the norm of gravity most of the time. With a wrong
+byte order or type the norms of the counts scatter; with a wrong scale only, they do not, and their
+median is the scale.
+
+Invariant: pure arithmetic on received numbers.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from math import isfinite, sqrt
+from statistics import median
+from typing import TYPE_CHECKING
+
+from jointfit_drivers.table_samples._units import GRAVITY, UNITS
+from jointfit_protocols.table import SLOTS, FieldReader
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from jointfit_protocols.table import Quantity, TableField
+
+_NEAR = {"quaternion": 0.02, "acceleration": 0.3}
+"""Largest deviation from the median norm, relative: accelerations contain motion."""
+_SHARE = 0.8
+"""Share of the norms that are near the median if byte order and type are correct."""
+_DIVISORS = (
+    1.0, 100.0, 256.0, 1000.0, 1024.0, 2048.0, 4096.0, 8192.0, 10_000.0, 16_384.0, 32_767.0,
+    32_768.0, 100_000.0, 1_000_000.0, float(1 << 30), float((1 << 31) - 1),
+)  # fmt: skip
+"""Counts per unit of existing devices."""
+_SNAP = {"quaternion": 0.01, "acceleration": 0.12}
+"""Largest deviation, relative, with which one of these is proposed instead of the measured one."""
+_KNOWN_SCALE = 1e-9
+
+
+def fitting_keys(
+    quantity: Quantity,
+    fields: Mapping[int, TableField] | None,
+    samples: Sequence[tuple[tuple[bytes, ...], tuple[float, ...]]],
+) -> str | None:
+    """Return the keys of ``fields.QUANTITY`` with which the data fit, as text of rig.toml.
+
+    Parameters
+    ----------
+    quantity
+        ``quaternion`` or ``acceleration``.
+    fields
+        Place of each slot of the record; None for text lines.
+    samples
+        Data of the frames of each sample, and its components as sent.
+
+    Returns
+    -------
+    str or None
+        None if no change of byte order, type and scale explains the data.
+    """
+    target = 1.0 if quantity == "quaternion" else GRAVITY
+    if fields is None:
+        typical = _typical([_norm(counts) for _, counts in samples], quantity)
+        return None if typical is None else _scale_key(quantity, typical, target)
+
+    mine = [fields[slot] for slot in SLOTS[quantity]]
+    for changes, candidate in _candidates(mine):
+        reads = [(field.frame, FieldReader([field]).read) for field in candidate]
+        norms = [
+            _norm(tuple(read(data[frame], 0)[0] for frame, read in reads)) for data, _ in samples
+        ]
+        typical = _typical(norms, quantity)
+        if typical is None:
+            continue
+        keys = [f'{key} = "{value}"' for key, value in changes.items()]
+        scale = mine[0].scale
+        if not changes or abs(typical * scale / target - 1) > _SNAP[quantity]:
+            keys.append(_scale_key(quantity, typical, target))
+        return ", ".join(keys)
+    return None
+
+
+def _candidates(
+    fields: Sequence[TableField],
+) -> Iterator[tuple[dict[str, str], list[TableField]]]:
+    """Yield changes of type and byte order, the configured ones first."""
+    first = fields[0]
+    kinds = dict.fromkeys((first.kind, "i", "f" if first.bits in {32, 64} else "i"))
+    orders = dict.fromkeys((first.byte_order, "little", "big"))
+    for kind, order in product(kinds, orders):
+        changes = {"type": f"{kind}{first.bits}"} if kind != first.kind else {}
+        if order != first.byte_order:
+            if any(field.bit or field.bits % 8 for field in fields):
+                continue  # another byte order has other places, too
+            changes["byte_order"] = order
+        yield (
+            changes,
+            [field._replace(kind=kind, byte_order=order) for field in fields],
+        )
+
+
+def _norm(counts: Sequence[float]) -> float:
+    return sqrt(square) if isfinite(square := sum(c * c for c in counts)) else float("nan")
+
+
+def _typical(norms: Sequence[float], quantity: Quantity) -> float | None:
+    """Return the median norm if most norms are near it."""
+    finite = [norm for norm in norms if isfinite(norm)]
+    if not finite:
+        return None
+    middle = median(finite)
+    near = _NEAR[quantity] * middle
+    share = sum(abs(norm - middle) <= near for norm in finite) / len(norms)
+    return middle if share >= _SHARE and middle > _KNOWN_SCALE else None
+
+
+def _scale_key(quantity: Quantity, typical: float, target: float) -> str:
+    """Return the key that scales a norm of `typical` counts to `target`."""
+    if quantity == "quaternion":
+        return _divisor_key(typical, _SNAP[quantity])
+    fits: list[tuple[float, bool, str]] = []
+    for unit, si in UNITS["acceleration"].items():
+        counts = typical * si / target
+        divisor = min(_DIVISORS, key=lambda known: abs(counts / known - 1))
+        error = abs(counts / divisor - 1)
+        if error <= _SNAP[quantity]:
+            key = f'unit = "{unit}"' + ("" if divisor == 1.0 else f", divisor = {divisor:.0f}")
+            fits.append((round(error, 2), divisor != 1.0, key))
+    return min(fits)[2] if fits else f'unit = "m/s2", scale = {target / typical:.3g}'
+
+
+def _divisor_key(divisor: float, snap: float) -> str:
+    known = min(_DIVISORS, key=lambda each: abs(divisor / each - 1))
+    if abs(divisor / known - 1) <= snap:
+        return f"divisor = {known:.0f}"
+    return f"divisor = {divisor:.6g}"

@@ -1,0 +1,91 @@
+r"""Check of the unit of angular rates by the motion of gravity in sensor axes.
+
+The direction a of the specific force, constant in the world, changes in sensor axes by
+
+.. math:: \Delta a = -k \, (\omega \times a) \, \Delta t ,
+
+with k = 1 if the rate is in rad/s. k is the slope of a regression over the first rotations. Linear
+acceleration scatters the differences, and does not bias the slope.
+
+Invariant: a function of the readings fed, without a clock of its own.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import TYPE_CHECKING
+
+from jointfit_drivers.table_samples._units import GRAVITY, UNITS
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Vector
+
+_STEPS = 300
+"""Steps after which the slope is evaluated for the first time."""
+_MOST_STEPS = 6000
+"""Steps after which a sensor that hardly rotated is no longer checked."""
+_EXPLAINED = 0.5
+"""Least share of the differences that the regression explains."""
+_LOW, _HIGH = 0.6, 1.7
+"""Range of k with a correct unit."""
+_FREE = 0.3
+"""Largest deviation of the specific force from gravity, relative."""
+_LONGEST_S = 0.1
+"""Longest step, s."""
+
+
+class RateUnitCheck:
+    """Compares angular rate and specific force of one sensor."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, Vector, Vector] | None = None
+        self._cross = self._predicted = self._observed = 0.0
+        self._steps = 0
+        self.slope: float | None = None
+        """k if it is wrong and certain; None otherwise."""
+        self.done = False
+        """Whether the check ended."""
+
+    def take(self, t_ns: int, rate: Vector, force: Vector) -> None:
+        """Add a reading: rate in rad/s, specific force in m/s^2."""
+        length = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+        if abs(length - GRAVITY) > _FREE * GRAVITY:
+            self._last = None
+            return
+        a = (force[0] / length, force[1] / length, force[2] / length)
+        last, self._last = self._last, (t_ns, rate, a)
+        if last is None or not 0 < t_ns - last[0] <= _LONGEST_S * 1e9:
+            return
+
+        # The mean of two readings: a device sends the rate at, or before, its instant.
+        step_s = 0.5e-9 * (t_ns - last[0])
+        wx, wy, wz = ((now + then) * step_s for now, then in zip(rate, last[1], strict=True))
+        bx, by, bz = last[2]
+        predicted = (wz * by - wy * bz, wx * bz - wz * bx, wy * bx - wx * by)
+        observed = (a[0] - bx, a[1] - by, a[2] - bz)
+        for p, d in zip(predicted, observed, strict=True):
+            self._cross += p * d
+            self._predicted += p * p
+            self._observed += d * d
+        self._steps += 1
+        if self._steps % _STEPS == 0:
+            self._evaluate()
+
+    def fitting_unit(self, configured: float) -> str | None:
+        """Return the unit with which k is 1; `configured` is the SI value of the present one."""
+        if self.slope is None:
+            return None
+        for unit, si in UNITS["rate"].items():
+            if _LOW <= self.slope * configured / si <= _HIGH:
+                return unit
+        return None
+
+    def _evaluate(self) -> None:
+        self.done = self._steps >= _MOST_STEPS
+        spread = self._predicted * self._observed
+        if spread <= 0.0 or self._cross**2 < _EXPLAINED * spread:
+            return
+        self.done = True
+        slope = self._cross / self._predicted
+        if not _LOW <= slope <= _HIGH:
+            self.slope = slope

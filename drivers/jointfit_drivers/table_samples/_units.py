@@ -1,0 +1,16 @@
+"""Units of the quantities of a table."""
+
+from __future__ import annotations
+
+from math import pi
+
+GRAVITY = 9.80665
+"""Standard gravity, m/s^2."""
+
+UNITS: dict[str, dict[str, float]] = {
+    "rate": {"rad/s": 1.0, "deg/s": pi / 180, "mdeg/s": pi / 180_000, "mrad/s": 1e-3},
+    "acceleration": {"m/s2": 1.0, "g": GRAVITY, "mg": GRAVITY / 1000},
+    "time": {"s": 1.0, "ms": 1e-3, "100us": 1e-4, "us": 1e-6, "ns": 1e-9},
+}
+"""SI value of each unit by quantity, the default first; quaternions and magnetic fields have none,
+and time has no default."""

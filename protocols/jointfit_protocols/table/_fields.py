@@ -1,0 +1,255 @@
+"""Numbers at fixed places of a frame: compiled once to ``struct`` formats, then read and written.
+
+A record is the tuple of all numbers of one sample, as sent, in the order of their slots:
+
+    slot   0..3        4..6   7..9          10..12    13    14       15
+           quaternion  rate   acceleration  magnetic  time  counter  valid
+           w x y z     x y z  x y z         x y z
+
+A record contains the slots that the device sends, and no others. The place of a number is its first
+byte and the bit in it, counted in the direction in which the number grows: from the least
+significant bit of that byte if it is little-endian, from the most significant one if big-endian.
+
+Invariant: every frame of at least `FieldReader.size` bytes is read; nothing is interpreted for each
+sample.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable  # noqa: TC003 - types of attributes
+from operator import itemgetter
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+ByteOrder = Literal["little", "big"]
+Kind = Literal["u", "i", "f"]
+Quantity = Literal["quaternion", "rate", "acceleration", "magnetic", "time", "counter", "valid"]
+
+SLOTS: dict[Quantity, range] = {
+    "quaternion": range(4),
+    "rate": range(4, 7),
+    "acceleration": range(7, 10),
+    "magnetic": range(10, 13),
+    "time": range(13, 14),
+    "counter": range(14, 15),
+    "valid": range(15, 16),
+}
+"""Slots of each quantity in a record."""
+COMPONENTS = {"quaternion": "wxyz", "rate": "xyz", "acceleration": "xyz", "magnetic": "xyz"}
+"""Names of the components, in the order of their slots."""
+MEASURED = 13
+"""Number of slots with components of measurements; the others are integers or times."""
+
+_TYPE = re.compile(r"(?P<kind>[uif])(?P<bits>[1-9]\d?)")
+_FLOATS = (16, 32, 64)
+_MOST_BITS = 64
+_CODES = {
+    ("u", 8): "B", ("u", 16): "H", ("u", 32): "I", ("u", 64): "Q",
+    ("i", 8): "b", ("i", 16): "h", ("i", 32): "i", ("i", 64): "q",
+    ("f", 16): "e", ("f", 32): "f", ("f", 64): "d",
+}  # fmt: skip
+"""Codes of ``struct`` by kind and bits."""
+
+
+class TableField(NamedTuple):
+    """Place and form of one number."""
+
+    offset: int
+    """First byte in the frame."""
+    kind: Kind
+    """Unsigned integer, signed integer (two's complement), or float (IEEE 754)."""
+    bits: int
+    byte_order: ByteOrder = "little"
+    bit: int = 0
+    """First bit in the first byte."""
+    scale: float = 1.0
+    """SI value of one count."""
+    zero: float = 0.0
+    """SI value of the count 0."""
+    frame: int = 0
+    """Number of the frame that contains it, for devices that send several per sample."""
+
+    @property
+    def end(self) -> int:
+        """Bytes from the start of the frame to the last one of this number."""
+        return self.offset + (self.bit + self.bits + 7) // 8
+
+    @property
+    def modulus(self) -> int:
+        """Number of values of the integer."""
+        return 1 << self.bits
+
+    def occupied_bits(self) -> set[int]:
+        """Return the bits of the frame that this number occupies: 8 byte + significance."""
+        first = 8 * self.offset + self.bit
+        if self.byte_order == "little":
+            return set(range(first, first + self.bits))
+        return {at ^ 7 for at in range(first, first + self.bits)}
+
+
+def parse_type(text: str) -> tuple[Kind, int] | None:
+    """Return kind and bits of a type such as ``i16``, ``u12`` or ``f32``; None for other texts."""
+    match = _TYPE.fullmatch(text)
+    if match is None:
+        return None
+    kind: Kind = "u" if match["kind"] == "u" else "i" if match["kind"] == "i" else "f"
+    bits = int(match["bits"])
+    possible = bits in _FLOATS if kind == "f" else bits <= _MOST_BITS
+    return (kind, bits) if possible else None
+
+
+def overlaps(fields: Mapping[str, TableField]) -> list[tuple[str, str]]:
+    """Return the pairs of names whose numbers share bits of the same frame."""
+    found = []
+    named = [(name, field, field.occupied_bits()) for name, field in fields.items()]
+    for at, (first, one, bits) in enumerate(named):
+        found += [
+            (first, second)
+            for second, other, others in named[at + 1 :]
+            if one.frame == other.frame and bits & others
+        ]
+    return found
+
+
+class FieldReader:
+    """Reads numbers from frames, in the given order.
+
+    Parameters
+    ----------
+    fields : sequence of TableField
+        Numbers of one frame; they may not overlap.
+    """
+
+    def __init__(self, fields: Sequence[TableField]) -> None:
+        self.size = max((field.end for field in fields), default=0)
+        """Bytes that a frame must have."""
+        orders: tuple[ByteOrder, ByteOrder] = ("little", "big")
+        whole = [
+            [at for at in _by_place(fields) if _is_whole(fields[at], order)] for order in orders
+        ]
+        taken = [at for part in whole for at in part]
+        split = [at for at in range(len(fields)) if at not in taken]
+        structs = [
+            struct.Struct(_format([fields[at] for at in part], order))
+            for part, order in zip(whole, orders, strict=True)
+            if part
+        ]
+        self._structs = structs
+        self._bits = [_BitField(fields[at]) for at in split]
+        self._wire_order = [*taken, *split]
+        self.read: Callable[[bytes, int], tuple[float, ...]] = self._compile()
+        """Return the numbers of the frame that begins at an index of `data`."""
+
+    def _compile(self) -> Callable[[bytes, int], tuple[float, ...]]:
+        """Return the shortest function that reads all numbers."""
+        structs, bits, order = self._structs, self._bits, self._wire_order
+        if len(structs) == 1 and not bits and order == sorted(order):
+            plain: Callable[[bytes, int], tuple[float, ...]] = structs[0].unpack_from
+            return plain
+
+        places = [order.index(at) for at in range(len(order))]
+        if len(structs) == 1 and not bits:
+            unpack = structs[0].unpack_from
+            sort: Callable[[tuple[float, ...]], tuple[float, ...]] = itemgetter(*places)
+
+            def read_struct(data: bytes, at: int) -> tuple[float, ...]:
+                return sort(unpack(data, at))
+
+            return read_struct
+
+        unpacks = [each.unpack_from for each in structs]
+        reads = [each.read for each in bits]
+
+        def read_mixed(data: bytes, at: int) -> tuple[float, ...]:
+            raw: list[float] = []
+            for unpack in unpacks:
+                raw += unpack(data, at)
+            raw += [read(data, at) for read in reads]
+            return tuple([raw[place] for place in places])
+
+        return read_mixed
+
+    def write(self, frame: bytearray, values: Sequence[float]) -> None:
+        """Write numbers into a frame.
+
+        Raises
+        ------
+        struct.error, ValueError, OverflowError
+            A number does not fit its place, or there is a wrong number of them.
+        """
+        rest = iter([values[at] for at in self._wire_order])
+        for each in self._structs:
+            mask = bytearray(len(frame))
+            count = sum(code != "x" for code in re.findall(r"[a-zA-Z]", each.format))
+            each.pack_into(mask, 0, *[next(rest) for _ in range(count)])
+            for at, byte in enumerate(mask[: each.size]):
+                frame[at] |= byte
+        for bit_field in self._bits:
+            bit_field.write(frame, int(next(rest)))
+
+
+class _BitField:
+    """An integer that is no whole number of bytes, or for which ``struct`` has no code."""
+
+    def __init__(self, field: TableField) -> None:
+        self._field = field
+        self._length = field.end - field.offset
+        at_end = 8 * self._length - field.bit - field.bits
+        self._shift = field.bit if field.byte_order == "little" else at_end
+        self._mask = (1 << field.bits) - 1
+        self._sign = 1 << (field.bits - 1) if field.kind == "i" else 0
+        self.read = self._compile()
+
+    def _compile(self) -> Callable[[bytes, int], int]:
+        field, length, shift, mask, sign = (
+            self._field, self._length, self._shift, self._mask, self._sign
+        )  # fmt: skip
+        offset, order = field.offset, field.byte_order
+
+        def read(data: bytes, at: int) -> int:
+            first = at + offset
+            value = int.from_bytes(data[first : first + length], order) >> shift & mask
+            return (value ^ sign) - sign
+
+        return read
+
+    def write(self, frame: bytearray, value: int) -> None:
+        low = -self._sign
+        if not low <= value <= self._mask + low:
+            raise OverflowError(f"{value} does not fit {self._field.kind}{self._field.bits}")
+        field = self._field
+        place = slice(field.offset, field.end)
+        bits = int.from_bytes(frame[place], field.byte_order)
+        bits |= (value & self._mask) << self._shift
+        frame[place] = bits.to_bytes(self._length, field.byte_order)
+
+
+def slot_quantities(slots: Iterable[int]) -> tuple[Quantity, ...]:
+    """Return the quantities that have a slot in `slots`, in the order of a record."""
+    present = set(slots)
+    return tuple(name for name, place in SLOTS.items() if present & set(place))
+
+
+def _is_whole(field: TableField, order: ByteOrder) -> bool:
+    """Return whether ``struct`` reads the field with this byte order."""
+    if field.bit or (field.kind, field.bits) not in _CODES:
+        return False
+    return order == (field.byte_order if field.bits > 8 else "little")  # noqa: PLR2004 - one byte
+
+
+def _by_place(fields: Sequence[TableField]) -> list[int]:
+    return sorted(range(len(fields)), key=lambda at: fields[at].offset)
+
+
+def _format(fields: Sequence[TableField], order: ByteOrder) -> str:
+    """Return the format of fields in ascending order, with padding for the bytes in between."""
+    text, at = "<" if order == "little" else ">", 0
+    for field in fields:
+        text += f"{field.offset - at}x" if field.offset > at else ""
+        text += _CODES[field.kind, field.bits]
+        at = field.end
+    return text

@@ -1,0 +1,79 @@
+"""CAN frames by table: assembly of samples, lost and foreign frames."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_protocols.can import CanFrame
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.table import (
+    CanSample,
+    CanTable,
+    CanTableCodec,
+    TableField,
+    encode_can_frames,
+)
+
+MS = 1_000_000
+HALVES = CanTable(
+    ((0x100, False), (0x110, False), (0x111, False)),
+    {
+        **{slot: TableField(4 * (slot % 2), "f", 32, frame=1 + slot // 2) for slot in range(4)},
+        13: TableField(0, "u", 32, frame=0),
+    },
+    longest_ns=5 * MS,
+    names=("time", "first", "second"),
+)
+
+
+def frames(number: int, t_ns: int) -> list[CanFrame]:
+    sent = encode_can_frames(HALVES, [number, 2, 3, 4, 10 * number])
+    return [CanFrame(t_ns + at, key[0], data, key[1]) for at, (key, data) in enumerate(sent)]
+
+
+def test_frames_join_to_samples_with_the_stamp_of_the_first() -> None:
+    codec = CanTableCodec(HALVES)
+    found = [codec.feed(frame) for frame in frames(5, 1000)]
+    assert found[:2] == [None, None]
+    assert isinstance(found[2], CanSample)
+    assert (found[2].t_ns, found[2].values) == (1000, (5, 2, 3, 4, 50))
+
+
+def test_a_lost_time_leaves_the_sample_and_a_lost_half_none() -> None:
+    codec = CanTableCodec(HALVES)
+    sent = [
+        *frames(1, 0)[1:],
+        *frames(2, 10 * MS)[:2],
+        *frames(3, 20 * MS),
+        *frames(4, 30 * MS)[2:],
+    ]
+    found = [item for frame in sent if isinstance(item := codec.feed(frame), CanSample)]
+    assert [item.values for item in found] == [(1, 2, 3, 4, None), (3, 2, 3, 4, 30)]
+    assert codec.incomplete == 2
+
+
+def test_halves_of_different_samples_are_never_joined() -> None:
+    codec = CanTableCodec(HALVES)
+    assert codec.feed(frames(1, 0)[1]) is None
+    assert codec.feed(frames(2, 10 * MS)[2]) is None
+    assert codec.incomplete == 2
+
+
+@given(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 2), st.booleans()), max_size=60))
+def test_any_order_of_frames_joins_neighbours_only(sent: list[tuple[int, int, bool]]) -> None:
+    codec = CanTableCodec(HALVES)
+    t_ns = 0
+    for number, part, late in sent:
+        t_ns += 10 * MS if late else 0
+        sample = codec.feed(frames(number, t_ns)[part])
+        assert sample is None or isinstance(sample, CanSample)
+
+
+def test_short_frames_are_corrupt_and_foreign_ones_counted() -> None:
+    codec = CanTableCodec(HALVES)
+    short = codec.feed(CanFrame(0, 0x110, b"1234567"))
+    assert isinstance(short, CorruptBytes)
+    assert "first: 7 data bytes, expected 8" in short.reason
+    assert codec.feed(CanFrame(0, 0x110, bytes(8), extended=True)) is None
+    assert codec.foreign == 1
