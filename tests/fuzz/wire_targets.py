@@ -19,6 +19,7 @@ from jointfit_daemon.pipeline.sources import SourceState
 from jointfit_drivers.natnet._open_requests import OpenRequests
 from jointfit_drivers.qtm import QtmDecoder, QtmSettings
 from jointfit_drivers.witmotion import WitMotionImu, WitMotionSettings
+from jointfit_drivers.ximu3 import XImu3Imu, XImu3Settings
 from jointfit_protocols import qtm
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
 from jointfit_protocols.can.slcan import SlcanCodec
@@ -32,6 +33,10 @@ from jointfit_protocols.witmotion import encode as encode_witmotion
 from jointfit_protocols.xbus import XbusCodec, XbusMessage
 from jointfit_protocols.xbus import encode as encode_xbus
 from jointfit_protocols.xbus._framing import MAX_DATA
+from jointfit_protocols.ximu3 import XImu3Codec
+from jointfit_protocols.ximu3 import encode_command as encode_ximu3_command
+from jointfit_protocols.ximu3 import encode_data as encode_ximu3
+from jointfit_protocols.ximu3 import encode_text as encode_ximu3_text
 from tests.drivers.natnet.feeder import INFO, MODEL, frame, marker
 from tests.drivers.qtm.feeder import frame as qtm_frame
 from tests.drivers.qtm.feeder import xml as qtm_xml
@@ -374,10 +379,52 @@ def seeds_qtm_records() -> list[bytes]:
     return [b"".join(packed), *packed]
 
 
+# --- x-IMU3 -----------------------------------------------------------------------------------
+
+
+def run_ximu3_bytes(data: bytes) -> None:
+    """Decode serial bytes in pieces; every byte belongs to a message or is counted."""
+    decoder, found = XImu3Codec(), []
+    for piece in cut(data):
+        found += decoder.feed(piece)
+    found += decoder.flush()
+    used = sum(item.discarded if isinstance(item, CorruptBytes) else item.size for item in found)
+    if used != len(data):
+        raise UnaccountedError(f"{len(data)} bytes, {used} in messages or discarded")
+
+
+def run_ximu3_driver(data: bytes) -> None:
+    """Take serial bytes through the driver's decoder, and its events to JSON."""
+    table = {"id": "S1", "segment": "thigh", "driver": "ximu3", "port": "p", "sync_wire": 0}
+    decoder = XImu3Imu(XImu3Settings.model_validate(table)).decoder()
+    for number, piece in enumerate(cut(data)):
+        for item in decoder.feed(Chunk(BEGIN_NS + number * PERIOD_NS, piece)):
+            if isinstance(item, DeviceEvent):
+                encode_payload(item.data)
+
+
+def seeds_ximu3() -> list[bytes]:
+    """Return measurements in every form, reports and replies."""
+    q = (0.5, -0.5, 0.1, 0.7)
+    data = [encode_ximu3("Q", 1_000_000 + 10_000 * k, q, binary=k % 2 == 0) for k in range(12)]
+    other = [
+        encode_ximu3("A", 1_130_000, (10.0, 20.0, 30.0)),
+        encode_ximu3("Y", 1_130_000, (1.0,)),
+        encode_ximu3("B", 1_130_000, (5.0, 3.6, 0.0)),
+        encode_ximu3_text("F", 1_130_000, b"fault"),
+        encode_ximu3_command("ping", {"interface": "USB", "name": "x-IMU3", "sn": "01234567"}),
+        encode_ximu3_command("ahrs_axes_convention", 2),
+        encode_ximu3_command("bogus", {"error": "Unknown command"}),
+    ]
+    return [b"".join(data), b"".join(data[:4] + other), b"".join(other)]
+
+
 TARGETS = (
     Target("xbus-bytes", run_xbus_bytes, seeds_xbus, share=40),
     Target("xbus-source", run_xbus_source, seeds_xbus_records, share=4),
     Target("xbus-core", run_xbus_core, seeds_xbus_records, share=1),
+    Target("ximu3-bytes", run_ximu3_bytes, seeds_ximu3, share=40),
+    Target("ximu3-driver", run_ximu3_driver, seeds_ximu3, share=4),
     Target("serial-core", run_serial_core, seeds_xbus, share=1),
     Target("slcan-source", run_slcan, seeds_slcan, share=4),
     Target("witmotion-bytes", run_witmotion_bytes, seeds_witmotion, share=4),

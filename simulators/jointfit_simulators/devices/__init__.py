@@ -41,6 +41,7 @@ from jointfit_simulators.devices._witmotion_device import (
 )
 from jointfit_simulators.devices._xbus_device import XbusDevice, XbusDeviceOptions
 from jointfit_simulators.devices._xcdi_device import XcdiDevice, XcdiDeviceOptions
+from jointfit_simulators.devices._ximu3_device import XImu3Device, XImu3DeviceOptions
 
 __all__ = [
     "LOOPBACK",
@@ -82,6 +83,8 @@ __all__ = [
     "Vector",
     "WitMotionDevice",
     "WitMotionDeviceOptions",
+    "XImu3Device",
+    "XImu3DeviceOptions",
     "XbusDevice",
     "XbusDeviceOptions",
     "XcdiDevice",

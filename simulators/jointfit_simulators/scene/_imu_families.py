@@ -16,6 +16,7 @@ from jointfit_protocols.xbus.configuration import SyncSetting
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_protocols.xbus.sync_lines import IN1, Polarity, SyncFunction
 from jointfit_protocols.xcdi import XcdiIds
+from jointfit_protocols.ximu3 import BASE_RATE_HZ
 from jointfit_simulators.devices import (
     WITH_QUATERNION,
     LpmsCanDevice,
@@ -30,6 +31,8 @@ from jointfit_simulators.devices import (
     XbusDeviceOptions,
     XcdiDevice,
     XcdiDeviceOptions,
+    XImu3Device,
+    XImu3DeviceOptions,
 )
 from jointfit_simulators.wires import line_noise
 
@@ -186,6 +189,22 @@ def _xcdi(place: SensorPlace, bus: CanWire) -> ConnectedImu:
     return ConnectedImu(device, [f'can = "{BUS}"', ids_toml(ids)], f"{BUS}:{ids.quaternion:#05x}")
 
 
+def _ximu3(place: SensorPlace, port: Path) -> ConnectedImu:
+    stored = {
+        "serial_mode": 1,
+        "serial_number": f"000000{place.number:02X}",
+        "ahrs_message_rate_divisor": round(BASE_RATE_HZ / place.knobs.rate_hz),
+        "inertial_message_rate_divisor": 0,
+        "magnetometer_message_rate_divisor": 0,
+    }
+    device = XImu3Device(
+        port,
+        options=XImu3DeviceOptions(stored),
+        wire_noise=line_noise(place.knobs, place.name),
+    )
+    return ConnectedImu(device, [f'port = "{port}"', "baud = 921600"], str(port))
+
+
 def ids_toml(ids: XcdiIds) -> str:
     """Return the line of rig.toml with the CAN identifiers of a sensor."""
     return (
@@ -201,5 +220,6 @@ IMU_FAMILIES: dict[str, UartFamily | CanFamily] = {
     "witmotion": UartFamily(_witmotion),
     "xbus": UartFamily(_xbus),
     "xcdi": CanFamily(_xcdi),
+    "ximu3": UartFamily(_ximu3),
 }
 """Families by driver."""

@@ -1,0 +1,245 @@
+"""Decoder of the x-IMU3 driver: chunks in, samples in SI units with canonical orientation out.
+
+A sample is stamped with the arrival of its first byte. On a serial line this is the arrival of the
+chunk minus the duration of the message and of the bytes behind it, at ten bits per byte. On USB it
+is the arrival of the chunk.
+
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
+from jointfit_drivers.ximu3._continuity import XImu3Continuity, XImu3Point
+from jointfit_drivers.ximu3._device_reports import DeviceReports
+from jointfit_drivers.ximu3._orientation import is_orientation, orientation_of
+from jointfit_drivers.ximu3._raw_orientation import XImu3RawOrientation
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.orientation import OrientationGate, canonical
+from jointfit_protocols.ximu3 import MAX_LINE, TICK_NS, DataKind, XImu3Codec, XImu3Data
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Chunk, Decoded, Quaternion
+    from jointfit_drivers.ximu3._continuity import XImu3Step
+    from jointfit_drivers.ximu3._settings import XImu3Settings
+    from jointfit_protocols.ximu3 import XImu3Reply
+
+_BITS = 10
+"""Bits of one byte on the line, 8N1."""
+_SILENCE_FLOOR_NS = 250_000_000
+"""Lower bound, ns, of the silence after which a pending message is discarded."""
+_LATEST_TICKS = 1 << 52
+"""Device time, us, that is not plausible: 142 years."""
+_RATE_TOLERANCE = 0.1
+"""Largest relative difference of the measured rate from ``rate_hz`` without a warning."""
+_OLD_PULSE_US = 10_000_000
+"""Largest difference, us, between an edge and the last measurement."""
+
+
+class _Measurement(NamedTuple):
+    """A message with a measurement that has not been classified yet."""
+
+    message: XImu3Data
+    arrived_ns: int
+    native: Quaternion | None
+    q: Quaternion | None
+    """None for raw measurements."""
+
+
+class XImu3Decoder:
+    """Decoder of one x-IMU3.
+
+    Parameters
+    ----------
+    settings : XImu3Settings
+        Its table of rig.toml.
+    """
+
+    def __init__(self, settings: XImu3Settings) -> None:
+        self._settings = settings
+        self._codec = XImu3Codec()
+        self._reports = DeviceReports(settings.world)
+        self._byte_ns = _BITS * 1e9 / settings.baud if settings.transport == "uart" else 0.0
+        self._silence_ns = max(1.5 * MAX_LINE * self._byte_ns, _SILENCE_FLOOR_NS)
+        self._raw = None
+        if settings.orientation == "gateway":
+            self._raw = XImu3RawOrientation(
+                settings.rate_hz, magnetometer=settings.magnetometer, settle_s=settings.settle_s
+            )
+        self._continuity = XImu3Continuity()
+        self._held: _Measurement | None = None
+        self._gate = OrientationGate()
+        self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
+        self._last_ns = self._arrival_ns = self._last_ticks = 0
+        self._refused = self._refused_bytes = 0
+        self._norm_checked = self._rate_checked = False
+
+    @property
+    def tick_clock(self) -> TickClock:
+        """Unit of the device time: microseconds since its start, without wrap."""
+        return TickClock(TICK_NS, None)
+
+    @property
+    def messages(self) -> int:
+        """Well-formed messages so far."""
+        return self._codec.messages - self._refused
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes so far that belong to no message, or to a message that was rejected."""
+        return self._codec.discarded + self._refused_bytes
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return the content that `chunk` completed, in wire order; never raises."""
+        out: list[Decoded] = []
+        if self._codec.pending:
+            quiet_ns = chunk.t_ns - self._last_ns - len(chunk.data) * self._byte_ns
+            if quiet_ns > self._silence_ns:  # the rest of the pending message was lost
+                out = self._take(self._codec.flush())
+        self._last_ns = chunk.t_ns
+        found = self._codec.feed(chunk.data)
+        return out + self._take(found) if found else out
+
+    def flush(self) -> list[Decoded]:
+        """Discard a pending message and a measurement that waits for confirmation."""
+        return self._take(self._codec.flush()) + self._drop_held()
+
+    def _take(self, found: list[XImu3Data | XImu3Reply | CorruptBytes]) -> list[Decoded]:
+        out: list[Decoded] = []
+        for event in found:
+            if isinstance(event, XImu3Data):
+                if event.channel is None:
+                    out += self._take_data(event)
+            elif isinstance(event, CorruptBytes):
+                out.append(Corrupt(event.discarded, event.reason))
+            elif event.channel is None:
+                world = self._reports.world
+                out += self._reports.reply_events(event)
+                if self._reports.world != world:
+                    self._forget_motion()
+        return out
+
+    def _take_data(self, message: XImu3Data) -> list[Decoded]:
+        """Return the content of a data message of the device itself."""
+        if message.ticks >= _LATEST_TICKS:
+            return [self._refuse(message, "device time out of range")]
+
+        kind = message.kind
+        if self._raw is not None:
+            if kind == DataKind.INERTIAL:
+                return self._measure(message, None)
+            if kind == DataKind.MAGNETIC:
+                self._raw.measure_field(message)
+        elif is_orientation(message):
+            native = orientation_of(message)
+            if native is None:
+                return [self._refuse(message, "rotation matrix is not orthonormal")]
+            return self._measure(message, native)
+
+        if kind == DataKind.SYNC:
+            return self._sync_pulse(message)
+        return self._reports.data_events(message)
+
+    def _measure(self, message: XImu3Data, native: Quaternion | None) -> list[Decoded]:
+        """Return the samples that a measurement completes, after the check of time and motion."""
+        q = None
+        if native is not None:
+            q = self._gate.admit(canonical(native, self._reports.world))
+            if q is None:
+                return [self._refuse(message, "quaternion norm is not 1"), *self._norm_warning()]
+
+        # Arrival of the first byte. USB devices and ptys are faster than the configured speed:
+        # keep the stamps in order.
+        since = self._codec.fed - message.end + message.size
+        self._arrival_ns = max(self._arrival_ns, self._last_ns - round(since * self._byte_ns))
+        step = self._continuity.step(XImu3Point(message.ticks, self._arrival_ns, q))
+        return self._continue(step, _Measurement(message, self._arrival_ns, native, q))
+
+    def _continue(self, step: XImu3Step, measured: _Measurement) -> list[Decoded]:
+        """Return the samples of the held measurement, if confirmed, then those of `measured`."""
+        held = self._held
+        out = [] if step.confirmed else self._drop_held()
+        self._held = measured if step.held else None
+        if step.held:
+            return out
+
+        if step.restarted and held is not None:
+            self._q = (1.0, 0.0, 0.0, 0.0)
+            if self._raw is not None:
+                self._raw.forget()
+            out.append(DeviceEvent("restart", f"device clock restarted at {held.message.ticks} us"))
+        out += _gap(step.lost)
+        if held is not None and step.confirmed:
+            out += self._sample(held)
+            out += _gap(step.lost_since)
+        out += self._sample(measured)
+        return out if self._rate_checked else out + self._rate_warning()
+
+    def _sample(self, measured: _Measurement) -> list[Decoded]:
+        """Return the samples of an accepted measurement."""
+        message, arrived_ns, native, q = measured
+        self._last_ticks = message.ticks
+        if self._raw is not None:
+            found = self._raw.samples(message, arrived_ns)
+            return [self._refuse(message, "raw values out of range")] if found is None else found
+        if native is None or q is None:
+            return []
+
+        # A dropped quaternion may have changed the sign: continue that of the last sample.
+        (a, b, c, d), (w, x, y, z) = self._q, q
+        if a * w + b * x + c * y + d * z < 0.0:
+            q = (-w, -x, -y, -z)
+        self._q = q
+        return [ImuSample(arrived_ns, q, native, message.ticks, None)]
+
+    def _sync_pulse(self, message: XImu3Data) -> list[Decoded]:
+        """Return the pulse of an edge that counts."""
+        wire, edge = self._settings.sync_wire, message.values[0] != 0.0
+        if wire is None or edge != (self._settings.sync_edge == "rising"):
+            return []
+        if abs(message.ticks - self._last_ticks) > _OLD_PULSE_US:
+            return [self._refuse(message, "time of an edge far from that of the measurements")]
+        return [SyncPulse(self._last_ns, message.ticks, wire)]
+
+    def _rate_warning(self) -> list[Decoded]:
+        """Return a warning, once, if the device sends at another rate than configured."""
+        period_us = self._continuity.period_us
+        if period_us is None:
+            return []
+        self._rate_checked = True
+        found_hz, rate_hz = 1e6 / period_us, self._settings.rate_hz
+        if abs(found_hz / rate_hz - 1.0) <= _RATE_TOLERANCE:
+            return []
+        text = f"the device sends at {found_hz:.4g} Hz, rate_hz is {rate_hz:g}: correct one of them"
+        return [DeviceEvent("warning", text, {"rate_hz": round(found_hz, 3)})]
+
+    def _norm_warning(self) -> list[Decoded]:
+        """Return a warning, once, if hardly any quaternion has norm 1."""
+        norm = None if self._norm_checked else self._gate.misconfigured_norm
+        if norm is None:
+            return []
+        self._norm_checked = True
+        text = f"median quaternion norm is {norm:.4g}, expected 1: order or scale is wrong"
+        return [DeviceEvent("warning", text, {"median_norm": norm})]
+
+    def _forget_motion(self) -> None:
+        """Start again with the next measurement: the world of the orientations changed."""
+        self._continuity.forget()
+
+    def _refuse(self, message: XImu3Data, reason: str) -> Corrupt:
+        self._refused += 1
+        self._refused_bytes += message.size
+        return Corrupt(message.size, reason)
+
+    def _drop_held(self) -> list[Decoded]:
+        """Reject a measurement that no later message confirmed."""
+        held, self._held = self._held, None
+        if held is None:
+            return []
+        return [self._refuse(held.message, "time or motion disagrees with the other messages")]
+
+
+def _gap(lost: int) -> list[Decoded]:
+    return [DeviceEvent("gap", f"{lost} messages lost", {"lost": lost})] if lost else []

@@ -1,0 +1,64 @@
+"""Driver of x-io x-IMU3 on a serial port or USB, and of boards that send its messages.
+
+`XImu3Decoder` is the pure part. `XImu3Imu.run` opens the port, checks the settings of the device
+and reads until cancelled. The two share only chunks.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from jointfit_drivers.ports.serial_port import SerialPort
+from jointfit_drivers.ximu3._decoder import XImu3Decoder
+from jointfit_drivers.ximu3._handshake import LINE_SPEEDS, XImu3Handshake
+from jointfit_drivers.ximu3._passive_check import ensure_expected_messages
+from jointfit_drivers.ximu3._settings import XImu3Settings
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit, Wire
+
+_PERIODS_OF_SILENCE = 3
+"""Smallest number of sample periods without data after which a device counts as silent."""
+_HUNT_EVERY = 10
+"""Number of attempts to connect per search at other speeds, which takes longer than an attempt."""
+
+
+class XImu3Imu:
+    """One x-IMU3: orientation, device time in microseconds."""
+
+    Settings: ClassVar[type[XImu3Settings]] = XImu3Settings
+    wire: ClassVar[Wire] = "stream"
+    usual_bauds: ClassVar[tuple[int, ...]] = LINE_SPEEDS
+
+    def __init__(self, settings: XImu3Settings) -> None:
+        self._settings = settings
+        self._attempts = 0
+
+    def decoder(self) -> XImu3Decoder:
+        """Return the decoder from chunks to samples, for live data and replay."""
+        return XImu3Decoder(self._settings)
+
+    async def run(self, emit: Emit) -> None:
+        """Open the port, check the device, and read until cancelled.
+
+        Raises
+        ------
+        DeviceLostError
+            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+        DeviceMisconfiguredError
+            The file is no serial port, the speed is another, no x-IMU3 answers, or its settings
+            differ while ``persist`` is false.
+        """
+        settings = self._settings
+
+        with SerialPort(settings.port, settings.baud) as port:
+            silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
+            if settings.passive:
+                port.flush_input()
+                await ensure_expected_messages(port, emit, settings, silence_s)
+            else:
+                hunt = self._attempts % _HUNT_EVERY == 0
+                self._attempts += 1
+                await XImu3Handshake(port, emit, settings, hunt=hunt).ensure_configured()
+                self._attempts = 0
+            await port.pump(emit, silence_s)

@@ -1,0 +1,199 @@
+"""From an open port to an x-IMU3 with the required settings, or to the error that explains why not.
+
+The settings are read and compared. They are changed only where they differ and ``persist`` allows
+it, because the device also saves them when it is switched off. A fault that may clear by itself
+raises `DeviceLostError`, any other `DeviceMisconfiguredError`.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, NoReturn
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.ximu3._conversation import XImu3Conversation
+from jointfit_drivers.ximu3._required_settings import (
+    REPORTED,
+    WORLD,
+    differences,
+    rate_hint,
+    required_settings,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit
+    from jointfit_drivers.ports.serial_port import SerialPort
+    from jointfit_drivers.ximu3._required_settings import RequiredSetting
+    from jointfit_drivers.ximu3._settings import XImu3Settings
+
+log = logging.getLogger(__name__)
+
+LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 1_000_000, 2_000_000, 57_600, 38_400, 9_600)
+"""Line speeds to search, bit/s: the factory setting first."""
+_LISTEN_S = 0.2
+"""Wait for a reply at each speed of the search, s."""
+_INTERFACES = {"USB": "usb", "Serial": "uart"}
+"""Names of the interface in the reply to a ping, and the transport of rig.toml."""
+_WORLDS = (0, 1, 2)
+
+
+class XImu3Handshake:
+    """Checks one device and configures it if that is allowed.
+
+    Parameters
+    ----------
+    port, emit : SerialPort, Emit
+        Open port, and the receiver of the device's bytes.
+    settings : XImu3Settings
+        Its table of rig.toml.
+    hunt : bool
+        Whether to search for a silent device at other speeds.
+    """
+
+    def __init__(
+        self, port: SerialPort, emit: Emit, settings: XImu3Settings, *, hunt: bool = True
+    ) -> None:
+        self._port = port
+        self._settings = settings
+        self._hunt = hunt
+        self._conversation = XImu3Conversation(port, emit)
+        self._who = settings.port
+        self._required = required_settings(settings)
+
+    async def ensure_configured(self) -> None:
+        """Return when the device sends the requested measurements.
+
+        Raises
+        ------
+        DeviceLostError
+            The device is silent, unplugged, or stopped answering.
+        DeviceMisconfiguredError
+            The speed is another, the device is of another kind, or its settings differ and may not
+            be written.
+        """
+        settings = self._settings
+        needs = settings.serial_bits_per_s
+        if needs is not None and needs > settings.baud:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
+                f"{settings.baud}: lower `rate_hz`, or raise serial_baud_rate of the device and "
+                "`baud`"
+            )
+
+        self._conversation.reset()
+        ping = await self._conversation.request("ping")
+        if ping is None:
+            await self._explain_silence()
+        interface = ping.value.get("interface") if isinstance(ping.value, dict) else None
+        transport = _INTERFACES.get(str(interface))
+        if transport not in {None, settings.transport}:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: the device answers on its interface {interface}, expected transport "
+                f'"{settings.transport}": set transport = "{transport}"'
+            )
+
+        found = await self._read([*REPORTED, *(key for key, _ in self._required)])
+        if found.get(WORLD) not in _WORLDS:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {WORLD} is {found.get(WORLD)}, expected 0 (NWU), 1 (ENU) or 2 "
+                "(NED): correct it with the vendor's software, or update this program"
+            )
+        await self._ensure_settings(found)
+
+    async def _read(self, keys: list[str]) -> dict[str, object]:
+        """Return the values of settings; a setting that the device refuses has none."""
+        found: dict[str, object] = {}
+        refused = []
+        for key in dict.fromkeys(keys):
+            reply = await self._conversation.request(key)
+            if reply is None:
+                raise DeviceLostError(
+                    f"{self._who}: stopped answering during configuration: check its power and "
+                    "cable"
+                )
+            if reply.error is not None:
+                refused.append(f"{key} ({reply.error})")
+            else:
+                found[key] = reply.value
+        needed = [text for text in refused if text.partition(" ")[0] not in REPORTED[:2]]
+        if needed:
+            firmware = found.get("firmware_version", "unknown")
+            raise DeviceMisconfiguredError(
+                f"{self._who}: firmware {firmware} does not have {', '.join(needed)}: "
+                "install another one with the vendor's software, or set passive = true"
+            )
+        return found
+
+    async def _ensure_settings(self, found: dict[str, object]) -> None:
+        """Compare the settings, and write those that differ if that is allowed."""
+        faults = differences(found, self._required)
+        if not faults:
+            return
+        text = "; ".join(faults.values())
+        if not self._settings.persist:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {text}{rate_hint(found, self._required)}: set persist = true once "
+                "to write it into the device, or change it with the vendor's software"
+            )
+        log.warning("%s: writing its settings: %s", self._settings.id, text)
+
+        for key, values in self._required:
+            if key in faults:
+                reply = await self._conversation.request(key, values[0])
+                if reply is not None and reply.error is not None:
+                    raise DeviceMisconfiguredError(
+                        f"{self._who}: refuses {key} = {values[0]} ({reply.error}): correct "
+                        "rig.toml, or update the firmware of the device"
+                    )
+        await self._conversation.request("apply")
+
+        left = differences(await self._read(list(faults)), self._required_of(faults))
+        if left:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: does not accept its settings: {'; '.join(left.values())}: correct "
+                "rig.toml, or update the firmware of the device"
+            )
+        await self._conversation.request("save")
+
+    def _required_of(self, keys: dict[str, str]) -> tuple[RequiredSetting, ...]:
+        return tuple(one for one in self._required if one.key in keys)
+
+    async def _explain_silence(self) -> NoReturn:
+        """Raise the error for a device that does not answer a ping."""
+        conversation, received = self._conversation, self._conversation.received
+        if conversation.understood:
+            raise DeviceLostError(
+                f"{self._who}: sends measurements but does not answer commands: check the wire "
+                "from host to device, or set passive = true for a device that only sends"
+            )
+
+        speed = await self._other_speed() if self._hunt or received else None
+        if speed is not None:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {self._settings.baud} baud, but no message can be decoded; the "
+                f"device answers at {speed}: set baud = {speed}"
+            )
+        if not received:
+            raise DeviceLostError(
+                f"{self._who}: silent: check its power, and that TX and RX are not swapped. The "
+                "serial interface of a new x-IMU3 is disabled: set serial_mode = 1 over USB once"
+            )
+        raise DeviceMisconfiguredError(
+            f"{self._who}: the device on this port is not an x-IMU3: it sends bytes, none of them "
+            "its messages at any common speed: correct `port` or `driver`"
+        )
+
+    async def _other_speed(self) -> int | None:
+        """Return the speed at which the device answers, or sends its messages."""
+        for baud in LINE_SPEEDS:
+            if baud == self._settings.baud:
+                continue
+            try:
+                self._port.set_baud(baud)
+            except DeviceMisconfiguredError:  # the port does not support it
+                continue
+            self._conversation.reset()
+            reply = await self._conversation.request("ping", tries=1, wait_s=_LISTEN_S)
+            if reply is not None or self._conversation.understood:
+                return baud
+        return None

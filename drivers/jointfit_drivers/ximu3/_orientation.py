@@ -1,0 +1,83 @@
+r"""Orientation in the data messages of an x-IMU3: quaternion, rotation matrix or Euler angles.
+
+.. math:: R = R_z(\psi) R_y(\theta) R_x(\varphi), \qquad v_\mathrm{world} = R\, v_\mathrm{sensor}
+
+with yaw, pitch and roll in the order of the message: roll, pitch, yaw.
+"""
+
+from __future__ import annotations
+
+from math import cos, radians, sin, sqrt
+from typing import TYPE_CHECKING, cast
+
+from jointfit_protocols.ximu3 import DataKind
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.model import Quaternion
+    from jointfit_protocols.ximu3 import XImu3Data
+
+_ACCELERATIONS = (DataKind.LINEAR_ACCELERATION, DataKind.EARTH_ACCELERATION)
+_WITH_QUATERNION = 7
+"""Values of an acceleration message of older firmware."""
+_ORTHONORMAL = 0.02
+"""Largest error of the products of the columns of a rotation matrix."""
+
+
+def is_orientation(message: XImu3Data) -> bool:
+    """Return whether a message contains an orientation."""
+    if message.kind in {DataKind.QUATERNION, DataKind.MATRIX, DataKind.EULER}:
+        return True
+    return message.kind in _ACCELERATIONS and len(message.values) == _WITH_QUATERNION
+
+
+def orientation_of(message: XImu3Data) -> Quaternion | None:
+    """Return the quaternion of a message with an orientation, in the world of the device.
+
+    None if a rotation matrix is not orthonormal.
+    """
+    values = message.values
+    if message.kind == DataKind.MATRIX:
+        return _quaternion_of_matrix(values)
+    if message.kind == DataKind.EULER:
+        return _quaternion_of_angles(*values)
+    return cast("Quaternion", values[:4])
+
+
+def _quaternion_of_matrix(rows: Sequence[float]) -> Quaternion | None:
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = rows
+    products = (
+        xx * xx + yx * yx + zx * zx - 1.0,
+        xy * xy + yy * yy + zy * zy - 1.0,
+        xz * xz + yz * yz + zz * zz - 1.0,
+        xx * xy + yx * yy + zx * zy,
+        xx * xz + yx * yz + zx * zz,
+        xy * xz + yy * yz + zy * zz,
+    )
+    volume = xx * (yy * zz - yz * zy) - xy * (yx * zz - yz * zx) + xz * (yx * zy - yy * zx)
+    if not all(abs(value) <= _ORTHONORMAL for value in products) or not volume > 0.0:
+        return None
+
+    # The largest of 4w², 4x², 4y², 4z² gives its component, and the others by division.
+    squares = (1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz)
+    largest = squares.index(max(squares))
+    double = sqrt(squares[largest])
+    scale = 0.5 / double
+    a, b, c = (zy - yz) * scale, (xz - zx) * scale, (yx - xy) * scale
+    d, e, f = (xy + yx) * scale, (xz + zx) * scale, (yz + zy) * scale
+    half = 0.5 * double
+    found = ((half, a, b, c), (a, half, d, e), (b, d, half, f), (c, e, f, half))
+    return found[largest]
+
+
+def _quaternion_of_angles(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """Return the quaternion of Euler angles, deg."""
+    halves = [0.5 * radians(angle) for angle in (roll, pitch, yaw)]
+    (a, b, c), (i, j, k) = map(cos, halves), map(sin, halves)
+    return (
+        c * b * a + k * j * i,
+        c * b * i - k * j * a,
+        c * j * a + k * b * i,
+        k * b * a - c * j * i,
+    )

@@ -1,0 +1,70 @@
+"""First seconds of a device that is only listened to: its messages must be the expected ones."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.ximu3._orientation import is_orientation
+from jointfit_protocols.ximu3 import DataKind, XImu3Codec, XImu3Data
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit
+    from jointfit_drivers.ports.serial_port import SerialPort
+    from jointfit_drivers.ximu3._settings import XImu3Settings
+
+_LISTEN_S = 2.0
+"""Time to the first expected message, s; a device at 1 Hz sends two."""
+
+
+async def ensure_expected_messages(
+    port: SerialPort, emit: Emit, settings: XImu3Settings, silence_s: float
+) -> None:
+    """Emit all bytes and return at the first message with the expected measurement.
+
+    Raises
+    ------
+    DeviceLostError
+        No byte arrives for `silence_s`.
+    DeviceMisconfiguredError
+        Bytes arrive, but no messages, or messages without the expected measurement.
+    """
+    codec, kinds = XImu3Codec(), Counter[str]()
+    loop = asyncio.get_running_loop()
+    until = loop.time() + _LISTEN_S
+
+    while loop.time() < until:
+        chunk = await port.receive(silence_s)
+        if chunk is None:
+            raise DeviceLostError(
+                f"{settings.port}: silent for {silence_s:g} s: check power and cable, and `baud`"
+            )
+        emit(chunk)
+        for message in codec.feed(chunk.data):
+            if not isinstance(message, XImu3Data):
+                continue
+            kinds[message.kind] += 1
+            if settings.orientation == "gateway":
+                expected = message.kind == DataKind.INERTIAL
+            else:
+                expected = is_orientation(message)
+            if expected:
+                return
+
+    if not kinds:
+        raise DeviceMisconfiguredError(
+            f"{settings.port}: {codec.fed} bytes at {settings.baud} baud, none of them messages of "
+            "an x-IMU3: correct `baud`, `port` or `driver`"
+        )
+    needs = "I (inertial)" if settings.orientation == "gateway" else "Q, R or A (orientation)"
+    other = (
+        'orientation = "gateway"'
+        if DataKind.INERTIAL in kinds
+        else "ahrs_message_type = 0 in the device"
+    )
+    sent = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    raise DeviceMisconfiguredError(
+        f"{settings.port}: sends messages {sent}, expected {needs}: set {other}"
+    )

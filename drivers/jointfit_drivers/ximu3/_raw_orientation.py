@@ -1,0 +1,96 @@
+"""Orientation on the gateway from the inertial and magnetic messages of an x-IMU3.
+
+The magnetometer is slower than the gyroscope and has messages of its own. Between them, the last
+field is rotated with the angular rate to the time of each inertial message.
+
+Invariant: the output depends only on the messages fed; no clock and no port is read.
+"""
+
+from __future__ import annotations
+
+from math import radians
+from typing import TYPE_CHECKING
+
+from jointfit_drivers.gateway_orientation import (
+    RawReading,
+    RawSamples,
+    RawStamp,
+    is_plausible,
+    turned_field,
+)
+from jointfit_protocols.ximu3 import TICK_NS
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Decoded, Vector
+    from jointfit_protocols.ximu3 import XImu3Data
+
+STANDARD_GRAVITY = 9.80665
+"""Unit of specific force, m/s²."""
+_DEGREE = radians(1.0)
+_OLDEST_US = 1_000_000
+"""Age of a field, us, above which it is not used: the magnetometer was switched off."""
+
+
+class XImu3RawOrientation:
+    """Computes samples from raw messages.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Nominal rate, Hz.
+    magnetometer : bool
+        Whether heading comes from the magnetometer.
+    settle_s : float
+        Longest time without output after the start of the filter, s.
+    """
+
+    def __init__(self, rate_hz: float, *, magnetometer: bool, settle_s: float) -> None:
+        self._made = (rate_hz, magnetometer, settle_s)
+        self._samples = RawSamples(rate_hz, magnetometer=magnetometer, settle_s=settle_s)
+        self._ticks: int | None = None
+        self._first_ticks = 0
+        self._measured_ticks = self._field_ticks = 0
+        self._field: Vector | None = None
+
+    def forget(self) -> None:
+        """Start again: the device and its clock restarted."""
+        rate_hz, magnetometer, settle_s = self._made
+        self.__init__(  # type: ignore[misc] # the state of a new filter
+            rate_hz, magnetometer=magnetometer, settle_s=settle_s
+        )
+
+    def measure_field(self, message: XImu3Data) -> None:
+        """Store the field of a magnetic message."""
+        x, y, z = message.values
+        if self._samples.magnetometer and x * x + y * y + z * z < _STRONGEST:  # False for NaN
+            self._field, self._field_ticks = (x, y, z), message.ticks
+            self._measured_ticks = message.ticks
+
+    def samples(self, message: XImu3Data, arrived_ns: int) -> list[Decoded] | None:
+        """Return warnings and samples of an inertial message; None if it is not plausible."""
+        ticks = message.ticks
+        a, b, c, *force = message.values
+        rate = (a * _DEGREE, b * _DEGREE, c * _DEGREE)
+        x, y, z = force
+        specific = (x * STANDARD_GRAVITY, y * STANDARD_GRAVITY, z * STANDARD_GRAVITY)
+
+        if self._ticks is None:
+            self._first_ticks = ticks
+        reading = RawReading((ticks - self._first_ticks) * TICK_NS, rate, specific)
+        if (self._ticks is not None and ticks <= self._ticks) or not is_plausible(reading):
+            return None
+        self._ticks = ticks
+        reading = reading._replace(magnetic=self._field_at(ticks, rate))
+        return self._samples.take(RawStamp(arrived_ns, ticks), reading)
+
+    def _field_at(self, ticks: int, rate: Vector) -> Vector | None:
+        """Return the field at the time of an inertial message; None without a recent one."""
+        if self._field is None or ticks - self._measured_ticks > _OLDEST_US:
+            return None
+        self._field = turned_field(self._field, rate, (ticks - self._field_ticks) * 1e-6)
+        self._field_ticks = ticks
+        return self._field
+
+
+_STRONGEST = 1e4
+"""Square of the largest plausible field, in units of the earth's field."""

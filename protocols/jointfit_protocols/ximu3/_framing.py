@@ -1,0 +1,116 @@
+"""Bytes of an x-IMU3 to messages: lines that end with LF.
+
+A line that is no message may still end with one, because the terminator before it was lost. Its
+last bytes are therefore searched for a message, one byte after the other.
+
+Invariant: bytes in, messages out; no port, no clock. The result does not depend on the pieces.
+"""
+
+from __future__ import annotations
+
+import re
+
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.ximu3._messages import (
+    LAYOUTS,
+    TERMINATOR,
+    MessageFault,
+    XImu3Data,
+    XImu3Reply,
+    parse_line,
+    parse_rest,
+)
+
+MAX_LINE = 4096
+"""Longest message, bytes, terminator included: the buffer of the vendor's software."""
+_SEARCHED = 256
+"""Last bytes of a corrupt line that are searched for a message: more than any with numbers."""
+_MOST_PENDING = MAX_LINE + _SEARCHED
+_TOO_LONG = f"line longer than {MAX_LINE} bytes"
+_CUT_OFF = "cut off"
+_STARTS = re.compile(
+    b"[{" + b"".join(re.escape(bytes((first, first ^ 0x80))) for first, _ in sorted(LAYOUTS)) + b"]"
+)
+"""First bytes of messages that may follow a lost terminator."""
+
+Found = XImu3Data | XImu3Reply | CorruptBytes
+
+
+class XImu3Codec:
+    """Decoder of pieces of any size to messages.
+
+    A line without a message becomes one `CorruptBytes`; a line that is too long becomes several.
+    """
+
+    def __init__(self) -> None:
+        self._pending = b""
+        self._too_long = False  # whether the pending line lost its beginning
+        self.fed = 0
+        """Bytes fed so far."""
+        self.messages = 0
+        """Messages so far."""
+        self.discarded = 0
+        """Bytes without a message so far."""
+
+    @property
+    def pending(self) -> int:
+        """Bytes of an incomplete message; fewer than 4352."""
+        return len(self._pending)
+
+    def feed(self, data: bytes) -> list[Found]:
+        """Return the messages that `data` completed, in wire order; never raises."""
+        found: list[Found] = []
+        buffer = self._pending + data if self._pending else data
+        at, base = 0, self.fed - len(self._pending)
+        self.fed += len(data)
+
+        while (after := buffer.find(TERMINATOR, at) + 1) > 0:
+            message = self._message(buffer[at:after], base + after, found)
+            if message is not None:
+                self.messages += 1
+                found.append(message)
+            at = after
+
+        self._pending = self._shortened(buffer[at:], found) if at < len(buffer) else b""
+        return found
+
+    def flush(self) -> list[Found]:
+        """End the input, or a silence: return the pending bytes as corrupt."""
+        found: list[Found] = []
+        self._discard(len(self._pending), _TOO_LONG if self._too_long else _CUT_OFF, found)
+        self._pending, self._too_long = b"", False
+        return found
+
+    def _message(self, line: bytes, end: int, found: list[Found]) -> XImu3Data | XImu3Reply | None:
+        """Return the message of a line; bytes before it are appended to `found` as corrupt."""
+        if self._too_long or len(line) > MAX_LINE:
+            line, reason = self._shortened(line, found), _TOO_LONG
+            self._too_long = False
+        else:
+            message = parse_line(line, end)
+            if not isinstance(message, MessageFault):
+                return message
+            reason = message.reason
+
+        # The terminator of an earlier message may be lost: search the end of the line.
+        first = max(len(line) - _SEARCHED, 0)
+        for start in _STARTS.finditer(line, first):
+            rest = parse_rest(line[start.start() :], end)
+            if rest is not None:
+                self._discard(start.start(), reason, found)
+                return rest
+        self._discard(len(line), reason, found)
+        return None
+
+    def _shortened(self, line: bytes, found: list[Found]) -> bytes:
+        """Return the last bytes of a line that is too long; those before them are corrupt."""
+        blocks = max(len(line) - _MOST_PENDING + MAX_LINE, 0) // MAX_LINE
+        for _ in range(blocks):
+            self._too_long = True
+            self._discard(MAX_LINE, _TOO_LONG, found)
+        return line[blocks * MAX_LINE :]
+
+    def _discard(self, count: int, reason: str, found: list[Found]) -> None:
+        if count:
+            self.discarded += count
+            found.append(CorruptBytes(count, reason))

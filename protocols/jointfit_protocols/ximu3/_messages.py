@@ -1,0 +1,343 @@
+r"""Messages of an x-IMU3; each one is a line that ends with LF.
+
+    { "key": value }                         command of the host, or reply of the device
+    ^ | channel | message                    message of another device, through a multiplexer
+    Q,<time, us>,<number>,...,<number>\r\n   data in ASCII; the letter is the kind
+    D1 | time U8, us | float32 ... | 0A      data in binary; the kind is the letter | 0x80
+
+Numbers are little-endian. In data messages the bytes 0A and DB before the terminator are sent as
+DB DC and DB DD. There is no checksum: kind, length and escapes are the only checks.
+
+Source: x-IMU3-Software of x-io Technologies (MIT), API 1.9.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import struct
+from enum import StrEnum
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+TICK_NS = 1000
+"""Unit of device time, ns."""
+BASE_RATE_HZ = 400
+"""Rate, Hz, of which every rate of orientations and inertial messages is a whole fraction."""
+TERMINATOR = 0x0A
+ESCAPE = 0xDB
+MULTIPLEXER = 0x5E
+OBJECT = 0x7B
+"""First byte of a command or reply: an opening brace."""
+MOST_CHANNELS = 3
+"""Multiplexers in a row; more are corrupt."""
+_BINARY = 0x80
+_ESCAPED = {0xDC: b"\n", 0xDD: b"\xdb"}
+_HEAD = struct.Struct("<BQ")
+_TICKS = 1 << 64
+_PLAUSIBLE_TICKS = 1 << 52
+"""Device time, us, below which a message inside a corrupt line counts as found: 142 years."""
+
+
+class DataKind(StrEnum):
+    """Letter of a data message."""
+
+    QUATERNION = "Q"
+    """w x y z."""
+    MATRIX = "R"
+    """Rotation matrix, row by row: xx xy xz yx yy yz zx zy zz."""
+    EULER = "A"
+    """Roll, pitch, yaw, deg: R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    LINEAR_ACCELERATION = "L"
+    """x y z in sensor axes, g; of older firmware after a quaternion."""
+    EARTH_ACCELERATION = "E"
+    """x y z in the world, g; of older firmware after a quaternion."""
+    INERTIAL = "I"
+    """Angular rate x y z, deg/s; specific force x y z, g."""
+    MAGNETIC = "M"
+    """x y z, 1 is the earth's field."""
+    HIGH_G = "H"
+    """Specific force x y z, g."""
+    SYNC = "Y"
+    """Edge at the sync input: 1 rising, 0 falling."""
+    TEMPERATURE = "T"
+    """Degrees Celsius."""
+    BATTERY = "B"
+    """Charge, percent; voltage, V; state of charging."""
+    RSSI = "W"
+    """Signal strength of Wi-Fi, percent; power, dBm."""
+    BUTTON = "O"
+    """1 pressed, 0 released."""
+    STATUS = "U"
+    """State of the orientation filter, as text."""
+    NOTIFICATION = "N"
+    ERROR = "F"
+    ACCESSORY = "S"
+    """Bytes of an accessory on the serial port."""
+    TIMECODE = "C"
+    """Linear timecode, as text."""
+
+
+COUNTS: dict[str, tuple[int, ...]] = {
+    DataKind.QUATERNION: (4,), DataKind.MATRIX: (9,), DataKind.EULER: (3,),
+    DataKind.LINEAR_ACCELERATION: (3, 7), DataKind.EARTH_ACCELERATION: (3, 7),
+    DataKind.INERTIAL: (6,), DataKind.MAGNETIC: (3,), DataKind.HIGH_G: (3,),
+    DataKind.SYNC: (1,), DataKind.TEMPERATURE: (1,), DataKind.BATTERY: (3,),
+    DataKind.RSSI: (2,), DataKind.BUTTON: (1,),
+}  # fmt: skip
+"""Possible numbers of values of each kind; the other kinds contain text."""
+LAYOUTS: dict[tuple[int, int], tuple[DataKind, struct.Struct]] = {
+    (ord(kind) | _BINARY, _HEAD.size + 4 * count + 1): (
+        DataKind(kind), struct.Struct(f"<xQ{count}fx"),
+    )
+    for kind, counts in COUNTS.items() for count in counts
+}  # fmt: skip
+"""Kind and layout of binary data messages, by first byte and length without escapes."""
+_TEXTS = {ord(kind): kind for kind in DataKind if kind not in COUNTS}
+_KINDS = {ord(kind): kind for kind in DataKind}
+_NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+_MOST_DIGITS = 20
+"""Digits of the largest time."""
+
+
+class XImu3Data(NamedTuple):
+    """One data message."""
+
+    kind: DataKind
+    ticks: int
+    """Device time, us."""
+    values: tuple[float, ...]
+    """Numbers, in the order and units of `DataKind`; empty for text."""
+    text: bytes = b""
+    binary: bool = True
+    size: int = 0
+    """Bytes on the wire."""
+    end: int = 0
+    """Bytes fed to the codec up to and including the terminator, for back-dating."""
+    channel: int | None = None
+    """Channel of the multiplexer; None for the device itself."""
+
+
+class XImu3Reply(NamedTuple):
+    """One reply of the device, or one command of the host: both have the same form."""
+
+    key: str
+    value: object
+    """Value in force; None in a command that reads it."""
+    error: str | None = None
+    """Reason why the device refused the command."""
+    size: int = 0
+    end: int = 0
+    channel: int | None = None
+
+
+class MessageFault(NamedTuple):
+    """Reason why a line is no message."""
+
+    reason: str
+
+
+Line = XImu3Data | XImu3Reply | MessageFault
+UNKNOWN = MessageFault("no known message")
+_JSON = MessageFault("JSON with other than one key, or malformed")
+_STUFFING = MessageFault("escape byte before neither DC nor DD")
+_LENGTH = MessageFault("binary message of another length")
+_ASCII = MessageFault("malformed ASCII message")
+_CHANNELS = MessageFault("message of a multiplexer malformed")
+
+
+def parse_line(line: bytes, end: int = 0) -> Line:
+    """Return the message in a line that ends with LF, or the reason why there is none.
+
+    Parameters
+    ----------
+    line : bytes
+        One line on the wire, terminator included.
+    end : int
+        Bytes fed up to and including the terminator.
+    """
+    channel, at = None, 0
+    while line[at] == MULTIPLEXER:
+        if len(line) < at + 4 or at == 2 * MOST_CHANNELS:
+            return _CHANNELS
+        channel, at = line[at + 1], at + 2
+
+    inner = line[at:] if at else line
+    if inner[0] == OBJECT:
+        return _parse_reply(inner, len(line), end, channel)
+    if ESCAPE in inner:
+        plain = unstuffed(inner)
+        return _STUFFING if plain is None else _parse_data(plain, len(line), end, channel)
+    return _parse_data(inner, len(line), end, channel)
+
+
+def parse_rest(rest: bytes, end: int) -> XImu3Data | XImu3Reply | None:
+    """Return the message that the end of a corrupt line contains; None if there is none.
+
+    Accidental matches are the reason for narrower rules than those of `parse_line`: no text, no
+    multiplexer, and a plausible time.
+    """
+    if rest[0] & 0x7F not in _KINDS and rest[0] != OBJECT:
+        return None
+    if (rest[0] & 0x7F) in _TEXTS:
+        return None
+    found = parse_line(rest, end)
+    if isinstance(found, XImu3Data):
+        return found if found.ticks < _PLAUSIBLE_TICKS else None
+    return found if isinstance(found, XImu3Reply) else None
+
+
+def unstuffed(line: bytes) -> bytes | None:
+    """Return the bytes without escapes; None if an escape is malformed."""
+    head, *parts = line.split(b"\xdb")
+    plain = [head]
+    for part in parts:
+        escaped = _ESCAPED.get(part[0]) if part else None
+        if escaped is None:
+            return None
+        plain += escaped, part[1:]
+    return b"".join(plain)
+
+
+def _parse_data(plain: bytes, size: int, end: int, channel: int | None) -> Line:
+    first = plain[0]
+    if not first & _BINARY:
+        return _parse_ascii(plain, size, end, channel)
+
+    layout = LAYOUTS.get((first, len(plain)))
+    if layout is not None:
+        ticks, *values = layout[1].unpack(plain)
+        return XImu3Data(layout[0], ticks, tuple(values), b"", True, size, end, channel)
+
+    kind = _TEXTS.get(first ^ _BINARY)
+    if kind is None:
+        return _LENGTH if first ^ _BINARY in _KINDS else UNKNOWN
+    if len(plain) <= _HEAD.size:
+        return _LENGTH
+    _, ticks = _HEAD.unpack_from(plain)
+    return XImu3Data(kind, ticks, (), plain[_HEAD.size : -1], True, size, end, channel)
+
+
+def _parse_ascii(plain: bytes, size: int, end: int, channel: int | None) -> Line:
+    kind = _KINDS.get(plain[0])
+    if kind is None:
+        return UNKNOWN
+    name, _, rest = plain.rstrip(b"\r\n").partition(b",")
+    time, comma, content = rest.partition(b",")
+    if len(name) != 1 or not time.isdigit() or not comma or len(time) > _MOST_DIGITS:
+        return _ASCII
+    ticks = int(time)
+    if ticks >= _TICKS:
+        return _ASCII
+    if kind not in COUNTS:
+        return XImu3Data(kind, ticks, (), content, False, size, end, channel)
+
+    numbers = content.split(b",")
+    if len(numbers) not in COUNTS[kind] or not all(map(_NUMBER.fullmatch, numbers)):
+        return _ASCII
+    values = tuple(map(float, numbers))
+    return XImu3Data(kind, ticks, values, b"", False, size, end, channel)
+
+
+def _parse_reply(inner: bytes, size: int, end: int, channel: int | None) -> Line:
+    try:
+        pairs = json.loads(inner, object_pairs_hook=_pairs, parse_constant=_refuse_constant)
+    except (ValueError, RecursionError):  # not JSON, not UTF-8, or nested too deeply
+        return _JSON
+    if not isinstance(pairs, _Pairs) or len(pairs) != 1:
+        return _JSON
+    key, value = pairs[0]
+    plain = _plain(value)
+    error = None
+    if isinstance(plain, dict) and isinstance(plain.get("error"), str):
+        error = plain["error"]
+    return XImu3Reply(key, plain, error, size, end, channel)
+
+
+class _Pairs(list[tuple[str, object]]):
+    """Members of a JSON object; a dict would lose a repeated key."""
+
+
+def _pairs(members: list[tuple[str, object]]) -> _Pairs:
+    return _Pairs(members)
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, _Pairs):
+        return {key: _plain(inner) for key, inner in value}
+    return [_plain(inner) for inner in value] if isinstance(value, list) else value
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no JSON")
+
+
+def encode_command(key: str, value: object = None) -> bytes:
+    """Return a command or reply on the wire; without a value, the command reads or acts.
+
+    Raises
+    ------
+    ValueError
+        `value` is no JSON value.
+    """
+    text = json.dumps({key: value}, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    return text.encode() + b"\n"
+
+
+def encode_data(
+    kind: str, ticks: int, values: Sequence[float], *, binary: bool = True, decimals: int = 4
+) -> bytes:
+    """Return a data message with numbers on the wire.
+
+    Parameters
+    ----------
+    kind : str
+        Letter, see `DataKind`.
+    ticks : int
+        Device time, us.
+    values : sequence of float
+        As many as the kind has, in its units.
+    binary : bool
+        Binary with float32, or ASCII.
+    decimals : int
+        Decimals in ASCII.
+
+    Raises
+    ------
+    ValueError
+        The kind does not have this number of values.
+    """
+    if len(values) not in COUNTS.get(kind, ()):
+        raise ValueError(f"{len(values)} values in a message of kind {kind}")
+    if not binary:
+        numbers = ",".join(f"{value:.{decimals}f}" for value in values)
+        return f"{DataKind(kind)},{ticks},{numbers}\r\n".encode()
+    return _stuffed(
+        _HEAD.pack(ord(kind) | _BINARY, ticks) + struct.pack(f"<{len(values)}f", *values)
+    )
+
+
+def encode_text(kind: str, ticks: int, text: bytes, *, binary: bool = True) -> bytes:
+    """Return a data message with text on the wire.
+
+    Raises
+    ------
+    ValueError
+        The kind has numbers instead of text.
+    """
+    if kind in COUNTS:
+        raise ValueError(f"a message of kind {kind} has numbers, not text")
+    if binary:
+        return _stuffed(_HEAD.pack(ord(kind) | _BINARY, ticks) + text)
+    return _stuffed(f"{DataKind(kind)},{ticks},".encode() + text + b"\r")
+
+
+def encode_multiplexed(channel: int, message: bytes) -> bytes:
+    """Return a message of another device, as a multiplexer passes it on."""
+    return bytes((MULTIPLEXER, channel)) + message
+
+
+def _stuffed(plain: bytes) -> bytes:
+    return plain.replace(b"\xdb", b"\xdb\xdd").replace(b"\n", b"\xdb\xdc") + b"\n"

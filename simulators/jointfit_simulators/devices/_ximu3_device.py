@@ -1,0 +1,334 @@
+"""Virtual x-IMU3 on a pty, with the behaviour and faults of real devices.
+
+Invariant: the serial interface is dead until ``serial_mode`` is 1. The device sends measurements
+all the time, replies to every command with its key, uses new settings after ``apply``, and has
+quaternions of norm 1.000121. Source: x-IMU3-Software of x-io Technologies (MIT), and its example
+log of a device.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import asin, atan2, degrees
+from typing import TYPE_CHECKING, Literal
+
+from jointfit_protocols.orientation import World, native_of
+from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_protocols.ximu3 import (
+    BASE_RATE_HZ,
+    TICK_NS,
+    DataKind,
+    XImu3Codec,
+    XImu3Reply,
+    encode_command,
+    encode_data,
+    encode_text,
+)
+from jointfit_simulators.devices._inertial_signals import InertialSignals
+from jointfit_simulators.imu_device import clean_wire
+from jointfit_simulators.wires import PtyLine
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from jointfit_simulators.imu_device import Quaternion, WireNoise
+
+NORM = 1.000121
+"""Norm of the quaternions of the recorded device."""
+STANDARD_GRAVITY = 9.80665
+_WORLDS: tuple[World, ...] = ("NWU", "ENU", "NED")
+_FACTORY: dict[str, object] = {
+    "device_name": "x-IMU3",
+    "serial_number": "0123ABCD",
+    "firmware_version": "v1.3.0",
+    "hardware_version": "v2.0",
+    "serial_mode": 0,
+    "serial_baud_rate": 115_200,
+    "serial_data_messages_enabled": True,
+    "usb_data_messages_enabled": True,
+    "binary_mode_enabled": True,
+    "ahrs_message_type": 0,
+    "ahrs_message_rate_divisor": 8,
+    "inertial_message_rate_divisor": 8,
+    "magnetometer_message_rate_divisor": 1,
+    "ahrs_axes_convention": 0,
+    "axes_alignment": 0,
+    "ahrs_ignore_magnetometer": False,
+}
+_READ_ONLY = ("serial_number", "firmware_version", "hardware_version")
+_MOST = {
+    "serial_mode": 2, "ahrs_message_type": 4, "ahrs_axes_convention": 2, "axes_alignment": 23,
+    "ahrs_message_rate_divisor": 400, "inertial_message_rate_divisor": 400,
+    "magnetometer_message_rate_divisor": 20, "serial_baud_rate": 12_000_000,
+}  # fmt: skip
+"""Largest values of numbers."""
+_ACTIONS = ("apply", "save", "strobe", "heading")
+_ACCESSORY = 2
+"""Serial mode in which an accessory occupies the serial interface."""
+_MAGNETIC_NS = 50_000_000
+"""Interval of the magnetometer, ns, at divisor 1."""
+_BATTERY_NS = 1_000_000_000
+_BITS = 10
+"""Bits of one byte on the line (8N1)."""
+
+
+@dataclass(frozen=True, slots=True)
+class XImu3DeviceOptions:
+    """Settings and faults of a device."""
+
+    settings: Mapping[str, object] = field(default_factory=dict)
+    """Stored settings that differ from those of a new device."""
+    interface: Literal["Serial", "USB"] = "Serial"
+    baud: int | None = None
+    """Speed of the device, bit/s; at another speed both sides receive garbage. None: any (USB)."""
+    answers: bool = True
+    """Whether the device answers commands; otherwise it is a board that only sends."""
+    missing: tuple[str, ...] = ()
+    """Settings that its firmware does not have."""
+    error: str = ""
+    """Text of an error message with the first measurement."""
+    battery_percent: float = 80.0
+    first_tick: int = 0
+    """Clock at power-up, us."""
+
+
+class XImu3Device:
+    """`ImuDevice` on a pty.
+
+    Parameters
+    ----------
+    link
+        Symbolic link to the host's port.
+    options
+        Settings and faults.
+    wire_noise
+        Noise applied to each message to the host.
+    """
+
+    def __init__(
+        self,
+        link: Path,
+        *,
+        options: XImu3DeviceOptions | None = None,
+        wire_noise: WireNoise = clean_wire,
+    ) -> None:
+        self._options = options = options or XImu3DeviceOptions()
+        self._line = PtyLine(link)
+        self._noise = wire_noise
+        self._inertial = InertialSignals()
+        self._codec = XImu3Codec()
+        self.settings = _FACTORY | dict(options.settings)
+        """Settings in force."""
+        self._pending = dict(self.settings)
+        self._epoch_ns = self._last_ns = self._pushes = self._to_lose = 0
+        self._next_ns = {DataKind.MAGNETIC: 0, DataKind.BATTERY: 0}
+        self._error = options.error
+        self.sent = 0
+        """Number of complete samples written to the wire."""
+        self.saves = 0
+        """Number of times that the settings were saved."""
+
+    # --- control by the simulation ------------------------------------------------------------
+
+    @property
+    def streaming(self) -> bool:
+        """Whether the interface sends measurements."""
+        if self._options.interface == "USB":
+            return bool(self.settings["usb_data_messages_enabled"])
+        return self._alive and bool(self.settings["serial_data_messages_enabled"])
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second of the orientation, or of the raw measurements without one."""
+        for key in ("ahrs_message_rate_divisor", "inertial_message_rate_divisor"):
+            if divisor := self._number(key):
+                return BASE_RATE_HZ / divisor
+        return 0.0
+
+    @property
+    def counter(self) -> int:
+        """Number of the next sample; it is not on the wire."""
+        return self._pushes
+
+    @property
+    def line_ns(self) -> int:
+        """Transmission time of a sample at the speed of the host's port, ns."""
+        baud = self._line.host_baud
+        size = len(self._ahrs_message(0, (1.0, 0.0, 0.0, 0.0)))
+        return size * _BITS * 1_000_000_000 // baud if baud else 0
+
+    def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
+        """Send the messages of one sample now, as described in `ImuDevice.push`."""
+        self._last_ns = device_ns
+        self._inertial.update(device_ns, q_world_sensor)
+        if not self.streaming:
+            return
+        number, self._pushes = self._pushes, self._pushes + 1
+        if self._to_lose:
+            self._to_lose -= 1
+            return
+
+        ticks = self._ticks(device_ns)
+        if self._error:
+            self._send(
+                encode_text(DataKind.ERROR, ticks, self._error.encode(), binary=self._binary)
+            )
+            self._error = ""
+        self._push_slow_messages(device_ns, ticks)
+
+        ahrs, inertial = map(
+            self._number, ("ahrs_message_rate_divisor", "inertial_message_rate_divisor")
+        )
+        sent = True
+        if inertial and number % max(round(inertial / (ahrs or inertial)), 1) == 0:
+            sent = self._send(self._data(DataKind.INERTIAL, ticks, self._inertial_values()))
+        if ahrs:
+            sent = self._send(self._ahrs_message(ticks, q_world_sensor))
+        self.sent += sent
+
+    def edge(self, device_ns: int, *, rising: bool = True) -> None:
+        """Send the message of an edge at the accessory's sync input, if one is in use."""
+        if self.streaming and self.settings["serial_mode"] == _ACCESSORY:
+            self._send(self._data(DataKind.SYNC, self._ticks(device_ns), (float(rising),)))
+
+    def lose(self, count: int) -> None:
+        """Lose the next `count` samples."""
+        self._to_lose += count
+
+    def power_cycle(self) -> None:
+        """Interrupt the power supply: the clock restarts."""
+        self._epoch_ns, self._next_ns = self._last_ns, dict.fromkeys(self._next_ns, 0)
+
+    def unplug(self) -> None:
+        """Disconnect the wire."""
+        self._line.unplug()
+
+    def plug(self) -> None:
+        """Connect the wire; the device remained powered."""
+        self._line.plug()
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        await self._line.serve(self._receive)
+
+    # --- commands of the host -----------------------------------------------------------------
+
+    @property
+    def _alive(self) -> bool:
+        return self._options.interface == "USB" or self.settings["serial_mode"] == 1
+
+    def _receive(self, data: bytes) -> None:
+        if not self._same_speed:
+            data = bytes(byte ^ 0x55 for byte in data)
+        for command in self._codec.feed(data):
+            if isinstance(command, XImu3Reply) and self._alive and self._options.answers:
+                self._send(encode_command(command.key, self._reply(command.key, command.value)))
+
+    def _reply(self, key: str, value: object) -> object:
+        """Return the value of the answer to a command."""
+        if key == "ping":
+            names = {"name": "device_name", "sn": "serial_number"}
+            found = {name: self.settings[stored] for name, stored in names.items()}
+            return {"interface": self._options.interface} | found
+        if key in _ACTIONS:
+            if key == "apply":
+                self.settings = dict(self._pending)
+            self.saves += key == "save"
+            return None
+        if key not in self._pending or key in self._options.missing:
+            return {"error": "Unknown command"}
+        if value is not None:
+            fault = _fault(key, value, self._pending[key])
+            if fault:
+                return {"error": fault}
+            self._pending[key] = value
+        return self._pending[key]
+
+    # --- messages to the host -----------------------------------------------------------------
+
+    @property
+    def _same_speed(self) -> bool:
+        return self._options.baud in {None, self._line.host_baud}
+
+    @property
+    def _binary(self) -> bool:
+        return bool(self.settings["binary_mode_enabled"])
+
+    def _number(self, key: str) -> int:
+        value = self.settings[key]
+        return value if isinstance(value, int) else 0
+
+    def _send(self, wire: bytes) -> bool:
+        if not self._same_speed:  # the same number of bytes, none of them correct
+            wire = bytes((byte * 7 + 1) & 0x7F for byte in wire)
+        return self._line.write(self._noise(wire))
+
+    def _ticks(self, device_ns: int) -> int:
+        return self._options.first_tick + (device_ns - self._epoch_ns) // TICK_NS
+
+    def _data(self, kind: DataKind, ticks: int, values: tuple[float, ...]) -> bytes:
+        return encode_data(kind, ticks, values, binary=self._binary)
+
+    def _push_slow_messages(self, device_ns: int, ticks: int) -> None:
+        """Send the messages of the magnetometer and the battery if they are due."""
+        divisor = self._number("magnetometer_message_rate_divisor")
+        x, y, z = self._inertial.value(Item.MAGNETIC_FIELD) or (0.0, 0.0, 0.0)
+        due = {
+            DataKind.MAGNETIC: (_MAGNETIC_NS * divisor, (x, y, z)),
+            DataKind.BATTERY: (_BATTERY_NS, (self._options.battery_percent, 3.9, 0.0)),
+        }
+        for kind, (interval_ns, values) in due.items():
+            if interval_ns and device_ns - self._epoch_ns >= self._next_ns[kind]:
+                self._next_ns[kind] = device_ns - self._epoch_ns + interval_ns
+                self._send(self._data(kind, ticks, values))
+
+    def _inertial_values(self) -> tuple[float, ...]:
+        """Return angular rate, deg/s, and specific force, g."""
+        rate = self._inertial.value(Item.RATE_OF_TURN) or (0.0, 0.0, 0.0)
+        force = self._inertial.value(Item.ACCELERATION) or (0.0, 0.0, 0.0)
+        return (*map(degrees, rate), *(value / STANDARD_GRAVITY for value in force))
+
+    def _ahrs_message(self, ticks: int, q_world_sensor: Quaternion) -> bytes:
+        """Return the message of the orientation in the configured form."""
+        world = _WORLDS[self._number("ahrs_axes_convention")]
+        q = native_of(q_world_sensor, world)
+        encode: tuple[Callable[[], bytes], ...] = (
+            lambda: self._data(DataKind.QUATERNION, ticks, tuple(NORM * part for part in q)),
+            lambda: self._data(DataKind.MATRIX, ticks, _matrix(q)),
+            lambda: self._data(DataKind.EULER, ticks, _angles(q)),
+            lambda: self._data(DataKind.LINEAR_ACCELERATION, ticks, (0.0, 0.0, 0.0)),
+            lambda: self._data(DataKind.EARTH_ACCELERATION, ticks, (0.0, 0.0, 0.0)),
+        )
+        return encode[self._number("ahrs_message_type")]()
+
+
+def _fault(key: str, value: object, before: object) -> str:
+    """Return why a setting cannot have a value; empty if it can."""
+    if key in _READ_ONLY:
+        return "Read only"
+    if isinstance(value, bool) != isinstance(before, bool) or type(value) is not type(before):
+        return "Invalid type"
+    if isinstance(value, int) and not 0 <= value <= _MOST.get(key, 1):
+        return "Out of range"
+    return ""
+
+
+def _matrix(q: Quaternion) -> tuple[float, ...]:
+    """Return the rotation matrix of a unit quaternion, row by row."""
+    w, x, y, z = q
+    return (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+
+
+def _angles(q: Quaternion) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of a unit quaternion, deg."""
+    xx, _, _, yx, _, _, zx, zy, zz = _matrix(q)
+    return (
+        degrees(atan2(zy, zz)),
+        degrees(-asin(min(max(zx, -1.0), 1.0))),
+        degrees(atan2(yx, xx)),
+    )
