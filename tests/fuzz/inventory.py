@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.fuzz import broker_targets, file_targets, mip_targets, wire_targets
+from tests.fuzz import broker_targets, file_targets, mip_targets, vectornav_targets, wire_targets
 
 TARGETS = {
     target.name: target
-    for module in (wire_targets, mip_targets, broker_targets, file_targets)
+    for module in (wire_targets, mip_targets, vectornav_targets, broker_targets, file_targets)
     for target in module.TARGETS
 }
 REPRODUCERS = Path(__file__).parent / "reproducers"

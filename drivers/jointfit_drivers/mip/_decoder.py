@@ -9,15 +9,13 @@ Invariant: the output depends only on the chunks fed; the decoder reads no clock
 
 from __future__ import annotations
 
-from math import isfinite
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, cast
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, TickClock
-from jointfit_drivers.gateway_orientation import RawReading, RawStamp, is_plausible
+from jointfit_daemon.model import Corrupt, DeviceEvent, TickClock
 from jointfit_drivers.mip._device_replies import reply_events
 from jointfit_drivers.mip._required_fields import GPS_TIMES, QUATERNIONS
 from jointfit_drivers.serial_imu import ArrivalStamps
-from jointfit_drivers.time_continuity import TimeContinuity
+from jointfit_drivers.timed_samples import RawVectors, TimedReading, TimedSamples
 from jointfit_protocols.mip import MAX_PACKET, MipCodec, MipPacket
 from jointfit_protocols.mip.data import (
     STANDARD_GRAVITY,
@@ -27,12 +25,12 @@ from jointfit_protocols.mip.data import (
     decode_field,
     gps_ns,
 )
-from jointfit_protocols.orientation import OrientationGate, Quaternion, canonical
+from jointfit_protocols.orientation import canonical
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_daemon.model import Chunk, Decoded, Vector
     from jointfit_drivers.gateway_orientation import RawSamples
     from jointfit_drivers.mip._required_fields import RequiredFields
     from jointfit_protocols.corrupt import CorruptBytes
@@ -47,15 +45,6 @@ _FOREIGN = 20
 """Orientations of the other data set, none of the expected one between them, that are reported."""
 _REPORT_NS = 10_000_000_000
 """Least time between two reports of invalid orientations, ns."""
-
-
-class _MipOrientation(NamedTuple):
-    """A packet with an orientation or raw measurements."""
-
-    packet: MipPacket
-    arrival_ns: int
-    ticks: int | None
-    values: dict[int, tuple[Any, ...]]
 
 
 class MipDecoder:
@@ -79,38 +68,31 @@ class MipDecoder:
         required: RequiredFields,
         make_raw: Callable[[], RawSamples] | None = None,
     ) -> None:
-        self._set = int(required.data_set)
-        self._make_raw = make_raw
-        self._raw = None if make_raw is None else make_raw()
+        self._set, self._is_raw = int(required.data_set), make_raw is not None
         self._quaternion = int(QUATERNIONS[required.data_set])
         self._gps_time = int(GPS_TIMES[required.data_set])
-        raw_fields = {_RATE, _FORCE, _FIELD} if make_raw is not None else {self._quaternion}
+        raw_fields = {_RATE, _FORCE, _FIELD} if self._is_raw else {self._quaternion}
         self._wanted = {_TIME, self._gps_time, *raw_fields}
-        self._needed = frozenset({_RATE, _FORCE} if make_raw is not None else {self._quaternion})
+        self._needed = frozenset({_RATE, _FORCE} if self._is_raw else {self._quaternion})
         self._other = {int(one): int(field) for one, field in QUATERNIONS.items()}
         del self._other[self._set]
 
         self._codec = MipCodec()
         self._stamps = ArrivalStamps(baud, MAX_PACKET)
-        self._continuity = TimeContinuity()
-        self._held: _MipOrientation | None = None
-        self._gate = OrientationGate()
-        self._refused = self._refused_bytes = 0
+        self._samples = TimedSamples(make_raw, "give the time field the same decimation")
         self._foreign = 0
-        self._timed = self._untimed = self._norm_checked = False
-        self._raw_ns: int | None = None
         self._invalid_since_ns: int | None = None
         self._invalid_reported_ns = -_REPORT_NS
 
     @property
     def messages(self) -> int:
         """Well-formed packets so far."""
-        return self._codec.packets - self._refused
+        return self._codec.packets - self._samples.refused
 
     @property
     def discarded_bytes(self) -> int:
         """Bytes so far that belong to no packet, or to a packet that was rejected."""
-        return self._codec.discarded + self._refused_bytes
+        return self._codec.discarded + self._samples.refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the content that `chunk` completed, in wire order; never raises."""
@@ -123,7 +105,7 @@ class MipDecoder:
 
     def flush(self) -> list[Decoded]:
         """Discard a pending packet and an orientation that waits for confirmation."""
-        return self._take(self._codec.flush()) + self._drop_held()
+        return self._take(self._codec.flush()) + self._samples.flush()
 
     def _take(self, found: list[MipPacket | CorruptBytes]) -> list[Decoded]:
         out: list[Decoded] = []
@@ -145,22 +127,33 @@ class MipDecoder:
             if descriptor in self._wanted:
                 value = decode_field(self._set, descriptor, data)
                 if value is None:
-                    return [self._refuse(packet, f"field 0x{descriptor:02X} malformed")]
+                    reason = f"field 0x{descriptor:02X} malformed"
+                    return [self._samples.refuse(packet.size, reason)]
                 values[descriptor] = value
         if not self._needed <= values.keys():  # fields with other decimations
             return []
 
         self._foreign = 0
+        arrival_ns = self._stamps.stamp(self._codec.fed - packet.end + packet.size)
         ticks = self._time_in(values)
-        if ticks is None and (self._timed or self._raw is not None):
-            return [*self._warn_untimed(), self._refuse(packet, "orientation without time")]
+        if self._is_raw:
+            x, y, z = values[_FORCE]
+            force = (STANDARD_GRAVITY * x, STANDARD_GRAVITY * y, STANDARD_GRAVITY * z)
+            field = cast("Vector | None", values.get(_FIELD))
+            raw = RawVectors(cast("Vector", values[_RATE]), force, field)
+            return self._samples.add(TimedReading(packet.size, arrival_ns, ticks, raw=raw))
 
-        since = self._codec.fed - packet.end + packet.size
-        orientation = _MipOrientation(packet, self._stamps.stamp(since), ticks, values)
-        if ticks is None:
-            return self._warn_untimed() + self._sample(orientation)
-        self._timed = True
-        return self._continue(ticks, orientation)
+        w, x, y, z, *flags = values[self._quaternion]
+        native = (w, x, y, z)
+        status = flags[0] if flags else None
+        out: list[Decoded] = []
+        if status is not None:
+            out = self._note_validity(arrival_ns, is_valid=bool(status & 1))
+            if not status & 1:  # only its time counts
+                return out + self._samples.add(TimedReading(packet.size, arrival_ns, ticks))
+        q = canonical(native, "NED")
+        reading = TimedReading(packet.size, arrival_ns, ticks, q, native, status)
+        return out + self._samples.add(reading) if out else self._samples.add(reading)
 
     def _time_in(self, values: dict[int, tuple[Any, ...]]) -> int | None:
         """Return the device time in a packet, ns."""
@@ -170,73 +163,6 @@ class MipDecoder:
             return None
         time_of_week_s, week, _ = values[self._gps_time]
         return gps_ns(week, time_of_week_s)
-
-    def _continue(self, ticks: int, orientation: _MipOrientation) -> list[Decoded]:
-        """Return the samples of the held orientation, if valid, then those of `orientation`."""
-        step = self._continuity.add(ticks, orientation.arrival_ns)
-        held = self._held
-        if step.restarted and held is not None:
-            self._held = None
-            self._gate.forget()
-            if self._make_raw is not None:
-                self._raw, self._raw_ns = self._make_raw(), None
-            text = f"device clock restarted at {(held.ticks or 0) * 1e-9:.3f} s"
-            restart = DeviceEvent("restart", text)
-            return [restart, *self._sample(held), *self._sample(orientation)]
-
-        out = self._drop_held()
-        if step.held:
-            self._held = orientation
-            return out
-        if step.lost:
-            out.append(DeviceEvent("gap", f"{step.lost} packets lost", {"lost": step.lost}))
-        return out + self._sample(orientation)
-
-    def _sample(self, orientation: _MipOrientation) -> list[Decoded]:
-        """Return the sample of an accepted orientation."""
-        packet, arrival_ns, ticks, values = orientation
-        if self._raw is not None and ticks is not None:
-            return self._raw_samples(self._raw, orientation, ticks)
-
-        w, x, y, z, *flags = values[self._quaternion]
-        native: Quaternion = (w, x, y, z)
-        valid = flags[0] if flags else None
-        if valid is not None:
-            out = self._note_validity(arrival_ns, is_valid=bool(valid & 1))
-            if not valid & 1:
-                return out
-        else:
-            out = []
-
-        q = self._gate.admit(canonical(native, "NED"))
-        if q is None:
-            out.append(self._refuse(packet, "quaternion norm is not 1"))
-        else:
-            out.append(ImuSample(arrival_ns, q, native, ticks, None, valid))
-
-        # Warn once if hardly any quaternion has norm 1.
-        if not self._norm_checked:
-            self._norm_checked, norm = self._gate.judged, self._gate.misconfigured_norm
-            if norm is not None:
-                text = f"median quaternion norm is {norm:.4g}, expected 1"
-                text += ": this is no device with MIP as documented"
-                data = {"median_norm": norm} if isfinite(norm) else {}
-                out.append(DeviceEvent("warning", text, data))
-        return out
-
-    def _raw_samples(
-        self, raw: RawSamples, orientation: _MipOrientation, ticks: int
-    ) -> list[Decoded]:
-        """Return the samples of raw measurements."""
-        values = orientation.values
-        x, y, z = values[_FORCE]
-        force = (STANDARD_GRAVITY * x, STANDARD_GRAVITY * y, STANDARD_GRAVITY * z)
-        field = values.get(_FIELD) if raw.magnetometer else None
-        reading = RawReading(ticks, values[_RATE], force, field)
-        if ticks == self._raw_ns or not is_plausible(reading):
-            return [self._refuse(orientation.packet, "raw measurements out of range")]
-        self._raw_ns = ticks
-        return raw.take(RawStamp(orientation.arrival_ns, ticks), reading)
 
     def _note_validity(self, arrival_ns: int, *, is_valid: bool) -> list[Decoded]:
         """Return the event of a change between valid and invalid orientations."""
@@ -273,26 +199,3 @@ class MipDecoder:
             f'0x{self._set:02X}: set estimator = "{name}"'
         )
         return [DeviceEvent("warning", text, {"estimator": name})]
-
-    def _warn_untimed(self) -> list[Decoded]:
-        """Return a warning about the first orientation without time."""
-        if self._untimed:
-            return []
-        self._untimed = True
-        text = (
-            "orientation without time in its packet: give the time field the same decimation and "
-            "place it in the same message format"
-        )
-        return [DeviceEvent("warning", text)]
-
-    def _refuse(self, packet: MipPacket, reason: str) -> Corrupt:
-        self._refused += 1
-        self._refused_bytes += packet.size
-        return Corrupt(packet.size, reason)
-
-    def _drop_held(self) -> list[Decoded]:
-        """Reject an orientation that no later one confirmed."""
-        held, self._held = self._held, None
-        if held is None:
-            return []
-        return [self._refuse(held.packet, "time disagrees with the other packets")]

@@ -34,6 +34,7 @@ from jointfit_simulators.devices._table_device import (
     TableDeviceOptions,
 )
 from jointfit_simulators.devices._tcp_port import TcpClient, TcpPort, TextServer
+from jointfit_simulators.devices._vectornav_device import VectorNavDevice, VectorNavDeviceOptions
 from jointfit_simulators.devices._witmotion_device import (
     WITH_QUATERNION,
     WitMotionDevice,
@@ -81,6 +82,8 @@ __all__ = [
     "TcpPort",
     "TextServer",
     "Vector",
+    "VectorNavDevice",
+    "VectorNavDeviceOptions",
     "WitMotionDevice",
     "WitMotionDeviceOptions",
     "XImu3Device",

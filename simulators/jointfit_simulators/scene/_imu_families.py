@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from jointfit_protocols.lpms.channels import sequential_ids, tpdo_ids
 from jointfit_protocols.lpms.configuration import GENERATION_3, Generation
 from jointfit_protocols.mip.data import DataSet, FilterField, SharedField
+from jointfit_protocols.vectornav import Field
+from jointfit_protocols.vectornav.registers import BOTH_PORTS
 from jointfit_protocols.witmotion import RATE_CODES
 from jointfit_protocols.xbus.configuration import SyncSetting
 from jointfit_protocols.xbus.mtdata2 import Item
@@ -25,6 +27,8 @@ from jointfit_simulators.devices import (
     LpmsDeviceOptions,
     MipDevice,
     MipDeviceOptions,
+    VectorNavDevice,
+    VectorNavDeviceOptions,
     WitMotionDevice,
     WitMotionDeviceOptions,
     XbusDevice,
@@ -152,6 +156,18 @@ def _mip(place: SensorPlace, port: Path) -> ConnectedImu:
     return ConnectedImu(device, [f'port = "{port}"', "baud = 921600"], str(port))
 
 
+def _vectornav(place: SensorPlace, port: Path) -> ConnectedImu:
+    imu_rate_hz = 800
+    divisor = max(round(imu_rate_hz / place.knobs.rate_hz), 1)
+    fields = (int(Field.TIME_STARTUP), int(Field.QUATERNION))
+    options = VectorNavDeviceOptions(
+        imu_rate_hz=imu_rate_hz, outputs=((BOTH_PORTS, divisor, fields),), text_output=""
+    )
+    noise = line_noise(place.knobs, place.name)
+    device = VectorNavDevice(port, options=options, wire_noise=noise)
+    return ConnectedImu(device, [f'port = "{port}"', "baud = 921600"], str(port))
+
+
 def _witmotion(place: SensorPlace, port: Path) -> ConnectedImu:
     rate_hz = max((rate for rate in RATE_CODES if rate <= place.knobs.rate_hz), default=10)
     options = WitMotionDeviceOptions(content=WITH_QUATERNION, rate_hz=rate_hz)
@@ -217,6 +233,7 @@ IMU_FAMILIES: dict[str, UartFamily | CanFamily] = {
     "lpms": UartFamily(_lpms),
     "lpms-can": CanFamily(_lpms_can),
     "mip": UartFamily(_mip),
+    "vectornav": UartFamily(_vectornav),
     "witmotion": UartFamily(_witmotion),
     "xbus": UartFamily(_xbus),
     "xcdi": CanFamily(_xcdi),

@@ -117,7 +117,7 @@ def test_a_single_corrupt_time_is_dropped() -> None:
     found = decoded(wires)
     assert len(samples(found)) == 39
     assert [one.reason for one in found if isinstance(one, Corrupt)] == [
-        "time disagrees with the other packets"
+        "time disagrees with the others"
     ]
     assert events_of(found, "restart") == []
 

@@ -1,0 +1,161 @@
+"""Samples of an IMU that sends device time in nanoseconds and no message counter.
+
+`TimedSamples` checks the time of each reading, the norm of its quaternion and the plausibility of
+its raw measurements, and reports losses, restarts and faults as device events.
+
+Invariant: the output depends only on the readings added; no clock and no port is read.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
+from jointfit_drivers.gateway_orientation import RawReading, RawStamp, is_plausible
+from jointfit_drivers.time_continuity import TimeContinuity
+from jointfit_protocols.orientation import OrientationGate, Quaternion
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.model import Decoded, Vector
+    from jointfit_drivers.gateway_orientation import RawSamples
+
+
+class RawVectors(NamedTuple):
+    """Raw measurements in sensor axes."""
+
+    rate: Vector
+    """Angular rate, rad/s."""
+    force: Vector
+    """Specific force, m/s^2."""
+    magnetic: Vector | None = None
+    """Magnetic field, any unit."""
+
+
+class TimedReading(NamedTuple):
+    """Content of one message: an orientation, raw measurements, or neither if it is not valid."""
+
+    size: int
+    """Bytes on the wire."""
+    arrival_ns: int
+    ticks: int | None
+    """Device time, ns; None without one."""
+    q_world_sensor: Quaternion | None = None
+    """Sensor to ENU, any norm."""
+    q_native: Quaternion | None = None
+    """As sent."""
+    status: int | None = None
+    raw: RawVectors | None = None
+
+
+class TimedSamples:
+    """Computes the samples of one device.
+
+    Parameters
+    ----------
+    make_raw : callable, optional
+        Returns a new filter of raw measurements; None if the device sends orientations.
+    untimed_remedy : str
+        Remedy for readings without time.
+    """
+
+    def __init__(self, make_raw: Callable[[], RawSamples] | None, untimed_remedy: str) -> None:
+        self._make_raw = make_raw
+        self._raw = None if make_raw is None else make_raw()
+        self._untimed_remedy = untimed_remedy
+        self._continuity = TimeContinuity()
+        self._held: TimedReading | None = None
+        self._gate = OrientationGate()
+        self._raw_ns: int | None = None
+        self._timed = self._untimed = self._norm_checked = False
+        self.refused = 0
+        """Messages rejected so far."""
+        self.refused_bytes = 0
+        """Bytes of these messages."""
+
+    def add(self, reading: TimedReading) -> list[Decoded]:
+        """Return the events and samples that a reading completes."""
+        if reading.ticks is None:
+            return self._add_untimed(reading)
+
+        self._timed = True
+        step = self._continuity.add(reading.ticks, reading.arrival_ns)
+        held = self._held
+        if step.restarted and held is not None:
+            self._held = None
+            self._gate.forget()
+            if self._make_raw is not None:
+                self._raw, self._raw_ns = self._make_raw(), None
+            text = f"device clock restarted at {(held.ticks or 0) * 1e-9:.3f} s"
+            restart = DeviceEvent("restart", text)
+            return [restart, *self._samples(held), *self._samples(reading)]
+
+        out = self.flush()
+        if step.held:
+            self._held = reading
+            return out
+        if step.lost:
+            out.append(DeviceEvent("gap", f"{step.lost} messages lost", {"lost": step.lost}))
+        return out + self._samples(reading)
+
+    def flush(self) -> list[Decoded]:
+        """Reject a reading that no later one confirmed."""
+        held, self._held = self._held, None
+        return [] if held is None else [self.refuse(held.size, "time disagrees with the others")]
+
+    def refuse(self, size: int, reason: str) -> Corrupt:
+        """Count a message of `size` bytes as rejected."""
+        self.refused += 1
+        self.refused_bytes += size
+        return Corrupt(size, reason)
+
+    def _add_untimed(self, reading: TimedReading) -> list[Decoded]:
+        """Return a sample stamped with its arrival; reject it if others have a time."""
+        out: list[Decoded] = []
+        if not self._untimed:
+            self._untimed = True
+            text = f"orientation without time in its message: {self._untimed_remedy}"
+            out.append(DeviceEvent("warning", text))
+        if self._timed or self._make_raw is not None:
+            return [*out, self.refuse(reading.size, "orientation without time")]
+        return out + self._samples(reading)
+
+    def _samples(self, reading: TimedReading) -> list[Decoded]:
+        """Return the samples of an accepted reading."""
+        if reading.raw is not None and self._raw is not None:
+            return self._raw_samples(reading, reading.raw, self._raw)
+        if reading.q_world_sensor is None:
+            return []
+
+        out: list[Decoded] = []
+        q = self._gate.admit(reading.q_world_sensor)
+        if q is None:
+            out.append(self.refuse(reading.size, "quaternion norm is not 1"))
+        else:
+            native = reading.q_native or reading.q_world_sensor
+            out.append(
+                ImuSample(reading.arrival_ns, q, native, reading.ticks, None, reading.status)
+            )
+
+        # Warn once if hardly any quaternion has norm 1.
+        if not self._norm_checked:
+            self._norm_checked, norm = self._gate.judged, self._gate.misconfigured_norm
+            if norm is not None:
+                text = f"median quaternion norm is {norm:.4g}, expected 1"
+                text += ": byte order or scale is not as documented"
+                data = {"median_norm": norm} if isfinite(norm) else {}
+                out.append(DeviceEvent("warning", text, data))
+        return out
+
+    def _raw_samples(
+        self, reading: TimedReading, found: RawVectors, raw: RawSamples
+    ) -> list[Decoded]:
+        ticks = reading.ticks or 0
+        field = found.magnetic if raw.magnetometer else None
+        measured = RawReading(ticks, found.rate, found.force, field)
+        if ticks == self._raw_ns or not is_plausible(measured):
+            return [self.refuse(reading.size, "raw measurements out of range")]
+        self._raw_ns = ticks
+        return raw.take(RawStamp(reading.arrival_ns, ticks), measured)

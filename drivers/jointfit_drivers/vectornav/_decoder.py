@@ -1,0 +1,189 @@
+"""Decoder of the VectorNav driver: chunks in, samples in SI units with canonical orientation out.
+
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, TickClock
+from jointfit_drivers.serial_imu import ArrivalStamps
+from jointfit_drivers.timed_samples import RawVectors, TimedReading, TimedSamples
+from jointfit_protocols.orientation import canonical
+from jointfit_protocols.vectornav import (
+    MAX_MESSAGE,
+    BinaryPacket,
+    Field,
+    TextMessage,
+    VectorNavCodec,
+    VectorNavMessage,
+    error_text,
+)
+from jointfit_protocols.vectornav.registers import Register, decode_output, decode_rotation
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from jointfit_daemon.model import Chunk, Decoded, Vector
+    from jointfit_drivers.gateway_orientation import RawSamples
+    from jointfit_protocols.corrupt import CorruptBytes
+
+_CLOCK = TickClock(1, None)
+_TIMES = (int(Field.TIME_STARTUP), int(Field.TIME_GROUP_STARTUP))
+_QUATERNIONS = (int(Field.QUATERNION), int(Field.ATTITUDE_QUATERNION))
+_RATES = (int(Field.ANGULAR_RATE), int(Field.IMU_ANGULAR_RATE))
+_FORCES = (int(Field.ACCELERATION), int(Field.IMU_ACCELERATION))
+_FIELDS = (int(Field.IMU_MAGNETIC_FIELD), int(Field.MAGNETIC_AND_PRESSURE))
+_NAMES = {Register.MODEL: "model", Register.SERIAL: "serial", Register.FIRMWARE: "firmware"}
+_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_SMALL = 1e-4
+"""Element of a rotation that counts as that of the identity."""
+
+
+class _Places:
+    """Places of the decoded fields in one kind of output; None for those that it does not have."""
+
+    __slots__ = ("field", "force", "quaternion", "rate", "time")
+
+    def __init__(self, places: dict[int, slice]) -> None:
+        def first(fields: tuple[int, ...]) -> slice | None:
+            return next((places[field] for field in fields if field in places), None)
+
+        self.time, self.quaternion = first(_TIMES), first(_QUATERNIONS)
+        self.rate, self.force = first(_RATES), first(_FORCES)
+        field = first(_FIELDS)
+        self.field = None if field is None else slice(field.start, field.start + 3)
+
+
+class VectorNavDecoder:
+    """Decoder of one VectorNav device.
+
+    Parameters
+    ----------
+    baud : int, optional
+        Line speed, bit/s, for back-dating of stamps; None for USB.
+    world_to_sensor : bool
+        Whether the quaternion maps world to sensor coordinates.
+    make_raw : callable, optional
+        Returns a new filter of raw measurements; None if the device sends orientations.
+    """
+
+    tick_clock = _CLOCK
+
+    def __init__(
+        self,
+        baud: int | None,
+        *,
+        world_to_sensor: bool = False,
+        make_raw: Callable[[], RawSamples] | None = None,
+    ) -> None:
+        self._inverse, self._is_raw = world_to_sensor, make_raw is not None
+        self._codec = VectorNavCodec()
+        self._stamps = ArrivalStamps(baud, MAX_MESSAGE)
+        self._samples = TimedSamples(make_raw, "add the field TimeStartup to this binary output")
+        self._places: dict[bytes, _Places] = {}  # by header; a device sends up to three kinds
+
+    @property
+    def messages(self) -> int:
+        """Well-formed messages so far."""
+        return self._codec.messages - self._samples.refused
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes so far that belong to no message, or to a message that was rejected."""
+        return self._codec.discarded + self._samples.refused_bytes
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return the content that `chunk` completed, in wire order; never raises."""
+        out: list[Decoded] = []
+        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
+            out = self._take(self._codec.flush())
+        self._stamps.start_chunk(chunk.t_ns)
+        found = self._codec.feed(chunk.data)
+        return out + self._take(found) if found else out
+
+    def flush(self) -> list[Decoded]:
+        """Discard a pending message and an orientation that waits for confirmation."""
+        return self._take(self._codec.flush()) + self._samples.flush()
+
+    def _take(self, found: list[VectorNavMessage | CorruptBytes]) -> list[Decoded]:
+        out: list[Decoded] = []
+        for event in found:
+            if isinstance(event, BinaryPacket):
+                out += self._decode_output(event)
+            elif isinstance(event, TextMessage):
+                out += _text_events(event)
+            else:
+                out.append(Corrupt(event.discarded, event.reason))
+        return out
+
+    def _decode_output(self, packet: BinaryPacket) -> list[Decoded]:
+        """Return the content of a binary output; nothing for one without the needed fields."""
+        header = packet.layout.header
+        places = self._places.get(header)
+        if places is None:
+            if len(self._places) >= _MOST_KINDS:
+                self._places.clear()
+            places = self._places[header] = _Places(packet.layout.places)
+
+        values = packet.values
+        since = self._codec.fed - packet.end + packet.size
+        ticks = None if places.time is None else int(values[places.time][0])
+        if self._is_raw:
+            if places.rate is None or places.force is None:
+                return []
+            field = None if places.field is None else _vector(values[places.field])
+            raw = RawVectors(_vector(values[places.rate]), _vector(values[places.force]), field)
+            arrival_ns = self._stamps.stamp(since)
+            return self._samples.add(TimedReading(packet.size, arrival_ns, ticks, raw=raw))
+
+        if places.quaternion is None:
+            return []
+        x, y, z, w = values[places.quaternion]
+        native = (w, x, y, z)
+        q = canonical(native, "NED", world_to_sensor=self._inverse)
+        arrival_ns = self._stamps.stamp(since)
+        return self._samples.add(TimedReading(packet.size, arrival_ns, ticks, q, native))
+
+
+_MOST_KINDS = 16
+"""Kinds of outputs whose places are stored."""
+
+
+def _vector(values: tuple[Any, ...]) -> Vector:
+    return cast("Vector", values)
+
+
+def _text_events(message: TextMessage) -> Iterator[Decoded]:
+    """Yield the events of a reply or an error."""
+    if message.error is not None:
+        yield DeviceEvent("warning", error_text(message.error), {"code": message.error})
+
+    register, values = message.register, message.values[1:]
+    known: dict[str, object] = {}
+    if register in _NAMES and values:
+        known = {_NAMES[Register(register)]: values[0]}
+    elif register is not None and 0 <= register - Register.BINARY_OUTPUT < 3:  # noqa: PLR2004 - three outputs
+        output = decode_output(values)
+        if output is not None:
+            number = register - Register.BINARY_OUTPUT + 1
+            fields = [f"0x{field:02X}" for field in output.fields]
+            known = {f"output_{number}": [output.ports, output.divisor, *fields]}
+    if known:
+        yield DeviceEvent(
+            "info", ", ".join(f"{key} {value}" for key, value in known.items()), known
+        )
+
+    rotation = decode_rotation(values) if register == Register.ROTATION else None
+    if rotation is not None:
+        data = {"reference_frame": list(rotation)}
+        yield DeviceEvent("info", f"reference_frame {data['reference_frame']}", data)
+        pairs = zip(rotation, _IDENTITY, strict=True)
+        if not all(abs(found - expected) <= _SMALL for found, expected in pairs):
+            text = (
+                f"a reference frame rotation is stored (register 26: {data['reference_frame']}): "
+                "sensor axes are not the printed ones. Reset it with the vendor's tool before "
+                "calibration, or leave it as it is"
+            )
+            yield DeviceEvent("warning", text, data)

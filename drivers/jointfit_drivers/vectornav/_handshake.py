@@ -1,0 +1,253 @@
+"""From an open port to a streaming VectorNav device, or to the error that explains the failure.
+
+Registers are read and compared, and written only where they differ. They are volatile: without
+``persist`` the device returns to its own at the next power-up. A fault that may clear by itself
+raises `DeviceLostError`, any other `DeviceMisconfiguredError`; the device then streams as before.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING, NoReturn
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.serial_conversation import SerialConversation
+from jointfit_protocols.vectornav import (
+    TextMessage,
+    VectorNavCodec,
+    VectorNavMessage,
+    encode_text,
+    error_text,
+)
+from jointfit_protocols.vectornav.registers import (
+    BOTH_PORTS,
+    BinaryOutput,
+    Register,
+    decode_output,
+    encode_output,
+)
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit
+    from jointfit_drivers.ports.serial_port import SerialPort
+    from jointfit_drivers.vectornav._settings import VectorNavSettings
+
+log = logging.getLogger(__name__)
+
+LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 128_000, 57_600, 38_400, 19_200, 9_600)
+"""Line speeds to search, bit/s: factory setting and common choices first."""
+_REPLY_S, _STORE_S, _LISTEN_S = 0.5, 3.0, 0.15
+"""Longest wait for a reply, for all registers to be stored, and at each speed of the search, s."""
+_IMU_RATES = {"VN-3": 400}
+_IMU_RATE = 800
+"""Rate of the IMU, Hz, by the beginning of the model name, and of all other models."""
+_RATES_SHOWN = 12
+"""Rates that a message lists."""
+
+
+class VectorNavHandshake:
+    """Brings one device into streaming.
+
+    Parameters
+    ----------
+    port, emit : SerialPort, Emit
+        Open port, and the receiver of the device's bytes.
+    settings : VectorNavSettings
+        Its table of rig.toml.
+    hunt : bool
+        Whether to search for a silent device at other speeds. A device whose bytes cannot be
+        decoded is always searched for.
+    """
+
+    def __init__(
+        self, port: SerialPort, emit: Emit, settings: VectorNavSettings, *, hunt: bool = True
+    ) -> None:
+        self._port = port
+        self._settings = settings
+        self._hunt = hunt
+        self._conversation = SerialConversation[VectorNavMessage](port, emit, VectorNavCodec)
+        self._who = settings.port
+        self._model = "the device"
+
+    async def ensure_streaming(self) -> None:
+        """Return when the device streams according to the settings.
+
+        Raises
+        ------
+        DeviceLostError
+            The device is silent, unplugged, or stopped answering.
+        DeviceMisconfiguredError
+            The speed is another, the device is of another kind, or it cannot send the orientation
+            at this rate.
+        """
+        settings = self._settings
+        needs = settings.serial_bits_per_s
+        if needs is not None and needs > settings.baud:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
+                f"{settings.baud}: lower `rate_hz`, or raise the speed of the device and `baud`"
+            )
+
+        self._conversation.reset()
+        if await self._ask("VNASY,0", tries=3) is None:
+            await self._explain_silence()
+
+        try:
+            await self._configure()
+        except DeviceMisconfiguredError:  # it streams as before
+            await self._ask("VNASY,1", tries=1)
+            raise
+        self._refuse(await self._answer("VNASY,1"), "refuses to stream")
+
+    async def _configure(self) -> None:
+        """Write the registers that differ, while the device is paused."""
+        model = await self._answer(f"VNRRG,{Register.MODEL}")
+        if model.error is None and len(model.values) > 1:
+            self._model = model.values[1]
+        for register in (Register.SERIAL, Register.FIRMWARE, Register.ROTATION):
+            await self._answer(f"VNRRG,{register}")  # the decoder reports them
+
+        changed = await self._ensure_output()
+        changed |= await self._ensure_no_text()
+        if changed and self._settings.persist:
+            self._refuse(
+                await self._answer("VNWNV", wait_s=_STORE_S),
+                "refuses to store its registers",
+                "persist = false",
+            )
+
+    async def _ensure_output(self) -> bool:
+        """Make the device send the required fields; return whether it was written."""
+        register = Register.BINARY_OUTPUT + self._settings.output - 1
+        wanted = BinaryOutput(BOTH_PORTS, self._divisor(), self._settings.required)
+        found = await self._read_output(register)
+        if _is_sufficient(found, wanted):
+            return False
+        log.warning(
+            "%s: writing register %d: %s instead of %s",
+            self._settings.id,
+            register,
+            encode_output(wanted),
+            "unknown fields" if found is None else encode_output(found) if found.fields else "none",
+        )
+
+        reply = await self._answer(f"VNWRG,{register},{encode_output(wanted)}")
+        self._refuse(reply, f"refuses binary output {self._settings.output}")
+        left = await self._read_output(register)
+        if not _is_sufficient(left, wanted):
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {self._model} does not keep register {register} = "
+                f"{encode_output(wanted)}: correct `rate_hz`, or update the firmware of the device"
+            )
+        return True
+
+    async def _read_output(self, register: int) -> BinaryOutput | None:
+        reply = await self._answer(f"VNRRG,{register}")
+        self._refuse(reply, f"has no register {register}", "`output`")
+        return decode_output(reply.values[1:])
+
+    async def _ensure_no_text(self) -> bool:
+        """Switch the ASCII output off, which takes time on the line; return whether it was on."""
+        reply = await self._answer(f"VNRRG,{Register.TEXT_OUTPUT}")
+        if reply.error is not None or reply.values[1:2] == ("0",):
+            return False
+        log.warning("%s: switching its ASCII output off", self._settings.id)
+        reply = await self._answer(f"VNWRG,{Register.TEXT_OUTPUT},0")
+        self._refuse(reply, "refuses to switch its ASCII output off")
+        return True
+
+    def _divisor(self) -> int:
+        """Return the divisor of the requested rate."""
+        rate_hz = self._settings.rate_hz
+        imu_hz = next((hz for name, hz in _IMU_RATES.items() if name in self._model), _IMU_RATE)
+        divisor = round(imu_hz / rate_hz)
+        if divisor < 1 or abs(imu_hz / divisor - rate_hz) > 1e-3 * rate_hz:
+            rates = [imu_hz / k for k in range(1, imu_hz + 1) if imu_hz % k == 0]
+            shown = ", ".join(f"{rate:g}" for rate in rates[:_RATES_SHOWN])
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {rate_hz:g} Hz is no whole fraction of the {imu_hz} Hz of "
+                f"{self._model}: set rate_hz to one of {shown}"
+            )
+        return divisor
+
+    async def _ask(
+        self, request: str, *, tries: int, wait_s: float = _REPLY_S
+    ) -> TextMessage | None:
+        """Return the reply to a request, or the error instead; None without either."""
+        command, _, rest = request.partition(",")
+        register = int(rest.split(",")[0]) if command in {"VNRRG", "VNWRG"} else None
+
+        def is_reply(message: VectorNavMessage) -> bool:
+            if not isinstance(message, TextMessage):
+                return False
+            same = message.command == command and message.register == register
+            return same or message.command == "VNERR"
+
+        found = await self._conversation.ask(
+            encode_text(request), is_reply, tries=tries, wait_s=wait_s
+        )
+        return found if isinstance(found, TextMessage) else None
+
+    async def _answer(self, request: str, *, wait_s: float = _REPLY_S) -> TextMessage:
+        """Return the reply to a request that the device must answer; it may be an error."""
+        reply = await self._ask(request, tries=3, wait_s=wait_s)
+        if reply is None:
+            raise DeviceLostError(
+                f"{self._who}: stopped answering during configuration: check its power and cable"
+            )
+        return reply
+
+    def _refuse(self, reply: TextMessage, what: str, change: str = "`rate_hz` or `baud`") -> None:
+        if reply.error is not None:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {self._model} {what} ({error_text(reply.error)}): "
+                f"set or change {change}"
+            )
+
+    async def _explain_silence(self) -> NoReturn:
+        """Raise the error for a device that does not answer."""
+        conversation = self._conversation
+        received = conversation.received
+        if conversation.understood:
+            raise DeviceLostError(
+                f"{self._who}: streams but does not answer: check the wire from host to device"
+            )
+
+        speed = await self._other_speed() if self._hunt or received else None
+        if speed is not None:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {self._settings.baud} baud, but no message can be decoded; "
+                f"the device answers at {speed}: set baud = {speed}"
+            )
+        if not received:
+            raise DeviceLostError(
+                f"{self._who}: silent: check its power, and that TX and RX are not swapped"
+            )
+        raise DeviceMisconfiguredError(
+            f"{self._who}: the device on this port is not from VectorNav: it sends bytes, none of "
+            "them a VectorNav message at any common speed: correct `port` or `driver`"
+        )
+
+    async def _other_speed(self) -> int | None:
+        """Return the speed at which the device answers; it continues to stream as before."""
+        for baud in LINE_SPEEDS:
+            if baud == self._settings.baud:
+                continue
+            try:
+                self._port.set_baud(baud)
+            except DeviceMisconfiguredError:  # the port does not support it
+                continue
+            self._conversation.reset()
+            answered = await self._ask("VNASY,0", tries=1, wait_s=_LISTEN_S)
+            if answered is not None:  # wait for the reply: closing the port discards unsent bytes
+                await self._ask("VNASY,1", tries=1)
+            if answered is not None or self._conversation.understood:
+                return baud
+        return None
+
+
+def _is_sufficient(found: BinaryOutput | None, wanted: BinaryOutput) -> bool:
+    """Return whether an output is on both ports, at the rate, and has the required fields."""
+    if found is None or found[:2] != wanted[:2]:
+        return False
+    return set(wanted.fields) <= set(found.fields)

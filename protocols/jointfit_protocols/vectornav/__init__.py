@@ -1,0 +1,25 @@
+"""VectorNav over UART or USB: binary outputs and ASCII register messages in one stream."""
+
+from jointfit_protocols.vectornav._framing import (
+    MAX_MESSAGE,
+    BinaryPacket,
+    VectorNavCodec,
+    VectorNavMessage,
+    encode_binary,
+)
+from jointfit_protocols.vectornav._layout import BinaryLayout, Field, Fields
+from jointfit_protocols.vectornav._text import TextMessage, encode_text, error_text
+
+__all__ = [
+    "MAX_MESSAGE",
+    "BinaryLayout",
+    "BinaryPacket",
+    "Field",
+    "Fields",
+    "TextMessage",
+    "VectorNavCodec",
+    "VectorNavMessage",
+    "encode_binary",
+    "encode_text",
+    "error_text",
+]

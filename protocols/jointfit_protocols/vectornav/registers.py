@@ -1,0 +1,94 @@
+"""Registers of VectorNav devices that a driver reads and writes.
+
+| register | content                                                                       |
+|----------|-------------------------------------------------------------------------------|
+| 1, 3, 4  | model, serial number, firmware version                                        |
+| 5        | baud rate of the port                                                         |
+| 6        | type of the asynchronous ASCII output; 0: off                                 |
+| 7        | its rate, Hz                                                                  |
+| 26       | reference frame rotation, 3 x 3, row by row: sensor to body axes              |
+| 75 to 77 | binary outputs 1 to 3: ports, divisor, groups, fields of each group           |
+
+Writes last until power-down, unless the command VNWNV stores all registers.
+
+Source: VN-100 user manual (UM001), section 6.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_protocols.vectornav._layout import BinaryLayout, layout_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_protocols.vectornav._layout import Fields
+
+
+class Register(IntEnum):
+    """Numbers of registers."""
+
+    MODEL = 1
+    SERIAL = 3
+    FIRMWARE = 4
+    BAUD = 5
+    TEXT_OUTPUT = 6
+    TEXT_RATE = 7
+    QUATERNION = 9
+    ROTATION = 26
+    BINARY_OUTPUT = 75
+
+
+BOTH_PORTS = 3
+"""Ports of a binary output: 0 none, 1 and 2 one of them, 3 both."""
+_MATRIX_VALUES = 9
+
+
+class BinaryOutput(NamedTuple):
+    """Content of a register of binary outputs."""
+
+    ports: int
+    divisor: int
+    """Rate of the IMU divided by that of the output."""
+    fields: Fields
+
+
+def encode_output(output: BinaryOutput) -> str:
+    """Return the values of the register, without its number.
+
+    Raises
+    ------
+    KeyError
+        A field is unknown.
+    """
+    header = BinaryLayout(output.fields).header
+    words = (header[at : at + 2] for at in range(1, len(header), 2))
+    fields = ",".join(f"{int.from_bytes(word, 'little'):04X}" for word in words)
+    return f"{output.ports},{output.divisor},{header[0]:02X},{fields}"
+
+
+def decode_output(values: Sequence[str]) -> BinaryOutput | None:
+    """Return the content of the register; None if it is malformed or has unknown fields."""
+    try:
+        ports, divisor, groups = int(values[0]), int(values[1]), int(values[2], 16)
+        words = [int(value, 16).to_bytes(2, "little") for value in values[3:]]
+    except (ValueError, IndexError, OverflowError):
+        return None
+    if not 0 <= groups < 128 or len(words) < groups.bit_count():  # noqa: PLR2004 - 7 groups
+        return None
+    if not groups:
+        return BinaryOutput(ports, divisor, ())
+    layout = layout_of(bytes((groups,)) + b"".join(words[: groups.bit_count()]))
+    return None if layout is None else BinaryOutput(ports, divisor, layout.fields)
+
+
+def decode_rotation(values: Sequence[str]) -> tuple[float, ...] | None:
+    """Return the nine elements of a rotation, row by row; None if they are malformed."""
+    if len(values) < _MATRIX_VALUES:
+        return None
+    try:
+        return tuple(map(float, values[:_MATRIX_VALUES]))
+    except ValueError:
+        return None

@@ -1,0 +1,298 @@
+"""Virtual VectorNav device: binary outputs and ASCII registers on a pty.
+
+Invariant: registers are volatile until stored, replies repeat the request, an error replaces a
+reply, ASCII messages stand between binary outputs, and asynchronous output can be paused.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import asin, atan2, degrees
+from typing import TYPE_CHECKING, Any
+
+from jointfit_protocols.orientation import native_of
+from jointfit_protocols.vectornav import (
+    BinaryLayout,
+    Field,
+    TextMessage,
+    VectorNavCodec,
+    encode_binary,
+    encode_text,
+)
+from jointfit_protocols.vectornav.registers import (
+    BOTH_PORTS,
+    BinaryOutput,
+    Register,
+    decode_output,
+    encode_output,
+)
+from jointfit_simulators.devices._inertial_signals import InertialSignals
+from jointfit_simulators.imu_device import clean_wire
+from jointfit_simulators.wires import PtyLine
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_simulators.imu_device import Quaternion, WireNoise
+
+_BITS = 10
+"""Bits of one byte on the line (8N1)."""
+_OUTPUTS = range(Register.BINARY_OUTPUT, Register.BINARY_OUTPUT + 3)
+_INVALID_PARAMETER, _INVALID_REGISTER, _INVALID_COMMAND = 7, 8, 4
+_IDENTITY = "1,0,0,0,1,0,0,0,1"
+ORIENTATION = BinaryLayout((Field.TIME_STARTUP, Field.QUATERNION)).fields
+
+
+@dataclass(frozen=True, slots=True)
+class VectorNavDeviceOptions:
+    """Model, settings and faults of a device."""
+
+    model: str = "VN-100S-CR"
+    serial: str = "0100012345"
+    firmware: str = "3.1.0.0"
+    imu_rate_hz: int = 800
+    outputs: tuple[tuple[int, int, tuple[int, ...]], ...] = ()
+    """Stored binary outputs 1, 2 and 3: ports, divisor and fields."""
+    text_output: str = "VNYMR"
+    """ASCII output that is on in the stored settings; empty: off."""
+    rotation: str = _IDENTITY
+    """Reference frame rotation, register 26."""
+    missing_fields: tuple[int, ...] = ()
+    """Fields of binary outputs that this model refuses."""
+    baud: int | None = None
+    """Speed of the device, bit/s; at another speed both sides receive garbage. None: any (USB)."""
+    first_ns: int = 0
+    """Clock at power-up, ns."""
+
+
+class VectorNavDevice:
+    """`ImuDevice` on a pty.
+
+    Parameters
+    ----------
+    link
+        Symbolic link to the host's port.
+    options
+        Model, settings and faults.
+    wire_noise
+        Noise applied to each message to the host.
+    """
+
+    def __init__(
+        self,
+        link: Path,
+        *,
+        options: VectorNavDeviceOptions | None = None,
+        wire_noise: WireNoise = clean_wire,
+    ) -> None:
+        self._options = options = options or VectorNavDeviceOptions()
+        self._line = PtyLine(link)
+        self._noise = wire_noise
+        self._codec = VectorNavCodec()
+        self._inertial = InertialSignals()
+        self._stored_outputs = dict(
+            zip(_OUTPUTS, (BinaryOutput(*one) for one in options.outputs), strict=False)
+        )
+        self._stored_text = options.text_output
+        self._epoch_ns = self._last_ns = self._to_lose = 0
+        self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
+        self.sent = 0
+        """Number of complete samples written to the wire."""
+        self.writes = 0
+        """Number of registers written."""
+        self.stores = 0
+        """Number of times that the registers were stored."""
+        self._power_up()
+
+    def _power_up(self) -> None:
+        none = BinaryOutput(0, 1, ())
+        self.outputs = {number: self._stored_outputs.get(number, none) for number in _OUTPUTS}
+        """Binary outputs in force, by register."""
+        self.text_output = self._stored_text
+        """ASCII output in force; empty: off."""
+        self.paused = False
+        """Whether asynchronous output is paused."""
+        self.counter = 0
+        """Number of the next sample, which is not sent."""
+
+    # --- control by the simulation ------------------------------------------------------------
+
+    @property
+    def streaming(self) -> bool:
+        """Whether the device sends binary outputs."""
+        return not self.paused and any(one.ports and one.fields for one in self.outputs.values())
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second of the first binary output that is on; 0 without one."""
+        for one in self.outputs.values():
+            if one.ports and one.fields:
+                return self._options.imu_rate_hz / one.divisor
+        return 0.0
+
+    @property
+    def line_ns(self) -> int:
+        """Transmission time of a sample at the speed of the host's port, ns."""
+        baud = self._line.host_baud
+        size = sum(
+            len(self._output(one, 0, self._q))
+            for one in self.outputs.values()
+            if one.ports and one.fields
+        )
+        return size * _BITS * 1_000_000_000 // baud if baud else 0
+
+    def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
+        """Send one sample now while streaming, as described in `ImuDevice.push`."""
+        self._last_ns, self._q = device_ns, q_world_sensor
+        self._inertial.update(device_ns, q_world_sensor)
+        if self.paused:
+            return
+        if self.text_output:
+            yaw, pitch, roll = _angles(native_of(q_world_sensor, "NED"))
+            self._write(
+                encode_text(f"{self.text_output},{yaw:+08.3f},{pitch:+08.3f},{roll:+08.3f}")
+            )
+        if not self.streaming:
+            return
+
+        self.counter += 1
+        if self._to_lose:
+            self._to_lose -= 1
+            return
+        complete = True
+        for one in self.outputs.values():
+            if one.ports and one.fields:
+                complete &= self._write(self._output(one, device_ns, q_world_sensor))
+        self.sent += complete
+
+    def edge(self, device_ns: int) -> None:
+        """Ignore an edge: no sync input is wired."""
+
+    def lose(self, count: int) -> None:
+        """Lose the next `count` samples."""
+        self._to_lose += count
+
+    def power_cycle(self) -> None:
+        """Interrupt the power supply: the clock restarts, and stored registers apply."""
+        self._epoch_ns = self._last_ns
+        self._power_up()
+
+    def unplug(self) -> None:
+        """Disconnect the wire."""
+        self._line.unplug()
+
+    def plug(self) -> None:
+        """Connect the wire; the device remained powered."""
+        self._line.plug()
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        await self._line.serve(self._receive)
+
+    # --- requests of the host -----------------------------------------------------------------
+
+    def _receive(self, data: bytes) -> None:
+        if not self._same_speed:
+            data = bytes(byte ^ 0x55 for byte in data)
+        for event in self._codec.feed(data):
+            if isinstance(event, TextMessage):
+                self._write(encode_text(self._reply(event)))
+
+    def _reply(self, message: TextMessage) -> str:
+        """Return the reply to a request, or an error."""
+        echo = ",".join((message.command, *message.values))
+        match message.command:
+            case "VNASY" if message.values in {("0",), ("1",)}:
+                self.paused = message.values == ("0",)
+            case "VNWNV":
+                self._stored_outputs, self._stored_text = dict(self.outputs), self.text_output
+                self.stores += 1
+            case "VNRRG" if message.register is not None:
+                content = self._read(message.register)
+                if content is None:
+                    return _error(_INVALID_REGISTER)
+                echo = f"VNRRG,{message.register:02d},{content}"
+            case "VNWRG" if message.register is not None:
+                if not self._store_volatile(message.register, message.values[1:]):
+                    return _error(_INVALID_PARAMETER)
+                self.writes += 1
+            case _:
+                return _error(_INVALID_COMMAND)
+        return echo
+
+    def _read(self, register: int) -> str | None:
+        """Return the content of a register; None if there is none."""
+        if register in self.outputs:
+            output = self.outputs[register]
+            return encode_output(output) if output.fields else f"{output.ports},{output.divisor},00"
+        x, y, z = (f"{value:+.6f}" for value in native_of(self._q, "NED")[1:])
+        options = self._options
+        return {
+            int(Register.MODEL): options.model,
+            int(Register.SERIAL): options.serial,
+            int(Register.FIRMWARE): options.firmware,
+            int(Register.BAUD): str(options.baud or 115_200),
+            int(Register.TEXT_OUTPUT): "14" if self.text_output else "0",
+            int(Register.QUATERNION): f"{x},{y},{z},{native_of(self._q, 'NED')[0]:+.6f}",
+            int(Register.ROTATION): options.rotation,
+        }.get(register)
+
+    def _store_volatile(self, register: int, values: tuple[str, ...]) -> bool:
+        """Write a register; return whether it and its values are valid."""
+        if register == Register.TEXT_OUTPUT and values[:1] == ("0",):
+            self.text_output = ""
+            return True
+        output = decode_output(values) if register in self.outputs else None
+        if output is None or output.ports > BOTH_PORTS or output.divisor < 1:
+            return False
+        if set(output.fields) & set(self._options.missing_fields):
+            return False
+        self.outputs[register] = output
+        return True
+
+    # --- messages to the host -----------------------------------------------------------------
+
+    @property
+    def _same_speed(self) -> bool:
+        return self._options.baud in {None, self._line.host_baud}
+
+    def _write(self, wire: bytes) -> bool:
+        if not self._same_speed:  # the same number of bytes, none of them correct
+            wire = bytes((byte * 7 + 1) & 0x1F for byte in wire)
+        return self._line.write(self._noise(wire))
+
+    def _output(self, output: BinaryOutput, device_ns: int, q: Quaternion) -> bytes:
+        t_ns = self._options.first_ns + device_ns - self._epoch_ns
+        w, x, y, z = native_of(q, "NED")
+        known: dict[int, tuple[Any, ...]] = {
+            Field.TIME_STARTUP: (t_ns,),
+            Field.TIME_GROUP_STARTUP: (t_ns,),
+            Field.QUATERNION: (x, y, z, w),
+            Field.ATTITUDE_QUATERNION: (x, y, z, w),
+            Field.ANGULAR_RATE: self._inertial.rate,
+            Field.IMU_ANGULAR_RATE: self._inertial.rate,
+            Field.ACCELERATION: self._inertial.force,
+            Field.IMU_ACCELERATION: self._inertial.force,
+            Field.IMU_MAGNETIC_FIELD: self._inertial.field,
+            Field.MAGNETIC_AND_PRESSURE: (*self._inertial.field, 25.0, 101.3),
+        }
+        places = BinaryLayout(output.fields).places
+        return encode_binary(
+            {
+                field: known.get(field, (0,) * (place.stop - place.start))
+                for field, place in places.items()
+            }
+        )
+
+
+def _error(code: int) -> str:
+    return f"VNERR,{code:02X}"
+
+
+def _angles(q: Quaternion) -> tuple[float, float, float]:
+    """Return yaw, pitch and roll, degrees."""
+    w, x, y, z = q
+    yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    pitch = asin(max(-1.0, min(1.0, 2 * (w * y - x * z))))
+    roll = atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return degrees(yaw), degrees(pitch), degrees(roll)
