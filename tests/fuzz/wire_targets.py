@@ -18,9 +18,10 @@ from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClos
 from jointfit_daemon.pipeline.sources import SourceState
 from jointfit_drivers.natnet._open_requests import OpenRequests
 from jointfit_drivers.qtm import QtmDecoder, QtmSettings
+from jointfit_drivers.vicon import ViconDecoder, ViconSettings
 from jointfit_drivers.witmotion import WitMotionImu, WitMotionSettings
 from jointfit_drivers.ximu3 import XImu3Imu, XImu3Settings
-from jointfit_protocols import qtm
+from jointfit_protocols import qtm, vicon
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
 from jointfit_protocols.can.slcan import SlcanCodec
 from jointfit_protocols.can.slcan import encode_frame as encode_slcan
@@ -40,6 +41,8 @@ from jointfit_protocols.ximu3 import encode_text as encode_ximu3_text
 from tests.drivers.natnet.feeder import INFO, MODEL, frame, marker
 from tests.drivers.qtm.feeder import frame as qtm_frame
 from tests.drivers.qtm.feeder import xml as qtm_xml
+from tests.drivers.vicon.feeder import frame as vicon_frame
+from tests.drivers.vicon.feeder import static as vicon_static
 from tests.fuzz.target import Target, UnaccountedError
 from tests.pipeline.core_feed import (
     BEGIN_NS,
@@ -338,7 +341,7 @@ def seeds_natnet_core() -> list[bytes]:
     return [b"".join(packed), *packed]
 
 
-# --- packets of QTM ---------------------------------------------------------------------------
+# --- packets of QTM and Vicon ---------------------------------------------------------------------
 
 
 def run_qtm_stream(data: bytes) -> None:
@@ -377,6 +380,40 @@ def seeds_qtm_records() -> list[bytes]:
     """Return a session of QTM as records."""
     packed = [struct.pack("<BH", data[4], len(data) - 8) + data[8:] for data in seeds_qtm()]
     return [b"".join(packed), *packed]
+
+
+def run_vicon_decoder(data: bytes) -> None:
+    """Put records of 16-bit length into objects and take each as a packet through the decoder."""
+    decoder = ViconDecoder(ViconSettings(driver="vicon", server="x"))
+    decoder.feed(Chunk(BEGIN_NS, seeds_vicon()[0]))
+    at = 0
+    while at + 3 <= len(data):
+        kind, size = struct.unpack_from("<BH", data, at)
+        item = vicon.OpaqueObject(kind, data[at + 3 : at + 3 + size])
+        frame_number = vicon.FrameInfo(at)
+        decoder.feed(Chunk(BEGIN_NS + at, vicon.encode(frame_number, item)))
+        at += 3 + size
+    found = vicon.decode(data)
+    if isinstance(found, CorruptBytes) and found.discarded != len(data):
+        raise UnaccountedError(f"{len(data)} bytes, {found.discarded} discarded")
+
+
+def seeds_vicon() -> list[bytes]:
+    """Return static objects and frames of Vicon."""
+    return [vicon_static(), *(vicon_frame(n) for n in (1, 2, 5))]
+
+
+def seeds_vicon_records() -> list[bytes]:
+    """Return the objects of a session of Vicon as records."""
+    packed = []
+    for data in seeds_vicon():
+        at = vicon.HEADER.size
+        while at < len(data):
+            kind, size = vicon.HEADER.unpack_from(data, at)
+            at += vicon.HEADER.size
+            packed.append(struct.pack("<BH", kind & 0xFF, size) + data[at : at + size])
+            at += size
+    return [b"".join(packed), *packed, seeds_vicon()[1]]
 
 
 # --- x-IMU3 -----------------------------------------------------------------------------------
@@ -436,4 +473,5 @@ TARGETS = (
     Target("natnet-core", run_natnet_core, seeds_natnet_core, share=1, longest=1500),
     Target("qtm-stream", run_qtm_stream, seeds_qtm, share=10, longest=1500),
     Target("qtm-decoder", run_qtm_decoder, seeds_qtm_records, share=4, longest=1500),
+    Target("vicon-decoder", run_vicon_decoder, seeds_vicon_records, share=4, longest=1500),
 )

@@ -24,6 +24,7 @@ from jointfit_protocols.qtm._messages import (
     NoMoreData,
     PacketType,
     QtmEvent,
+    QtmStream,
     ServerAnnouncement,
     SettingsReply,
     SkippedPacket,
@@ -38,7 +39,6 @@ from jointfit_protocols.qtm._settings_xml import (
     QtmSkeleton,
     parse_settings,
 )
-from jointfit_protocols.qtm._stream import QtmStream
 
 __all__ = [
     "HEADER",

@@ -11,6 +11,7 @@ from struct import Struct
 from typing import NamedTuple
 
 from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.packet_stream import PacketStream
 from jointfit_protocols.qtm._components import (
     COMPONENT_HEAD,
     Component,
@@ -223,6 +224,18 @@ def encode(message: Message) -> bytes:
         case SkippedPacket():
             kind, data = message
     return HEADER.pack(HEADER.size + len(data), kind) + data
+
+
+class QtmStream(PacketStream):
+    """Splits the bytes of a connection into packets."""
+
+    def __init__(self) -> None:
+        super().__init__(HEADER.size, _packet_size)
+
+
+def _packet_size(buffer: bytearray, at: int) -> int | None:
+    size: int = HEADER.unpack_from(buffer, at)[0]
+    return size if HEADER.size <= size <= LARGEST_PACKET else None
 
 
 def decode_announcement(datagram: bytes) -> ServerAnnouncement | CorruptBytes:

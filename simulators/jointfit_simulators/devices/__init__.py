@@ -35,6 +35,7 @@ from jointfit_simulators.devices._table_device import (
 )
 from jointfit_simulators.devices._tcp_port import TcpClient, TcpPort, TextServer
 from jointfit_simulators.devices._vectornav_device import VectorNavDevice, VectorNavDeviceOptions
+from jointfit_simulators.devices._vicon_server import ViconServer, ViconServerOptions
 from jointfit_simulators.devices._witmotion_device import (
     WITH_QUATERNION,
     WitMotionDevice,
@@ -84,6 +85,8 @@ __all__ = [
     "Vector",
     "VectorNavDevice",
     "VectorNavDeviceOptions",
+    "ViconServer",
+    "ViconServerOptions",
     "WitMotionDevice",
     "WitMotionDeviceOptions",
     "XImu3Device",

@@ -16,6 +16,8 @@ from jointfit_simulators.devices import (
     QtmServer,
     QtmServerOptions,
     RigidBodyAsset,
+    ViconServer,
+    ViconServerOptions,
 )
 
 if TYPE_CHECKING:
@@ -143,8 +145,25 @@ def _qtm(place: CameraPlace) -> tuple[QtmServer, list[str]]:
     return server, ['server = "127.0.0.1"', f"command_port = {server.command_port}"]
 
 
+def _vicon(place: CameraPlace) -> tuple[ViconServer, list[str]]:
+    server = ViconServer(
+        ViconServerOptions(
+            bodies=tuple(
+                RigidBodyAsset(body, names, number)
+                for number, (body, names) in enumerate(place.markers_by_body.items(), 1)
+            ),
+            command_port=place.command_port,
+            rate_hz=place.knobs.mocap_hz,
+            device_ns=place.timing.device_ns,
+            seed=place.knobs.seed,
+        )
+    )
+    return server, ['server = "127.0.0.1"', f"command_port = {server.command_port}"]
+
+
 MOCAP_FAMILIES = {
     "natnet": MocapFamily(_natnet, sync_line=True),
     "qtm": MocapFamily(_qtm),
+    "vicon": MocapFamily(_vicon),
 }
 """Families by driver."""

@@ -1,0 +1,7 @@
+"""Driver for Vicon Nexus, Tracker, Shogun and Evoke by the DataStream."""
+
+from jointfit_drivers.vicon._decoder import ViconDecoder
+from jointfit_drivers.vicon._driver import ViconMocap
+from jointfit_drivers.vicon._settings import ViconSettings
+
+__all__ = ["ViconDecoder", "ViconMocap", "ViconSettings"]

@@ -1,0 +1,227 @@
+"""Decoder of the Vicon driver: packets in, optical frames out.
+
+Every chunk is one packet. Device time is the number of the frame according to the cameras, in
+units of the frame period. Arrivals are back-dated by the announced delay.
+
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no socket.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, TypeVar
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, MocapFrame, TickClock
+from jointfit_drivers.motion_capture import FrameContinuity, binding_events, wanted_names
+from jointfit_drivers.vicon._binding import bind_subjects
+from jointfit_drivers.vicon._latency import AnnouncedLatency
+from jointfit_drivers.vicon._poses import ViconPoseConverter
+from jointfit_drivers.vicon._scene_state import SceneState
+from jointfit_protocols import vicon
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.vicon import ObjectId
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from jointfit_daemon.model import Chunk, Decoded
+    from jointfit_drivers.vicon._binding import ViconBinding
+    from jointfit_drivers.vicon._settings import ViconSettings
+    from jointfit_protocols.vicon import Object
+
+_CLOCK = TickClock(0, None, vicon.TICKS_PER_S)
+_LONGEST_PERIOD = 10 * vicon.TICKS_PER_S
+"""Longest plausible frame period, ticks."""
+_Y_UP = 1
+_LATENCY_AFTER = 100
+"""Frames after which the announced delay is reported."""
+
+_Found = TypeVar("_Found")
+
+
+class ViconDecoder:
+    """Decoder of one DataStream server.
+
+    Parameters
+    ----------
+    settings : ViconSettings
+        Names in rig.toml, and up axis.
+    """
+
+    def __init__(self, settings: ViconSettings) -> None:
+        self._wanted_markers, self._wanted_bodies = wanted_names(settings)
+        self._up_axis = settings.up_axis
+        self._least_quality = settings.least_quality
+        self._poses = ViconPoseConverter("z" if settings.up_axis == "auto" else settings.up_axis)
+        self._axis = ""
+        self._state = SceneState()
+        self._continuity = FrameContinuity()
+        self._latency = AnnouncedLatency()
+        self._binding: ViconBinding | None = None
+        self._period: int | None = None
+        self._poor: set[int] = set()
+        self._offered: frozenset[int] | None = None
+        self._frames = self._arrival_ns = 0
+        self.messages = 0
+        """Well-formed packets so far."""
+        self.discarded_bytes = 0
+        """Bytes of packets that could not be read."""
+        self.unknown_ids = 0
+        """Markers and segments dropped because no subject has them."""
+        self.suspicious = 0
+        """Segments rejected because their rotation is none."""
+
+    @property
+    def tick_clock(self) -> TickClock | None:
+        """Ticks of 1/135 000 000 s, once the frame period is known."""
+        return None if self._period is None else _CLOCK
+
+    @property
+    def duplicates(self) -> int:
+        """Frames dropped because their number was that of the last one."""
+        return self._continuity.duplicates
+
+    @property
+    def late(self) -> int:
+        """Frames dropped because a later one had arrived."""
+        return self._continuity.late
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return the content of one packet; never raises."""
+        packet = vicon.decode(chunk.data)
+        if isinstance(packet, CorruptBytes):
+            self.discarded_bytes += packet.discarded
+            return [Corrupt(packet.discarded, packet.reason)]
+
+        self.messages += 1
+        out: list[Decoded] = []
+        self._state.add(packet.objects)
+        for item in packet.objects:
+            if isinstance(item, vicon.Ping):
+                self._latency.add_ping(item.number, chunk.t_ns)
+            elif isinstance(item, vicon.ObjectEnums) and item.ids != self._offered:
+                self._offered = item.ids
+                data = {"model": "Vicon DataStream", "transport": "tcp"}
+                out.append(DeviceEvent("info", "Vicon DataStream", data))
+        self._take_static(packet.objects, out)
+        number = _first(packet.objects, vicon.FrameInfo)
+        if number is not None:
+            self._frame(chunk, number.number, out)
+        return out
+
+    def flush(self) -> list[Decoded]:
+        """Return an empty list: every chunk is a whole packet."""
+        return []
+
+    # --- static objects -----------------------------------------------------------------------
+
+    def _take_static(self, objects: Iterable[Object], out: list[Decoded]) -> None:
+        """Append the changes of subjects, axis, period and quality."""
+        if not any(isinstance(item, _STATIC_TYPES) for item in objects):
+            return
+        application = _first(self._state.static(ObjectId.APPLICATION_INFO), vicon.ApplicationInfo)
+        axis = "y" if application is not None and application.orientation == _Y_UP else "z"
+        if self._up_axis == "auto" and axis != self._axis:
+            self._axis = axis
+            self._poses = ViconPoseConverter(axis)
+
+        info = _first(self._state.static(ObjectId.STREAM_INFO), vicon.StreamInfo)
+        period = None if info is None or not 0 < info.period <= _LONGEST_PERIOD else info.period
+        if period != self._period:
+            if self._period is not None:
+                out.append(DeviceEvent("restart", "the frame rate changed"))
+            self._period = period
+
+        subjects = self._state.subjects
+        if self._binding is None or subjects != self._binding.subjects:
+            self._bind(subjects, out)
+        for item in self._state.static(ObjectId.OBJECT_QUALITY):
+            if isinstance(item, vicon.ObjectQuality):
+                self._report_quality(item, out)
+
+    def _bind(self, subjects: tuple[vicon.SubjectInfo, ...], out: list[Decoded]) -> ViconBinding:
+        """Bind the columns to the subjects; append their changes and the warnings about them."""
+        binding = bind_subjects(subjects, self._wanted_markers, self._wanted_bodies)
+        before = self._binding
+        out += binding_events(
+            None if before is None else before.columns, binding.columns, unpublished=0
+        )
+        if before is not None and before.columns.layout == binding.columns.layout:
+            columns = replace(binding.columns, layout=before.columns.layout)
+            binding = replace(binding, columns=columns)
+        self._binding = binding
+        self._poor.clear()
+        return binding
+
+    def _report_quality(self, item: vicon.ObjectQuality, out: list[Decoded]) -> None:
+        """Append a warning when the quality of a subject becomes poor, and its end."""
+        poor = not item.quality >= self._least_quality
+        if poor == (item.subject in self._poor):
+            return
+        names = {subject.subject: subject.name for subject in self._state.subjects}
+        name = names.get(item.subject, str(item.subject))
+        if poor:
+            self._poor.add(item.subject)
+            text = f"quality of {name!r} is below {self._least_quality:g}"
+            out.append(DeviceEvent("warning", text, {"subject": name, "quality": item.quality}))
+        else:
+            self._poor.discard(item.subject)
+            out.append(DeviceEvent("setting", f"quality of {name!r} is sufficient again"))
+
+    # --- frames -------------------------------------------------------------------------------
+
+    def _frame(self, chunk: Chunk, number: int, out: list[Decoded]) -> None:
+        """Append the frame in the columns of the subjects, after the events that it causes."""
+        state = self._state
+        hardware = _first(state.dynamic(ObjectId.HARDWARE_FRAME), vicon.HardwareFrame)
+        count = number if hardware is None else hardware.number
+        step = self._continuity.frame(number, count, chunk.t_ns)
+        if not step.use:
+            return
+        if step.restarted:
+            out.append(DeviceEvent("restart", f"frame numbers restarted at {number}"))
+        elif step.lost:
+            out.append(DeviceEvent("gap", f"{step.lost} frames lost", {"lost": step.lost}))
+
+        self._latency.add_frame(_first(state.dynamic(ObjectId.LATENCY_INFO), vicon.LatencyInfo))
+        self._frames += 1
+        if self._frames == _LATENCY_AFTER:
+            out.append(self._latency_event())
+
+        binding = self._binding or self._bind(state.subjects, out)
+        found = self._poses.columns(state, binding)
+        self.suspicious += found.suspicious
+        self.unknown_ids += found.unknown
+        self._arrival_ns = max(self._arrival_ns, chunk.t_ns - self._latency.delay_ns)
+        out.append(
+            MocapFrame(
+                self._arrival_ns,
+                number,
+                None if self._period is None else count * self._period,
+                binding.columns.layout,
+                found.markers,
+                found.body_positions,
+                found.body_orientations,
+            )
+        )
+
+    def _latency_event(self) -> DeviceEvent:
+        """Return the announced delay, or the warning that there is none."""
+        if not self._latency.announced:
+            text = "the server announces no latency: set latency_ms in [mocap] to the whole delay"
+            return DeviceEvent("warning", text)
+        delay_ms, sd_ms = self._latency.delay_ns / 1e6, self._latency.uncertainty_ns / 1e6
+        text = f"announced delay {delay_ms:.1f} ms ± {sd_ms:.1f} ms"
+        return DeviceEvent("info", text, {"delay_ms": delay_ms, "delay_sd_ms": sd_ms})
+
+
+_STATIC_TYPES = (
+    vicon.StreamInfo,
+    vicon.SubjectInfo,
+    vicon.ApplicationInfo,
+    vicon.ObjectQuality,
+)
+
+
+def _first(items: Iterable[object], kind: type[_Found]) -> _Found | None:
+    return next((item for item in items if isinstance(item, kind)), None)

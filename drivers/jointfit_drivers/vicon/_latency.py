@@ -1,0 +1,67 @@
+"""Delay from exposure to arrival, as far as the server announces it.
+
+There is no exposure time and no clock of the server. LatencyInfo gives the duration of the stages
+of processing, and a ping bounds the delay of the network.
+
+Invariant: pure.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jointfit_protocols.vicon import LatencyInfo
+
+_NS = 10**9
+_LONGEST_S = 1.0
+"""Longest plausible sum of the stages, s, and age of a ping that is used."""
+_SUMS = 101
+"""Last frames from which the median of the sums is computed."""
+_PINGS = 20
+_EVERY = 32
+"""Frames between two computations of the median."""
+
+
+class AnnouncedLatency:
+    """Median of the announced delay, and half the round-trip time of pings."""
+
+    def __init__(self) -> None:
+        self._sums_ns: deque[int] = deque(maxlen=_SUMS)
+        self._round_trips_ns: deque[int] = deque(maxlen=_PINGS)
+        self._frames = 0
+        self.delay_ns = 0
+        """Announced delay of processing and network, ns."""
+
+    @property
+    def announced(self) -> bool:
+        """Whether the server announces the duration of its stages."""
+        return bool(self._sums_ns)
+
+    @property
+    def uncertainty_ns(self) -> int:
+        """Half the round trip, and the spread of the sums, ns."""
+        spread = statistics.pstdev(self._sums_ns) if len(self._sums_ns) > 1 else 0.0
+        return round(self._half_trip_ns + spread)
+
+    @property
+    def _half_trip_ns(self) -> float:
+        return statistics.mean(self._round_trips_ns) / 2 if self._round_trips_ns else 0.0
+
+    def add_frame(self, latency: LatencyInfo | None) -> None:
+        """Add the stages of one frame."""
+        if latency is not None:
+            total = sum(seconds for _, seconds in latency.stages)
+            if 0 <= total <= _LONGEST_S:
+                self._sums_ns.append(round(total * _NS))
+        if self._frames % _EVERY == 0:
+            median = statistics.median(self._sums_ns) if self._sums_ns else 0
+            self.delay_ns = round(median + self._half_trip_ns)
+        self._frames += 1
+
+    def add_ping(self, sent_ns: int, arrival_ns: int) -> None:
+        """Add the answer to a ping that was sent at `sent_ns`."""
+        if 0 <= arrival_ns - sent_ns <= _LONGEST_S * _NS:
+            self._round_trips_ns.append(arrival_ns - sent_ns)

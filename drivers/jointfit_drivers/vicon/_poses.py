@@ -1,0 +1,153 @@
+"""Conversion of the objects of one Vicon frame to columns: SI units, world z up, NaN if missing.
+
+A subject that is not seen has no object. Positions are millimetres, rotations row-major. Without
+global poses the light-weight ones are used: they are relative to the parent, and a segment without
+its parent is absent.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.kinematics.rotation_scalar import exp_one, multiply_one, rotate_one
+from jointfit_drivers.motion_capture import (
+    ABSENT,
+    NO_POSITION,
+    is_near,
+    matrix_quaternion,
+    rows_array,
+    world_rotation,
+)
+from jointfit_drivers.vicon._binding import member_key
+from jointfit_protocols import vicon
+from jointfit_protocols.vicon import ObjectId
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.model import Quaternion, Vector
+    from jointfit_drivers.vicon._binding import ViconBinding
+    from jointfit_drivers.vicon._scene_state import SceneState
+
+    Pose = tuple[Vector, Quaternion]
+
+_MM = 1e-3
+_WIDEST = 2 * math.pi
+"""Largest plausible component of a rotation vector, rad; NaN compares as larger."""
+_DEEPEST = 200
+"""Segments from a root to the last one; a longer chain is a loop."""
+
+
+class ViconColumns(NamedTuple):
+    """Arrays of one `MocapFrame`, and the data left out of them."""
+
+    markers: Array
+    body_positions: Array
+    body_orientations: Array
+    suspicious: int
+    """Segments with a position whose rotation is none."""
+    unknown: int
+    """Markers and segments that no subject has."""
+
+
+class ViconPoseConverter:
+    """Converts frames of one server to columns.
+
+    Parameters
+    ----------
+    up_axis : UpAxis
+        The stream's axis that points up.
+    """
+
+    def __init__(self, up_axis: str) -> None:
+        self._place, self._turn = world_rotation(up_axis)
+
+    def columns(self, state: SceneState, binding: ViconBinding) -> ViconColumns:
+        """Return the frame in force in the columns of `binding`."""
+        unknown = 0
+        seen: dict[int, Vector] = {}
+        for item in state.dynamic(ObjectId.LABELED_RECONS):
+            for recon in item.recons if isinstance(item, vicon.LabeledRecons) else ():
+                key = member_key(recon.subject, recon.marker)
+                unknown += key not in binding.known_markers
+                x, y, z = recon.x * _MM, recon.y * _MM, recon.z * _MM
+                if is_near(x, y, z):
+                    seen[key] = self._place(x, y, z)
+
+        poses, suspicious = _global_poses(state)
+        if not poses and not suspicious:
+            poses, suspicious = _chained_poses(state, binding.parents)
+        turned = {
+            key: (self._place(*position), self._turn(*q)) for key, (position, q) in poses.items()
+        }
+        unknown += sum(key & 0xFFFFFFFF not in binding.parents.get(key >> 32, {}) for key in poses)
+
+        columns = binding.columns
+        rows = [turned.get(key, ABSENT) for key in columns.bodies if isinstance(key, int)]
+        places = [seen.get(key, NO_POSITION) for key in columns.markers if isinstance(key, int)]
+        return ViconColumns(
+            rows_array(places, 3),
+            rows_array([place for place, _ in rows], 3),
+            rows_array([turn for _, turn in rows], 4),
+            suspicious,
+            unknown,
+        )
+
+
+def _global_poses(state: SceneState) -> tuple[dict[int, Pose], int]:
+    """Return the global poses by key, and the number of suspicious ones."""
+    poses: dict[int, Pose] = {}
+    suspicious = 0
+    for item in state.dynamic(ObjectId.GLOBAL_SEGMENTS):
+        if not isinstance(item, vicon.Segments):
+            continue
+        for segment in item.segments:
+            x, y, z = (value * _MM for value in segment.position)
+            q = matrix_quaternion(segment.rotation)
+            if q is None:
+                suspicious += 1
+            elif is_near(x, y, z):
+                poses[member_key(item.subject, segment.segment)] = (x, y, z), q
+    return poses, suspicious
+
+
+def _chained_poses(
+    state: SceneState, parents: dict[int, dict[int, int]]
+) -> tuple[dict[int, Pose], int]:
+    """Return the global poses from local ones, and the number of suspicious ones."""
+    poses: dict[int, Pose] = {}
+    suspicious = 0
+    for item in state.dynamic(ObjectId.LIGHT_SEGMENTS):
+        if not isinstance(item, vicon.LightSegments):
+            continue
+        local: dict[int, Pose] = {}
+        for segment in item.segments:
+            x, y, z = segment.x * _MM, segment.y * _MM, segment.z * _MM
+            turn = segment.rx, segment.ry, segment.rz
+            if is_near(x, y, z) and all(abs(angle) <= _WIDEST for angle in turn):
+                local[segment.segment] = (x, y, z), exp_one(turn)
+            else:
+                suspicious += 1
+
+        of_subject = parents.get(item.subject, {})
+        for number in local:
+            pose = _chain(number, local, of_subject)
+            if pose is not None:
+                poses[member_key(item.subject, number)] = pose
+    return poses, suspicious
+
+
+def _chain(number: int, local: dict[int, Pose], parents: dict[int, int]) -> Pose | None:
+    """Return the global pose of a segment; None without all of its parents."""
+    pose = local.get(number)
+    for _ in range(_DEEPEST):
+        number = parents.get(number, 0)
+        if number == 0 or pose is None:
+            return pose
+        parent = local.get(number)
+        if parent is None:
+            return None
+        (px, py, pz), q = parent
+        x, y, z = rotate_one(q, pose[0])
+        pose = (px + x, py + y, pz + z), multiply_one(q, pose[1])
+    return None

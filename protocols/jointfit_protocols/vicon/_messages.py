@@ -1,0 +1,251 @@
+"""Objects of the Vicon DataStream: ``u32 id, u32 length, body``.
+
+A string is a u32 length and bytes, a vector or a set a u32 count and items, a map a u32 count and
+pairs. Positions are millimetres, rotations row-major, segment to world.
+
+*Static* objects describe subjects and are sent after a change; *dynamic* ones belong to a frame.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from struct import Struct
+from typing import NamedTuple
+
+HEADER = Struct("<II")
+"""Id and length of a packet or object."""
+PACKET = 0x1A2B0001
+"""Id of a packet."""
+LARGEST_PACKET = 16 << 20
+"""Largest accepted packet, bytes."""
+TICKS_PER_S = 135_000_000
+"""Unit of the frame period, 1/s."""
+
+
+class ObjectId(IntEnum):
+    """Ids of the objects that are read."""
+
+    STREAM_INFO = 1
+    SUBJECT_INFO = 2
+    FRAME_INFO = 5
+    LABELED_RECONS = 6
+    LOCAL_SEGMENTS = 8
+    GLOBAL_SEGMENTS = 9
+    TIMECODE = 23
+    LATENCY_INFO = 26
+    HARDWARE_FRAME = 36
+    APPLICATION_INFO = 37
+    FRAME_RATES = 39
+    OBJECT_QUALITY = 40
+    PING = 42
+    LIGHT_SEGMENTS = 901
+    OBJECT_ENUMS = 100_001
+    REQUEST_FRAME = 100_002
+    KEEP_ALIVE = 100_003
+    CONTENTS = 100_004
+
+
+STATIC = frozenset((1, 2, 28, 29, 37, 40, 28_001))
+"""Ids of the objects that describe subjects and stream."""
+DYNAMIC = frozenset((5, 6, 7, 8, 9, 23, 26, 36, 39, 901))
+"""Ids of the objects that belong to one frame."""
+
+
+class StreamInfo(NamedTuple):
+    """Period of the frames."""
+
+    period: int
+    """Ticks of `TICKS_PER_S`."""
+
+
+class SegmentInfo(NamedTuple):
+    """One segment of a subject."""
+
+    parent: int
+    """Id of its parent; 0 for the root."""
+    id: int
+    name: str
+
+
+class MarkerInfo(NamedTuple):
+    """One marker of a subject."""
+
+    id: int
+    name: str
+
+
+class SubjectInfo(NamedTuple):
+    """One subject: a person or a prop."""
+
+    subject: int
+    name: str
+    segments: tuple[SegmentInfo, ...]
+    markers: tuple[MarkerInfo, ...]
+    attachments: tuple[tuple[int, int], ...] = ()
+    """Marker and segment to which it is attached."""
+
+
+class FrameInfo(NamedTuple):
+    """Number of the frame, from 0."""
+
+    number: int
+
+
+class LabeledRecon(NamedTuple):
+    """Position of one labeled marker."""
+
+    subject: int
+    marker: int
+    radius: float
+    x: float
+    y: float
+    z: float
+
+
+class LabeledRecons(NamedTuple):
+    """Positions of the labeled markers that are seen, mm."""
+
+    recons: tuple[LabeledRecon, ...]
+
+
+class SegmentPose(NamedTuple):
+    """Pose of one segment."""
+
+    segment: int
+    position: tuple[float, float, float]
+    """mm."""
+    rotation: tuple[float, ...]
+    """Nine numbers by rows."""
+
+
+class Segments(NamedTuple):
+    """Poses of the segments of one subject; a subject that is not seen has no such object."""
+
+    id: int
+    """`ObjectId.GLOBAL_SEGMENTS`, or ``LOCAL_SEGMENTS`` for poses relative to the parent."""
+    subject: int
+    segments: tuple[SegmentPose, ...]
+
+
+class LightSegment(NamedTuple):
+    """Pose of one segment relative to its parent: mm, rotation vector in rad."""
+
+    segment: int
+    x: float
+    y: float
+    z: float
+    rx: float
+    ry: float
+    rz: float
+
+
+class LightSegments(NamedTuple):
+    """Poses of the segments of one subject in 32-bit numbers."""
+
+    subject: int
+    segments: tuple[LightSegment, ...]
+
+
+class StreamTimecode(NamedTuple):
+    """Timecode of the frame."""
+
+    hours: int
+    minutes: int
+    seconds: int
+    frames: int
+    subframes: int
+    subframes_per_frame: int
+    standard: int
+    """0 PAL, 1 NTSC, 2 drop frame, 3 film, 4 NTSC film, 5 ATSC; 0xFFFFFFFF: none."""
+    user_bits: int = 0
+    field: int = 0
+
+
+class LatencyInfo(NamedTuple):
+    """Stages of processing, each with its duration, s."""
+
+    stages: tuple[tuple[str, float], ...]
+
+
+class HardwareFrame(NamedTuple):
+    """Number of the frame according to the cameras."""
+
+    number: int
+
+
+class ApplicationInfo(NamedTuple):
+    """Orientation of the world: 0 z up, 1 y up."""
+
+    orientation: int
+
+
+class FrameRates(NamedTuple):
+    """Rates by name, Hz."""
+
+    rates: tuple[tuple[str, float], ...]
+
+
+class ObjectQuality(NamedTuple):
+    """Quality of the tracking of one subject, 0 to 1."""
+
+    subject: int
+    quality: float
+
+
+class Ping(NamedTuple):
+    """Question of a client, or the same object as its answer."""
+
+    number: int
+
+
+class ObjectEnums(NamedTuple):
+    """Ids that the server can send, or that the client wants."""
+
+    ids: frozenset[int]
+
+
+class RequestFrame(NamedTuple):
+    """Request of one frame, or of all."""
+
+    stream: bool
+
+
+class KeepAlive(NamedTuple):
+    """An object without content."""
+
+
+class Contents(NamedTuple):
+    """Ids of the frame's objects, and ids of those that are unchanged."""
+
+    present: tuple[tuple[int, int], ...]
+    """Id and number of objects."""
+    unchanged: frozenset[int]
+
+
+class OpaqueObject(NamedTuple):
+    """An object that is not read."""
+
+    id: int
+    data: bytes
+
+
+Object = (
+    StreamInfo
+    | SubjectInfo
+    | FrameInfo
+    | LabeledRecons
+    | Segments
+    | LightSegments
+    | StreamTimecode
+    | LatencyInfo
+    | HardwareFrame
+    | ApplicationInfo
+    | FrameRates
+    | ObjectQuality
+    | Ping
+    | ObjectEnums
+    | RequestFrame
+    | KeepAlive
+    | Contents
+    | OpaqueObject
+)
