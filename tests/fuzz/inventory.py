@@ -4,13 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tests.fuzz import broker_targets, file_targets, mip_targets, vectornav_targets, wire_targets
+from tests.fuzz import (
+    broker_targets,
+    file_targets,
+    lpms_targets,
+    mip_targets,
+    vectornav_targets,
+    wire_targets,
+)
 
-TARGETS = {
-    target.name: target
-    for module in (wire_targets, mip_targets, vectornav_targets, broker_targets, file_targets)
-    for target in module.TARGETS
-}
+MODULES = (
+    wire_targets,
+    lpms_targets,
+    mip_targets,
+    vectornav_targets,
+    broker_targets,
+    file_targets,
+)
+TARGETS = {target.name: target for module in MODULES for target in module.TARGETS}
 REPRODUCERS = Path(__file__).parent / "reproducers"
 """One folder a target; every input in it failed once, and must not fail again."""
 

@@ -7,7 +7,6 @@ Runs where the kernel has an interface vcan0 that may be changed: in the light v
 from __future__ import annotations
 
 import asyncio
-import socket
 import time
 from typing import TYPE_CHECKING
 
@@ -27,7 +26,9 @@ from tests.vm.vcan_link import (
     BUS,
     LINK,
     NEEDS_VCAN,
+    LinkWire,
     ReceivedFrames,
+    RemovableWire,
     identity,
     ip,
     running,
@@ -41,44 +42,6 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import WireNoise
 
 pytestmark = NEEDS_VCAN
-
-
-class LinkWire(PythonCanWire):
-    """A wire whose plug is the interface itself."""
-
-    def __init__(self) -> None:
-        ip("set", LINK, "up")
-        super().__init__("socketcan", LINK)
-
-    @override
-    def unplug(self) -> None:
-        super().unplug()
-        ip("set", LINK, "down")
-
-    @override
-    def plug(self) -> None:
-        ip("set", LINK, "up")
-        super().plug()
-
-
-class RemovableWire(PythonCanWire):
-    """A wire whose plug is the adapter: the interface vanishes and comes back."""
-
-    def __init__(self) -> None:
-        super().__init__("socketcan", LINK)
-
-    @override
-    def unplug(self) -> None:
-        super().unplug()
-        if LINK in {name for _, name in socket.if_nameindex()}:
-            ip("delete", LINK)
-
-    @override
-    def plug(self) -> None:
-        if LINK not in {name for _, name in socket.if_nameindex()}:
-            ip("add", "dev", LINK, "type", "vcan")
-            ip("set", LINK, "up")
-        super().plug()
 
 
 class TestXcdiOnVcanThatGoesDown(DriverContract):

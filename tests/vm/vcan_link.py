@@ -10,15 +10,18 @@ from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusSettings
 from jointfit_daemon.model import Chunk, ImuSample
-from jointfit_drivers.xcdi import XcdiImu, XcdiSettings
+from jointfit_drivers.xcdi import XcdiSettings
 from jointfit_protocols.can import CanFrame, unpack_frames
+from jointfit_simulators.wires import PythonCanWire
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from jointfit_daemon.driver import Driver
     from jointfit_simulators.devices import XcdiDevice
 
 LINK = "vcan0"
@@ -47,6 +50,44 @@ def ip(*words: str) -> None:
     subprocess.run([tool, "link", *words], check=True)
 
 
+class LinkWire(PythonCanWire):
+    """A wire whose plug is the interface itself."""
+
+    def __init__(self) -> None:
+        ip("set", LINK, "up")
+        super().__init__("socketcan", LINK)
+
+    @override
+    def unplug(self) -> None:
+        super().unplug()
+        ip("set", LINK, "down")
+
+    @override
+    def plug(self) -> None:
+        ip("set", LINK, "up")
+        super().plug()
+
+
+class RemovableWire(PythonCanWire):
+    """A wire whose plug is the adapter: the interface vanishes and comes back."""
+
+    def __init__(self) -> None:
+        super().__init__("socketcan", LINK)
+
+    @override
+    def unplug(self) -> None:
+        super().unplug()
+        if LINK in {name for _, name in socket.if_nameindex()}:
+            ip("delete", LINK)
+
+    @override
+    def plug(self) -> None:
+        if LINK not in {name for _, name in socket.if_nameindex()}:
+            ip("add", "dev", LINK, "type", "vcan")
+            ip("set", LINK, "up")
+        super().plug()
+
+
 BUS = CanBusSettings(interface="socketcan", channel=LINK, bitrate=1_000_000)
 
 
@@ -59,8 +100,8 @@ def settings(name: str = "S3", **more: Any) -> XcdiSettings:
 class ReceivedFrames:
     """Everything a driver emitted, decoded."""
 
-    def __init__(self, driver: XcdiImu) -> None:
-        self.decoder = driver.decoder()
+    def __init__(self, driver: Driver) -> None:
+        self.decoder: Any = driver.decoder()
         self.events: list[Any] = []
         self.frames: list[CanFrame] = []
 
@@ -79,7 +120,7 @@ class ReceivedFrames:
 
 
 @asynccontextmanager
-async def running(driver: XcdiImu) -> AsyncIterator[ReceivedFrames]:
+async def running(driver: Driver) -> AsyncIterator[ReceivedFrames]:
     heard = ReceivedFrames(driver)
     task = asyncio.create_task(driver.run(heard.emit))
     await asyncio.sleep(0.05)

@@ -198,7 +198,8 @@ class LpmsCanCodec:
         if place == 0:
             self.incomplete += self._received
             self._t_ns, self._values, self._received = t_ns, values, 1
-        elif place == self._received and 0 <= t_ns - self._t_ns <= self._longest_ns:
+        elif place == self._received and abs(t_ns - self._t_ns) <= self._longest_ns:
+            # frames come in order, while their stamps may differ by the error of two clock readings
             self._values += values
             self._received += 1
         else:

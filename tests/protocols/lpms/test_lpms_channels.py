@@ -140,6 +140,13 @@ def test_halves_in_the_wrong_order_give_no_quaternion() -> None:
     assert decoder.incomplete == 20
 
 
+def test_stamps_that_decrease_by_a_clock_error_do_not_tear_a_sample() -> None:
+    decoder = codec("float32")
+    (first, _), (_, rest) = halves(1, 1000), halves(1, 900)
+    assert decoder.feed(first) is None
+    assert isinstance(decoder.feed(rest), ChannelQuaternion)
+
+
 def test_halves_of_two_periods_are_not_combined() -> None:
     decoder = codec("float32")
     (first, _), (_, late) = halves(1, 0), halves(2, HALF_NS + 1)
