@@ -245,7 +245,9 @@ async def test_overlapping_identifiers_of_neighbours_are_refused_by_name(tmp_pat
     )
     run = DriverRun(LpmsCanImu(first))
     await asyncio.sleep(0.05)
-    with pytest.raises(DeviceMisconfiguredError, match=r"0x516 .*also that of S1"):
+    with pytest.raises(
+        DeviceMisconfiguredError, match=r"0x516 .*also that of S1.*the vendor's tool"
+    ):
         await LpmsCanImu(second).run(lambda _: None)
     await run.cancel()
 
