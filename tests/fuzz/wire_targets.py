@@ -7,7 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.config import parse_rig
-from jointfit_daemon.model import Chunk, DeviceEvent
+from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent
 from jointfit_daemon.outputs.mqtt import Outbox
 from jointfit_daemon.outputs.payloads import TopicWriter
 from jointfit_daemon.outputs.payloads._encoding import encode as encode_payload
@@ -19,9 +19,10 @@ from jointfit_daemon.pipeline.sources import SourceState
 from jointfit_drivers.natnet._open_requests import OpenRequests
 from jointfit_drivers.qtm import QtmDecoder, QtmSettings
 from jointfit_drivers.vicon import ViconDecoder, ViconSettings
+from jointfit_drivers.vrpn import VrpnDecoder, VrpnSettings
 from jointfit_drivers.witmotion import WitMotionImu, WitMotionSettings
 from jointfit_drivers.ximu3 import XImu3Imu, XImu3Settings
-from jointfit_protocols import qtm, vicon
+from jointfit_protocols import qtm, vicon, vrpn
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
 from jointfit_protocols.can.slcan import SlcanCodec
 from jointfit_protocols.can.slcan import encode_frame as encode_slcan
@@ -287,6 +288,42 @@ def seeds_can_core() -> list[bytes]:
     return [found, found[:40]]
 
 
+# --- VRPN -------------------------------------------------------------------------------------
+
+
+def run_vrpn(data: bytes) -> None:
+    """Decode a VRPN stream in pieces, up to frames; every discarded byte is reported."""
+    decoder = VrpnDecoder(VrpnSettings(driver="vrpn", server="x"))
+    lost, t_ns = 0, BEGIN_NS
+    for piece in cut(data):
+        t_ns += _MS
+        found = decoder.feed(Chunk(t_ns, piece))
+        lost += sum(item.discarded for item in found if isinstance(item, Corrupt))
+    lost += sum(item.discarded for item in decoder.flush() if isinstance(item, Corrupt))
+    if lost != decoder.discarded_bytes:
+        raise UnaccountedError(f"{decoder.discarded_bytes} bytes discarded, {lost} reported")
+    vrpn.is_whole(data)
+    vrpn.decode_announcement(data)
+
+
+def seeds_vrpn() -> list[bytes]:
+    """Return connections with descriptions, poses and a heartbeat."""
+    types = {name: number for number, name in enumerate(vrpn.TYPE_NAMES)}
+    opening: list[vrpn.VrpnContent] = [vrpn.Cookie(), vrpn.SenderDescription(1, "Thigh")]
+    opening += [vrpn.TypeDescription(number, name) for name, number in types.items()]
+    poses: list[vrpn.VrpnContent] = [
+        vrpn.TrackerPose(10_000 * n, 1, n % 2, 0.1 * n, 1.0, 2.0, 0.0, 0.0, 0.6, 0.8)
+        for n in range(6)
+    ]
+    rest: list[vrpn.VrpnContent] = [
+        vrpn.Ping(0, 1),
+        vrpn.UdpChannel(4000, "127.0.0.1"),
+        vrpn.Disconnect(),
+    ]
+    whole = [vrpn.encode(message, types) for message in (*opening, *poses, *rest)]
+    return [b"".join(whole), b"".join(whole[:9]), vrpn.encode(vrpn.Cookie()) * 2]
+
+
 # --- UDP --------------------------------------------------------------------------------------
 
 
@@ -468,6 +505,7 @@ TARGETS = (
     Target("can-records", run_can_records, seeds_can_records, share=3),
     Target("can-source", run_can_source, seeds_can_core, share=4),
     Target("can-core", run_can_core, seeds_can_core, share=1),
+    Target("vrpn-source", run_vrpn, seeds_vrpn, share=10, longest=4096),
     Target("natnet-codec", run_natnet_codec, seeds_natnet, share=30, longest=1500),
     Target("natnet-source", run_natnet_source, seeds_natnet_core, share=2, longest=1500),
     Target("natnet-core", run_natnet_core, seeds_natnet_core, share=1, longest=1500),

@@ -36,6 +36,8 @@ from jointfit_simulators.devices._table_device import (
 from jointfit_simulators.devices._tcp_port import TcpClient, TcpPort, TextServer
 from jointfit_simulators.devices._vectornav_device import VectorNavDevice, VectorNavDeviceOptions
 from jointfit_simulators.devices._vicon_server import ViconServer, ViconServerOptions
+from jointfit_simulators.devices._vrpn_options import VrpnServerOptions
+from jointfit_simulators.devices._vrpn_server import VrpnServer
 from jointfit_simulators.devices._witmotion_device import (
     WITH_QUATERNION,
     WitMotionDevice,
@@ -87,6 +89,8 @@ __all__ = [
     "VectorNavDeviceOptions",
     "ViconServer",
     "ViconServerOptions",
+    "VrpnServer",
+    "VrpnServerOptions",
     "WitMotionDevice",
     "WitMotionDeviceOptions",
     "XImu3Device",

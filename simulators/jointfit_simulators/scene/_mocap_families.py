@@ -18,6 +18,8 @@ from jointfit_simulators.devices import (
     RigidBodyAsset,
     ViconServer,
     ViconServerOptions,
+    VrpnServer,
+    VrpnServerOptions,
 )
 
 if TYPE_CHECKING:
@@ -161,9 +163,28 @@ def _vicon(place: CameraPlace) -> tuple[ViconServer, list[str]]:
     return server, ['server = "127.0.0.1"', f"command_port = {server.command_port}"]
 
 
+def _vrpn(place: CameraPlace) -> tuple[VrpnServer, list[str]]:
+    markers = tuple(name for names in place.clusters.values() for name in names)
+    options = VrpnServerOptions(
+        bodies=tuple(place.bodies),
+        markers=markers,
+        port=place.command_port,
+        device_ns=place.timing.device_ns,
+        seed=place.knobs.seed,
+    )
+    server = VrpnServer(options)
+    lines = [
+        'server = "127.0.0.1"',
+        f"port = {server.command_port}",
+        f'up_axis = "{options.up_axis}"',
+    ]
+    return server, lines
+
+
 MOCAP_FAMILIES = {
     "natnet": MocapFamily(_natnet, sync_line=True),
     "qtm": MocapFamily(_qtm),
     "vicon": MocapFamily(_vicon),
+    "vrpn": MocapFamily(_vrpn),
 }
 """Families by driver."""

@@ -1,0 +1,271 @@
+"""Decoder of the VRPN driver: messages in, optical frames out.
+
+The poses of one instant form a frame (`FrameAssembler`). A body is known by the name of its tracker
+once it was described or seen; names of rig.toml that are unknown after half a second are reported.
+
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no socket.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, MocapFrame, TickClock
+from jointfit_drivers.backlog import BacklogDelay
+from jointfit_drivers.motion_capture import (
+    ABSENT,
+    NO_POSITION,
+    ColumnBinding,
+    ModelEntry,
+    bind_columns,
+    binding_events,
+    rows_array,
+    unit_quaternion,
+    wanted_names,
+    world_rotation,
+)
+from jointfit_drivers.vrpn._frame_assembler import FrameAssembler, ReportedFrame
+from jointfit_drivers.vrpn._unit_check import UnitCheck
+from jointfit_protocols import vrpn
+from jointfit_protocols.corrupt import CorruptBytes
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Chunk, Decoded, Quaternion, Vector
+    from jointfit_drivers.motion_capture import ColumnKey
+    from jointfit_drivers.vrpn._settings import VrpnSettings
+
+_STEP_US = 100_000
+"""Least difference, µs, of elapsed server and arrival time that is a step of the server's clock."""
+_PACE_US = 250_000
+"""Time at the server's own pace after which the delay of its messages is known, µs."""
+_LATEST_US = 1_000_000
+"""Longest delay of the first messages of a connection, µs."""
+_SETTLED_US = 500_000
+"""Time after the first report from which missing names are reported, µs."""
+_FARTHEST_M = 1_000.0
+"""Largest plausible coordinate, m: servers send larger ones for bodies that are not seen."""
+_MOST_BODIES = 2000
+"""Bodies of one server; those beyond are dropped, because each costs memory."""
+_CLOCKS = {"server": TickClock(1000, None), "utc": TickClock(1000, None, None, "unix")}
+
+
+class VrpnDecoder:
+    """Decoder of one VRPN server.
+
+    Parameters
+    ----------
+    settings : VrpnSettings
+        Names in rig.toml, unit, up axis and clock.
+    """
+
+    def __init__(self, settings: VrpnSettings) -> None:
+        self._codec = vrpn.VrpnCodec()
+        self._assembler = FrameAssembler()
+        self._clock = _CLOCKS[settings.time]
+        self._wanted_markers, self._wanted_bodies = wanted_names(settings)
+        self._place, self._turn = world_rotation(settings.up_axis)
+        self._scale = 0.001 if settings.unit == "mm" else 1.0
+        self._unit_check = UnitCheck(settings.unit)
+        self._bodies: dict[tuple[str, int], None] = {}
+        """Bodies that have reported, in order of their first report."""
+        self._binding: ColumnBinding | None = None
+        self._stale_binding = True
+        self._settled = False
+        self._number = 0
+        self._first_us: int | None = None
+        self._last: tuple[int, int] | None = None  # time and arrival of the last frame, µs
+        self._delay = BacklogDelay()
+        self._named_unknown: set[int] = set()
+        self.unknown_ids = 0
+        """Reports dropped because the server has not described their sender."""
+        self.suspicious = 0
+        """Poses rejected because their numbers are implausible."""
+
+    @property
+    def tick_clock(self) -> TickClock:
+        """Wall clock of the server, µs since 1970."""
+        return self._clock
+
+    @property
+    def messages(self) -> int:
+        """Well-formed messages of any kind so far."""
+        return self._codec.messages
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes that belong to no message so far."""
+        return self._codec.discarded
+
+    @property
+    def late_reports(self) -> int:
+        """Reports dropped because their frame had ended, or a later one had arrived."""
+        return self._assembler.late
+
+    @property
+    def repeated_reports(self) -> int:
+        """Reports dropped because their body had reported at the same time."""
+        return self._assembler.duplicates
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return the frames that `chunk` completes, and events; never raises."""
+        out: list[Decoded] = []
+        for message in self._codec.feed(chunk.data):
+            match message:
+                case vrpn.TrackerPose():
+                    self._report(message, chunk.t_ns, out)
+                case CorruptBytes():
+                    out.append(Corrupt(message.discarded, message.reason))
+                case vrpn.Cookie():
+                    self._connected(message, out)
+                case vrpn.SenderDescription():
+                    self._stale_binding = True
+                case vrpn.Disconnect():
+                    out.append(DeviceEvent("info", "the server ended the connection"))
+        return out
+
+    def flush(self) -> list[Decoded]:
+        """Return the frame in progress, and discard an incomplete message."""
+        out: list[Decoded] = []
+        for frame in self._assembler.flush():
+            self._frame(frame, out)
+        out += [Corrupt(item.discarded, item.reason) for item in self._codec.flush()]
+        return out
+
+    # --- server -------------------------------------------------------------------------------
+
+    def _connected(self, cookie: vrpn.Cookie, out: list[Decoded]) -> None:
+        """Start again with the server of a new connection."""
+        version = f"{cookie.major:02d}.{cookie.minor:02d}"
+        out.append(DeviceEvent("info", f"VRPN {version}", {"vrpn": version}))
+        if cookie.major != vrpn.MAJOR:
+            text = f"the server speaks VRPN {version}, expected {vrpn.MAJOR:02d}.xx"
+            out.append(DeviceEvent("error", text, {"vrpn": version}))
+        self._assembler.forget()
+        self._named_unknown.clear()
+        self._stale_binding = True
+
+    # --- reports ------------------------------------------------------------------------------
+
+    def _report(self, report: vrpn.TrackerPose, arrival_ns: int, out: list[Decoded]) -> None:
+        """Add the pose of one body; append the frames that it completes."""
+        name = self._codec.senders.get(report.sender)
+        if name is None:
+            self.unknown_ids += 1
+            if report.sender not in self._named_unknown and not self._named_unknown:
+                self._named_unknown.add(report.sender)
+                text = f"poses of sender {report.sender}, which has no name yet, are dropped"
+                out.append(DeviceEvent("warning", text, {"ids": [report.sender]}))
+            return
+
+        key = (name, report.sensor)
+        if key not in self._bodies:
+            if len(self._bodies) >= _MOST_BODIES:
+                self.unknown_ids += 1
+                return
+            self._bodies[key] = None
+            self._stale_binding = True
+        for frame in self._assembler.feed(key, report, arrival_ns):
+            self._frame(frame, out)
+
+    def _frame(self, frame: ReportedFrame, out: list[Decoded]) -> None:
+        """Append one frame, after the events that it causes."""
+        self._check_clock(frame, out)
+        if self._first_us is None:
+            self._first_us = frame.time_us
+        if not self._settled and frame.time_us - self._first_us >= _SETTLED_US:
+            self._settled = self._stale_binding = True
+        binding = self._bound(out)
+
+        poses: dict[ColumnKey, tuple[Vector, Quaternion | None]] = {}
+        for key, report in frame.reports.items():
+            pose = self._pose(report)
+            if pose is None:
+                self.suspicious += 1
+            else:
+                poses[key] = pose
+            if (text := self._unit_check.feed(report.x, report.y, report.z)) is not None:
+                out.append(DeviceEvent("warning", text))
+
+        places = [poses.get(key, ABSENT) for key in binding.bodies]
+        whole = [(position, turn) if turn is not None else ABSENT for position, turn in places]
+        self.suspicious += sum(turn is None for _, turn in places)
+        self._number += 1
+        out.append(
+            MocapFrame(
+                frame.arrival_ns,
+                self._number,
+                frame.time_us,
+                binding.layout,
+                rows_array([poses.get(k, (NO_POSITION,))[0] for k in binding.markers], 3),
+                rows_array([position for position, _ in whole], 3),
+                rows_array([turn for _, turn in whole], 4),
+            )
+        )
+
+    def _pose(self, report: vrpn.TrackerPose) -> tuple[Vector, Quaternion | None] | None:
+        """Return position and orientation, z up; None for an implausible position."""
+        scale, far = self._scale, _FARTHEST_M
+        x, y, z = scale * report.x, scale * report.y, scale * report.z
+        if not (abs(x) <= far and abs(y) <= far and abs(z) <= far):
+            return None
+        turn = unit_quaternion(report.qw, report.qx, report.qy, report.qz)
+        return self._place(x, y, z), None if turn is None else self._turn(*turn)
+
+    def _check_clock(self, frame: ReportedFrame, out: list[Decoded]) -> None:
+        """Report a step of the server's clock, which is not explained by delayed messages."""
+        last, now_us = self._last, frame.arrival_ns // 1000
+        self._last = (frame.time_us, now_us)
+        if last is None:
+            return
+        advance_us, elapsed_us = frame.time_us - last[0], now_us - last[1]
+        delay_us = self._delay.limit(_PACE_US, _LATEST_US)
+        # Less advance than elapsed time is a delay in the network, unless time runs backwards.
+        if 0 <= advance_us <= elapsed_us + delay_us + _STEP_US:
+            self._delay.feed(advance_us, elapsed_us)
+            return
+
+        self._delay = BacklogDelay()
+        self._first_us = frame.time_us
+        step_s = (advance_us - elapsed_us) / 1e6
+        text = f"clock of the server stepped by {step_s:+.3f} s"
+        out.append(DeviceEvent("restart", text, {"step_s": step_s}))
+
+    # --- names --------------------------------------------------------------------------------
+
+    def _bound(self, out: list[Decoded]) -> ColumnBinding:
+        """Return the columns, renewed after a new name; append the events of changes."""
+        before = self._binding
+        if before is not None and not self._stale_binding:
+            return before
+
+        # Markers are trackers that rig.toml names as such; all others are bodies.
+        entries = self._entries()
+        markers = [entry for entry in entries if entry.name in self._wanted_markers]
+        others = [entry for entry in entries if entry.name not in self._wanted_markers]
+        binding = bind_columns(markers, others, self._wanted_markers, self._wanted_bodies)
+        if not self._settled:
+            binding = ColumnBinding(binding.layout, binding.markers, binding.bodies, (), ())
+        elif before is not None and before.layout == binding.layout:
+            binding = ColumnBinding(
+                before.layout, binding.markers, binding.bodies, binding.warnings, binding.unknown
+            )
+        out += binding_events(before, binding, 0)
+        self._binding, self._stale_binding = binding, False
+        return binding
+
+    def _entries(self) -> list[ModelEntry]:
+        """Return the bodies that have reported, and those of rig.toml that are described."""
+        wanted = {**self._wanted_markers, **self._wanted_bodies}
+        described = set(self._codec.senders.values())
+        keys = dict(self._bodies)
+        for name in wanted:
+            tracker, _, sensor = name.rpartition("#")
+            key = (tracker, int(sensor)) if tracker and sensor.isdecimal() else (name, 0)
+            if key[0] in described:
+                keys.setdefault(key)
+        entries = []
+        for tracker, number in keys:
+            numbered = f"{tracker}#{number}"
+            plain = numbered if number or numbered in wanted else tracker
+            entries.append(ModelEntry((tracker, number), "", plain, number + 1))
+        return entries

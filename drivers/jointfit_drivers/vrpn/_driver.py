@@ -1,0 +1,68 @@
+"""Driver of motion-capture systems with a VRPN server.
+
+`VrpnDecoder` is the pure part. `VrpnMocap.run` connects and emits whole messages in order of
+arrival, so that a replay has the same input as the live decoder.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from jointfit_drivers.motion_capture import find_route
+from jointfit_drivers.vrpn._decoder import VrpnDecoder
+from jointfit_drivers.vrpn._server_search import diagnose, find_servers
+from jointfit_drivers.vrpn._session import VrpnSession
+from jointfit_drivers.vrpn._settings import VrpnSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.device_search import Finding, FoundServer
+    from jointfit_daemon.driver import Emit, Wire
+
+
+class VrpnMocap:
+    """One VRPN server: rigid bodies, stamped by its wall clock when the message was made."""
+
+    Settings: ClassVar[type[VrpnSettings]] = VrpnSettings
+    wire: ClassVar[Wire] = "stream"
+    least_delay_ms: ClassVar[tuple[float, float]] = (15.0, 10.0)
+    """Delay from exposure to arrival, ms: the stamp is that of the message, not of the exposure."""
+
+    def __init__(self, settings: VrpnSettings) -> None:
+        self._settings = settings
+        self._silent = False
+
+    def decoder(self) -> VrpnDecoder:
+        """Return the decoder from messages to optical frames in SI units."""
+        return VrpnDecoder(self._settings)
+
+    @classmethod
+    async def find_servers(
+        cls, hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
+    ) -> list[FoundServer]:
+        """Return the VRPN servers that answer; see `jointfit_daemon.device_search`."""
+        return await find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
+
+    @classmethod
+    async def diagnose(cls, settings: VrpnSettings, wait_s: float) -> list[Finding]:
+        """Return the causes of missing poses; see `jointfit_daemon.device_search`."""
+        return await diagnose(settings, wait_s)
+
+    async def run(self, emit: Emit) -> None:
+        """Connect to the server and read until cancelled.
+
+        Raises
+        ------
+        DeviceLostError
+            The host is unknown, does not answer, has no listening server, closes the connection, or
+            sends no pose for ``silence_s``. A retry may succeed.
+        DeviceMisconfiguredError
+            The host is no VRPN server, its major version differs, or the network card is unknown.
+        """
+        route = await find_route("VRPN", self._settings)
+        session = VrpnSession(self._settings, route, emit, after_silence=self._silent)
+        try:
+            await session.run()
+        finally:
+            self._silent = session.silent

@@ -1,0 +1,95 @@
+"""Search for VRPN servers, and diagnosis of missing poses.
+
+VRPN has no discovery: only hosts that are named are asked. The connection of the diagnosis is that
+of the driver.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.device_search import Finding, FoundServer
+from jointfit_drivers.motion_capture import CHECK, Reception, content_findings, find_route
+from jointfit_drivers.ports.udp_socket import local_address
+from jointfit_drivers.vrpn._decoder import VrpnDecoder
+from jointfit_drivers.vrpn._session import CONNECT_S, VrpnSession
+from jointfit_drivers.vrpn._settings import VrpnSettings
+from jointfit_protocols.vrpn import DEFAULT_PORT
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.driver import Emit
+
+_REMEDY = "enable VRPN streaming and rigid bodies in the camera software"
+
+
+def _reception(settings: VrpnSettings, silence_s: float) -> Reception:
+    """Return the reception of a server, as the driver connects to it."""
+    patient = settings.model_copy(update={"silence_s": silence_s})
+
+    async def connect(emit: Emit) -> None:
+        route = await find_route("VRPN", patient)
+        await VrpnSession(patient, route, emit).run()
+
+    return Reception(VrpnDecoder(settings), connect)
+
+
+async def find_servers(
+    hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
+) -> list[FoundServer]:
+    """Return the VRPN servers that answer; see `ServerSearch.find_servers`."""
+    loop = asyncio.get_running_loop()
+    addresses = ["127.0.0.1"] if broadcast else []
+    for host in hosts:
+        try:
+            found = await loop.getaddrinfo(host, None, family=socket.AF_INET)
+        except (OSError, UnicodeError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise OSError(
+                f"{host}: no such host ({why}): set the address of the server, such as 192.168.1.20"
+            ) from None
+        addresses.append(str(found[0][4][0]))
+
+    unique = list(dict.fromkeys(addresses))
+    async with asyncio.TaskGroup() as group:
+        asked = [
+            group.create_task(_ask(address, port or DEFAULT_PORT, wait_s)) for address in unique
+        ]
+    return [server for task in asked if (server := task.result()) is not None]
+
+
+async def _ask(address: str, port: int, wait_s: float) -> FoundServer | None:
+    """Return the server at an address with the bodies that it reports; None without an answer."""
+    settings = VrpnSettings(driver="vrpn", server=address, port=port)
+    reception = _reception(settings, wait_s)
+    await reception.receive(wait_s)
+    version = str(reception.facts.get("vrpn", ""))
+    if not version:
+        return None
+    return FoundServer(
+        driver="vrpn",
+        server=address,
+        port=port,
+        interface=local_address(address, None),
+        application="VRPN server",
+        version=version,
+        protocol=f"VRPN {version}",
+        transport="unicast",
+        bodies=reception.frames[-1].layout.bodies if reception.frames else (),
+    )
+
+
+async def diagnose(settings: VrpnSettings, wait_s: float) -> list[Finding]:
+    """Return the findings for a ``[mocap]`` table; see `Diagnosis.diagnose`."""
+    name, reception = settings.server, _reception(settings, wait_s)
+    await reception.receive(2 * CONNECT_S + wait_s)
+    if not reception.frames:
+        text = str(reception.failure or f"no pose within {wait_s:g} s")
+        return [Finding(CHECK, name, "error", text, _REMEDY)]
+    # The first frames lack the bodies that reported later.
+    layout = reception.frames[-1].layout
+    reception.frames = [frame for frame in reception.frames if frame.layout == layout]
+    return content_findings(settings, reception, name, _REMEDY)

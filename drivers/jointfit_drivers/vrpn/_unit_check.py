@@ -1,0 +1,54 @@
+"""Detection of a wrong unit by the size of the coordinates.
+
+Camera volumes are smaller than 50 m, and a body rarely stays within 20 mm of the origin.
+
+Invariant: pure; at most one text.
+"""
+
+from __future__ import annotations
+
+_LARGEST_M = 50.0
+"""Coordinate, m, that no camera volume has."""
+_SMALLEST_MM = 20.0
+"""Distance from the origin, mm, that tracked bodies exceed."""
+_REPORTS = 500
+"""Reports after which coordinates in mm have exceeded `_SMALLEST_MM`."""
+
+
+class UnitCheck:
+    """Checks the first reports of a server.
+
+    Parameters
+    ----------
+    unit : str
+        ``m`` or ``mm``, as configured.
+    """
+
+    def __init__(self, unit: str) -> None:
+        self._unit = unit
+        self._largest = 0.0
+        self._reports = 0
+
+    def feed(self, x: float, y: float, z: float) -> str | None:
+        """Return the warning for a position as sent; None without a new one."""
+        if self._reports > _REPORTS:
+            return None
+        largest = max(abs(x), abs(y), abs(z))
+        if not largest < float("inf"):
+            return None
+        self._reports += 1
+        self._largest = max(self._largest, largest)
+        if self._unit == "m" and self._largest > _LARGEST_M:
+            self._reports = _REPORTS + 1
+            return (
+                f'coordinates up to {self._largest:.0f} with unit = "m": the server seems to send '
+                'millimetres; set unit = "mm" in [mocap]'
+            )
+        if self._unit == "mm" and self._reports == _REPORTS:
+            self._reports = _REPORTS + 1
+            if self._largest < _SMALLEST_MM:
+                return (
+                    f'coordinates up to {self._largest:.2f} with unit = "mm": the server seems to '
+                    'send metres; set unit = "m" in [mocap]'
+                )
+        return None

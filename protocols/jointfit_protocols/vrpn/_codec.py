@@ -1,0 +1,284 @@
+"""Decoder of a VRPN byte stream: cookie, messages and descriptions of types.
+
+A datagram contains whole messages, so that the bytes of datagrams may be fed between whole messages
+of a TCP connection. A message has no start pattern and no checksum. After an impossible length,
+everything up to the next cookie is discarded; a driver closes the connection.
+
+Invariant: bytes in, messages out; no socket, no clock. The output does not depend on the pieces.
+Pending bytes are at most one message, descriptions at most `MAX_IDS` of each kind.
+"""
+
+from __future__ import annotations
+
+import re
+from enum import IntEnum
+
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.vrpn._messages import (
+    ACCELERATION,
+    HEADER,
+    MAX_IDS,
+    MAX_MESSAGE,
+    MAX_NAME,
+    MOTION_LAYOUT,
+    NAME_LENGTH,
+    PING,
+    PONG,
+    POS_QUAT,
+    POSE_LAYOUT,
+    VELOCITY,
+    Cookie,
+    Disconnect,
+    Ping,
+    Pong,
+    SenderDescription,
+    SystemType,
+    TrackerMotion,
+    TrackerPose,
+    TypeDescription,
+    UdpChannel,
+    VrpnContent,
+    VrpnMessage,
+)
+
+COOKIE_BYTES = 24
+HEADER_BYTES = HEADER.size
+_MAGIC = b"vrpn: ver. "
+_COOKIE = re.compile(rb"vrpn: ver\. (\d\d)\.(\d\d)  ([0-3])\0{5}", re.DOTALL)
+_FIRST = int.from_bytes(_MAGIC[:4], "big")
+"""Length field that the first bytes of a cookie look like."""
+_US = 1_000_000
+_POSE_BYTES = HEADER_BYTES + POSE_LAYOUT.size
+_RUN = 4096
+"""Bytes without a message after which they are reported."""
+
+
+class _Kind(IntEnum):
+    POSE = 1
+    VELOCITY = 2
+    ACCELERATION = 3
+    PING = 4
+    PONG = 5
+
+
+_KINDS = {
+    POS_QUAT: _Kind.POSE,
+    VELOCITY: _Kind.VELOCITY,
+    ACCELERATION: _Kind.ACCELERATION,
+    PING: _Kind.PING,
+    PONG: _Kind.PONG,
+}
+
+
+class VrpnCodec:
+    """Decoder of one side of a connection.
+
+    A cookie starts a new connection: the descriptions of the last one are discarded.
+    """
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._needed = HEADER_BYTES
+        """Bytes in the buffer from which the next message can be decoded."""
+        self._lost = False
+        self._run = 0
+        self._kinds: dict[int, _Kind] = {}
+        self.senders: dict[int, str] = {}
+        """Names of the senders that the peer has described."""
+        self.types: dict[int, str] = {}
+        """Names of the message types that the peer has described."""
+        self.messages = 0
+        """Messages so far; cookies count."""
+        self.discarded = 0
+        """Bytes without a message so far."""
+
+    @property
+    def pending(self) -> int:
+        """Bytes of an incomplete message."""
+        return len(self._buffer)
+
+    @property
+    def lost(self) -> bool:
+        """Whether the stream cannot be decoded before the next cookie."""
+        return self._lost
+
+    def feed(self, data: bytes) -> list[VrpnContent | CorruptBytes]:
+        """Return the messages that `data` completes, in wire order; never raises."""
+        buffer = self._buffer
+        buffer += data
+        if len(buffer) < self._needed:
+            return []
+
+        found: list[VrpnContent | CorruptBytes] = []
+        at, end = 0, len(buffer)
+        unpack, unpack_pose, kinds = HEADER.unpack_from, POSE_LAYOUT.unpack_from, self._kinds
+        while True:
+            if self._lost:
+                at = self._seek_cookie(at, found)
+            if end - at < HEADER_BYTES:
+                self._needed = HEADER_BYTES
+                break
+            length, seconds, micros, sender, kind, _ = unpack(buffer, at)
+            if length == _FIRST:
+                at = self._cookie(at, found)
+                continue
+            if not HEADER_BYTES <= length <= MAX_MESSAGE:
+                self._lost = True
+                continue
+
+            size = (length + 7) & ~7
+            if end - at < size:
+                self._needed = size
+                break
+            # The common case first: it is nearly the whole stream.
+            if length == _POSE_BYTES and kinds.get(kind) is _Kind.POSE and micros < _US:
+                sensor, x, y, z, qx, qy, qz, qw = unpack_pose(buffer, at + HEADER_BYTES)
+                found.append(
+                    TrackerPose(seconds * _US + micros, sender, sensor, x, y, z, qx, qy, qz, qw)
+                )
+                self.messages += 1
+            else:
+                body = bytes(buffer[at + HEADER_BYTES : at + length])
+                content = self._content(seconds, micros, sender, kind, body)
+                if isinstance(content, str):
+                    self.discarded += size
+                    found.append(CorruptBytes(size, content))
+                else:
+                    self.messages += 1
+                    found.append(content)
+            at += size
+
+        del buffer[:at]
+        return found
+
+    def flush(self) -> list[CorruptBytes]:
+        """Discard an incomplete message: the connection is closed."""
+        pending = len(self._buffer) + self._run
+        self.discarded += len(self._buffer)
+        self._buffer.clear()
+        self._needed, self._run = HEADER_BYTES, 0
+        return [CorruptBytes(pending, "incomplete message")] if pending else []
+
+    # --- connection ---------------------------------------------------------------------------
+
+    def _seek_cookie(self, at: int, found: list[VrpnContent | CorruptBytes]) -> int:
+        """Return the start of the next cookie, or of bytes that may be one; count those before."""
+        start = self._buffer.find(_MAGIC, at)
+        if start >= 0:
+            self._lost = False
+        else:
+            start = max(at, len(self._buffer) - len(_MAGIC) + 1)
+
+        self.discarded += start - at
+        self._run += start - at
+        while self._run >= _RUN or (self._run and not self._lost):
+            part = min(self._run, _RUN)
+            found.append(CorruptBytes(part, "no message: lost until the next connection"))
+            self._run -= part
+        return start
+
+    def _cookie(self, at: int, found: list[VrpnContent | CorruptBytes]) -> int:
+        """Append the cookie at `at` and forget the peer before; return the place after it."""
+        match = _COOKIE.fullmatch(self._buffer, at, at + COOKIE_BYTES)
+        if match is None:
+            self.discarded += 1
+            self._run += 1
+            self._lost = True
+            return at + 1
+        self.senders.clear()
+        self.types.clear()
+        self._kinds.clear()
+        self.messages += 1
+        found.append(Cookie(int(match[1]), int(match[2]), int(match[3])))
+        return at + COOKIE_BYTES
+
+    # --- messages -----------------------------------------------------------------------------
+
+    def _content(  # noqa: PLR0911 - one case a type
+        self, seconds: int, micros: int, sender: int, kind: int, body: bytes
+    ) -> VrpnContent | str:
+        """Return one message, or the reason why it is rejected."""
+        if kind < 0:
+            return self._system(seconds * _US + micros, sender, kind, body)
+        if micros >= _US:
+            return "more than 999 999 microseconds"
+
+        time_us = seconds * _US + micros
+        match self._kinds.get(kind):
+            case _Kind.POSE:
+                return "pose without 64 bytes"
+            case _Kind.VELOCITY | _Kind.ACCELERATION:
+                if len(body) != MOTION_LAYOUT.size:
+                    return "velocity or acceleration without 72 bytes"
+                return TrackerMotion(self.types[kind], time_us, sender, *MOTION_LAYOUT.unpack(body))
+            case _Kind.PING:
+                return Ping(time_us, sender)
+            case _Kind.PONG:
+                return Pong(time_us, sender)
+        return VrpnMessage(time_us, sender, kind, body)
+
+    def _system(self, time_us: int, sender: int, kind: int, body: bytes) -> VrpnContent | str:
+        match kind:
+            case SystemType.SENDER | SystemType.TYPE:
+                return self._description(sender, kind, body)
+            case SystemType.UDP:
+                if not 0 < sender <= 0xFFFF:  # noqa: PLR2004 - highest port
+                    return "no UDP port"
+                return UdpChannel(sender, _text(body))
+            case SystemType.DISCONNECT:
+                return Disconnect()
+        return VrpnMessage(time_us, sender, kind, body)
+
+    def _description(self, number: int, kind: int, body: bytes) -> VrpnContent | str:
+        if not 0 <= number < MAX_IDS:
+            return f"described id outside 0..{MAX_IDS - 1}"
+        if len(body) < NAME_LENGTH.size:
+            return "description without a name"
+        (length,) = NAME_LENGTH.unpack_from(body)
+        if length > len(body) - NAME_LENGTH.size or length > MAX_NAME + 1:
+            return "name longer than its description"
+        name = _text(body[NAME_LENGTH.size : NAME_LENGTH.size + length])
+
+        if kind == SystemType.SENDER:
+            self.senders[number] = name
+            return SenderDescription(number, name)
+        self.types[number] = name
+        self._kinds.pop(number, None)
+        if name in _KINDS:
+            self._kinds[number] = _KINDS[name]
+        return TypeDescription(number, name)
+
+
+def whole_messages(data: bytes) -> int:
+    """Return the bytes of `data` up to the end of its last whole message or cookie.
+
+    Decodes no content. An impossible length counts as the end of the data: the codec rejects it.
+    """
+    at, end = 0, len(data)
+    while end - at >= HEADER_BYTES:
+        length = int.from_bytes(data[at : at + 4], "big")
+        if length == _FIRST:
+            size = COOKIE_BYTES
+        elif HEADER_BYTES <= length <= MAX_MESSAGE:
+            size = (length + 7) & ~7
+        else:
+            return end
+        if end - at < size:
+            break
+        at += size
+    return at
+
+
+def is_whole(datagram: bytes) -> bool:
+    """Return whether a datagram consists of whole messages; a cookie is none."""
+    at, end = 0, len(datagram)
+    while end - at >= HEADER_BYTES:
+        length = int.from_bytes(datagram[at : at + 4], "big")
+        if not HEADER_BYTES <= length <= MAX_MESSAGE:
+            return False
+        at += (length + 7) & ~7
+    return at == end > 0
+
+
+def _text(data: bytes) -> str:
+    return data[:MAX_NAME].split(b"\0", 1)[0].decode("utf-8", "replace")
