@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample
+from jointfit_daemon.tools.discovery._serial_listening import _decode
 from jointfit_drivers.lpms import LpmsDecoder, LpmsImu, LpmsSettings
 from jointfit_protocols.lpms import encode
 from jointfit_protocols.lpms.configuration import (
@@ -202,8 +203,7 @@ def test_packets_of_another_length_are_reported_once_with_both_lengths() -> None
     found = fed(under_test, [wire] * 10)
     (text,) = texts(found, "warning")
     assert text.startswith("data packets of 36 bytes, expected 20 (32 bit) or 12 (16 bit)")
-    assert under_test.discarded_bytes == 10 * len(wire)
-    assert under_test.messages == 0
+    assert (under_test.messages, under_test.discarded_bytes) == (10, 0)
 
 
 def test_outputs_that_the_sensor_names_are_skipped() -> None:
@@ -238,3 +238,18 @@ def test_any_messages_are_decoded_or_counted(wires: list[bytes]) -> None:
     found = fed(under_test, wires) + under_test.flush()
     lost = sum(event.discarded for event in found if isinstance(event, Corrupt))
     assert lost == under_test.discarded_bytes <= sum(map(len, wires))
+
+
+@pytest.mark.parametrize("outputs", [("quaternion",), ("accelerometer", "quaternion", "euler")])
+def test_a_stream_is_recognized_with_any_outputs(outputs: tuple[str, ...]) -> None:
+    layout = PacketLayout(TABLES[3], TABLES[3].mask(*outputs))
+    values = [0.0] * layout.values
+    values[layout.places["quaternion"]] = [1.0, 0.0, 0.0, 0.0]
+    chunks = [
+        Chunk(n * PERIOD_NS, encode(9, layout.encode(5 * n, values, floats=True)))
+        for n in range(1, 40)
+    ]
+    found = _decode(115_200, chunks)
+    assert [device.driver for device in found] == ["lpms"]
+    assert (found[0].samples > 0) == (len(outputs) == 1)
+    assert bool(found[0].warnings) == (len(outputs) > 1)
