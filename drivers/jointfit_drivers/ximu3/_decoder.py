@@ -12,6 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
+from jointfit_drivers.serial_imu import ArrivalStamps
 from jointfit_drivers.ximu3._continuity import XImu3Continuity, XImu3Point
 from jointfit_drivers.ximu3._device_reports import DeviceReports
 from jointfit_drivers.ximu3._orientation import is_orientation, orientation_of
@@ -26,10 +27,6 @@ if TYPE_CHECKING:
     from jointfit_drivers.ximu3._settings import XImu3Settings
     from jointfit_protocols.ximu3 import XImu3Reply
 
-_BITS = 10
-"""Bits of one byte on the line, 8N1."""
-_SILENCE_FLOOR_NS = 250_000_000
-"""Lower bound, ns, of the silence after which a pending message is discarded."""
 _LATEST_TICKS = 1 << 52
 """Device time, us, that is not plausible: 142 years."""
 _RATE_TOLERANCE = 0.1
@@ -61,8 +58,7 @@ class XImu3Decoder:
         self._settings = settings
         self._codec = XImu3Codec()
         self._reports = DeviceReports(settings.world)
-        self._byte_ns = _BITS * 1e9 / settings.baud if settings.transport == "uart" else 0.0
-        self._silence_ns = max(1.5 * MAX_LINE * self._byte_ns, _SILENCE_FLOOR_NS)
+        self._stamps = ArrivalStamps(settings.line_baud, MAX_LINE)
         self._raw = None
         if settings.orientation == "gateway":
             self._raw = XImu3RawOrientation(
@@ -72,7 +68,7 @@ class XImu3Decoder:
         self._held: _Measurement | None = None
         self._gate = OrientationGate()
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
-        self._last_ns = self._arrival_ns = self._last_ticks = 0
+        self._last_ticks = 0
         self._refused = self._refused_bytes = 0
         self._norm_checked = self._rate_checked = False
 
@@ -94,11 +90,9 @@ class XImu3Decoder:
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the content that `chunk` completed, in wire order; never raises."""
         out: list[Decoded] = []
-        if self._codec.pending:
-            quiet_ns = chunk.t_ns - self._last_ns - len(chunk.data) * self._byte_ns
-            if quiet_ns > self._silence_ns:  # the rest of the pending message was lost
-                out = self._take(self._codec.flush())
-        self._last_ns = chunk.t_ns
+        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
+            out = self._take(self._codec.flush())
+        self._stamps.start_chunk(chunk.t_ns)
         found = self._codec.feed(chunk.data)
         return out + self._take(found) if found else out
 
@@ -150,12 +144,13 @@ class XImu3Decoder:
             if q is None:
                 return [self._refuse(message, "quaternion norm is not 1"), *self._norm_warning()]
 
-        # Arrival of the first byte. USB devices and ptys are faster than the configured speed:
-        # keep the stamps in order.
-        since = self._codec.fed - message.end + message.size
-        self._arrival_ns = max(self._arrival_ns, self._last_ns - round(since * self._byte_ns))
-        step = self._continuity.step(XImu3Point(message.ticks, self._arrival_ns, q))
-        return self._continue(step, _Measurement(message, self._arrival_ns, native, q))
+        arrived_ns = self._arrival_of(message)
+        step = self._continuity.step(XImu3Point(message.ticks, arrived_ns, q))
+        return self._continue(step, _Measurement(message, arrived_ns, native, q))
+
+    def _arrival_of(self, message: XImu3Data) -> int:
+        """Return the arrival of the first byte of `message`, monotonic ns."""
+        return self._stamps.stamp(self._codec.fed - message.end + message.size)
 
     def _continue(self, step: XImu3Step, measured: _Measurement) -> list[Decoded]:
         """Return the samples of the held measurement, if confirmed, then those of `measured`."""
@@ -201,7 +196,7 @@ class XImu3Decoder:
             return []
         if abs(message.ticks - self._last_ticks) > _OLD_PULSE_US:
             return [self._refuse(message, "time of an edge far from that of the measurements")]
-        return [SyncPulse(self._last_ns, message.ticks, wire)]
+        return [SyncPulse(self._arrival_of(message), message.ticks, wire)]
 
     def _rate_warning(self) -> list[Decoded]:
         """Return a warning, once, if the device sends at another rate than configured."""

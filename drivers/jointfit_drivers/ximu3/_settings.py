@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field
 from typing_extensions import override
 
-from jointfit_daemon.driver import FASTEST_BAUD, SLOWEST_BAUD, ImuSettings, port_path_fault
-from jointfit_drivers import gateway_orientation
+from jointfit_drivers.gateway_orientation import GatewaySettings
+from jointfit_drivers.serial_imu import SerialImuSettings
 from jointfit_protocols.ximu3 import BASE_RATE_HZ
 
 if TYPE_CHECKING:
@@ -20,18 +20,9 @@ _MAGNETIC_HZ = 20
 """Rate of the magnetometer."""
 
 
-class XImu3Settings(ImuSettings):
+class XImu3Settings(GatewaySettings, SerialImuSettings):
     """One x-IMU3 on a serial port or USB."""
 
-    port: str = Field(description="serial port, preferably a link under /dev/serial/by-id")
-    baud: int = Field(
-        115_200, ge=SLOWEST_BAUD, le=FASTEST_BAUD, description="speed the device runs at, baud"
-    )
-    transport: Literal["uart", "usb"] = Field(
-        "uart",
-        description="`uart`: the device's serial interface at `baud`, also behind a USB bridge; "
-        "stamps are back-dated by the bytes that came. `usb`: the device's own USB port",
-    )
     passive: bool = Field(
         False,
         description="only listen: send nothing and read no settings. For boards that only send "
@@ -55,23 +46,6 @@ class XImu3Settings(ImuSettings):
     ignore_magnetometer: bool | None = Field(
         None,
         description="required `ahrs_ignore_magnetometer` of the device; default: any, reported",
-    )
-    orientation: Literal["device", "gateway"] = Field(
-        "device",
-        description="computed by the `device`, or by the `gateway` from raw angular rates and "
-        "accelerations (needs the extra `vqf`); the same choice for all IMUs of a rig is best",
-    )
-    magnetometer: bool = Field(
-        False,
-        description='with `orientation = "gateway"`: heading by magnetometer; left out it drifts '
-        "freely. The same for all IMUs",
-    )
-    settle_s: float = Field(
-        gateway_orientation.LONGEST_SETTLE_S,
-        ge=0,
-        le=60,
-        description='with `orientation = "gateway"`: longest time, s, after the start (or a gap) '
-        "without output while the orientation is uncertain; 1.5 s at rest",
     )
     sync_wire: int | None = Field(
         None, ge=0, description="number of the sync wire of the rig at its accessory's sync input"
@@ -106,29 +80,6 @@ class XImu3Settings(ImuSettings):
             for key, value in checked.items():
                 if value is not None:
                     yield key, "a passive driver sends nothing: remove the key, or passive"
-
-    @field_validator("port")
-    @classmethod
-    def _port_with_a_name(cls, port: str) -> str:
-        if (fault := port_path_fault(port)) is not None:
-            raise ValueError(fault)
-        return port
-
-    @field_validator("orientation")
-    @classmethod
-    def _filter_that_is_installed(cls, orientation: str) -> str:
-        """Refuse a missing package before the port is opened."""
-        if orientation == "gateway" and not gateway_orientation.is_installed():
-            raise ValueError(gateway_orientation.PACKAGE_MISSING)
-        return orientation
-
-    @field_validator("magnetometer")
-    @classmethod
-    def _magnetometer_of_a_filter(cls, magnetometer: bool, info: ValidationInfo) -> bool:
-        """Refuse a magnetometer without a filter on the gateway."""
-        if magnetometer and info.data.get("orientation") == "device":
-            raise ValueError('needs orientation = "gateway": a device uses its own as it is set')
-        return magnetometer
 
 
 def rate_divisor(rate_hz: float) -> int | None:
