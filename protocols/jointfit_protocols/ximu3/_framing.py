@@ -12,6 +12,7 @@ import re
 
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.ximu3._messages import (
+    ESCAPE,
     LAYOUTS,
     TERMINATOR,
     MessageFault,
@@ -26,6 +27,12 @@ MAX_LINE = 4096
 _SEARCHED = 256
 """Last bytes of a corrupt line that are searched for a message: more than any with numbers."""
 _MOST_PENDING = MAX_LINE + _SEARCHED
+_NEVER = 1 << 62
+"""Modulus that makes -1, the result of a search without a match, larger than every position."""
+_QUATERNION = (0xD1, 26)
+"""First byte and size of a binary quaternion."""
+_new_data = tuple.__new__
+"""Constructor of a message from all of its fields, in half of the time of its own."""
 _TOO_LONG = f"line longer than {MAX_LINE} bytes"
 _CUT_OFF = "cut off"
 _STARTS = re.compile(
@@ -44,6 +51,7 @@ class XImu3Codec:
 
     def __init__(self) -> None:
         self._pending = b""
+        self._usual = _QUATERNION
         self._too_long = False  # whether the pending line lost its beginning
         self.fed = 0
         """Bytes fed so far."""
@@ -64,11 +72,30 @@ class XImu3Codec:
         at, base = 0, self.fed - len(self._pending)
         self.fed += len(data)
 
-        while (after := buffer.find(TERMINATOR, at) + 1) > 0:
+        # Most lines are binary messages of one kind: their layout is known.
+        (first, size), (kind, layout) = self._usual, LAYOUTS[self._usual]
+        size, unpack_from, find = 0 if self._too_long else size, layout.unpack_from, buffer.find
+        escape = find(ESCAPE) % _NEVER
+        while (after := find(TERMINATOR, at) + 1) > 0:
+            if after - at == size and buffer[at] == first and after <= escape:
+                read = unpack_from(buffer, at)
+                fields = (kind, read[0], read[1:], b"", True, size, base + after, None)
+                found.append(_new_data(XImu3Data, fields))
+                self.messages += 1
+                at = after
+                continue
+
             message = self._message(buffer[at:after], base + after, found)
             if message is not None:
                 self.messages += 1
                 found.append(message)
+                usual = (buffer[at], after - at)
+                if usual in LAYOUTS:
+                    self._usual = usual
+                    (first, size), (kind, layout) = usual, LAYOUTS[usual]
+                    unpack_from = layout.unpack_from
+            if escape < after:
+                escape = find(ESCAPE, after) % _NEVER
             at = after
 
         self._pending = self._shortened(buffer[at:], found) if at < len(buffer) else b""

@@ -34,7 +34,6 @@ OBJECT = 0x7B
 MOST_CHANNELS = 3
 """Multiplexers in a row; more are corrupt."""
 _BINARY = 0x80
-_ESCAPED = {0xDC: b"\n", 0xDD: b"\xdb"}
 _HEAD = struct.Struct("<BQ")
 _TICKS = 1 << 64
 _PLAUSIBLE_TICKS = 1 << 52
@@ -191,14 +190,9 @@ def parse_rest(rest: bytes, end: int) -> XImu3Data | XImu3Reply | None:
 
 def unstuffed(line: bytes) -> bytes | None:
     """Return the bytes without escapes; None if an escape is malformed."""
-    head, *parts = line.split(b"\xdb")
-    plain = [head]
-    for part in parts:
-        escaped = _ESCAPED.get(part[0]) if part else None
-        if escaped is None:
-            return None
-        plain += escaped, part[1:]
-    return b"".join(plain)
+    if line.count(ESCAPE) != line.count(b"\xdb\xdc") + line.count(b"\xdb\xdd"):
+        return None
+    return line.replace(b"\xdb\xdc", b"\n").replace(b"\xdb\xdd", b"\xdb")
 
 
 def _parse_data(plain: bytes, size: int, end: int, channel: int | None) -> Line:
@@ -208,8 +202,8 @@ def _parse_data(plain: bytes, size: int, end: int, channel: int | None) -> Line:
 
     layout = LAYOUTS.get((first, len(plain)))
     if layout is not None:
-        ticks, *values = layout[1].unpack(plain)
-        return XImu3Data(layout[0], ticks, tuple(values), b"", True, size, end, channel)
+        read = layout[1].unpack(plain)
+        return XImu3Data(layout[0], read[0], read[1:], b"", True, size, end, channel)
 
     kind = _TEXTS.get(first ^ _BINARY)
     if kind is None:
