@@ -31,6 +31,8 @@ class MocapDriver:
     name: str
     port: int | None = None
     """Default of its key ``command_port``; None without that key."""
+    up_axis: str = "y"
+    """Default of its key ``up_axis``; ``auto`` if the server announces the axis."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -301,8 +301,12 @@ QUESTIONS: tuple[Question, ...] = (
         "choice",
         "Vertical axis of the stream",
         "Motive's default is y.",
-        subjects=_if(has_cameras),
-        default=_always("y"),
+        subjects=lambda answers, found: (
+            ONCE
+            if has_cameras(answers) and mocap_driver_of(answers, found).up_axis != "auto"
+            else ()
+        ),
+        default=lambda answers, found, _: mocap_driver_of(answers, found).up_axis,
         choices=_list(("x", ""), ("y", ""), ("z", "")),
     ),
     Question(

@@ -128,7 +128,8 @@ def _mocap(answers: Given, found: Found) -> dict[str, Any]:
     table: dict[str, Any] = {"driver": driver.name, "server": host}
     if port and driver.port is not None:
         table["command_port"] = port
-    table["up_axis"] = answers["up_axis", ""]
+    if driver.up_axis != "auto":  # otherwise the driver reads it from the stream
+        table["up_axis"] = answers["up_axis", ""]
     if answers.get(("plate", "")) is not None:
         table["plate"] = answers["plate", ""]
     named = {part: answers["markers", part] for part in marked_parts(answers)}

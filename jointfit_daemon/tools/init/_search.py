@@ -49,7 +49,7 @@ def drivers_found() -> Found:
             imu.append(_imu_driver(name, fields))
         elif issubclass(driver.Settings, MocapSettings) and "server" in fields:
             port = fields["command_port"].default if "command_port" in fields else None
-            mocap.append(MocapDriver(name, port))
+            mocap.append(MocapDriver(name, port, fields["up_axis"].default))
     return Found(imu_drivers=tuple(imu), mocap_drivers=tuple(mocap))
 
 
