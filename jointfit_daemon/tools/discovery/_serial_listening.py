@@ -52,7 +52,10 @@ class SerialTraffic:
 
 
 def usual_bauds() -> tuple[int, ...]:
-    """Return the speeds of all installed drivers of byte streams, the most frequent first."""
+    """Return the speeds of all installed drivers of byte streams, the most frequent first.
+
+    Speeds that this system cannot set, such as 128 000 baud, are left out.
+    """
     speeds: list[tuple[int, ...]] = [
         getattr(driver, "usual_bauds", _DEFAULT_BAUDS)
         for _, driver in installed_drivers()
@@ -61,7 +64,7 @@ def usual_bauds() -> tuple[int, ...]:
     longest = max(map(len, speeds), default=0)
     # One speed of every driver in turn, so that each default comes before any rare speed.
     turns = [bauds[k] for k in range(longest) for bauds in speeds if k < len(bauds)]
-    return tuple(dict.fromkeys(turns))
+    return tuple(baud for baud in dict.fromkeys(turns) if hasattr(termios, f"B{baud}"))
 
 
 def listen_serial(

@@ -64,6 +64,8 @@ def _sensors(
 
 
 def _imu(number: int, device: DecodedDevice, connection: dict[str, Any]) -> str:
+    from jointfit_daemon.driver import find_driver
+
     keys: dict[str, Any] = {
         "id": f"imu{number}",
         "segment": "SEGMENT",
@@ -72,7 +74,13 @@ def _imu(number: int, device: DecodedDevice, connection: dict[str, Any]) -> str:
     }
     if device.usual_rate_hz is not None:
         keys["rate_hz"] = device.usual_rate_hz
-    return _table("[[imu]]", keys)
+
+    # keys without default that no stream shows
+    fields = find_driver(device.driver).Settings.model_fields
+    missing = [key for key, field in fields.items() if field.is_required() and key not in keys]
+    return _table("[[imu]]", keys) + "".join(
+        f"# add {key}: {fields[key].description}\n" for key in missing
+    )
 
 
 def _cameras(servers: Sequence[FoundServer]) -> Iterator[str]:

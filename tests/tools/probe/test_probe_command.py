@@ -186,3 +186,12 @@ base = "jointfit/leg"
         "can0", 0x221, "little",
     )  # fmt: skip
     assert (cameras.server, cameras.rigid_body) == ("192.168.1.2", {"thigh": "Thigh"})
+
+
+def test_keys_that_no_stream_shows_are_named_with_their_meaning() -> None:
+    imu = DecodedDevice("lpms", {"baud": 115_200}, 99, 99, 100.0, 0)
+    serial = [SerialTraffic("/dev/ttyUSB0", None, {115_200: 9}, 115_200, (imu,))]
+    text = _rig_lines.rig_lines([], serial, [], [])
+    assert "\n# add generation: 1: B2, CU2, URS2" in text
+    (table,) = tomllib.loads(text)["imu"]
+    assert (table["driver"], table["port"], table["baud"]) == ("lpms", "/dev/ttyUSB0", 115_200)
