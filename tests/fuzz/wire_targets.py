@@ -16,6 +16,7 @@ from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import ChunkArrived, Configured, SourceClosed, SourceOpened
 from jointfit_daemon.pipeline.sources import SourceState
+from jointfit_drivers.bno085 import Bno085Imu, Bno085Settings
 from jointfit_drivers.natnet._open_requests import OpenRequests
 from jointfit_drivers.qtm import QtmDecoder, QtmSettings
 from jointfit_drivers.vicon import ViconDecoder, ViconSettings
@@ -23,6 +24,20 @@ from jointfit_drivers.vrpn import VrpnDecoder, VrpnSettings
 from jointfit_drivers.witmotion import WitMotionImu, WitMotionSettings
 from jointfit_drivers.ximu3 import XImu3Imu, XImu3Settings
 from jointfit_protocols import qtm, vicon, vrpn
+from jointfit_protocols.bno085 import (
+    RVC_BYTES,
+    HubReport,
+    HubReportId,
+    RvcCodec,
+    RvcFrame,
+    ShtpCodec,
+    encode_base_time,
+    encode_firmware,
+    encode_report,
+    encode_rvc,
+    encode_shtp,
+    encode_status,
+)
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, pack_frames, unpack_frames
 from jointfit_protocols.can.slcan import SlcanCodec
 from jointfit_protocols.can.slcan import encode_frame as encode_slcan
@@ -187,6 +202,40 @@ def seeds_xbus_records() -> list[bytes]:
     packed = b"".join(bytes((data[2], data[3])) + data[4:-1] for data in samples)
     kinds = [bytes((kind, 6)) + b"\x07MTi-30"[:6] for kind in ANSWERS]
     return [packed, packed + b"".join(kinds), b"".join(kinds)]
+
+
+def run_bno085_bytes(data: bytes) -> None:
+    """Decode BNO085 bytes in pieces, in both modes; every byte is accounted for."""
+    rvc, shtp = RvcCodec(), ShtpCodec()
+    frames, packets = [], []
+    for piece in cut(data):
+        frames += rvc.feed(piece)
+        packets += shtp.feed(piece)
+    frames += rvc.flush()
+    packets += shtp.flush()
+    used = sum(RVC_BYTES if isinstance(item, RvcFrame) else item.discarded for item in frames)
+    between = sum(
+        item.discarded if isinstance(item, CorruptBytes) else item.size - 2 for item in packets
+    )
+    if not used == between + shtp.flags == len(data):
+        raise UnaccountedError(f"{len(data)} bytes, {used} in RVC, {between} between flags")
+
+    for baud in (115_200, 3_000_000):
+        settings = {"id": "S1", "segment": "thigh", "driver": "bno085", "port": "p", "baud": baud}
+        decoder = Bno085Imu(Bno085Settings.model_validate(settings)).decoder()
+        for number, piece in enumerate(cut(data)):
+            decoder.feed(Chunk(BEGIN_NS + number * _MS, piece))
+        decoder.flush()
+
+
+def seeds_bno085() -> list[bytes]:
+    """Return frames of both modes."""
+    frames = [encode_rvc(RvcFrame(k, (10 * k, -110, 2085), (-371, -20, 977))) for k in range(4)]
+    report = HubReport(HubReportId.ROTATION_VECTOR, 1, 3, 1, (0.0, 0.0, 0.6, 0.8, 0.05))
+    packets = [encode_shtp(3, k, encode_base_time(12) + encode_report(report)) for k in range(4)]
+    packets += [encode_shtp(1, 0, b"\x01"), encode_status(256), encode_status(None)]
+    packets.append(encode_shtp(2, 0, encode_firmware((3, 12, 4), 0x7E7D, 230)))
+    return [b"".join(frames), b"".join(packets)]
 
 
 def run_witmotion_bytes(data: bytes) -> None:
@@ -501,6 +550,7 @@ TARGETS = (
     Target("ximu3-driver", run_ximu3_driver, seeds_ximu3, share=4),
     Target("serial-core", run_serial_core, seeds_xbus, share=1),
     Target("slcan-source", run_slcan, seeds_slcan, share=4),
+    Target("bno085-bytes", run_bno085_bytes, seeds_bno085, share=4),
     Target("witmotion-bytes", run_witmotion_bytes, seeds_witmotion, share=4),
     Target("can-records", run_can_records, seeds_can_records, share=3),
     Target("can-source", run_can_source, seeds_can_core, share=4),

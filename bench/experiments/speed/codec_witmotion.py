@@ -1,4 +1,4 @@
-"""WitMotion: codec and decoder per frame, beside the package `witmotion` in the same run."""
+"""WitMotion: codec and decoder per frame, compared with the package `witmotion` in the same run."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Virtual IMUs and a virtual motion-capture server that behave like real devices."""
 
+from jointfit_simulators.devices._bno085_device import Bno085Device, Bno085DeviceOptions
 from jointfit_simulators.devices._cameras import CameraFrames, Cameras
 from jointfit_simulators.devices._clocks import (
     NS,
@@ -52,6 +53,8 @@ __all__ = [
     "NS",
     "WITH_QUATERNION",
     "Address",
+    "Bno085Device",
+    "Bno085DeviceOptions",
     "Bodies",
     "CameraFrames",
     "Cameras",

@@ -21,6 +21,8 @@ from jointfit_protocols.xcdi import XcdiIds
 from jointfit_protocols.ximu3 import BASE_RATE_HZ
 from jointfit_simulators.devices import (
     WITH_QUATERNION,
+    Bno085Device,
+    Bno085DeviceOptions,
     LpmsCanDevice,
     LpmsCanDeviceOptions,
     LpmsDevice,
@@ -156,6 +158,12 @@ def _mip(place: SensorPlace, port: Path) -> ConnectedImu:
     return ConnectedImu(device, [f'port = "{port}"', "baud = 921600"], str(port))
 
 
+def _bno085(place: SensorPlace, port: Path) -> ConnectedImu:
+    noise = line_noise(place.knobs, place.name)
+    device = Bno085Device(port, options=Bno085DeviceOptions(mode="shtp"), wire_noise=noise)
+    return ConnectedImu(device, [f'port = "{port}"', "baud = 3000000"], str(port))
+
+
 def _vectornav(place: SensorPlace, port: Path) -> ConnectedImu:
     imu_rate_hz = 800
     divisor = max(round(imu_rate_hz / place.knobs.rate_hz), 1)
@@ -230,6 +238,7 @@ def ids_toml(ids: XcdiIds) -> str:
 
 
 IMU_FAMILIES: dict[str, UartFamily | CanFamily] = {
+    "bno085": UartFamily(_bno085),
     "lpms": UartFamily(_lpms),
     "lpms-can": CanFamily(_lpms_can),
     "mip": UartFamily(_mip),

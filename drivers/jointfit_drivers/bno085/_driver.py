@@ -1,0 +1,66 @@
+"""Driver of Bosch / CEVA BNO085 and BNO086 on a serial port.
+
+`RvcDecoder` and `ShtpDecoder` are the pure part. `Bno085Imu.run` opens the port, makes the device
+send and reads until cancelled. The two share only chunks. The speed of the port is that of the
+mode.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from jointfit_drivers.bno085._handshake import ensure_rvc, ensure_shtp
+from jointfit_drivers.bno085._rvc_decoder import RvcDecoder
+from jointfit_drivers.bno085._settings import RVC_BAUD, SHTP_BAUD, Bno085Settings
+from jointfit_drivers.bno085._shtp_decoder import ShtpDecoder
+from jointfit_drivers.gateway_orientation import RawSamples
+from jointfit_drivers.ports.serial_port import SerialPort
+
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit, Wire
+
+_PERIODS_OF_SILENCE = 3
+"""Smallest number of sample periods without data after which a device counts as silent."""
+
+
+class Bno085Imu:
+    """One BNO085 or BNO086: orientation and an 8-bit number of samples, without device time."""
+
+    Settings: ClassVar[type[Bno085Settings]] = Bno085Settings
+    wire: ClassVar[Wire] = "stream"
+    usual_bauds: ClassVar[tuple[int, ...]] = (RVC_BAUD, SHTP_BAUD)
+
+    def __init__(self, settings: Bno085Settings) -> None:
+        self._settings = settings
+
+    def decoder(self) -> RvcDecoder | ShtpDecoder:
+        """Return the decoder from chunks to samples, for live data and replay."""
+        settings = self._settings
+        if settings.baud == RVC_BAUD:
+            return RvcDecoder(settings.line_baud, settings.euler)
+        raw = None
+        if settings.orientation == "gateway":
+            raw = RawSamples(
+                settings.rate_hz,
+                magnetometer=settings.magnetometer,
+                settle_s=settings.settle_s,
+            )
+        return ShtpDecoder(settings.line_baud, raw)
+
+    async def run(self, emit: Emit) -> None:
+        """Open the port, make the device send, and read until cancelled.
+
+        Raises
+        ------
+        DeviceLostError
+            The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
+        DeviceMisconfiguredError
+            The file is no serial port, the device is of another kind or in another mode, or it
+            does not accept the rate.
+        """
+        settings = self._settings
+        ensure = ensure_rvc if settings.baud == RVC_BAUD else ensure_shtp
+        with SerialPort(settings.port, settings.baud) as port:
+            await ensure(port, emit, settings)
+            silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
+            await port.pump(emit, silence_s)

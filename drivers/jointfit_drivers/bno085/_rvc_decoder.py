@@ -1,0 +1,162 @@
+r"""Decoder of the mode UART-RVC: Euler angles to samples with canonical orientation.
+
+The data sheet lets yaw, pitch and roll follow each other about z, y and x. Its own example message
+contradicts this: pitch -1.10 and roll 20.85 degrees with accelerations of -371, -20 and 977 mg.
+With pitch about x and roll about y (``zxy``),
+
+.. math:: R = R_z(\text{yaw})\, R_x(\text{pitch})\, R_y(\text{roll}), \qquad
+    R^T e_z = (-0.356, -0.019, 0.934),
+
+which is the measured direction (-0.355, -0.019, 0.935); ``zyx`` gives (0.019, 0.356, 0.934). The
+default is therefore ``zxy``, and accelerations at rest show which one fits the device.
+
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+"""
+
+from __future__ import annotations
+
+from math import cos, hypot, radians, sin, sqrt
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
+from jointfit_drivers.serial_imu import ArrivalStamps
+from jointfit_protocols.bno085 import RVC_BYTES, RvcCodec, RvcFrame
+from jointfit_protocols.orientation import OrientationGate, Quaternion
+
+if TYPE_CHECKING:
+    from typing import Literal
+
+    from jointfit_daemon.model import Chunk, Decoded, Vector
+    from jointfit_protocols.corrupt import CorruptBytes
+
+_ANGLE = radians(0.01)
+"""Angle of one count, rad."""
+_FORCE = 9.80665e-3
+"""Specific force of one count, m/s^2."""
+_COUNTS = 256
+_MOST_LOST = 128
+"""Steps of the index from which it went back."""
+_REST = 0.06
+"""Largest deviation of an acceleration from 1 g at rest, relative."""
+_DISTINCT = 0.2
+"""Least difference of the two directions of gravity for a comparison."""
+_COMPARED = 100
+"""Frames at rest after which the two orders are compared."""
+_BETTER = 3.0
+"""Ratio of the two mean deviations from which the other order fits."""
+_G_COUNTS = 1000.0
+
+
+class RvcDecoder:
+    """Decoder of one device in the mode UART-RVC.
+
+    Parameters
+    ----------
+    baud : int, optional
+        Line speed, bit/s, for back-dating of stamps; None for USB.
+    euler : str
+        Axes of yaw, pitch and roll, ``zxy`` or ``zyx``.
+    """
+
+    tick_clock = None  # a frame has an index, but no time
+
+    def __init__(self, baud: int | None, euler: Literal["zxy", "zyx"] = "zxy") -> None:
+        self._euler = euler
+        self._codec, self._gate = RvcCodec(), OrientationGate()
+        self._stamps = ArrivalStamps(baud, RVC_BYTES)
+        self._number: int | None = None
+        self._compared = 0
+        self._deviations = [0.0, 0.0]  # of this order and of the other one
+
+    @property
+    def messages(self) -> int:
+        """Well-formed frames so far."""
+        return self._codec.frames
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes so far that belong to no frame."""
+        return self._codec.discarded
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return the content that `chunk` completed, in wire order; never raises."""
+        out: list[Decoded] = []
+        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
+            out = self.flush()
+        self._stamps.start_chunk(chunk.t_ns)
+        return out + self._take(self._codec.feed(chunk.data))
+
+    def flush(self) -> list[Decoded]:
+        """Discard a pending frame."""
+        return self._take(self._codec.flush())
+
+    def _take(self, found: list[RvcFrame | CorruptBytes]) -> list[Decoded]:
+        out: list[Decoded] = []
+        for event in found:
+            if isinstance(event, RvcFrame):
+                out += self._sample(event)
+            else:
+                out.append(Corrupt(event.discarded, event.reason))
+        return out
+
+    def _sample(self, frame: RvcFrame) -> list[Decoded]:
+        out: list[Decoded] = []
+        step = 1 if self._number is None else (frame.number - self._number) % _COUNTS
+        self._number = frame.number
+        if 1 < step < _MOST_LOST:
+            out.append(DeviceEvent("gap", f"{step - 1} messages lost", {"lost": step - 1}))
+
+        native = quaternion_of(frame.angles, self._euler)
+        q = self._gate.admit(native)
+        arrival_ns = self._stamps.stamp(self._codec.fed - frame.end + RVC_BYTES)
+        x, y, z = frame.acceleration
+        force = (_FORCE * x, _FORCE * y, _FORCE * z)
+        if q is not None:  # the norm is 1 but for rounding
+            out.append(ImuSample(arrival_ns, q, native, None, frame.number, acceleration=force))
+        if self._compared < _COMPARED:
+            out += self._compare(frame)
+        return out
+
+    def _compare(self, frame: RvcFrame) -> list[Decoded]:
+        """Compare both orders with an acceleration at rest; warn if the other one fits."""
+        x, y, z = frame.acceleration
+        strength = sqrt(x * x + y * y + z * z) / _G_COUNTS
+        if abs(strength - 1.0) > _REST:
+            return []
+        other: Literal["zxy", "zyx"] = "zyx" if self._euler == "zxy" else "zxy"
+        ours, theirs = (gravity_of(frame.angles, order) for order in (self._euler, other))
+        if _distance(ours, theirs) < _DISTINCT:
+            return []
+
+        scale = 1.0 / (strength * _G_COUNTS)
+        measured = (scale * x, scale * y, scale * z)
+        self._compared += 1
+        self._deviations[0] += _distance(ours, measured)
+        self._deviations[1] += _distance(theirs, measured)
+        if self._compared < _COMPARED or self._deviations[0] < _BETTER * self._deviations[1]:
+            return []
+        text = f'accelerations at rest fit euler = "{other}", not "{self._euler}": set euler'
+        return [DeviceEvent("warning", text, {"euler": other})]
+
+
+def quaternion_of(angles: tuple[int, int, int], euler: Literal["zxy", "zyx"]) -> Quaternion:
+    """Return the orientation of yaw, pitch and roll in 0.01 degrees, sensor to world, z up."""
+    (cz, sz), (cp, sp), (cr, sr) = (
+        (cos(0.5 * _ANGLE * angle), sin(0.5 * _ANGLE * angle)) for angle in angles
+    )
+    # q = q_z ⊗ (a + b i + c j + d k), with the product of pitch and roll in brackets
+    if euler == "zxy":
+        a, b, c, d = cp * cr, sp * cr, cp * sr, sp * sr
+    else:
+        a, b, c, d = cp * cr, cp * sr, sp * cr, -sp * sr
+    return (cz * a - sz * d, cz * b - sz * c, cz * c + sz * b, cz * d + sz * a)
+
+
+def gravity_of(angles: tuple[int, int, int], euler: Literal["zxy", "zyx"]) -> Vector:
+    """Return the upward direction in sensor axes."""
+    w, x, y, z = quaternion_of(angles, euler)
+    return (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z)
+
+
+def _distance(a: Vector, b: Vector) -> float:
+    return hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2])

@@ -1,0 +1,259 @@
+"""Decoder of the mode UART-SHTP: rotation vectors, or raw readings, to samples.
+
+Reports have a number of 8 bits and no absolute time: a packet contains the time between measurement
+and transmission. A sample is stamped with the arrival of the first byte of its packet minus that
+time. There is no checksum: packets with an impossible length or content are rejected, and
+quaternions whose norm is not 1.
+
+Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
+from jointfit_drivers.gateway_orientation import RawReading, RawStamp, is_plausible
+from jointfit_drivers.serial_imu import ArrivalStamps
+from jointfit_protocols.bno085 import (
+    ACCURACY,
+    MOST_PAYLOAD,
+    ROTATION_REPORTS,
+    TICK_NS,
+    HubReport,
+    HubReportId,
+    ShtpChannel,
+    ShtpCodec,
+    ShtpPacket,
+    base_time,
+    decode_firmware,
+    decode_interval,
+    decode_report,
+    split_reports,
+)
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.orientation import OrientationGate
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Chunk, Decoded, Vector
+    from jointfit_drivers.gateway_orientation import RawSamples
+    from jointfit_protocols.bno085 import ShtpBufferStatus
+
+_COUNTS = 256
+_MOST_LOST = 128
+"""Steps of a number from which it went back."""
+_OLDEST = 10_000
+"""Largest age of a measurement at transmission, 100 us; a larger one is corrupt."""
+_RESET_COMPLETE = b"\x01"
+_PERIOD_COUNTS = 200
+"""Readings after which their measured period replaces the nominal one."""
+_STALE_COUNTS = 2
+"""Readings of the gyroscope after which an acceleration is too old."""
+_SATURATED = 32_760
+"""Count of a gyroscope or accelerometer from which it is out of range."""
+_RATE_COUNT, _FORCE_COUNT = 2.0**-9, 2.0**-8
+
+
+class ShtpDecoder:
+    """Decoder of one device in the mode UART-SHTP.
+
+    Parameters
+    ----------
+    baud : int, optional
+        Line speed, bit/s, for back-dating of stamps; None for USB.
+    raw : RawSamples, optional
+        Computes orientations from raw readings; None if the device sends rotation vectors.
+    """
+
+    tick_clock = None  # reports have an age, but no time
+
+    def __init__(self, baud: int | None, raw: RawSamples | None = None) -> None:
+        self._codec, self._gate, self._raw = ShtpCodec(), OrientationGate(), raw
+        self._stamps = ArrivalStamps(baud, MOST_PAYLOAD)
+        self._arrival_ns = 0
+        self._sequences: dict[int, int] = {}
+        self._rejected = self._rejected_bytes = 0
+        self._measuring = False
+        self._accuracy: int | None = None
+        self._force: HubReport | None = None
+        self._field: HubReport | None = None
+        self._force_age = 0
+        self._reading_ns = self._readings = self._first_ns = 0
+
+    @property
+    def messages(self) -> int:
+        """Well-formed packets so far."""
+        return self._codec.packets - self._rejected
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes so far that belong to no packet, or to one that was rejected."""
+        return self._codec.discarded + self._rejected_bytes
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return the content that `chunk` completed, in wire order; never raises."""
+        out: list[Decoded] = []
+        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
+            out = self.flush()
+        self._stamps.start_chunk(chunk.t_ns)
+        return out + self._take(self._codec.feed(chunk.data))
+
+    def flush(self) -> list[Decoded]:
+        """Discard a pending packet."""
+        return self._take(self._codec.flush())
+
+    def _take(self, found: list[ShtpPacket | ShtpBufferStatus | CorruptBytes]) -> list[Decoded]:
+        out: list[Decoded] = []
+        for event in found:
+            if isinstance(event, ShtpPacket):
+                out += self._packet(event)
+            elif isinstance(event, CorruptBytes):
+                out.append(Corrupt(event.discarded, event.reason))
+        return out
+
+    def _packet(self, packet: ShtpPacket) -> list[Decoded]:
+        channel = packet.channel
+        if channel == ShtpChannel.EXECUTABLE:
+            return self._reset() if packet.payload == _RESET_COMPLETE else []
+        if channel not in {ShtpChannel.CONTROL, ShtpChannel.INPUT, ShtpChannel.WAKE_INPUT}:
+            return []  # advertisements
+        reports = split_reports(packet.payload)
+        if reports is None:
+            return [self._reject(packet, "reports do not fill the packet")]
+        if channel == ShtpChannel.CONTROL:
+            return [event for report in reports for event in _device_events(report)]
+        return self._reports(packet, reports)
+
+    def _reports(self, packet: ShtpPacket, reports: list[bytes]) -> list[Decoded]:
+        """Return the samples of a packet of measurements."""
+        out: list[Decoded] = []
+        base = 0
+        sent_ns = self._stamps.stamp(self._codec.fed - packet.end + packet.size)
+        for data in reports:
+            shift = base_time(data)
+            if shift is not None:
+                base += shift
+                continue
+            report = decode_report(data)
+            if report is None:
+                continue
+            age = -(base + report.delay)
+            if not -_OLDEST <= age <= _OLDEST:
+                return [*out, self._reject(packet, "time out of range")]
+
+            # an older measurement may follow a younger one of another sensor: stamps never decrease
+            self._arrival_ns = max(self._arrival_ns, sent_ns - max(age, 0) * TICK_NS)
+            if self._raw is not None:
+                out += self._reading(report, self._raw)
+            elif report.report_id in ROTATION_REPORTS:
+                out += self._orientation(packet, report)
+        return out
+
+    def _orientation(self, packet: ShtpPacket, report: HubReport) -> list[Decoded]:
+        """Return the sample of a rotation vector, which is sent as i j k real."""
+        i, j, k, real = report.values[:4]
+        native = (real, i, j, k)
+        q = self._gate.admit(native)
+        if q is None:
+            return [self._reject(packet, "quaternion norm is not 1")]
+        _, out = self._step(report)
+        self._measuring = True
+        counter, status = report.sequence, report.status
+        if status != self._accuracy:
+            self._accuracy = status
+            name = ACCURACY[status]
+            text = f"accuracy of the orientation: {name}"
+            out.append(DeviceEvent("info", text, {"accuracy": name}))
+        out.append(ImuSample(self._arrival_ns, q, native, None, counter, status))
+        return out
+
+    def _step(self, report: HubReport) -> tuple[int, list[Decoded]]:
+        """Return the number of steps since the last report of this sensor, and a loss."""
+        last = self._sequences.get(report.report_id)
+        self._sequences[report.report_id] = report.sequence
+        step = 1 if last is None else (report.sequence - last) % _COUNTS
+        if not 1 < step < _MOST_LOST:
+            return min(step, 1), []
+        lost = step - 1
+        return step, [DeviceEvent("gap", f"{lost} messages lost", {"lost": lost})]
+
+    def _reading(self, report: HubReport, raw: RawSamples) -> list[Decoded]:
+        """Take a raw reading; that of the gyroscope returns a sample."""
+        kind = report.report_id
+        if kind == HubReportId.ACCELEROMETER:
+            self._force, self._force_age = report, 0
+        elif kind == HubReportId.MAGNETIC_FIELD:
+            self._field = report
+        if kind != HubReportId.GYROSCOPE_UNCALIBRATED:
+            return []
+
+        step, out = self._step(report)
+        self._force_age += step
+        if step == 0 or self._force is None or self._force_age > _STALE_COUNTS:
+            return out
+        self._measuring = True
+        reading = RawReading(
+            self._time_of_reading(step, raw.period_ns),
+            _vector(report),
+            _vector(self._force),
+            _vector(self._field) if raw.magnetometer and self._field is not None else None,
+        )
+        if not is_plausible(reading):
+            return out
+        clipped = any(abs(v) >= _SATURATED * _RATE_COUNT for v in reading.rate)
+        clipped |= any(abs(v) >= _SATURATED * _FORCE_COUNT for v in reading.force)
+        stamp = RawStamp(self._arrival_ns, None, report.sequence, report.status)
+        return out + raw.take(stamp, reading, clipped=clipped)
+
+    def _time_of_reading(self, step: int, nominal_ns: float) -> int:
+        """Return the time of a reading, ns: its number times the measured period.
+
+        Without a clock of the device, the period is that of the arrivals since the first reading.
+        """
+        if self._readings == 0:
+            self._first_ns, self._readings = self._arrival_ns, 1
+            return 0
+        self._readings += step
+        period_ns = nominal_ns
+        if self._readings > _PERIOD_COUNTS:
+            period_ns = (self._arrival_ns - self._first_ns) / (self._readings - 1)
+        self._reading_ns += max(1, round(step * period_ns))
+        return self._reading_ns
+
+    def _reset(self) -> list[Decoded]:
+        """Return the restart of a device that measured."""
+        self._gate.forget()
+        self._sequences.clear()
+        self._accuracy = None
+        if not self._measuring:
+            return []
+        self._measuring = False
+        return [DeviceEvent("restart", "device restarted: it lost its settings")]
+
+    def _reject(self, packet: ShtpPacket, reason: str) -> Corrupt:
+        self._rejected += 1
+        self._rejected_bytes += packet.size - 2
+        return Corrupt(packet.size - 2, reason)
+
+
+def _vector(report: HubReport) -> Vector:
+    x, y, z = report.values[:3]
+    return (x, y, z)
+
+
+def _device_events(report: bytes) -> list[Decoded]:
+    """Return the events of a reply."""
+    firmware = decode_firmware(report)
+    if firmware is not None:
+        version, part, build = firmware
+        known: dict[str, object] = {
+            "firmware": ".".join(map(str, version)), "part_number": part, "build": build,
+        }  # fmt: skip
+        text = ", ".join(f"{key} {value}" for key, value in known.items())
+        return [DeviceEvent("info", text, known)]
+    interval = decode_interval(report)
+    if interval is None or not interval[1]:
+        return []
+    kind, interval_us = interval
+    text = f"report 0x{kind:02X} every {interval_us} us"
+    return [DeviceEvent("info", text, {f"report_0x{kind:02X}_us": interval_us})]

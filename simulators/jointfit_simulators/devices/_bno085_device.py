@@ -1,0 +1,247 @@
+"""Virtual BNO085 on a pty, in the modes UART-RVC and UART-SHTP.
+
+Invariant: in UART-RVC it sends from power-up and ignores the host; in UART-SHTP it announces itself
+after a reset, and sends reports only after their interval was set, which a reset forgets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import asin, atan2, degrees
+from typing import TYPE_CHECKING
+
+from jointfit_protocols.bno085 import (
+    ROTATION_REPORTS,
+    HubReport,
+    HubReportId,
+    RvcFrame,
+    ShtpChannel,
+    ShtpCodec,
+    ShtpPacket,
+    encode_base_time,
+    encode_feature,
+    encode_firmware,
+    encode_report,
+    encode_rvc,
+    encode_shtp,
+    encode_status,
+)
+from jointfit_protocols.bno085 import ShtpBufferStatus as _Status
+from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_simulators.devices._inertial_signals import InertialSignals
+from jointfit_simulators.imu_device import clean_wire
+from jointfit_simulators.wires import PtyLine
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import Literal
+
+    from jointfit_simulators.imu_device import Quaternion, WireNoise
+
+_BITS = 10
+_G = 9.80665
+_AGE = 12
+"""Time between measurement and transmission, 100 us."""
+_MICROTESLA = 50.0
+"""Magnitude of the magnetic field, uT."""
+_ADVERTISEMENT = bytes.fromhex("00010400000000800653482d322e3000")
+"""Part of an advertisement: version, and names of applications."""
+_FASTEST_US = 2500
+_RVC_BAUD, _SHTP_BAUD = 115_200, 3_000_000
+_ITEMS = {
+    HubReportId.ACCELEROMETER: Item.ACCELERATION,
+    HubReportId.GYROSCOPE_UNCALIBRATED: Item.RATE_OF_TURN,
+    HubReportId.GYROSCOPE: Item.RATE_OF_TURN,
+    HubReportId.MAGNETIC_FIELD: Item.MAGNETIC_FIELD,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Bno085DeviceOptions:
+    """Mode and faults of a device."""
+
+    mode: Literal["rvc", "shtp"] = "shtp"
+    euler: Literal["zxy", "zyx"] = "zxy"
+    """Axes of yaw, pitch and roll in UART-RVC."""
+    checks_speed: bool = False
+    """Whether a host at another speed receives garbage."""
+    least_interval_us: int = _FASTEST_US
+    """Shortest interval of reports; a shorter one is replaced by it."""
+    accuracy: int = 3
+
+
+class Bno085Device:
+    """`ImuDevice` on a pty.
+
+    Parameters
+    ----------
+    link
+        Symbolic link to the host's port.
+    options
+        Mode and faults.
+    wire_noise
+        Noise applied to each packet to the host.
+    """
+
+    def __init__(
+        self,
+        link: Path,
+        *,
+        options: Bno085DeviceOptions | None = None,
+        wire_noise: WireNoise = clean_wire,
+    ) -> None:
+        self._options = options or Bno085DeviceOptions()
+        self._line, self._noise = PtyLine(link), wire_noise
+        self._inertial = InertialSignals()
+        self._codec = ShtpCodec()
+        self.intervals: dict[int, int] = {}
+        """Interval of each enabled report, us."""
+        self._packets: dict[int, int] = {}
+        self._to_lose = self.sent = 0
+        self.counter = 0
+        """Number of the next sample; it is sent modulo 256."""
+        self.unplug, self.plug = self._line.unplug, self._line.plug
+
+    # --- control by the simulation ------------------------------------------------------------
+
+    @property
+    def streaming(self) -> bool:
+        """Whether the device sends samples."""
+        return self._options.mode == "rvc" or bool(self.intervals)
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second; 0 while no report is enabled."""
+        if self._options.mode == "rvc":
+            return 100.0
+        return 1e6 / min(self.intervals.values()) if self.intervals else 0.0
+
+    @property
+    def line_ns(self) -> int:
+        """Transmission time of a sample at the speed of the host's port, ns."""
+        baud = self._line.host_baud
+        size = len(self._sample((1.0, 0.0, 0.0, 0.0)))
+        return size * _BITS * 1_000_000_000 // baud if baud else 0
+
+    def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
+        """Send one sample now, as described in `ImuDevice.push`."""
+        self._inertial.update(device_ns, q_world_sensor)
+        wire = self._sample(q_world_sensor)
+        self.counter += 1
+        if self._to_lose:
+            self._to_lose -= 1
+        elif self.streaming and self._write(wire):
+            self.sent += 1
+
+    def lose(self, count: int) -> None:
+        """Lose the next `count` samples: they are numbered and not sent."""
+        self._to_lose += count
+
+    def edge(self, device_ns: int) -> None:
+        """Ignore an edge: the device has no sync input."""
+
+    def power_cycle(self) -> None:
+        """Interrupt the power supply: settings and numbers restart."""
+        self.intervals.clear()
+        self._packets.clear()
+        self.counter = 0
+        if self._options.mode == "shtp":
+            self._send(ShtpChannel.COMMAND, _ADVERTISEMENT)
+            self._send(ShtpChannel.EXECUTABLE, b"\x01")
+
+    async def run(self) -> None:
+        """Serve until cancelled."""
+        if self._options.mode == "shtp" and not self.intervals:
+            self.power_cycle()
+        await self._line.serve(self._receive)
+
+    # --- requests of the host -----------------------------------------------------------------
+
+    @property
+    def _same_speed(self) -> bool:
+        wanted = _RVC_BAUD if self._options.mode == "rvc" else _SHTP_BAUD
+        return not self._options.checks_speed or self._line.host_baud == wanted
+
+    def _receive(self, data: bytes) -> None:
+        if self._options.mode == "rvc" or not self._same_speed:
+            return
+        # the query of the buffer status has no length and is no packet of the codec
+        if encode_status(None) in data:
+            self._write(encode_status(256))
+        for event in self._codec.feed(data):
+            if isinstance(event, ShtpPacket) and event.channel == ShtpChannel.CONTROL:
+                self._answer(event.payload)
+            elif isinstance(event, _Status):
+                continue
+
+    def _answer(self, request: bytes) -> None:
+        kind = request[0] if request else 0
+        if kind == HubReportId.PRODUCT_REQUEST:
+            self._send(ShtpChannel.CONTROL, encode_firmware((3, 12, 4), 10_004_148, 230))
+        elif kind == HubReportId.FEATURE_REQUEST:
+            self._report_interval(request[1])
+        elif kind == HubReportId.SET_FEATURE:
+            wanted = int.from_bytes(request[5:9], "little")
+            self.intervals[request[1]] = max(wanted, self._options.least_interval_us)
+            if not wanted:
+                del self.intervals[request[1]]
+            self._report_interval(request[1])
+
+    def _report_interval(self, report: int) -> None:
+        interval_us = self.intervals.get(report, 0)
+        self._send(ShtpChannel.CONTROL, encode_feature(report, interval_us, response=True))
+
+    # --- samples ------------------------------------------------------------------------------
+
+    def _sample(self, q: Quaternion) -> bytes:
+        if self._options.mode == "rvc":
+            return self._rvc(q)
+        reports = [self._report(kind, q) for kind in sorted(self.intervals)]
+        payload = encode_base_time(_AGE + len(reports)) + b"".join(reports)
+        return self._packet(ShtpChannel.INPUT, payload)
+
+    def _report(self, kind: int, q: Quaternion) -> bytes:
+        w, x, y, z = q
+        values: tuple[float, ...] = (x, y, z, w)
+        if kind not in ROTATION_REPORTS:
+            values = self._inertial.value(_ITEMS[HubReportId(kind)]) or (0.0, 0.0, 0.0)
+            if kind == HubReportId.MAGNETIC_FIELD:
+                values = tuple(_MICROTESLA * value for value in values)
+            if kind == HubReportId.GYROSCOPE_UNCALIBRATED:
+                values = (*values, 0.0, 0.0, 0.0)
+        elif kind in {HubReportId.ROTATION_VECTOR, HubReportId.ARVR_ROTATION_VECTOR}:
+            values = (*values, 0.05)
+        return encode_report(HubReport(kind, self.counter, self._options.accuracy, 1, values))
+
+    def _rvc(self, q: Quaternion) -> bytes:
+        yaw, pitch, roll = (round(angle * 100) for angle in euler_deg(q, self._options.euler))
+        force = self._inertial.value(Item.ACCELERATION) or (0.0, 0.0, 0.0)
+        x, y, z = (round(1000 * value / _G) for value in force)
+        return encode_rvc(RvcFrame(self.counter & 0xFF, (yaw, pitch, roll), (x, y, z)))
+
+    def _packet(self, channel: int, payload: bytes) -> bytes:
+        number = self._packets.get(channel, 0)
+        self._packets[channel] = number + 1
+        return encode_shtp(channel, number, payload)
+
+    def _send(self, channel: int, payload: bytes) -> None:
+        self._write(self._packet(channel, payload))
+
+    def _write(self, wire: bytes) -> bool:
+        if not self._same_speed:  # bytes, none of them correct
+            wire = bytes((byte * 7 + 1) & 0x2A for byte in wire)
+        return self._line.write(self._noise(wire))
+
+
+def euler_deg(q: Quaternion, order: Literal["zxy", "zyx"]) -> tuple[float, float, float]:
+    """Return yaw, pitch and roll of an orientation, degrees."""
+    w, x, y, z = q
+    if order == "zxy":
+        sine = max(-1.0, min(1.0, 2 * (y * z + w * x)))
+        yaw = atan2(-2 * (x * y - w * z), 1 - 2 * (x * x + z * z))
+        roll = atan2(-2 * (x * z - w * y), 1 - 2 * (x * x + y * y))
+    else:
+        sine = max(-1.0, min(1.0, 2 * (w * y - x * z)))
+        yaw = atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
+        roll = atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+    return degrees(yaw), degrees(asin(sine)), degrees(roll)

@@ -1,0 +1,179 @@
+"""BNO085 decoders: orders of Euler angles, ages, numbers, damage and restarts."""
+
+from __future__ import annotations
+
+from math import atan2
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample
+from jointfit_drivers.bno085 import Bno085Imu, Bno085Settings
+from jointfit_drivers.bno085._rvc_decoder import gravity_of, quaternion_of
+from jointfit_protocols.bno085 import (
+    HubReport,
+    HubReportId,
+    RvcFrame,
+    ShtpChannel,
+    encode_base_time,
+    encode_report,
+    encode_rvc,
+    encode_shtp,
+)
+from jointfit_simulators.devices._bno085_device import euler_deg
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Decoded
+
+PERIOD_NS = 10_000_000
+EXAMPLE = (1, -110, 2085)
+ANGLES = st.tuples(
+    st.integers(-17_999, 17_999), st.integers(-8_999, 8_999), st.integers(-17_999, 17_999)
+)
+
+
+def decoder(baud: int, **more: Any) -> Any:
+    table: dict[str, Any] = {"id": "S1", "segment": "thigh", "driver": "bno085", "port": "p"}
+    return Bno085Imu(Bno085Settings(**table | {"baud": baud} | more)).decoder()
+
+
+def run(bno: Any, pieces: list[bytes]) -> list[Decoded]:
+    return [
+        item for k, data in enumerate(pieces, 1) for item in bno.feed(Chunk(k * PERIOD_NS, data))
+    ]
+
+
+def samples(events: list[Decoded]) -> list[ImuSample]:
+    return [event for event in events if isinstance(event, ImuSample)]
+
+
+def texts(events: list[Decoded]) -> list[str]:
+    return [event.text for event in events if isinstance(event, DeviceEvent)]
+
+
+# --- UART-RVC ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("euler", ["zxy", "zyx"])
+@given(angles=ANGLES)
+def test_angles_give_the_rotation_that_scipy_gives(
+    euler: Literal["zxy", "zyx"], angles: tuple[int, int, int]
+) -> None:
+    q = quaternion_of(angles, euler)
+    true = Rotation.from_euler(euler.upper(), np.multiply(angles, 0.01), degrees=True)
+    x, y, z, w = true.as_quat()
+    assert abs(np.dot(q, (w, x, y, z))) == pytest.approx(1.0, abs=1e-12)
+    assert gravity_of(angles, euler) == pytest.approx(true.inv().apply((0, 0, 1)), abs=1e-12)
+    again = Rotation.from_euler(euler.upper(), euler_deg(q, euler), degrees=True)
+    assert (again * true.inv()).magnitude() < 1e-6
+
+
+def test_the_message_of_the_data_sheet_fits_pitch_about_x_and_roll_about_y() -> None:
+    measured = np.array((-371, -20, 977)) / np.linalg.norm((-371, -20, 977))
+    assert gravity_of(EXAMPLE, "zxy") == pytest.approx(measured, abs=0.002)
+    assert np.linalg.norm(gravity_of(EXAMPLE, "zyx") - measured) > 0.4
+
+
+@pytest.mark.parametrize(("euler", "reported"), [("zxy", False), ("zyx", True)])
+def test_accelerations_at_rest_reveal_the_wrong_order(euler: str, reported: bool) -> None:
+    frames = [encode_rvc(RvcFrame(k & 0xFF, EXAMPLE, (-371, -20, 977))) for k in range(150)]
+    found = texts(run(decoder(115_200, euler=euler), frames))
+    assert any('fit euler = "zxy", not "zyx"' in text for text in found) == reported
+    assert len(found) == reported
+
+
+def test_a_level_or_moving_device_reveals_nothing() -> None:
+    level = [encode_rvc(RvcFrame(k & 0xFF, (k, 5, -5), (0, 0, 1000))) for k in range(256)]
+    moving = [encode_rvc(RvcFrame(k & 0xFF, EXAMPLE, (900, 900, 977))) for k in range(256)]
+    assert texts(run(decoder(115_200, euler="zyx"), level + moving)) == []
+
+
+def test_lost_frames_are_counted_across_the_wrap() -> None:
+    numbers = [253, 254, 255, 0, 3, 4]
+    frames = [encode_rvc(RvcFrame(k, EXAMPLE, (-371, -20, 977))) for k in numbers]
+    events = run(decoder(115_200), frames)
+    assert texts(events) == ["2 messages lost"]
+    assert [item.counter for item in samples(events)] == numbers
+    assert samples(events)[0].acceleration == pytest.approx((-3.638, -0.196, 9.581), abs=0.001)
+
+
+# --- UART-SHTP --------------------------------------------------------------------------------
+
+
+def packet(*reports: HubReport, age: int = 0) -> bytes:
+    payload = encode_base_time(age) + b"".join(map(encode_report, reports))
+    return encode_shtp(ShtpChannel.INPUT, 0, payload)
+
+
+def rotation(
+    number: int = 0,
+    delay: int = 0,
+    status: int = 3,
+    values: tuple[float, ...] = (0.0, 0.0, 0.6, 0.8, 0.05),
+) -> HubReport:
+    return HubReport(HubReportId.ROTATION_VECTOR, number, status, delay, values)
+
+
+def test_the_real_part_comes_last_and_a_sample_is_older_than_its_packet() -> None:
+    bno = decoder(3_000_000, transport="usb")
+    (sample,) = samples(bno.feed(Chunk(10**9, b"\x7e" + packet(rotation(7, delay=20), age=50))))
+    assert sample.q_world_sensor == pytest.approx((0.8, 0.0, 0.0, 0.6), abs=1e-4)
+    assert sample.arrival_ns == 10**9 - 3_000_000
+    assert (sample.counter, sample.status, sample.ticks) == (7, 3, None)
+
+
+def test_several_measurements_in_a_packet_have_their_own_age() -> None:
+    bno = decoder(3_000_000, transport="usb")
+    reports = [rotation(k, delay=25 * k) for k in range(3)]
+    found = samples(bno.feed(Chunk(10**9, b"\x7e" + packet(*reports, age=60))))
+    assert [10**9 - item.arrival_ns for item in found] == [6_000_000, 3_500_000, 1_000_000]
+
+
+def test_lost_reports_restarts_and_accuracy_are_events() -> None:
+    reset = encode_shtp(ShtpChannel.EXECUTABLE, 0, b"\x01")
+    wire = [b"\x7e" + reset, *(packet(rotation(k)) for k in (254, 255, 3))]
+    wire += [packet(rotation(4, status=1)), reset, packet(rotation(0))]
+    events = run(decoder(3_000_000), wire)
+    assert texts(events) == [
+        "accuracy of the orientation: high", "3 messages lost",
+        "accuracy of the orientation: low", "device restarted: it lost its settings",
+        "accuracy of the orientation: high",
+    ]  # fmt: skip
+    assert len(samples(events)) == 5
+
+
+def test_damage_is_rejected_and_counted() -> None:
+    bno = decoder(3_000_000)
+    bad = [
+        packet(rotation(values=(0.0, 0.0, 0.3, 0.8, 0.0))),
+        packet(rotation(), age=50_000),
+        encode_shtp(ShtpChannel.INPUT, 0, b"\x99\x01"),
+        packet(rotation())[:-4] + b"\x7e",
+    ]
+    events = run(bno, [b"\x7e" + bad[0], *bad[1:], packet(rotation())])
+    assert [item.reason for item in events if isinstance(item, Corrupt)] == [
+        "quaternion norm is not 1", "time out of range", "reports do not fill the packet", "length"
+    ]  # fmt: skip
+    assert len(samples(events)) == 1
+    assert bno.messages == 1
+
+
+def test_raw_readings_turn_by_rate_times_measured_time() -> None:
+    """The device is 4 % slower than requested; its period is measured from the arrivals."""
+    pytest.importorskip("vqf")
+    bno = decoder(3_000_000, orientation="gateway", settle_s=0, rate_hz=100, transport="usb")
+    found: list[Decoded] = []
+    for k in range(3000):
+        force = HubReport(HubReportId.ACCELEROMETER, k & 0xFF, 3, 0, (0.0, 0.0, 9.8))
+        values = (0.0, 0.0, 0.5, 0.0, 0.0, 0.0)
+        rate = HubReport(HubReportId.GYROSCOPE_UNCALIBRATED, k & 0xFF, 3, 0, values)
+        found += bno.feed(Chunk(10_400_000 * (k + 1), b"\x7e" + packet(force, rate)))
+    turned = samples(found)
+    (a, _, _, d), (w, _, _, z) = turned[1000].q_world_sensor, turned[-1].q_world_sensor
+    angle = 2 * atan2(a * z - d * w, a * w + d * z)
+    true = 0.5 * 0.0104 * (len(turned) - 1001)
+    assert (angle - true + np.pi) % (2 * np.pi) - np.pi == pytest.approx(0.0, abs=0.02 * true)

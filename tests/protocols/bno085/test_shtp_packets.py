@@ -1,0 +1,165 @@
+"""SHTP over UART: escapes, any cut, every byte accounted for, and reports in both directions."""
+
+from __future__ import annotations
+
+import itertools
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_protocols.bno085 import (
+    MOST_PAYLOAD,
+    HubReport,
+    HubReportId,
+    ShtpBufferStatus,
+    ShtpCodec,
+    ShtpPacket,
+    base_time,
+    decode_firmware,
+    decode_interval,
+    decode_report,
+    encode_base_time,
+    encode_feature,
+    encode_firmware,
+    encode_report,
+    encode_shtp,
+    encode_status,
+    feature_request,
+    product_request,
+    split_reports,
+)
+from jointfit_protocols.corrupt import CorruptBytes
+from tests.protocols.bno085.adafruit_oracle import adafruit
+
+Found = ShtpPacket | ShtpBufferStatus | CorruptBytes
+
+payloads = st.binary(max_size=40) | st.lists(st.sampled_from([0x7D, 0x7E, 0x5D, 0x5E])).map(bytes)
+packets = st.builds(encode_shtp, st.integers(0, 255), st.integers(0, 255), payloads)
+pieces_of_wire = packets | st.binary(max_size=30) | st.integers(0, 65535).map(encode_status)
+wires = st.lists(pieces_of_wire, max_size=8).map(b"".join)
+
+
+def decode(pieces: list[bytes]) -> tuple[list[Found], ShtpCodec]:
+    codec = ShtpCodec()
+    found = [event for piece in pieces for event in codec.feed(piece)]
+    return found + codec.flush(), codec
+
+
+@given(wires, st.lists(st.integers(0, 400), max_size=6))
+def test_packets_do_not_depend_on_the_cut_and_every_byte_is_counted(
+    wire: bytes, cuts: list[int]
+) -> None:
+    whole, codec = decode([wire])
+    at = sorted({0, len(wire), *(place % (len(wire) + 1) for place in cuts)})
+    assert decode([wire[a:b] for a, b in itertools.pairwise(at)])[0] == whole
+    assert decode([bytes([byte]) for byte in wire])[0] == whole
+    between = sum(
+        item.discarded if isinstance(item, CorruptBytes) else item.size - 2 for item in whole
+    )
+    assert between + codec.flags == len(wire)
+
+
+@given(st.integers(0, 255), st.integers(0, 255), payloads)
+def test_payloads_survive_their_escapes(channel: int, sequence: int, payload: bytes) -> None:
+    wire = encode_shtp(channel, sequence, payload)
+    assert wire.count(b"\x7e") == 2
+    (packet,), _ = decode([wire])
+    assert packet == ShtpPacket(channel, sequence, payload, len(wire), len(wire))
+
+
+def test_documented_bytes() -> None:
+    """Product id request, escapes, buffer status and its query, interval of a report."""
+    assert encode_shtp(2, 0, product_request()).hex() == "7e0106000200f9007e"
+    assert encode_status(None).hex() == "7e007e"
+    assert encode_shtp(2, 1, bytes((0x7E, 0x7D))).hex() == "7e01060002017d5e7d5d7e"
+    found, _ = decode([bytes.fromhex("7e0000017e")])
+    assert found == [ShtpBufferStatus(256, 5, 5)]
+    feature = encode_feature(HubReportId.ROTATION_VECTOR, 10_000)
+    assert feature.hex() == "fd0500000010270000" + "00" * 8
+
+
+def test_adjacent_packets_may_share_a_flag() -> None:
+    one, two = encode_shtp(3, 0, b"ab"), encode_shtp(3, 1, b"cd")
+    found, _ = decode([one[:-1] + two])
+    assert [item.payload for item in found if isinstance(item, ShtpPacket)] == [b"ab", b"cd"]
+
+
+def test_a_packet_after_damage_is_found() -> None:
+    good = encode_shtp(3, 1, b"cd")
+    for bad in (b"\x01\x09", good[:4] + b"\x7e", b"\x7e\x01\x7d\x7e", b"\x7e\x05ab\x7e", good[1:]):
+        found, _ = decode([bad + good])
+        assert isinstance(found[-1], ShtpPacket), bad
+        assert found[-1].payload == b"cd"
+
+
+def test_a_wrong_length_is_corrupt() -> None:
+    wire = bytearray(encode_shtp(3, 0, b"abcd"))
+    wire[2] += 1
+    (found,), codec = decode([bytes(wire)])
+    assert found == CorruptBytes(9, "length")
+    assert codec.packets == 0
+
+
+def test_noise_without_flag_is_bounded() -> None:
+    codec = ShtpCodec()
+    found = codec.feed(b"\x7e" + bytes(50_000))
+    assert codec.pending <= 2 * (MOST_PAYLOAD + 5)
+    assert sum(item.discarded for item in found if isinstance(item, CorruptBytes)) > 40_000
+    with pytest.raises(ValueError, match="2045 bytes"):
+        encode_shtp(3, 0, bytes(2045))
+
+
+@pytest.mark.parametrize("kind", [0x01, 0x02, 0x03, 0x05, 0x07, 0x08, 0x14, 0x15, 0x28, 0x29])
+@given(st.data())
+def test_reports_survive_both_directions(kind: int, data: st.DataObject) -> None:
+    count = {0x05: 5, 0x28: 5, 0x07: 6, 0x08: 4, 0x29: 4}.get(kind, 3)
+    raw = data.draw(st.lists(st.integers(-(2**15), 2**15 - 1), min_size=count, max_size=count))
+    head = bytes((kind, data.draw(st.integers(0, 255)), data.draw(st.integers(0, 255)), 7))
+    size = {0x05: 14, 0x28: 14, 0x08: 12, 0x29: 12, 0x07: 16, 0x14: 16, 0x15: 16}.get(kind, 10)
+    wire = (head + struct.pack(f"<{count}h", *raw)).ljust(size, b"\0")
+    (part,) = split_reports(wire) or [b""]
+    report = decode_report(part)
+    assert report is not None
+    assert report.delay == (head[2] >> 2) << 8 | 7
+    assert encode_report(report) == wire
+
+
+def test_units_of_reports() -> None:
+    report = decode_report(bytes.fromhex("0507030000000000666633330030"))
+    assert report is not None
+    assert (report.sequence, report.status, report.delay) == (7, 3, 0)
+    assert report.values == pytest.approx((0.0, 0.0, 0x6666 / 16384, 0x3333 / 16384, 3.0))
+    force = decode_report(bytes.fromhex("010002000000000" + "0d009"))
+    assert force is not None
+    assert force.values == pytest.approx((0.0, 0.0, 0x09D0 / 256))
+
+
+def test_base_times_have_the_sign_of_the_vendors_library() -> None:
+    assert base_time(encode_base_time(120)) == -120
+    assert base_time(bytes.fromhex("fa78000000")) == 120
+    assert base_time(bytes.fromhex("f900")) is None
+
+
+def test_packets_of_unknown_or_cut_off_reports_are_refused() -> None:
+    assert split_reports(encode_base_time(3) + b"\x99") is None
+    assert split_reports(encode_base_time(3)[:-1]) is None
+    assert split_reports(b"") == []
+
+
+def test_replies_of_the_hub() -> None:
+    wire = encode_firmware((3, 12, 4), 10_004_148, 230)
+    assert decode_firmware(wire) == ((3, 12, 4), 10_004_148, 230)
+    assert decode_firmware(b"\xf8") is None
+    assert decode_interval(encode_feature(5, 10_000, response=True)) == (5, 10_000)
+    assert decode_interval(b"\xfc") is None
+    assert feature_request(5) == b"\xfe\x05"
+
+
+def test_the_package_of_adafruit_reads_the_same_rotation() -> None:
+    package = adafruit("adafruit_bno08x")
+    report = HubReport(HubReportId.ROTATION_VECTOR, 1, 3, 0, (0.5, -0.25, 0.75, 0.125, 0.0))
+    values, accuracy = package._parse_sensor_report_data(bytearray(encode_report(report)))
+    assert values == report.values[:4]
+    assert accuracy == 3
