@@ -77,7 +77,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event
     from jointfit_protocols.natnet import Message
 
-VERSIONS = ((3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (0, 0), (99, 99))
+VERSIONS = ((2, 5), (2, 11), (3, 0), (3, 1), (4, 0), (4, 1), (4, 2), (0, 0), (99, 99))
 ANSWERS = (0x01, 0x0D, 0x13, 0x1D, 0x2D, 0x3E, 0x42, 0x43, 0xC1, 0xED)
 """Xbus messages that a device sends unsolicited or as answers."""
 SIZES = (1, 2, 7, 40, 300, 4096)

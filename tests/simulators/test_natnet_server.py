@@ -28,6 +28,7 @@ from jointfit_protocols.natnet import (
     encode,
 )
 from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, RigidBodyAsset
+from tests.drivers.motion_capture.oracle_client import needs_client, oracle_frames
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -253,3 +254,23 @@ async def test_network_faults_have_their_probability(fault: str) -> None:
         "hostile": len(received) == 60 and len(numbers) < 50,
     }
     assert observed[fault]
+
+
+@needs_client
+@pytest.mark.parametrize("version", [(3, 1), (4, 0), (4, 1)], ids=str)
+async def test_another_independent_client_reads_visible_bodies_only(
+    version: tuple[int, int],
+) -> None:
+    async with serving(bitstream=version, copy_to_data_port=True, up_axis="z") as server:
+
+        async def push() -> None:
+            while True:
+                server.push(time.monotonic_ns(), PLACES, POSES)
+                await asyncio.sleep(0.01)
+
+        pushing = asyncio.create_task(push())
+        settings = {"interface_ip": "127.0.0.1", "port_command": str(server.command_port)}
+        async with oracle_frames("optitrack", hostname="127.0.0.1", **settings) as next_frame:
+            seen = [await next_frame() for _ in range(5)]
+        pushing.cancel()
+    assert seen[1:] == [{"Thigh": [1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0]}] * 4

@@ -173,7 +173,7 @@ class NatNetDecoder:
 
         if not natnet.supported(info.bitstream):
             name = "{}.{}".format(*info.bitstream)
-            text = f"the server uses NatNet {name}, 3.0 or newer is required"
+            text = f"the server uses NatNet {name}, 2.5 or newer is required"
             out.append(DeviceEvent("error", text, {"bitstream": name}))
 
     def _model(self, model: natnet.ModelDefinition, out: list[Decoded]) -> None:

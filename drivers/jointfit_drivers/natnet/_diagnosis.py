@@ -185,9 +185,9 @@ async def _missing_frames(
         text = f"the server streams bitstream {natnet}, the newest known one is {_NEWEST}"
         remedy = 'switch Motive to unicast, and set bitstream = "4.1" in [mocap]'
         return [Finding(CHECK, name, "error", text, remedy)]
-    if major < OLDEST[0]:
+    if tuple(map(int, natnet.split("."))) < OLDEST:
         text = f"the server streams bitstream {natnet}, expected {oldest} or newer"
-        return [Finding(CHECK, name, "error", text, "update Motive to 2.0 or later")]
+        return [Finding(CHECK, name, "error", text, "update Motive to 1.5 or later")]
     if reception.datagrams or isinstance(failure, DeviceMisconfiguredError):
         remedy = "restart streaming in Motive; `jointfit decode natnet` shows a capture of it"
         text = str(failure) if failure is not None else "frames arrive before the model"

@@ -1,4 +1,4 @@
-"""Driver of OptiTrack Motive and other NatNet 3 or 4 servers, over UDP.
+"""Driver of OptiTrack Motive and other servers of NatNet 2.5 to 4.x, over UDP.
 
 `NatNetDecoder` is the pure part. `NatNetMocap.run` connects and emits every accepted datagram
 of the server, answers of the handshake included, so that a replay has the same input as the

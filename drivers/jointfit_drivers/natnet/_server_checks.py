@@ -9,7 +9,7 @@ from ipaddress import IPv4Address
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceMisconfiguredError
-from jointfit_protocols.natnet import OLDEST, Connect, supported
+from jointfit_protocols.natnet import OLDEST, TICKED, Connect, supported
 
 if TYPE_CHECKING:
     from jointfit_drivers.natnet._settings import NatNetSettings
@@ -40,7 +40,8 @@ def connect_request(settings: NatNetSettings) -> Connect:
 def is_unicast(settings: NatNetSettings, info: ServerInfo) -> bool:
     """Return whether frames arrive on the command socket."""
     if settings.transport == "auto":
-        return not info.multicast
+        # Servers of bitstream 2.x announce no transport; multicast was the default of Motive.
+        return not info.multicast and info.bitstream >= TICKED
     return settings.transport == "unicast"
 
 
@@ -55,8 +56,10 @@ def check_server(name: str, settings: NatNetSettings, info: ServerInfo) -> None:
     found = f"{name} ({info.application}) uses NatNet {info.bitstream[0]}.{info.bitstream[1]}"
     if not supported(info.bitstream):
         raise DeviceMisconfiguredError(
-            f"{found}; {OLDEST[0]}.{OLDEST[1]} or newer is required: update Motive to 2.0 or later"
+            f"{found}; {OLDEST[0]}.{OLDEST[1]} or newer is required: update Motive to 1.5 or later"
         )
+    if info.bitstream < TICKED:
+        return  # frames without server ticks: no clock is needed
     if not info.clock_hz:
         raise DeviceMisconfiguredError(
             f"{found} but announces no clock frequency, so its stamps cannot be used: "

@@ -60,8 +60,8 @@ MISFITS = 3
 
 _PARAMS = struct.Struct("<h")
 _PARAMS_FROM_END = 6
-"""Place of the flags: they and the end tag close every frame, in every bitstream."""
-_SHORTEST_FRAME = 4 + 78
+"""Place of the flags: they and the end tag close every frame from bitstream 2.6 on."""
+_SHORTEST_FRAME = 4 + 50
 
 
 class NatNetSession:
@@ -162,7 +162,7 @@ class NatNetSession:
             self._message(chunk)
 
     def _frame(self, chunk: Chunk) -> None:
-        if len(chunk.data) >= _SHORTEST_FRAME:
+        if len(chunk.data) >= _SHORTEST_FRAME and self._bitstream.version >= natnet.FLAGGED:
             (params,) = _PARAMS.unpack_from(chunk.data, len(chunk.data) - _PARAMS_FROM_END)
             self._model_wanted |= bool(params & natnet.FRAME_MODEL_CHANGED)
             self._info_wanted |= bool(params & natnet.FRAME_BITSTREAM_CHANGED)
@@ -246,7 +246,7 @@ class NatNetSession:
             now = time.monotonic()
             self._check_alive(info, unicast, max(self._frame_ns, began_ns))
 
-            if now >= echo_at:
+            if info.clock_hz and now >= echo_at:
                 self._send(natnet.EchoRequest(time.monotonic_ns()))
                 echoes += 1
                 usual_s = random.uniform(*ECHO_S)  # noqa: S311 - out of step, not secret
@@ -263,7 +263,7 @@ class NatNetSession:
                 if self._model_wanted:
                     self._send(natnet.Bare(NatNetMessageId.REQUEST_MODELDEF))
 
-            due = [echo_at, now + self._settings.silence_s / 4]
+            due = [echo_at] * bool(info.clock_hz) + [now + self._settings.silence_s / 4]
             await self._link.pause(min(due + [alive_at] * unicast) - now)
 
     def _check_alive(self, info: natnet.ServerInfo, unicast: bool, heard_ns: int) -> None:

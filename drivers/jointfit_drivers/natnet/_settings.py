@@ -10,7 +10,7 @@ from jointfit_drivers.motion_capture import ServerSettings
 
 
 class NatNetSettings(ServerSettings):
-    """The ``[mocap]`` table for OptiTrack Motive and other servers of NatNet 3 or 4."""
+    """The ``[mocap]`` table for OptiTrack Motive and other servers of NatNet 2.5 to 4.x."""
 
     server: str = Field(description="address or name of the PC that runs Motive")
     transport: Literal["auto", "unicast", "multicast"] = Field(

@@ -11,14 +11,16 @@ from jointfit_protocols.natnet._frame import (
     MARKER_POINT_CLOUD_SOLVED,
     OLDEST,
     SIZED,
+    TICKED,
     Body,
     FrameOfData,
     LabeledMarker,
     MarkerSet,
     Version,
-    decode_frame,
     supported,
 )
+from jointfit_protocols.natnet._frame_2x import FLAGGED
+from jointfit_protocols.natnet._frame_decode import decode_frame
 from jointfit_protocols.natnet._frame_layout import FrameLayout
 from jointfit_protocols.natnet._frame_time import DECIDING, PrecisionTime, timecode_of
 from jointfit_protocols.natnet._messages import (
@@ -48,6 +50,7 @@ from jointfit_protocols.natnet._model import (
 __all__ = [
     "BODY_TRACKED",
     "DECIDING",
+    "FLAGGED",
     "FRAME_BITSTREAM_CHANGED",
     "FRAME_EDIT_MODE",
     "FRAME_MODEL_CHANGED",
@@ -58,6 +61,7 @@ __all__ = [
     "NAMES_FROM",
     "OLDEST",
     "SIZED",
+    "TICKED",
     "AssetDescription",
     "Bare",
     "Body",

@@ -5,7 +5,6 @@
 
 Little-endian, packed. Each section starts with ``i32 n`` and, from 4.1, ``i32 bytes`` of its items;
 assets exist from 4.1 on. Positions are metres in the server's world, quaternions x, y, z, w.
-Bitstreams 2.x are refused: they have no exposure stamp, and their servers answer no echo.
 
 Source: NaturalPoint NatNet SDK 4.1, NatNetTypes.h and PythonClient.
 """
@@ -16,8 +15,7 @@ import struct
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jointfit_protocols.corrupt import CorruptBytes
-from jointfit_protocols.natnet._cursor import BREAKS, XYZ, Cursor, MalformedError
+from jointfit_protocols.natnet._cursor import XYZ, Cursor, MalformedError
 
 Version = tuple[int, int]
 """Bitstream in use: major and minor."""
@@ -27,7 +25,9 @@ Position = tuple[float, float, float]
 SectionReader = Callable[[Cursor, int], tuple[Any, ...]]
 """Reads the items of one section; the number of items is the argument."""
 
-OLDEST: Version = (3, 0)
+OLDEST: Version = (2, 5)
+TICKED: Version = (3, 0)
+"""From this bitstream on, frames contain server ticks; older ones are read by `_frame_2x`."""
 SIZED: Version = (4, 1)
 """From this bitstream on, sections contain their size in bytes."""
 
@@ -138,30 +138,12 @@ class FrameOfData(NamedTuple):
 
 
 def supported(version: Version) -> bool:
-    """Return whether frames of this bitstream can be decoded: 3.0 and newer, by section size."""
+    """Return whether frames of this bitstream can be decoded: 2.5 and newer, by section size."""
     return version >= OLDEST
 
 
-def decode_frame(datagram: bytes, version: Version) -> FrameOfData | CorruptBytes:
-    """Return the frame in a whole FRAMEOFDATA datagram (header included); never raises.
-
-    A frame is accepted only if it ends exactly at the end of the datagram, end tag included.
-    The length decides whether there is a precision timestamp, in every version.
-    """
-    if not supported(version):
-        return CorruptBytes(
-            len(datagram), f"NatNet bitstream {version[0]}.{version[1]} is not supported"
-        )
-    try:
-        return _read_frame(Cursor(datagram, 4), version >= SIZED)
-    except BREAKS as problem:
-        return CorruptBytes(len(datagram), f"frame: {problem}")
-
-
-# --- reading ----------------------------------------------------------------------------------
-
-
-def _read_frame(cursor: Cursor, sized: bool) -> FrameOfData:
+def read_frame(cursor: Cursor, sized: bool) -> FrameOfData:
+    """Read one frame; the length decides whether there is a precision timestamp."""
     number = cursor.integer()
     skipped: list[str] = []
     sections = {
@@ -232,6 +214,11 @@ def _read_analog(cursor: Cursor) -> Analog:
     return Analog(number, tuple(tuple(value for (value,) in channel) for channel in channels))
 
 
+def read_analogs(cursor: Cursor, n: int) -> tuple[Analog, ...]:
+    """Read `n` force plates or devices."""
+    return tuple(_read_analog(cursor) for _ in range(n))
+
+
 def _items(read: Callable[[Cursor], Any]) -> SectionReader:
     """Return the reader of a section whose items differ in size."""
     return lambda cursor, n: tuple(read(cursor) for _ in range(n))
@@ -244,8 +231,8 @@ _SECTIONS: tuple[tuple[str, int, SectionReader], ...] = (
     ("bodies", BODY_LAYOUT.size, _read_bodies),
     ("skeletons", 8, _items(lambda c: Skeleton(c.integer(), _read_bodies(c, c.integer())))),
     ("markers", MARKER_LAYOUT.size, _read_markers),
-    ("force_plates", 8, _items(_read_analog)),
-    ("devices", 8, _items(_read_analog)),
+    ("force_plates", 8, read_analogs),
+    ("devices", 8, read_analogs),
 )
 _ASSETS = _items(
     lambda c: Asset(c.integer(), _read_bodies(c, c.integer()), _read_markers(c, c.integer()))

@@ -16,12 +16,14 @@ from jointfit_protocols.natnet._frame import (
     PRECISION_LAYOUT,
     SIZED,
     STAMPS_LAYOUT,
+    TICKED,
     TWO_LAYOUT,
     Analog,
     FrameOfData,
     Version,
     supported,
 )
+from jointfit_protocols.natnet._frame_2x import put_frame_2x
 
 if TYPE_CHECKING:
     import struct
@@ -34,13 +36,15 @@ def encode_frame(frame: FrameOfData, version: Version) -> bytes:
     Raises
     ------
     ValueError
-        The bitstream is older than 3.0, or has no field for something in the frame.
+        The bitstream is older than 2.5, or has no field for something in the frame.
     struct.error
         A value exceeds its field.
     """
     if not supported(version):
         raise ValueError(f"bitstream {version[0]}.{version[1]} is not written")
 
+    if version < TICKED:
+        return put_frame_2x(frame, version, _put_analog)
     sized = version >= SIZED
     if not sized and frame.assets:
         raise ValueError("assets exist from bitstream 4.1 on")

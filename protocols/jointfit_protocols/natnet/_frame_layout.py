@@ -19,6 +19,7 @@ from jointfit_protocols.natnet._frame import (
     PRECISION_LAYOUT,
     SIZED,
     STAMPS_LAYOUT,
+    TICKED,
     Body,
     FrameOfData,
     LabeledMarker,
@@ -78,6 +79,8 @@ class FrameLayout:
     def of(datagram: bytes, frame: FrameOfData, version: Version) -> FrameLayout | None:
         """Return the layout of a decoded frame; None if it contains items without fixed places."""
         if frame.skeletons or frame.assets or frame.force_plates or frame.devices or frame.skipped:
+            return None
+        if version < TICKED:
             return None
         head = 2 * I32.size if version >= SIZED else I32.size
         at = _HEADER_BYTES + I32.size + head

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, NamedTuple
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet._connect import Connect, Version4, decode_connect, encode_connect
 from jointfit_protocols.natnet._cursor import fixed_text, put_fixed_text
-from jointfit_protocols.natnet._frame import FrameOfData, Version, decode_frame
+from jointfit_protocols.natnet._frame import FrameOfData, Version
+from jointfit_protocols.natnet._frame_decode import decode_frame
 from jointfit_protocols.natnet._frame_encode import encode_frame
 from jointfit_protocols.natnet._model import ModelDefinition, decode_model
 from jointfit_protocols.natnet._model_encode import encode_model

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.natnet._cursor import BREAKS, I32, XYZ, Cursor, MalformedError
-from jointfit_protocols.natnet._frame import SIZED, Position, Version, supported
+from jointfit_protocols.natnet._frame import SIZED, TICKED, Position, Version, supported
 
 
 class DescriptionType(IntEnum):
@@ -206,6 +206,7 @@ class _Reader:
 
     def __init__(self, cursor: Cursor, version: Version, rotated: bool) -> None:
         self._cursor = cursor
+        self._marked = version >= TICKED
         self._named = version >= NAMES_FROM
         self._rotated = rotated
 
@@ -242,6 +243,8 @@ class _Reader:
         cursor = self._cursor
         name = cursor.text()
         number, parent, *offset = cursor.unpack(BODY_HEAD_LAYOUT)
+        if not self._marked:
+            return BodyDescription(name, number, parent, (offset[0], offset[1], offset[2]))
         rotation: Any = cursor.unpack(QUATERNION_LAYOUT) if self._rotated else None
         n = cursor.count(XYZ.size + I32.size)
 
@@ -255,7 +258,7 @@ class _Reader:
         return BodyDescription(name, number, parent, (x, y, z), positions, labels, names, rotation)
 
     def _bodies(self) -> tuple[BodyDescription, ...]:
-        smallest = 1 + BODY_HEAD_LAYOUT.size + I32.size
+        smallest = 1 + BODY_HEAD_LAYOUT.size + I32.size * self._marked
         return tuple(self._body() for _ in range(self._cursor.count(smallest)))
 
     def _marker(self) -> AssetMarkerDescription:

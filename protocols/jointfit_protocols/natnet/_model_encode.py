@@ -6,7 +6,7 @@ Invariant: a model of a real server that `decode_model` has decoded is encoded b
 from __future__ import annotations
 
 from jointfit_protocols.natnet._cursor import I32, XYZ, put_text, put_texts
-from jointfit_protocols.natnet._frame import SIZED, TWO_LAYOUT, Version, supported
+from jointfit_protocols.natnet._frame import SIZED, TICKED, TWO_LAYOUT, Version, supported
 from jointfit_protocols.natnet._model import (
     ASSET_MARKER_LAYOUT,
     BODY_HEAD_LAYOUT,
@@ -33,7 +33,7 @@ def encode_model(model: ModelDefinition, version: Version) -> bytes:
     Raises
     ------
     ValueError
-        The bitstream is older than 3.0, or a description does not exist in it.
+        The bitstream is older than 2.5, or a description does not exist in it.
     """
     if not supported(version):
         raise ValueError(f"bitstream {version[0]}.{version[1]} is not written")
@@ -87,6 +87,8 @@ def _put(description: Description, version: Version) -> tuple[int, bytes]:  # no
 def _put_body(body: BodyDescription, version: Version) -> bytes:
     head = BODY_HEAD_LAYOUT.pack(body.id, body.parent, *body.offset)
     rotation = b"" if body.rotation is None else QUATERNION_LAYOUT.pack(*body.rotation)
+    if version < TICKED:
+        return put_text(body.name) + head
     n = len(body.positions)
     if len(body.labels) != n or (version >= NAMES_FROM and len(body.markers) != n):
         raise ValueError(f"{body.name}: as many labels and names as markers are needed")

@@ -19,6 +19,7 @@ from jointfit_protocols.natnet import (
     FRAME_MODEL_CHANGED,
     HEADER,
     SIZED,
+    TICKED,
     Bare,
     CommandRequest,
     CommandResponse,
@@ -279,7 +280,8 @@ class NatNetServer:
     def _send_info(self, address: Address, version: Version) -> None:
         options = self.options
         info = ServerInfo(
-            options.application, (3, 0, 0, 0), (*version, 0, 0), options.clock_hz,
+            options.application, (3, 0, 0, 0), (*version, 0, 0),
+            options.clock_hz if version >= TICKED else None,
             self.data_port, options.transport == "multicast", options.group,
         )  # fmt: skip
         data = bytearray(encode(info))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import socket
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
 from typing_extensions import override
@@ -48,6 +48,7 @@ class TestNatNet(DriverContract):
     has_noise = False  # a UDP checksum tells damaged datagrams apart before we see them
     test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
     options = NatNetServerOptions(bodies=(THIGH,), bitstream=(3, 1))
+    keys: ClassVar[dict[str, Any]] = {}
     _devices: list[Any]
 
     @pytest.fixture(autouse=True)
@@ -68,7 +69,7 @@ class TestNatNet(DriverContract):
         port = self._devices[-1].command_port if self._devices else 1510
         settings = NatNetSettings(
             driver="natnet", server="127.0.0.1", command_port=port, silence_s=0.5,
-            markers={"thigh": THIGH.markers},
+            markers={"thigh": THIGH.markers}, **self.keys,
         )  # fmt: skip
         return NatNetMocap(settings)
 
@@ -92,6 +93,15 @@ class TestNatNet(DriverContract):
 
 class TestNatNet41(TestNatNet):
     options = NatNetServerOptions(bodies=(THIGH,), bitstream=(4, 1))
+
+
+class TestNatNet29(TestNatNet):
+    options = NatNetServerOptions(bodies=(THIGH,), bitstream=(2, 9))
+    keys: ClassVar[dict[str, Any]] = {"transport": "unicast"}
+
+
+class TestNatNet25(TestNatNet29):
+    options = NatNetServerOptions(bodies=(THIGH,), bitstream=(2, 5))
 
 
 def multicast_works() -> bool:

@@ -229,11 +229,23 @@ def test_frames_in_the_requested_bitstream_are_decoded_without_confirmation() ->
     assert [type(event) for event in out] == [DeviceEvent, MocapFrame]
 
 
-def test_a_server_of_bitstream_2_is_refused_by_name() -> None:
+def test_a_server_before_bitstream_2_5_is_refused_by_name() -> None:
     feeder = Feeder()
-    (error,) = told(feeder(INFO._replace(natnet_version=(2, 9, 0, 0), clock_hz=None)), "error")
-    assert "2.9" in error.text
+    (error,) = told(feeder(INFO._replace(natnet_version=(2, 4, 0, 0), clock_hz=None)), "error")
+    assert "2.4" in error.text
     assert isinstance(feeder(frame(1))[0], Corrupt)
+
+
+@pytest.mark.parametrize("version", [(2, 5), (2, 6), (2, 7), (2, 9), (2, 11)])
+def test_frames_of_bitstream_2_have_no_device_time(version: tuple[int, int]) -> None:
+    feeder = Feeder(version=version)
+    feeder(INFO._replace(natnet_version=(*version, 0, 0), clock_hz=None), MODEL)
+    seen = feeder.frame(
+        frame(7, markers=(marker(65537, (1.0, 2.0, 3.0)),), bodies=(body(1, (0, 0, 0.6, 0.8)),))
+    )
+    assert (seen.number, seen.ticks, feeder.decoder.tick_clock) == (7, None, None)
+    assert seen.markers[seen.layout.markers.index("T1")].tolist() == [1.0, 2.0, 3.0]
+    assert seen.body_positions[seen.layout.bodies.index("Thigh")].tolist() == [1.0, 2.0, 3.0]
 
 
 def test_messages_of_clients_are_ignored() -> None:

@@ -221,9 +221,9 @@ class Claimant(NatNetServer):
     ("claims", "settings", "words"),
     [
         (
-            ServerInfo("Motive", (1, 9, 0, 0), (2, 9, 0, 0), None),
+            ServerInfo("Arena", (1, 4, 0, 0), (2, 4, 0, 0), None),
             {},
-            "uses NatNet 2.9; 3.0 or newer",
+            "uses NatNet 2.4; 2.5 or newer",
         ),
         (ServerInfo("Motive", (5, 0, 0, 0), (5, 0, 0, 0), 10**7), {}, "bitstream = '4.1'"),
         (ServerInfo("Fake", (3, 0, 0, 0), (4, 0, 0, 0), 0), {}, "no clock frequency"),

@@ -19,9 +19,9 @@ from jointfit_protocols.natnet import (
     ModelDefinition,
     ServerInfo,
     decode,
+    decode_frame,
     encode,
 )
-from jointfit_protocols.natnet._frame import decode_frame
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -1,0 +1,31 @@
+"""Decoder of NatNet FRAMEOFDATA in every supported bitstream.
+
+Invariant: a frame is accepted only if it ends exactly at the end of the datagram, end tag included.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.natnet._cursor import BREAKS, Cursor
+from jointfit_protocols.natnet._frame import SIZED, TICKED, read_frame, supported
+from jointfit_protocols.natnet._frame_2x import read_frame_2x
+
+if TYPE_CHECKING:
+    from jointfit_protocols.natnet._frame import FrameOfData, Version
+
+
+def decode_frame(datagram: bytes, version: Version) -> FrameOfData | CorruptBytes:
+    """Return the frame in a whole FRAMEOFDATA datagram (header included); never raises."""
+    if not supported(version):
+        return CorruptBytes(
+            len(datagram), f"NatNet bitstream {version[0]}.{version[1]} is not supported"
+        )
+    cursor = Cursor(datagram, 4)
+    try:
+        if version < TICKED:
+            return read_frame_2x(cursor, version)
+        return read_frame(cursor, version >= SIZED)
+    except BREAKS as problem:
+        return CorruptBytes(len(datagram), f"frame: {problem}")
