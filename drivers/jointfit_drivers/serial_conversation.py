@@ -81,6 +81,7 @@ class SerialConversation(Generic[Message]):
         self._codec = make_codec()
         self._emitting = False
         self._recent = b""
+        self._t_ns = 0  # arrival of the last chunk
         self._logged = 0
         self.received = 0
         """Bytes received so far."""
@@ -123,11 +124,12 @@ class SerialConversation(Generic[Message]):
             self.understood += len(messages)
             for message in messages:
                 if is_reply(message):
-                    self._begin(message, 0 if chunk is None else chunk.t_ns)
+                    self._begin(message)
                     return message
         return None
 
     def _take(self, chunk: Chunk) -> Sequence[Message | CorruptBytes]:
+        self._t_ns = chunk.t_ns
         self.received += len(chunk.data)
         if self._logged < _LOGGED:
             self._logged += 1
@@ -138,11 +140,11 @@ class SerialConversation(Generic[Message]):
             self._recent = (self._recent + chunk.data)[-_KEPT:]
         return self._codec.feed(chunk.data)
 
-    def _begin(self, first: Message, t_ns: int) -> None:
+    def _begin(self, first: Message) -> None:
         """Emit the first reply and the bytes behind it; all later bytes follow."""
         if self._emitting:
             return
         since = self._codec.fed - first.end + first.size
         data, self._recent = self._recent[-since:], b""
         self._emitting = True
-        self._emit(Chunk(t_ns, data))
+        self._emit(Chunk(self._t_ns, data))

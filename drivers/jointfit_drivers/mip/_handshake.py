@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NoReturn
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.mip._conversation import MipConversation, MipReply
+from jointfit_drivers.silence import explain_silence
 from jointfit_protocols.mip import commands
 from jointfit_protocols.mip.commands import Base, CommandSet, FilterSetup, Function, Output, Setup
 from jointfit_protocols.mip.data import DataSet
@@ -26,8 +27,6 @@ log = logging.getLogger(__name__)
 
 LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600)
 """Line speeds to search, bit/s: factory setting and common choices first."""
-_LISTEN_S = 0.15
-"""Time at each speed of the search, s."""
 _SAVE_S = 3.0
 """Longest wait for settings to be saved, s."""
 _READ = bytes((Function.READ,))
@@ -84,7 +83,16 @@ class MipHandshake:
 
         self._conversation.reset()
         if await self._conversation.command(CommandSet.BASE, Base.IDLE) is None:
-            await self._explain_silence()
+            await explain_silence(
+                self._port,
+                self._conversation,
+                baud=settings.baud,
+                speeds=LINE_SPEEDS,
+                hunt=self._hunt,
+                family="MIP",
+                pause=lambda wait_s: self._once(Base.IDLE, wait_s),
+                resume=lambda wait_s: self._once(Base.RESUME, wait_s),
+            )
 
         try:
             await self._configure()
@@ -233,6 +241,10 @@ class MipHandshake:
         self._refuse(reply, "refuses to stream", self._alternatives())
         return True
 
+    async def _once(self, command: Base, wait_s: float) -> MipReply | None:
+        """Return the reply to a command that is sent once."""
+        return await self._conversation.command(CommandSet.BASE, command, tries=1, wait_s=wait_s)
+
     async def _answer(self, command_set: int, command: int, data: bytes = b"") -> MipReply:
         """Return the reply to a command that the device must answer; it may be a refusal."""
         reply = await self._conversation.command(command_set, command, data)
@@ -251,49 +263,6 @@ class MipHandshake:
                 f"{self._who}: {self._model} {what} ({commands.code_text(reply.code)}): "
                 f"set or change {change}"
             )
-
-    async def _explain_silence(self) -> NoReturn:
-        """Raise the error for a device that does not answer."""
-        conversation = self._conversation
-        received = conversation.received
-        if conversation.understood:
-            raise DeviceLostError(
-                f"{self._who}: streams but does not answer: check the wire from host to device"
-            )
-
-        speed = await self._other_speed() if self._hunt or received else None
-        if speed is not None:
-            raise DeviceMisconfiguredError(
-                f"{self._who}: {self._settings.baud} baud, but no packet can be decoded; "
-                f"the device answers at {speed}: set baud = {speed}"
-            )
-        if not received:
-            raise DeviceLostError(
-                f"{self._who}: silent: check its power, and that TX and RX are not swapped"
-            )
-        raise DeviceMisconfiguredError(
-            f"{self._who}: the device on this port does not use MIP: it sends bytes, none of them "
-            "MIP at any common speed: correct `port` or `driver`"
-        )
-
-    async def _other_speed(self) -> int | None:
-        """Return the speed at which the device answers; it continues to stream as before."""
-        for baud in LINE_SPEEDS:
-            if baud == self._settings.baud:
-                continue
-            try:
-                self._port.set_baud(baud)
-            except DeviceMisconfiguredError:  # the port does not support it
-                continue
-            self._conversation.reset()
-            answered = await self._conversation.command(
-                CommandSet.BASE, Base.IDLE, tries=1, wait_s=_LISTEN_S
-            )
-            if answered is not None:  # wait for the reply: closing the port discards unsent bytes
-                await self._conversation.command(CommandSet.BASE, Base.RESUME, tries=1)
-            if answered is not None or self._conversation.understood:
-                return baud
-        return None
 
 
 def _describe(outputs: tuple[Output, ...]) -> str:

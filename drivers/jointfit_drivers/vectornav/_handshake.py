@@ -8,10 +8,11 @@ raises `DeviceLostError`, any other `DeviceMisconfiguredError`; the device then 
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.serial_conversation import SerialConversation
+from jointfit_drivers.silence import explain_silence
 from jointfit_protocols.vectornav import (
     TextMessage,
     VectorNavCodec,
@@ -36,8 +37,8 @@ log = logging.getLogger(__name__)
 
 LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 128_000, 57_600, 38_400, 19_200, 9_600)
 """Line speeds to search, bit/s: factory setting and common choices first."""
-_REPLY_S, _STORE_S, _LISTEN_S = 0.5, 3.0, 0.15
-"""Longest wait for a reply, for all registers to be stored, and at each speed of the search, s."""
+_REPLY_S, _STORE_S = 0.5, 3.0
+"""Longest wait for a reply, and for all registers to be stored, s."""
 _IMU_RATES = {"VN-3": 400}
 _IMU_RATE = 800
 """Rate of the IMU, Hz, by the beginning of the model name, and of all other models."""
@@ -90,7 +91,16 @@ class VectorNavHandshake:
 
         self._conversation.reset()
         if await self._ask("VNASY,0", tries=3) is None:
-            await self._explain_silence()
+            await explain_silence(
+                self._port,
+                self._conversation,
+                baud=settings.baud,
+                speeds=LINE_SPEEDS,
+                hunt=self._hunt,
+                family="VectorNav",
+                pause=lambda wait_s: self._ask("VNASY,0", tries=1, wait_s=wait_s),
+                resume=lambda wait_s: self._ask("VNASY,1", tries=1, wait_s=wait_s),
+            )
 
         try:
             await self._configure()
@@ -203,47 +213,6 @@ class VectorNavHandshake:
                 f"{self._who}: {self._model} {what} ({error_text(reply.error)}): "
                 f"set or change {change}"
             )
-
-    async def _explain_silence(self) -> NoReturn:
-        """Raise the error for a device that does not answer."""
-        conversation = self._conversation
-        received = conversation.received
-        if conversation.understood:
-            raise DeviceLostError(
-                f"{self._who}: streams but does not answer: check the wire from host to device"
-            )
-
-        speed = await self._other_speed() if self._hunt or received else None
-        if speed is not None:
-            raise DeviceMisconfiguredError(
-                f"{self._who}: {self._settings.baud} baud, but no message can be decoded; "
-                f"the device answers at {speed}: set baud = {speed}"
-            )
-        if not received:
-            raise DeviceLostError(
-                f"{self._who}: silent: check its power, and that TX and RX are not swapped"
-            )
-        raise DeviceMisconfiguredError(
-            f"{self._who}: the device on this port is not from VectorNav: it sends bytes, none of "
-            "them a VectorNav message at any common speed: correct `port` or `driver`"
-        )
-
-    async def _other_speed(self) -> int | None:
-        """Return the speed at which the device answers; it continues to stream as before."""
-        for baud in LINE_SPEEDS:
-            if baud == self._settings.baud:
-                continue
-            try:
-                self._port.set_baud(baud)
-            except DeviceMisconfiguredError:  # the port does not support it
-                continue
-            self._conversation.reset()
-            answered = await self._ask("VNASY,0", tries=1, wait_s=_LISTEN_S)
-            if answered is not None:  # wait for the reply: closing the port discards unsent bytes
-                await self._ask("VNASY,1", tries=1)
-            if answered is not None or self._conversation.understood:
-                return baud
-        return None
 
 
 def _is_sufficient(found: BinaryOutput | None, wanted: BinaryOutput) -> bool:

@@ -28,6 +28,7 @@ from jointfit_protocols.mip.data import (
     SensorField,
     SharedField,
     encode_field,
+    field_bytes,
 )
 from jointfit_protocols.orientation import native_of
 from jointfit_simulators.devices._inertial_signals import InertialSignals
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
 
 _BITS = 10
 """Bits of one byte on the line (8N1)."""
+_FRAME_BYTES = 6
+"""Framing of a packet, bytes."""
 _SPEED_BYTES = 4
 """Size of a speed in a command, bytes."""
 _SPEED_CHANGE_S = 0.25
@@ -189,7 +192,7 @@ class MipDevice:
         """Transmission time of a sample at the speed of the host's port, ns."""
         baud = self._line.host_baud
         size = sum(
-            len(encode(data_set, self._fields(data_set, state, 0, (1.0, 0.0, 0.0, 0.0))))
+            _FRAME_BYTES + sum(field_bytes(data_set, one.field) for one in state.outputs)
             for data_set, state in self._streams.items()
             if state.is_on
         )

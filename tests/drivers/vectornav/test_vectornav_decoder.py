@@ -122,6 +122,14 @@ def test_the_probe_tells_the_two_families_with_the_byte_fa_apart() -> None:
         assert decode_traffic(classes[other], other, {"baud": 115_200}, chunks) is None
 
 
+def test_the_probe_recognizes_the_factory_setting_without_orientations() -> None:
+    lines = [encode_text(f"VNYMR,+{k:07.3f},-007.330,+000.715") for k in range(20)]
+    chunks = [Chunk(k * PERIOD_NS, data) for k, data in enumerate(lines)]
+    found = decode_traffic(VectorNavImu, "vectornav", {"baud": 115_200}, chunks)
+    assert found is not None
+    assert (found.messages, found.samples) == (20, 0)
+
+
 @given(st.lists(st.tuples(st.integers(0, 2**64 - 1), st.integers(0, 10**12)), max_size=30))
 def test_hostile_times_never_raise(content: list[tuple[int, int]]) -> None:
     decoder = VectorNavImu(settings()).decoder()

@@ -1,0 +1,91 @@
+"""Reason why a device on a serial line does not answer, with a search at other line speeds.
+
+Invariant: a device that answers at another speed continues as before, and nothing is configured.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable, Sequence
+
+    from jointfit_drivers.ports.serial_port import SerialPort
+    from jointfit_drivers.serial_conversation import SerialConversation
+
+_LISTEN_S = 0.15
+"""Time at each speed of the search, s."""
+_RESUME_S = 0.5
+"""Longest wait for the device to continue, s."""
+
+
+async def explain_silence(
+    port: SerialPort,
+    conversation: SerialConversation[Any],
+    *,
+    baud: int,
+    speeds: Sequence[int],
+    hunt: bool,
+    family: str,
+    pause: Callable[[float], Awaitable[object]],
+    resume: Callable[[float], Awaitable[object]],
+) -> NoReturn:
+    """Raise the error for a device that does not answer.
+
+    Parameters
+    ----------
+    port, conversation
+        Open port, and the conversation that found no answer.
+    baud
+        Configured speed, bit/s.
+    speeds
+        Speeds to search.
+    hunt
+        Whether to search for a silent device; one whose bytes cannot be decoded is always searched
+        for.
+    family
+        Name of its protocol.
+    pause, resume
+        Ask the device to stop and to continue streaming, and wait for the reply at most as long as
+        given, s; None without a reply.
+
+    Raises
+    ------
+    DeviceLostError
+        The device is silent, or streams and does not answer.
+    DeviceMisconfiguredError
+        It answers at another speed, or is of another kind.
+    """
+    received = conversation.received
+    if conversation.understood:
+        raise DeviceLostError(
+            f"{port.path}: streams but does not answer: check the wire from host to device"
+        )
+
+    for speed in speeds if hunt or received else ():
+        if speed == baud:
+            continue
+        try:
+            port.set_baud(speed)
+        except DeviceMisconfiguredError:  # the port does not support it
+            continue
+        conversation.reset()
+        answered = await pause(_LISTEN_S)
+        if answered is not None:  # wait for the reply: closing the port discards unsent bytes
+            await resume(_RESUME_S)
+        if answered is not None or conversation.understood:
+            raise DeviceMisconfiguredError(
+                f"{port.path}: {baud} baud, but no message can be decoded; "
+                f"the device answers at {speed}: set baud = {speed}"
+            )
+
+    if not received:
+        raise DeviceLostError(
+            f"{port.path}: silent: check its power, and that TX and RX are not swapped"
+        )
+    raise DeviceMisconfiguredError(
+        f"{port.path}: the device on this port does not use {family}: it sends bytes, none of them "
+        f"{family} at any common speed: correct `port` or `driver`"
+    )
