@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -18,26 +19,39 @@ if TYPE_CHECKING:
 
 _MOST_PORT = 65_535
 
+_Serial = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="Serial port to listen on, PATH; repeatable.", autocompletion=complete_serial_port
+    ),
+]
+_Can = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="CAN interface to listen on, NAME; repeatable.", autocompletion=complete_can_interface
+    ),
+]
+_Mocap = Annotated[
+    list[str] | None,
+    typer.Option(help="Motion-capture server to ask, HOST or HOST:PORT; repeatable."),
+]
+_PhysicalTest = Annotated[
+    str | None,
+    typer.Option(
+        help="Sensor of rig.toml to test by three rotations, ID; the daemon must be stopped."
+    ),
+]
+_Config = Annotated[Path, typer.Option(help="Configuration of the sensor, for --physical-test.")]
+_Step = Annotated[
+    float, typer.Option("--step", help="Longest time for a rotation, s.", min=2.0, max=600.0)
+]
+
 
 def probe(
     *,
-    serial: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Serial port to listen on, PATH; repeatable.", autocompletion=complete_serial_port
-        ),
-    ] = None,
-    can: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="CAN interface to listen on, NAME; repeatable.",
-            autocompletion=complete_can_interface,
-        ),
-    ] = None,
-    mocap: Annotated[
-        list[str] | None,
-        typer.Option(help="Motion-capture server to ask, HOST or HOST:PORT; repeatable."),
-    ] = None,
+    serial: _Serial = None,
+    can: _Can = None,
+    mocap: _Mocap = None,
     network: Annotated[
         bool,
         typer.Option("--network", help="Search the network for servers by one broadcast."),
@@ -46,15 +60,26 @@ def probe(
         float,
         typer.Option("--listen", help="Time at each speed and interface, s.", min=0.1, max=60.0),
     ] = 1.0,
+    physical_test: _PhysicalTest = None,
+    config: _Config = Path("rig.toml"),
+    step_s: _Step = 60.0,
     json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """List serial ports, CAN interfaces and motion-capture servers; listen where requested.
 
     Opens only the named ports, interfaces and hosts, and changes no setting of a device. A port is
     read at the usual speeds of the installed drivers until one of them decodes the data. Prints
-    lines for rig.toml. Exit codes: 0 everything named was recognized; 1 a named port, interface or
-    server was not; 2 invalid options.
+    lines for rig.toml. With --physical-test it opens that sensor as the daemon does, guides through
+    three rotations, and prints what to correct. Exit codes: 0 everything named was recognized, or
+    the frames are as configured; 1 something was not, or they are not; 2 invalid options.
     """
+    if physical_test is not None:
+        if serial or can or mocap or network:
+            raise ValueError(
+                "--physical-test takes the port from rig.toml: leave out other devices"
+            )
+        _test_by_hand(physical_test, config, step_s, json=json)
+        return
     hosts = [_host_and_port(text) for text in mocap or ()]
 
     import orjson
@@ -70,6 +95,34 @@ def probe(
         for fault in report.faults:
             typer.echo(fault, err=True)
     if report.faults:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _test_by_hand(name: str, config: Path, step_s: float, *, json: bool) -> None:
+    from jointfit_daemon.config import load_rig
+    from jointfit_daemon.nearest_name import unknown_name
+    from jointfit_daemon.tools.probe._physical_test import PhysicalTestError, run_physical_test
+    from jointfit_daemon.tools.probe._test_report import test_lines
+    from jointfit_daemon.tools.text_output import echo_json, echo_wrapped
+
+    sensors = {source.id: source for source in load_rig(config).sources if source.kind == "imu"}
+    if name not in sensors:
+        raise ValueError(f"--physical-test: {unknown_name('sensor', name, list(sensors))}")
+
+    def tell(text: str) -> None:
+        typer.echo(text, err=json)
+
+    try:
+        result = asyncio.run(run_physical_test(sensors[name], tell, step_s=step_s))
+    except PhysicalTestError as error:
+        typer.echo(error, err=True)
+        raise typer.Exit(EXIT_FAILED) from None
+    if json:
+        echo_json(result)
+    else:
+        for line in test_lines(result):
+            echo_wrapped(line)
+    if not result.agrees:
         raise typer.Exit(EXIT_FAILED)
 
 

@@ -1,0 +1,141 @@
+"""Judges world, axes and direction of quaternions by three rotations of known axes. Pure.
+
+A sensor at rest, its z axis up, is turned three times by a quarter turn:
+
+1. about the vertical, counter-clockwise seen from above;
+2. about its own x axis, so that its y axis points up;
+3. about the vertical again, counter-clockwise.
+
+With ``q_k`` the orientation after rotation k, ``q_1 q_0*`` and ``q_3 q_2*`` must be +90 degrees
+about z in the world, and ``q_1* q_2`` +90 degrees about x in the sensor. Together they determine
+all but the heading: an inverse quaternion exchanges world and sensor, in which the axes of
+rotations 1 and 3 are at a right angle instead of equal.
+
+Exchanged components and wrong signs are an orthogonal transformation of q, which always equals a
+rotation of world and sensor of q or of its inverse. Of several explanations the simplest is given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.kinematics import rotation
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+
+TOLERANCE_RAD = radians(25.0)
+"""Largest deviation from a quarter turn that a hand makes, rad; another convention deviates by 90
+degrees or more."""
+_QUARTER = rotation.exp(0.5 * np.pi * np.eye(3)[[2, 0, 2]])
+_ORDERS = {"w x y z": (0, 1, 2, 3), "x y z w": (3, 0, 1, 2)}
+"""Index of w, x, y and z among the received components."""
+_AXES = "xyz"
+_PRINTED = "x is +x, y is +y, z is +z"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFit:
+    """How well poses at rest agree with the three rotations."""
+
+    deviations_rad: tuple[float, float, float]
+    """Angle between measured and expected change of each rotation, rad."""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether all rotations were measured as they were made."""
+        return all(angle <= TOLERANCE_RAD for angle in self.deviations_rad)
+
+
+def fit_frames(rests: Array) -> FrameFit:
+    """Compare four poses with the expected changes.
+
+    Parameters
+    ----------
+    rests : ndarray, shape (4, 4)
+        Canonical orientations q_world_sensor at rest, before the first rotation and after each.
+    """
+    back = rotation.conjugate(rests)
+    changes = np.stack(
+        (
+            rotation.multiply(rests[1], back[0]),
+            rotation.multiply(back[1], rests[2]),
+            rotation.multiply(rests[3], back[2]),
+        )
+    )
+    one, two, three = rotation.angle_between(_QUARTER, changes).tolist()
+    return FrameFit((one, two, three))
+
+
+def explain_frames(received: Array) -> str:
+    """Return in words which convention explains the received quaternions.
+
+    Order of the components, direction, axes of world and sensor are determined from the rotations,
+    each by the nearest axis.
+
+    Parameters
+    ----------
+    received : ndarray, shape (4, 4)
+        Quaternions as received, at rest, before the first rotation and after each.
+    """
+    explanations: list[tuple[int, str]] = []
+    for order, index in _ORDERS.items():
+        ordered = rotation.normalize(received[:, index])
+        for inverse in (False, True):
+            axes = _find_axes(rotation.conjugate(ordered) if inverse else ordered)
+            if axes is None:
+                continue
+            up, printed = axes
+            unusual = 2 * (printed != _PRINTED) + 2 * (up[1] != "z") + inverse + (index[0] != 0)
+            direction = "world to sensor" if inverse else "sensor to world"
+            explanations.append(
+                (
+                    unusual,
+                    f"components {order}, {direction}, {up} of the world points up, sensor axes "
+                    + ("as printed" if printed == _PRINTED else f"not as printed: {printed}"),
+                )
+            )
+    if explanations:
+        return min(explanations, key=lambda each: each[0])[1]
+
+    angles = np.degrees(rotation.angle_between(received[:-1], received[1:]))
+    measured = ", ".join(f"{angle:.0f}" for angle in angles)
+    return (
+        f"no convention explains rotations measured as {measured} deg: repeat the test with "
+        "quarter turns about the axes printed on the housing"
+    )
+
+
+def _find_axes(q: Array) -> tuple[str, str] | None:
+    """Return the vertical axis of the world and the printed axes, each as the nearest axis.
+
+    None if the rotations are no quarter turns, or their axes do not agree.
+    """
+    back = rotation.conjugate(q)
+    world = rotation.log(rotation.multiply(q[1:], back[:-1]))
+    sensor = rotation.log(rotation.multiply(back[:-1], q[1:]))
+    turned = np.linalg.norm(world, axis=1)
+    if np.abs(turned - 0.5 * np.pi).max() > TOLERANCE_RAD:
+        return None
+
+    # Rotations 1 and 3 are about the vertical, so their axes in the world are equal.
+    up, up_again = world[0] / turned[0], world[2] / turned[2]
+    if np.arccos(np.clip(up @ up_again, -1.0, 1.0)) > TOLERANCE_RAD:
+        return None
+    printed = np.stack((sensor[1], sensor[2], sensor[0])) / turned[[1, 2, 0], None]
+    names = [_axis_name(axis) for axis in (up, *printed)]
+    if None in names:
+        return None
+    pairs = zip(_AXES, names[1:], strict=True)
+    return str(names[0]), ", ".join(f"{axis} is {name}" for axis, name in pairs)
+
+
+def _axis_name(axis: Array) -> str | None:
+    k = int(np.argmax(np.abs(axis)))
+    if abs(axis[k]) < np.cos(TOLERANCE_RAD):
+        return None
+    return f"{'+' if axis[k] > 0.0 else '-'}{_AXES[k]}"

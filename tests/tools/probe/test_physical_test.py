@@ -1,0 +1,145 @@
+"""`jointfit probe --physical-test`: a turned sensor shows which settings are wrong."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+from typer.testing import CliRunner
+
+from jointfit_daemon.config import load_rig
+from jointfit_daemon.tools.__main__ import app
+from jointfit_daemon.tools.probe._physical_test import PhysicalTestError, run_physical_test
+from jointfit_simulators.devices import WitMotionDevice, WitMotionDeviceOptions
+from jointfit_simulators.devices._witmotion_device import WITH_QUATERNION
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+    from pathlib import Path
+
+pytestmark = pytest.mark.real_time
+
+TURN_S = 0.4
+RIG = """
+[rig]
+name = "bench"
+[chain]
+segments = ["thigh", "shank"]
+joints = ["hip", "knee", "ankle"]
+"""
+
+
+class Hand:
+    """Turns the device to the next pose at each instruction; it rests there."""
+
+    def __init__(self, device: WitMotionDevice) -> None:
+        flat = Rotation.from_euler("z", 40, degrees=True)
+        quarter = Rotation.from_euler("z", 90, degrees=True)
+        tipped = quarter * flat * Rotation.from_euler("x", 90, degrees=True)
+        self._poses = [flat, flat, quarter * flat, tipped, quarter * tipped]
+        self._device, self._step, self._begin_ns = device, 0, 0
+
+    def follow(self, line: str) -> None:
+        """Begin the next movement if the line is an instruction."""
+        if line.startswith(("Lay ", "Turn it", "Tip it")):
+            self._step, self._begin_ns = self._step + 1, time.monotonic_ns()
+
+    async def run(self) -> None:
+        """Send 100 orientations a second until cancelled."""
+        while True:
+            now_ns = time.monotonic_ns()
+            share = min((now_ns - self._begin_ns) / 1e9 / TURN_S, 1.0)
+            ends = self._poses[max(self._step - 1, 0) : self._step + 1] * (2 - (self._step > 0))
+            x, y, z, w = Slerp([0.0, 1.0], Rotation.concatenate(ends[:2]))(share).as_quat().tolist()
+            self._device.push(now_ns, (w, x, y, z))
+            await asyncio.sleep(0.01)
+
+
+@asynccontextmanager
+async def held(folder: Path, **sent: Any) -> AsyncIterator[Hand]:
+    """A hand with a device of these settings, and rig.toml with the default ones."""
+    keys = "\n".join(
+        f'[[imu]]\nid = "{name}"\nsegment = "{segment}"\ndriver = "witmotion"\nport = "{path}"\n'
+        "rate_hz = 100\n"
+        for name, segment, path in (
+            ("S1", "thigh", folder / "imu"),
+            ("S2", "shank", folder / "other"),
+        )
+    )
+    (folder / "rig.toml").write_text(RIG + keys)
+    options = WitMotionDeviceOptions(content=WITH_QUATERNION, rate_hz=100, **sent)
+    device = WitMotionDevice(folder / "imu", options=options)
+    hand = Hand(device)
+    tasks = [asyncio.create_task(work) for work in (device.run(), hand.run())]
+    try:
+        yield hand
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+        device.unplug()
+
+
+@pytest.mark.parametrize(
+    ("world", "inverse", "correction"),
+    [
+        ("ENU", False, ()),
+        ("ENU", True, ('direction = "world_to_sensor"',)),
+        ("NED", False, ('world = "NED"',)),
+    ],
+)
+async def test_wrong_settings_are_found_and_corrected(
+    tmp_path: Path, world: str, inverse: bool, correction: tuple[str, ...]
+) -> None:
+    async with held(tmp_path, world=world, world_to_sensor=inverse) as hand:
+        source = load_rig(tmp_path / "rig.toml").sources[0]
+        result = await run_physical_test(source, hand.follow, step_s=20.0)
+    assert result.agrees is not bool(correction)
+    assert result.rig_toml == correction
+    largest_deg = max(result.deviations_deg)
+    assert largest_deg > 85.0 if correction else largest_deg < 5.0
+
+
+async def test_the_command_guides_and_ends_with_the_lines_to_paste(tmp_path: Path) -> None:
+    async with held(tmp_path, world_to_sensor=True) as hand:
+        command = ["-m", "jointfit_daemon.tools", "probe", "--physical-test", "S1", "--step", "20"]
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-u", *command, "--config", str(tmp_path / "rig.toml"),
+            stdout=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        assert process.stdout is not None
+        lines = []
+        async for line in process.stdout:
+            lines.append(line.decode())
+            hand.follow(lines[-1])
+        code = await process.wait()
+    text = "".join(lines)
+    assert code == 1
+    assert text.startswith("Lay S1 flat, its z axis up, and let go.\nTurn it")
+    assert "S1 sends: components w x y z, world to sensor" in text
+    assert 'in its [[imu]] table of rig.toml:\ndirection = "world_to_sensor"' in text
+
+
+async def test_a_sensor_that_is_not_turned_ends_the_test_in_words(tmp_path: Path) -> None:
+    async with held(tmp_path):
+        source = load_rig(tmp_path / "rig.toml").sources[0]
+        with pytest.raises(PhysicalTestError, match="S1: not moved and at rest within 4 s: repeat"):
+            await run_physical_test(source, lambda _: None, step_s=4.0)
+
+
+def test_an_unknown_sensor_and_other_devices_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "rig.toml").write_text(
+        RIG + '[[imu]]\nid = "S1"\nsegment = "thigh"\ndriver = "xbus"\nport = "/dev/null"\n'
+        '[[imu]]\nid = "S2"\nsegment = "shank"\ndriver = "xbus"\nport = "/dev/zero"\n'
+    )
+    command = ["probe", "--config", str(tmp_path / "rig.toml"), "--physical-test"]
+    unknown = CliRunner().invoke(app, [*command, "S7"])
+    assert unknown.exit_code == 2
+    assert "no sensor 'S7'; did you mean 'S2'? known: S1, S2" in unknown.output
+    both = CliRunner().invoke(app, [*command, "S1", "--serial", "/dev/null"])
+    assert "--physical-test takes the port from rig.toml" in both.output
