@@ -14,6 +14,7 @@ import pytest
 from typer.main import get_command
 
 from jointfit_daemon.config import Rig, parse_rig
+from jointfit_daemon.driver import find_driver
 from jointfit_daemon.tools.__main__ import app
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -109,6 +110,19 @@ def test_every_driver_has_a_page_and_a_row_in_the_list_of_devices() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     drivers = set(project["entry-points"]["jointfit.drivers"])
     assert rows == pages == drivers
+
+
+@pytest.mark.parametrize(
+    "page", sorted(DEVICES.with_suffix("").glob("*.md")), ids=lambda page: page.stem
+)
+def test_the_example_of_every_device_page_is_accepted_by_its_driver(page: Path) -> None:
+    (first, *_) = blocks(page, "toml")
+    tables = tomllib.loads(first)
+    shown = [*tables.get("imu", ()), *([tables["mocap"]] if "mocap" in tables else [])]
+    assert page.stem in {table["driver"] for table in shown}
+    for table in shown:
+        bus = {"can": tables["can"][table["can"]]} if "can" in table else {}
+        find_driver(table["driver"]).Settings.model_validate({**table, **bus})
 
 
 @every_page
