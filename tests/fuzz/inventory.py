@@ -9,6 +9,7 @@ from tests.fuzz import (
     file_targets,
     lpms_targets,
     mip_targets,
+    table_targets,
     vectornav_targets,
     wire_targets,
 )
@@ -17,6 +18,7 @@ MODULES = (
     wire_targets,
     lpms_targets,
     mip_targets,
+    table_targets,
     vectornav_targets,
     broker_targets,
     file_targets,

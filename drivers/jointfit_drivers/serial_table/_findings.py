@@ -72,8 +72,9 @@ def _likely_separator(lines: Sequence[bytes], wire: LineFormat) -> str | None:
     """Return the separator of most lines if the configured one is in none of them."""
     if any(len(_cells(line, wire)) > 1 for line in lines):
         return None
+    start = len(wire.prefix)
     for separator in (",", ";", "\t", " "):
-        if sum(separator.encode() in line for line in lines) >= _SHARE * len(lines):
+        if sum(separator.encode() in line[start:] for line in lines) >= _SHARE * len(lines):
             return repr(separator)
     return None
 
@@ -97,9 +98,10 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
         if finding is not None:
             return finding
     frames = [data[a:b] for a, b in pairwise(starts) if b - a == spacing]
-    if wire.checksum is not None and not any(
-        _is_valid(frame, wire.checksum, wire) for frame in frames
-    ):
+    valid = 0
+    if wire.checksum is not None:
+        valid = sum(_is_valid(frame, wire.checksum, wire) for frame in frames)
+    if wire.checksum is not None and valid < _SHARE * len(frames):
         fitting = _fitting_checksum(frames, wire)
         known = "" if fitting is None else f"; the data fit {fitting}"
         return (

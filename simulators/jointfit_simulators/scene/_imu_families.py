@@ -40,6 +40,12 @@ from jointfit_simulators.devices import (
     XImu3Device,
     XImu3DeviceOptions,
 )
+from jointfit_simulators.scene._described_imus import (
+    binary_frames,
+    halves_of_floats,
+    text_lines,
+    time_and_integers,
+)
 from jointfit_simulators.wires import line_noise
 
 if TYPE_CHECKING:
@@ -116,6 +122,12 @@ class CanFamily:
     """Return a device on the bus."""
 
 
+def _can_table(place: SensorPlace, bus: CanWire) -> ConnectedImu:
+    create = time_and_integers if place.number % 4 in {1, 2} else halves_of_floats
+    device, keys = create(bus, place.first_can_id, place.knobs.rate_hz)
+    return ConnectedImu(device, [f'can = "{BUS}"', *keys], f"{BUS}:{place.first_can_id:#05x}")
+
+
 def _lpms(place: SensorPlace, port: Path) -> ConnectedImu:
     generation: Generation = 3 if int(place.knobs.rate_hz) in GENERATION_3.rates_hz else 1
     options = LpmsDeviceOptions(generation=generation)
@@ -156,6 +168,12 @@ def _mip(place: SensorPlace, port: Path) -> ConnectedImu:
         wire_noise=line_noise(place.knobs, place.name),
     )
     return ConnectedImu(device, [f'port = "{port}"', "baud = 921600"], str(port))
+
+
+def _serial_table(place: SensorPlace, port: Path) -> ConnectedImu:
+    create = binary_frames if place.number % 4 in {1, 2} else text_lines
+    device, keys = create(port, place.knobs.rate_hz, line_noise(place.knobs, place.name))
+    return ConnectedImu(device, keys, str(port))
 
 
 def _bno085(place: SensorPlace, port: Path) -> ConnectedImu:
@@ -239,9 +257,11 @@ def ids_toml(ids: XcdiIds) -> str:
 
 IMU_FAMILIES: dict[str, UartFamily | CanFamily] = {
     "bno085": UartFamily(_bno085),
+    "can-table": CanFamily(_can_table),
     "lpms": UartFamily(_lpms),
     "lpms-can": CanFamily(_lpms_can),
     "mip": UartFamily(_mip),
+    "serial-table": UartFamily(_serial_table),
     "vectornav": UartFamily(_vectornav),
     "witmotion": UartFamily(_witmotion),
     "xbus": UartFamily(_xbus),

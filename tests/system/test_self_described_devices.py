@@ -1,0 +1,27 @@
+"""A rig of four boards that tables alone describe: the accuracy and the account of the demo."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from jointfit_daemon.tools.demo._command import _run, missed_targets
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(240)]
+
+FAMILIES = {"S1": "serial-table", "S2": "can-table", "S3": "serial-table", "S4": "can-table"}
+
+
+async def test_four_boards_of_ones_own_meet_the_targets_of_the_demo(tmp_path: Path) -> None:
+    pytest.importorskip("iotcore")
+    options = [word for name, driver in FAMILIES.items() for word in ("--imu", f"{name}={driver}")]
+    figures, stopped = await _run(tmp_path, 15.0, "leg", options, headless=True, picture=None)
+    assert stopped is None
+    assert missed_targets(figures) == []
+    assert figures["corrupt"] == 0
+    rig = (tmp_path / "rig.toml").read_text(encoding="utf-8")
+    assert [rig.count(f'driver = "{name}"') for name in ("serial-table", "can-table")] == [2, 2]
