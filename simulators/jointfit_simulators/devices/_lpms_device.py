@@ -23,7 +23,6 @@ from jointfit_protocols.lpms.configuration import (
 )
 from jointfit_protocols.lpms.measurement import TICK_MODULUS, PacketLayout, tick_of
 from jointfit_protocols.orientation import native_of
-from jointfit_simulators.devices._inertial_signals import InertialSignals
 from jointfit_simulators.imu_device import clean_wire
 from jointfit_simulators.wires import PtyLine
 
@@ -104,7 +103,6 @@ class LpmsDevice:
         self._table = TABLES[options.generation]
         self._line = PtyLine(link)
         self._noise = wire_noise
-        self._inertial = InertialSignals()
         self._decoder = LpBusCodec()
         self.flash = options.configuration or _FACTORY[options.generation]
         """Settings that survive a loss of power."""
@@ -141,7 +139,6 @@ class LpmsDevice:
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now in stream mode, as described in `ImuDevice.push`."""
         self._last_ns = device_ns
-        self._inertial.update(device_ns, q_world_sensor)
         if not self.streaming or self.asleep:
             return
         self.counter += 1

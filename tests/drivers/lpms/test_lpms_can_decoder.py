@@ -17,7 +17,10 @@ from jointfit_daemon.tools.discovery._can_listening import _decode
 from jointfit_drivers.lpms import LpmsCanDecoder, LpmsCanIdSettings, LpmsCanImu, LpmsCanSettings
 from jointfit_drivers.lpms._arrival_gaps import ArrivalGaps
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, host_dropped, pack_frames
+from jointfit_protocols.lpms import LpBusCodec, LpBusMessage
 from jointfit_protocols.lpms.channels import encode_heartbeat, sequential_ids, tpdo_ids
+from jointfit_protocols.lpms.configuration import GENERATION_1
+from jointfit_protocols.lpms.measurement import PacketLayout
 from jointfit_simulators._contract_fixtures import orientation
 from jointfit_simulators.devices import LpmsCanDevice, LpmsCanDeviceOptions
 from jointfit_simulators.wires import PythonCanWire, SlcanAdapter
@@ -80,6 +83,17 @@ def samples(events: list[Decoded]) -> list[ImuSample]:
 
 def texts(events: list[Decoded], kind: str) -> list[str]:
     return [e.text for e in events if isinstance(e, DeviceEvent) and e.kind == kind]
+
+
+def test_lpbus_in_can_frames_is_the_stream_of_the_serial_line() -> None:
+    """The third mode of generation 1, which the simulator has and no driver reads."""
+    frames = recorded(3, mode="lpbus", node=1)
+    assert {frame.can_id for frame in frames} == {0x515}
+    assert max(len(frame.data) for frame in frames) == 8
+    found = LpBusCodec().feed(b"".join(frame.data for frame in frames))
+    layout = PacketLayout(GENERATION_1, GENERATION_1.quaternion)
+    packets = [layout.decode(item.data) for item in found if isinstance(item, LpBusMessage)]
+    assert [packet.tick for packet in packets if packet] == [0, 4, 8]
 
 
 CASES: dict[str, tuple[dict[str, Any], LpmsCanSettings]] = {
