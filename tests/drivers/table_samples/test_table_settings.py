@@ -14,6 +14,7 @@ import pytest
 from jointfit_daemon.config import ConfigError, load_rig, parse_rig
 from jointfit_daemon.driver import find_driver
 from jointfit_daemon.model import Chunk, ImuSample
+from jointfit_daemon.tools.decoder_settings import decoder_settings
 from jointfit_protocols.can import CanFrame, pack_frames
 from jointfit_protocols.orientation import canonical
 
@@ -310,3 +311,9 @@ def test_every_documented_table_is_accepted(text: str, tmp_path: Path) -> None:
         text += '[can.can0]\nchannel = "can0"\n'
     (tmp_path / "rig.toml").write_text(head + text)
     assert len(load_rig(tmp_path / "rig.toml").sources) == 2
+
+
+@pytest.mark.parametrize("name", ["serial-table", "can-table"])
+def test_a_capture_without_a_table_is_refused_with_the_missing_key(name: str) -> None:
+    with pytest.raises(ValueError, match=rf"{name}.fields: missing; place, scale and unit"):
+        decoder_settings(find_driver(name), name, {})
