@@ -9,6 +9,7 @@ are set.
 from __future__ import annotations
 
 import math
+import struct
 from typing import TYPE_CHECKING
 from xml.sax.saxutils import escape, quoteattr
 
@@ -35,7 +36,8 @@ if TYPE_CHECKING:
 _MM = 1000.0
 _RESIDUAL = 0.5
 """Residual of markers and bodies, mm."""
-_ABSENT = math.nan
+_ABSENT: float = struct.unpack("<d", b"\xff" * 8)[0]
+"""NaN whose bits are all set, also after its conversion to 32 bits."""
 _NESTED_FROM = (1, 21)
 """Version from which points of bodies are attributes."""
 _ENABLED_FROM = (1, 24)

@@ -7,7 +7,6 @@ that of its next command.
 from __future__ import annotations
 
 import asyncio
-import math
 import random
 import socket
 import struct
@@ -37,8 +36,6 @@ _NEWEST = (1, 28)
 _OLDEST = (1, 19)
 _FIRST: tuple[int, int] = (1, 1)
 """Version of a client that selects none."""
-_ALL_BITS = struct.pack("<f", math.nan)
-_NEGATIVE_NAN = b"\xff\xff\xff\xff"
 _HUGE = struct.pack("<I", 2**32 - 1)
 _TEXTS = {
     "byteorder": "Byte order is little endian",
@@ -255,7 +252,6 @@ class QtmServer:
         sent = True
         for group in groups:
             data = qtm.encode(qtm.DataFrame(stamp_us, number, group))
-            data = data.replace(_ALL_BITS, _NEGATIVE_NAN)
             if self._random.random() < self.options.hostile:
                 at = self._random.choice((20, 24, 32))
                 data = data[:at] + _HUGE + data[at + 4 :]
