@@ -124,6 +124,7 @@ def compile_modules(out: Path, groups: dict[str, list[str]], level: str = LEVEL)
     done = subprocess.run(  # noqa: S603 - our own program
         [sys.executable, "setup.py", level, *modules],
         cwd=work, text=True, capture_output=True, check=False,
+        env=os.environ | {"PYTHONHASHSEED": "0"},  # the C files follow the order of sets
     )  # fmt: skip
     if done.returncode:
         raise RuntimeError(f"{done.stdout}{done.stderr}compiling ended with {done.returncode}")

@@ -24,6 +24,7 @@ from jointfit_protocols.natnet._frame import (
     FrameOfData,
     LabeledMarker,
     MarkerSet,
+    Position,
 )
 
 if TYPE_CHECKING:
@@ -37,13 +38,17 @@ _marker: Callable[[Iterable[object]], LabeledMarker] = partial(tuple.__new__, La
 """Named tuples from unpacked records: a third of the time of ``_make``, which checks the length."""
 
 
+_Span = tuple[int, int]
+"""First byte of a section, and the byte behind it."""
+
+
 class _Places(NamedTuple):
     """Places of the numbers of a frame."""
 
-    sets: tuple[tuple[str, slice], ...]
-    others: slice
-    bodies: slice
-    markers: slice
+    sets: tuple[tuple[str, _Span], ...]
+    others: _Span
+    bodies: _Span
+    markers: _Span
     stamps: int
     precision: bool
     end: int
@@ -65,11 +70,11 @@ class FrameLayout:
     def __init__(self, places: _Places, example: bytes) -> None:
         self._places, self._size = places, len(example)
         fixed = bytearray(b"\xff" * len(example))
-        number = slice(_HEADER_BYTES, _HEADER_BYTES + I32.size)
-        tail = slice(places.stamps, places.end + 2)  # the flags of the frame, not its end tag
+        number = (_HEADER_BYTES, _HEADER_BYTES + I32.size)
+        tail = (places.stamps, places.end + 2)  # the flags of the frame, not its end tag
         changing = (number, *(one for _, one in places.sets), places.others, places.bodies)
-        for one in (*changing, places.markers, tail):
-            fixed[one] = bytes(one.stop - one.start)
+        for start, stop in (*changing, places.markers, tail):
+            fixed[start:stop] = bytes(stop - start)
 
         # One comparison of long integers checks all counts and names.
         self._mask = int.from_bytes(fixed, "little")
@@ -88,14 +93,14 @@ class FrameLayout:
         sets = []
         for marker_set in frame.marker_sets:
             at = datagram.index(0, at) + 1 + I32.size
-            sets.append((marker_set.name, _slice(at, XYZ.size * len(marker_set.positions))))
-            at = sets[-1][1].stop
-        others = _slice(at + head, XYZ.size * len(frame.other_markers))
-        bodies = _slice(others.stop + head, BODY_LAYOUT.size * len(frame.bodies))
+            sets.append((marker_set.name, _span(at, XYZ.size * len(marker_set.positions))))
+            at = sets[-1][1][1]
+        others = _span(at + head, XYZ.size * len(frame.other_markers))
+        bodies = _span(others[1] + head, BODY_LAYOUT.size * len(frame.bodies))
         absent = 2 if version >= SIZED else 1  # skeletons, and assets where they exist
-        labeled = bodies.stop + absent * head + head
-        markers = _slice(labeled, MARKER_LAYOUT.size * len(frame.markers))
-        stamps = markers.stop + 2 * head  # no force plates and no devices
+        labeled = bodies[1] + absent * head + head
+        markers = _span(labeled, MARKER_LAYOUT.size * len(frame.markers))
+        stamps = markers[1] + 2 * head  # no force plates and no devices
 
         precision = frame.precision is not None
         end = stamps + STAMPS_LAYOUT.size + (PRECISION_LAYOUT.size if precision else 0)
@@ -116,10 +121,10 @@ class FrameLayout:
         return FrameOfData(
             number, timestamp, exposure, received, transmit,
             END_LAYOUT.unpack_from(datagram, end)[0],
-            tuple(map(_body, BODY_LAYOUT.iter_unpack(datagram[bodies]))),
-            tuple(map(_marker, MARKER_LAYOUT.iter_unpack(datagram[markers]))),
-            tuple([MarkerSet(name, tuple(XYZ.iter_unpack(datagram[one]))) for name, one in sets]),
-            tuple(XYZ.iter_unpack(datagram[others])),
+            tuple(map(_body, BODY_LAYOUT.iter_unpack(datagram[bodies[0] : bodies[1]]))),
+            tuple(map(_marker, MARKER_LAYOUT.iter_unpack(datagram[markers[0] : markers[1]]))),
+            tuple([MarkerSet(name, _positions(datagram, span)) for name, span in sets]),
+            _positions(datagram, others),
             timecode=timecode, subframe=subframe,
             precision=_precision(datagram, end) if precise else None,
         )  # fmt: skip
@@ -130,5 +135,9 @@ def _precision(datagram: bytes, end: int) -> tuple[int, int]:
     return seconds, fraction
 
 
-def _slice(start: int, size: int) -> slice:
-    return slice(start, start + size)
+def _positions(datagram: bytes, span: _Span) -> tuple[Position, ...]:
+    return tuple(XYZ.iter_unpack(datagram[span[0] : span[1]]))
+
+
+def _span(start: int, size: int) -> _Span:
+    return start, start + size
