@@ -29,7 +29,7 @@ _REORDERED_US = 100_000
 """Time by which a report may be older than the last one of its body if datagrams were reordered;
 older ones show a step of the clock."""
 _GAIN = 0.1
-"""Gain of the mean period."""
+"""Gain of the mean time between two reports of a body."""
 
 
 class ReportedFrame(NamedTuple):
@@ -50,6 +50,7 @@ class FrameAssembler:
         self._time_us = self._arrival_ns = 0
         self._closed: ReportedFrame | None = None
         self._period_us: float | None = None
+        self._mean_us: dict[ColumnKey, float] = {}
         self._last_us: dict[ColumnKey, int] = {}
         self._awaited: set[ColumnKey] = set()
         self.late = 0
@@ -61,6 +62,7 @@ class FrameAssembler:
         """Start again: another server, or another connection."""
         self._reports = {}
         self._closed = self._period_us = None
+        self._mean_us.clear()
         self._last_us.clear()
         self._awaited.clear()
 
@@ -125,10 +127,11 @@ class FrameAssembler:
         """Measure the period, and await this body in the next frames."""
         step_us = time_us - self._last_us.get(key, time_us)
         if 0 < step_us <= _LONGEST_US:
-            period_us = self._period_us or float(step_us)
-            # A body that was not seen for some frames counts as one that missed a single one.
-            period_us += _GAIN * (min(step_us, 2.0 * period_us) - period_us)
-            self._period_us = period_us
+            # A mean, because steps between delayed frames are too long and too short in turn.
+            mean_us = self._mean_us.setdefault(key, float(step_us))
+            self._mean_us[key] = mean_us + _GAIN * (step_us - mean_us)
+            if self._period_us is None:
+                self._period_us = float(step_us)
         self._last_us[key] = time_us
         self._awaited.add(key)
 
@@ -136,6 +139,9 @@ class FrameAssembler:
         """Return the frame in progress, and drop bodies that are silent for too long."""
         frame = ReportedFrame(self._time_us, self._arrival_ns, self._reports)
         self._closed, self._reports = frame, {}
+        # A body that is always seen has the shortest mean.
+        known = [mean for key, mean in self._mean_us.items() if key in self._awaited]
+        self._period_us = min(known, default=self._period_us)
         missing = self._awaited - frame.reports.keys()
         if missing:
             limit_us = max(_LEAST_AWAITED_US, _AWAITED_PERIODS * (self._period_us or 0.0))

@@ -107,6 +107,19 @@ def test_a_stall_of_the_server_costs_no_report() -> None:
     assert feeder.decoder.late_reports == 0
 
 
+def test_frames_sent_in_bursts_remain_whole() -> None:
+    """A busy server makes the messages of late frames at nearly the same time."""
+    feeder = Feeder()
+    t_us = T0_US
+    for n in range(300):
+        t_us += 24_000 if n % 3 == 0 else 700
+        for place, sender in enumerate((1, 2, 3)):
+            feeder(report(sender, t_us + 200 * place), t_us=t_us)
+    whole = [frame for frame in feeder.frames if len(seen(frame)) == 3]
+    assert len(whole) >= 290  # the period is not known at the start
+    assert feeder.frames[-290:] == whole[-290:]
+
+
 @given(st.lists(st.sets(st.sampled_from([1, 2, 3]), min_size=1), min_size=1, max_size=40))
 def test_every_report_is_in_one_frame_or_counted(visible: list[set[int]]) -> None:
     feeder = Feeder()
