@@ -55,8 +55,11 @@ def drivers_for(answers: Mapping[Key, Any], found: Found, sensor: str) -> tuple[
 def driver_of(answers: Mapping[Key, Any], found: Found, sensor: str) -> ImuDriver:
     """Return the driver of `sensor`."""
     fitting = drivers_for(answers, found, sensor)
-    name = answers.get(("driver", sensor))
-    return next((driver for driver in fitting if driver.name == name), fitting[0])
+    named = {driver.name: driver for driver in fitting}
+    # unanswered: most rigs have sensors of one family, so that of the sensor before
+    sensors = list(sensors_of(answers))
+    known = [answers.get(("driver", name)) for name in sensors[: sensors.index(sensor) + 1]]
+    return next((named[name] for name in reversed(known) if name in named), fitting[0])
 
 
 def mocap_driver_of(answers: Mapping[Key, Any], found: Found) -> MocapDriver:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 _DIALOGUE_KEYS = {"id", "segment", "driver", "port", "can", "ids", "server"}
 """Keys without default that the dialogue can answer; drivers with others are not offered."""
+_PROPOSED_FIRST = ("xbus", "xcdi", "natnet")
+"""Drivers that lead the list of their kind; the others follow by name."""
 SERVER_WAIT_S = 1.0
 """Time to wait for motion-capture servers, s."""
 
@@ -40,7 +42,8 @@ SERVER_WAIT_S = 1.0
 def drivers_found() -> Found:
     """Return the installed drivers whose required keys the dialogue knows."""
     imu, mocap = [], []
-    for name, driver in installed_drivers():
+    known = sorted(installed_drivers(), key=lambda each: each[0] not in _PROPOSED_FIRST)
+    for name, driver in known:
         fields: Mapping[str, FieldInfo] = driver.Settings.model_fields
         required = {key for key, field in fields.items() if field.is_required()}
         if not required <= _DIALOGUE_KEYS:

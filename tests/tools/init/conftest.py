@@ -8,9 +8,17 @@ import pytest
 
 from jointfit_daemon import driver
 from jointfit_daemon.config import _load
+from jointfit_daemon.tools.init import _search
 
 
 @pytest.fixture(autouse=True)
 def fast_drivers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Search the installed packages for drivers once: a dialogue checks a rig for each answer."""
     monkeypatch.setattr(_load, "find_driver", cache(driver.find_driver))
+
+
+@pytest.fixture
+def one_driver_of_each_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Offer one driver for UARTs, one for CAN and one for cameras: no question which one."""
+    installed = [(name, driver.find_driver(name)) for name in ("natnet", "xbus", "xcdi")]
+    monkeypatch.setattr(_search, "installed_drivers", lambda: iter(installed))

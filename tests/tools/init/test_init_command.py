@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+pytestmark = pytest.mark.usefixtures("one_driver_of_each_kind")
+
 LEG = FoundServer(
     "natnet", "192.168.1.10", 1510, "192.168.1.2", "Motive", "3.1", "NatNet 4.1", "unicast",
     bodies=("Plate",), markers=tuple(f"{stem}{k}" for stem in "TSF" for k in range(1, 5)),

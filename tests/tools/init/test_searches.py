@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
 
 from jointfit_daemon.driver import DeviceLostError, ImuSettings
 from jointfit_daemon.model import Chunk, ImuSample
+from jointfit_daemon.tools import discovery
 from jointfit_daemon.tools.discovery import CanTraffic, DecodedDevice
 from jointfit_daemon.tools.init import _movement, _search
-from jointfit_daemon.tools.init._found import FoundDevice
+from jointfit_daemon.tools.init._found import FoundDevice, ImuDriver
 from jointfit_daemon.tools.init._movement import find_moved
 from jointfit_daemon.tools.init._parsing import AnswerError
 from jointfit_daemon.tools.init._search import DeviceSearch, drivers_found
-from tests.tools.init.dialogues import DEVICES
+from tests.tools.init.dialogues import DEVICES, completed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.driver import Emit
+    from jointfit_daemon.tools.init._engine import Asked
+
+pytestmark = pytest.mark.usefixtures("one_driver_of_each_kind")
 
 TURNS: dict[str, float] = {}
 """Rotation of each simulated device at its last sample, rad."""
@@ -160,3 +165,32 @@ def test_installed_drivers_are_described_by_the_keys_the_dialogue_asks_for() -> 
     assert drivers["xcdi"].wiring == "can"
     assert list(drivers["xcdi"].ids) == ["sample_time", "group_counter", "quaternion"]
     assert [(driver.name, driver.port) for driver in found.mocap_drivers] == [("natnet", 1510)]
+
+
+def test_the_usual_drivers_lead_the_installed_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_search, "installed_drivers", discovery.installed_drivers)
+    found = drivers_found()
+    names = [driver.name for driver in found.imu_drivers]
+    assert names[:2] == ["xbus", "xcdi"]
+    assert names[2:] == sorted(names[2:])
+    assert {"mip", "witmotion"} <= set(names[2:])
+    assert found.mocap_drivers[0].name == "natnet"
+
+
+def test_the_driver_of_a_sensor_is_proposed_for_the_next_one() -> None:
+    other = ImuDriver("mip", "serial", 115_200)
+    found = replace(DEVICES, imu_drivers=(*DEVICES.imu_drivers, other))
+    proposed: dict[str, str] = {}
+
+    def choose(asked: Asked) -> object:
+        if asked.question.key == "device":
+            return f"/dev/tty{asked.subject}"
+        if asked.question.key == "driver":
+            proposed[asked.subject] = asked.default
+            return "mip" if len(proposed) == 1 else asked.default
+        return asked.default
+
+    answers = completed(found, choose)
+    sensors = [name for key, name in answers if key == "driver"]
+    assert len(sensors) > 2
+    assert list(proposed.values()) == ["xbus", *["mip"] * (len(sensors) - 1)]

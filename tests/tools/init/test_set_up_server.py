@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
     from pathlib import Path
 
+pytestmark = pytest.mark.usefixtures("one_driver_of_each_kind")
+
 SUBPROTOCOL = [Subprotocol("jointfit-set-up")]
 LISTEN = ListenAddress(HOST, 0)
 NOWHERE = BrokerAddress(HOST, 1)
