@@ -94,7 +94,7 @@ class VrpnSession:
         except ConnectionRefusedError as error:
             raise DeviceLostError(
                 f"{self._name}: no program listens on this TCP port: start the VRPN server in the "
-                'camera software, or set connection = "classic" for servers older than 07.26'
+                'camera software, or set connection = "classic" if it accepts no direct connection'
             ) from error
         except TimeoutError as error:
             raise DeviceLostError(
@@ -202,7 +202,8 @@ class VrpnSession:
             # Ask only a quiet server: some do not answer.
             if quiet_s >= silence_s / 2:
                 if not pinged and self._codec.senders:
-                    name = next(iter(self._codec.senders.values()))
+                    # The first sender is the connection itself, which answers no ping.
+                    name = next(reversed(self._codec.senders.values()))
                     link.send(vrpn.SenderDescription(_SENDER, name))
                     pinged = True
                 if pinged:
