@@ -11,8 +11,8 @@ import pytest
 DRIVERS = Path(__file__).resolve().parents[2] / "drivers" / "jointfit_drivers"
 ERRORS = {"DeviceLostError", "DeviceAbsentError", "DeviceMisconfiguredError"}
 REMEDY = re.compile(
-    r"\b(add|change|check|choose|connect|connecting|correct|enter|give|let|load|lower|plug|remove"
-    r"|restart|retrying|set|start|stop|switch|update|use)\b"
+    r"\b(add|change|check|choose|close|connect|connecting|correct|enable|enter|give|let|load|lower"
+    r"|plug|remove|restart|retrying|set|start|stop|switch|update|use)\b"
 )
 VALUE = "…"
 

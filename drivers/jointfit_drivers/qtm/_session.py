@@ -230,7 +230,7 @@ class QtmSession:
                 return
         raise DeviceMisconfiguredError(
             f"{self._name} supports none of the protocol versions {VERSIONS[-1]} to {VERSIONS[0]}: "
-            "a newer QTM is required (2019 or later), and command_port must be its base port plus 1"
+            "use QTM 2019 or later, and set command_port to its base port plus 1"
         )
 
     async def _ask(self, command: str, *kinds: type) -> qtm.Message:
@@ -310,8 +310,8 @@ class QtmSession:
         self.silent = True
         hint = "" if udp_port is None else ", and allow UDP in firewalls or set transport = 'tcp'"
         raise DeviceLostError(
-            f"{self._name}: no frame for {self._settings.silence_s:g} s: {START}{hint}; `jointfit "
-            "doctor` names the cause"
+            f"{self._name}: no frame for {self._settings.silence_s:g} s: {START}{hint}, or let "
+            "`jointfit doctor` name the cause"
         )
 
 

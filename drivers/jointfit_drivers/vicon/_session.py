@@ -142,8 +142,8 @@ class ViconSession:
         if (time.monotonic_ns() - heard_ns) / 1e9 >= self._settings.silence_s:
             self.silent = True
             raise DeviceLostError(
-                f"{self._name}: no frame for {self._settings.silence_s:g} s: {START}; `jointfit "
-                "doctor` names the cause"
+                f"{self._name}: no frame for {self._settings.silence_s:g} s: {START}, or let "
+                "`jointfit doctor` name the cause"
             )
 
 
