@@ -1,8 +1,9 @@
 """Fail when a test that CI must run was skipped: `no_skips.py [--minimal] JUNIT.xml ...`.
 
-Two kinds of test may be skipped in that step. Those of tests/vm: a later step runs them on a kernel
-that has vcan, and fails if one is skipped there. And those that need something that cannot be
-installed: recordings that are not part of the project, a network interface that carries multicast.
+Some tests may be skipped in that step. Those of tests/vm: a later step runs them on a kernel
+that has vcan, and fails if one is skipped there. Those that need something that cannot be
+installed: recordings that are not part of the project, a network interface that carries multicast,
+packages that need hardware. And the parts of the conformance suite that a protocol rules out.
 On the minimal system tests that need a Debian package may be skipped as well; here they run.
 """
 
@@ -15,6 +16,9 @@ NOT_INSTALLABLE = (
     "recordings are not here",
     "vectors.json is not here",
     "loopback carries no multicast here",
+    "Adafruit's packages are not here",
+    "this wire detects damage itself, or does not allow its detection",
+    "this wire does not allow detection of a wrong device",
 )
 """Reasons of tests that a clean machine may skip; they are counted and printed."""
 NOT_IN_MINIMAL = tuple(

@@ -25,8 +25,8 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 BUILD = Path(__file__).resolve().parents[1] / "build"
-WORKERS_PER_CORE = 2
-"""Half of the time of the long tests is waiting, for devices and daemons in real time."""
+WORKERS_PER_CORE = 3
+"""Two thirds of the time of the tests is waiting, for devices and daemons in real time."""
 TESTS_FAILED = 1
 """Exit status of pytest when tests failed."""
 NO_TESTS = 5

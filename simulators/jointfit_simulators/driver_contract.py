@@ -230,7 +230,7 @@ class DriverContract(ABC):
     def test_line_noise_affects_only_damaged_samples(self, tmp_path: Path) -> None:
         """The driver continues, undamaged samples arrive, and damaged ones are rejected."""
         if not self.has_noise:
-            raise SkipTest("this wire has its own error detection")
+            raise SkipTest("this wire detects damage itself, or does not allow its detection")
 
         async def scene() -> None:
             noise = SwitchableNoise()

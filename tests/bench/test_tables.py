@@ -12,7 +12,7 @@ from bench.framework.material import SEEDED
 
 EXPERIMENTS = {experiment.id: experiment for experiment in find_experiments()}
 SHORT = [e for e in EXPERIMENTS.values() if not e.long and e.topic not in {"speed", "joint_center"}]
-WORDS = re.compile(r"[a-z]+(-[a-z]+)+")
+WORDS = re.compile(r"[a-z]+[0-9]*(-[a-z]+)+")  # names of devices end with digits
 
 
 @pytest.mark.experiment

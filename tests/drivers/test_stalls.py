@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from jointfit_drivers.xbus._continuity import XbusContinuity
@@ -121,6 +121,8 @@ def test_a_port_reopened_during_a_stall_shows_no_restart(
 
 
 @FAMILIES
+@example(start=(1_000_000, 0), stall_ms=250, kept=10, uncounted=True)
+@example(start=(1_000_000, 0), stall_ms=500, kept=32, uncounted=True)
 @given(starts, stalls_ms, st.integers(0, 2000), st.booleans())
 def test_a_backlog_of_a_stalled_receiver_is_a_delay_and_no_restart(
     restarts: Callable[[list[Received]], int],

@@ -37,7 +37,7 @@ _SLACK_COUNTS = 2
 _NEAR = 10
 """Counts that corruption of counter and time may appear to skip."""
 _SLACK_SHARE = 0.01
-_SILENT = 20
+_SILENT = _NEAR + 1
 """Least silence, groups, over which SampleTime is compared with host time."""
 _RAN_ON_SHARE = 0.1
 """Largest difference of SampleTime and host time over a silence, share of the silence."""

@@ -18,4 +18,4 @@ def adafruit(name: str) -> Any:
     vars(busio)["UART"] = object
     vars(micropython)["const"] = int
     with mock.patch.dict(sys.modules, busio=busio, micropython=micropython):
-        return pytest.importorskip(name)
+        return pytest.importorskip(name, reason="Adafruit's packages are not here")
