@@ -16,8 +16,8 @@ from tests.fuzz.target import LEAST_S, Target, UnaccountedError, run_case
 if TYPE_CHECKING:
     from pathlib import Path
 
-EXAMPLES = 25
-MUTANTS = 60
+EXAMPLES = 15
+MUTANTS = 40
 PER_BYTE = [name for name in TARGETS if not name.endswith("-core")]
 """Targets whose cost follows the bytes; that of the core follows the time that passes, too."""
 SHORT = 15_000

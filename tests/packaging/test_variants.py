@@ -53,6 +53,7 @@ def test_jointfit_pure_imports_sources_instead_of_extension_modules(
         assert "ImportError" in done.stderr
 
 
+@pytest.mark.experiment
 @pytest.mark.timeout(300)
 def test_compiled_modules_and_their_sources_give_the_same_frames_bit_for_bit() -> None:
     outputs = {}

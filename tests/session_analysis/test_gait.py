@@ -26,6 +26,7 @@ def walks() -> dict[int, tuple[SessionData, GaitCycles]]:
     return {seed: (s, find_gait_cycles(shank_of(s))) for seed, s in sessions.items()}
 
 
+@pytest.mark.experiment
 def test_every_stride_of_every_subject_is_found_once(
     walks: dict[int, tuple[SessionData, GaitCycles]],
 ) -> None:
@@ -36,6 +37,7 @@ def test_every_stride_of_every_subject_is_found_once(
     assert errors.max() < 0.02
 
 
+@pytest.mark.experiment
 def test_initial_contact_is_near_the_heel_strike(
     walks: dict[int, tuple[SessionData, GaitCycles]],
 ) -> None:
@@ -45,6 +47,7 @@ def test_initial_contact_is_near_the_heel_strike(
     assert np.abs(early_s - np.median(early_s)).max() < 0.015
 
 
+@pytest.mark.experiment
 def test_mean_curve_of_the_knee_equals_the_true_one(
     walks: dict[int, tuple[SessionData, GaitCycles]],
 ) -> None:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.child_processes import ChildProcess, Simulator
     from tests.broker_fixture import Broker
 
-pytestmark = [pytest.mark.system, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(300)]
 
 SETTLE_S = 1.7
 """A motion blends into the next for 1.5 s; s."""
