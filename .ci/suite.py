@@ -27,6 +27,8 @@ from pathlib import Path
 BUILD = Path(__file__).resolve().parents[1] / "build"
 WORKERS_PER_CORE = 3
 """Two thirds of the time of the tests is waiting, for devices and daemons in real time."""
+EXPERIMENTS_PER_CORE = 2
+"""Experiments compute, or run whole daemons with browsers: more of them starve each other."""
 TESTS_FAILED = 1
 """Exit status of pytest when tests failed."""
 NO_TESTS = 5
@@ -46,7 +48,7 @@ def main(arguments: list[str]) -> int:
     reports = BUILD / name
     shutil.rmtree(reports, ignore_errors=True)
     cores = len(os.sched_getaffinity(0))
-    workers = WORKERS_PER_CORE * cores
+    workers = (EXPERIMENTS_PER_CORE if experiments else WORKERS_PER_CORE) * cores
 
     # An idle worker takes tests from the others: there are few long ones.
     parallel = _run(parts[0], reports, ["-n", str(workers), "--dist", "worksteal", *arguments])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -30,7 +30,10 @@ def decoder_settings(driver: type[Driver], name: str, given: Mapping[str, Any]) 
             models = [k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)]
             if CanBusSettings in models:
                 table[key] = {"interface": "virtual", "channel": "file"}
-            elif not models and get_origin(info.annotation) is not dict:  # no description of data
+            elif not models and get_origin(info.annotation) not in {
+                dict,
+                Literal,
+            }:  # nobody can guess them
                 table[key] = "file" if str in kinds else 1
     try:
         return driver.Settings.model_validate(table)

@@ -51,5 +51,5 @@ class XbusSettings(GatewaySettings, SerialImuSettings):
     def _rate_the_device_can_run_at(cls, rate_hz: float) -> float:
         """Refuse rates that are no whole number of Hz."""
         if rate_hz != int(rate_hz) or rate_hz > MAX_RATE_HZ:
-            raise ValueError(f"whole Hz up to {MAX_RATE_HZ}, found {rate_hz:g}")
+            raise ValueError(f"expected whole Hz up to {MAX_RATE_HZ}, found {rate_hz:g}")
         return rate_hz

@@ -18,7 +18,7 @@ _DEFAULT_BITRATE = 1_000_000
 _WIRING = "check that all devices have the same bit rate, and 120 Ω at both ends of the bus"
 
 
-def check_can(host: Host, bitrates: Mapping[str, int] | None) -> Iterator[Finding]:
+def check_can(host: Host, bitrates: Mapping[str, int | None] | None) -> Iterator[Finding]:
     """Yield the findings about CAN interfaces.
 
     Parameters
@@ -26,7 +26,8 @@ def check_can(host: Host, bitrates: Mapping[str, int] | None) -> Iterator[Findin
     host
         The host.
     bitrates
-        Bit rate of each SocketCAN interface of rig.toml, bit/s; None for all interfaces.
+        SocketCAN interfaces of rig.toml with the bit rates it states, bit/s; None for all
+        interfaces of the host.
     """
     found = {interface.name: interface for interface in find_can_interfaces(host.root, host.run)}
     if bitrates is None and not found:

@@ -142,7 +142,11 @@ def _serial_paths(rig: Rig) -> list[str]:
     return list(dict.fromkeys(paths))
 
 
-def _can_bitrates(rig: Rig) -> dict[str, int]:
-    """Return the SocketCAN interfaces of a rig with their bit rates, bit/s."""
+def _can_bitrates(rig: Rig) -> dict[str, int | None]:
+    """Return the SocketCAN interfaces of a rig with the bit rates it states, bit/s, or None."""
     buses = (getattr(source.settings, "can", None) for source in rig.sources)
-    return {bus.channel: bus.bitrate for bus in buses if bus and bus.interface == "socketcan"}
+    return {
+        bus.channel: bus.bitrate if "bitrate" in bus.model_fields_set else None
+        for bus in buses
+        if bus and bus.interface == "socketcan"
+    }
