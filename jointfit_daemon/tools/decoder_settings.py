@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
 from jointfit_daemon.config import faults_of
-from jointfit_daemon.driver import CanBusSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,13 +26,9 @@ def decoder_settings(driver: type[Driver], name: str, given: Mapping[str, Any]) 
     for key, info in driver.Settings.model_fields.items():
         if info.is_required() and key not in table:
             kinds = [info.annotation, *get_args(info.annotation)]
-            models = [k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)]
-            if CanBusSettings in models:
+            if any(isinstance(kind, type) and issubclass(kind, BaseModel) for kind in kinds):
                 table[key] = {"interface": "virtual", "channel": "file"}
-            elif not models and get_origin(info.annotation) not in {
-                dict,
-                Literal,
-            }:  # nobody can guess them
+            else:
                 table[key] = "file" if str in kinds else 1
     try:
         return driver.Settings.model_validate(table)
