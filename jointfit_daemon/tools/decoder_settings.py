@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
 from jointfit_daemon.config import faults_of
+from jointfit_daemon.driver import CanBusSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,9 +27,10 @@ def decoder_settings(driver: type[Driver], name: str, given: Mapping[str, Any]) 
     for key, info in driver.Settings.model_fields.items():
         if info.is_required() and key not in table:
             kinds = [info.annotation, *get_args(info.annotation)]
-            if any(isinstance(kind, type) and issubclass(kind, BaseModel) for kind in kinds):
+            models = [k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)]
+            if CanBusSettings in models:
                 table[key] = {"interface": "virtual", "channel": "file"}
-            else:
+            elif not models and get_origin(info.annotation) is not dict:  # no description of data
                 table[key] = "file" if str in kinds else 1
     try:
         return driver.Settings.model_validate(table)

@@ -202,7 +202,7 @@ def test_requests_equal_their_vectors(name: str) -> None:
 def recording() -> bytes:
     path = SHARED / "microstrain" / "mip_data.bin"
     if not path.is_file():
-        pytest.skip(f"{path} is not here")
+        pytest.skip(f"real recordings are not here: {path}")
     return path.read_bytes()
 
 
