@@ -21,9 +21,12 @@ NOT_INSTALLABLE = (
     "this wire does not allow detection of a wrong device",
 )
 """Reasons of tests that a clean machine may skip; they are counted and printed."""
-NOT_IN_MINIMAL = tuple(
-    f"(Debian: apt install {package})"
-    for package in ("mosquitto", "systemd", "groff-base", "gcc python3-dev")
+NOT_IN_MINIMAL = (
+    *(
+        f"(Debian: apt install {package})"
+        for package in ("mosquitto", "systemd", "groff-base", "gcc python3-dev")
+    ),
+    "needs a host whose own name has an address",
 )
 """Further reasons of tests that the minimal system may skip."""
 

@@ -62,6 +62,10 @@ async def answers(server: VrpnServer, request: bytes, wait_s: float = 0.1) -> li
 @needs_client
 @pytest.mark.parametrize("prefix", ["tcp://", ""], ids=["tcp", "classic-udp"])
 async def test_the_reference_client_reads_visible_bodies_only(prefix: str) -> None:
+    try:
+        socket.gethostbyname(socket.gethostname())
+    except OSError:
+        pytest.skip("VRPN's reference client needs a host whose own name has an address")
     async with serving() as server:
 
         async def push() -> None:
