@@ -170,7 +170,12 @@ class CanBusSettings(Settings):
     )
     channel: str = Field(description="`can0`, or the serial port of an SLCAN adapter")
     bitrate: int = Field(
-        1_000_000, ge=10_000, le=1_000_000, description="bit/s; ignored if the kernel configures it"
+        1_000_000,
+        ge=10_000,
+        le=1_000_000,
+        description="speed of the bus, bit/s, the same as of all its devices; for `socketcan` it "
+        "is set by `ip link set can0 up type can bitrate 1000000`, and used here only to check "
+        "the load",
     )
     baud: int = Field(
         115_200,

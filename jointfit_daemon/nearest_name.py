@@ -1,4 +1,4 @@
-"""Nearest valid spelling of an unknown name, for error messages.
+"""Nearest valid spelling of an unknown name, and other words for keys, for error messages.
 
 Comparison ignores case and uses the similarity ratio of `difflib.SequenceMatcher` (Ratcliff and
 Obershelp): twice the number of matching characters over the total number of characters.
@@ -18,6 +18,69 @@ _CUTOFF = 0.5
 _SHORT = 3
 """Length, characters, up to which a similar name has the same first character, or the same
 characters in another order."""
+
+
+_OTHER_WORDS = {
+    "adapter": ("interface", "port", "channel"),
+    "address": ("server", "host", "port"),
+    "baudrate": ("baud", "bitrate"),
+    "bitrate": ("baud",),
+    "broker": ("host",),
+    "bus": ("can", "channel"),
+    "comport": ("port",),
+    "device": ("port", "can", "channel"),
+    "family": ("driver",),
+    "folder": ("store",),
+    "fps": ("rate_hz", "output_rate_hz"),
+    "frequency": ("rate_hz", "output_rate_hz"),
+    "host": ("server",),
+    "hostname": ("server", "host"),
+    "hz": ("rate_hz", "output_rate_hz"),
+    "ip": ("server", "host"),
+    "limb": ("segment", "segments"),
+    "login": ("username",),
+    "model": ("driver",),
+    "name": ("id",),
+    "odr": ("rate_hz",),
+    "password": ("password_file",),
+    "path": ("port",),
+    "placement": ("segment",),
+    "rate": ("rate_hz", "output_rate_hz"),
+    "rigidbodies": ("rigid_body",),
+    "samplerate": ("rate_hz", "output_rate_hz"),
+    "samplingrate": ("rate_hz", "output_rate_hz"),
+    "serial": ("port",),
+    "serialport": ("port",),
+    "server": ("host",),
+    "speed": ("baud", "bitrate"),
+    "topic": ("base",),
+    "tty": ("port",),
+    "type": ("driver",),
+    "up": ("up_axis",),
+    "updaterate": ("rate_hz", "output_rate_hz"),
+    "url": ("server", "host"),
+    "user": ("username",),
+    "vertical": ("up_axis",),
+    "zaxis": ("up_axis",),
+}
+"""Keys of rig.toml by other words for them, in lower case without separators. The first one that
+the table has is meant."""
+
+
+def nearest_key(key: object, known: Iterable[str]) -> str | None:
+    """Return the key of `known` that `key` is another word for, or else resembles; None without.
+
+    A spelling that differs by case and separators only is meant before another word.
+    """
+    keys = [other for other in known if other != key]
+    folded = _without_separators(str(key))
+    same = (other for other in keys if _without_separators(other) == folded)
+    others = (other for other in _OTHER_WORDS.get(folded, ()) if other in keys)
+    return next(same, None) or next(others, None) or nearest_name(key, keys)
+
+
+def _without_separators(key: str) -> str:
+    return key.casefold().replace("_", "").replace("-", "").replace(" ", "")
 
 
 def nearest_names(name: object, known: Iterable[str], *, count: int = 1) -> list[str]:

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from jointfit_daemon.nearest_name import did_you_mean, nearest_name, nearest_names, unknown_name
+from jointfit_daemon.nearest_name import (
+    did_you_mean,
+    nearest_key,
+    nearest_name,
+    nearest_names,
+    unknown_name,
+)
 
 SEGMENTS = ("thigh", "shank", "foot")
 
@@ -43,3 +49,34 @@ def test_unknown_name_lists_all_names_and_suggests_candidates_only() -> None:
     assert unknown_name("driver", "zzz", ()) == "no driver 'zzz'; known: none"
     text = unknown_name("sensor", "s3", ["s1", "s2"], candidates=["s2"])
     assert text == "no sensor 's3'; did you mean 's2'? known: s1, s2"
+
+
+SERIAL = ("id", "segment", "driver", "rate_hz", "silence_s", "port", "baud")
+MOCAP = ("driver", "server", "command_port", "up_axis", "markers", "rigid_body")
+BROKER = ("host", "port", "username", "password_file")
+
+
+@pytest.mark.parametrize(
+    ("key", "known", "meant"),
+    [
+        ("serial", SERIAL, "port"),
+        ("device", SERIAL, "port"),
+        ("baudrate", SERIAL, "baud"),
+        ("baud-rate", SERIAL, "baud"),
+        ("Rate", SERIAL, "rate_hz"),
+        ("sampling_rate", SERIAL, "rate_hz"),
+        ("name", SERIAL, "id"),
+        ("rateHz", SERIAL, "rate_hz"),
+        ("host", MOCAP, "server"),
+        ("address", MOCAP, "server"),
+        ("rigid_bodies", MOCAP, "rigid_body"),
+        ("server", BROKER, "host"),
+        ("address", BROKER, "host"),
+        ("marker", MOCAP, "markers"),
+        ("zzz", SERIAL, None),
+    ],
+)
+def test_another_word_for_a_key_leads_to_the_key_of_the_table(
+    key: str, known: tuple[str, ...], meant: str | None
+) -> None:
+    assert nearest_key(key, known) == meant

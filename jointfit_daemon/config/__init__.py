@@ -3,7 +3,12 @@
 Invariant: degrees and millimetres exist in this package only; no device is opened here.
 """
 
-from jointfit_daemon.config._checks import drifting_imus, heading_warning, missing_files
+from jointfit_daemon.config._checks import (
+    drifting_imus,
+    heading_warning,
+    missing_files,
+    rig_warnings,
+)
 from jointfit_daemon.config._fault_messages import ConfigError, Fault, faults_of
 from jointfit_daemon.config._load import load_rig, parse_rig
 from jointfit_daemon.config._open_places import LATER
@@ -39,4 +44,5 @@ __all__ = [
     "missing_files",
     "parse_rig",
     "rig_schema",
+    "rig_warnings",
 ]

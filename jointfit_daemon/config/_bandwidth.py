@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 from pydantic import BaseModel
 
 from jointfit_daemon.config._fault_messages import Fault
-from jointfit_daemon.nearest_name import nearest_name
+from jointfit_daemon.nearest_name import nearest_key
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -84,7 +84,7 @@ def least_load(settings: Any, unknown: Iterable[str]) -> Any:
         for name, field in fields.items()
         if getattr(settings, name) is None and (field.is_required() or field.default is not None)
     }
-    faulty |= {near for name in unknown if (near := nearest_name(name, fields)) is not None}
+    faulty |= {near for name in unknown if (near := nearest_key(name, fields)) is not None}
 
     possible: list[tuple[float, int, Any]] = []
     choices = {name: _choices(fields[name]) for name in sorted(faulty)}

@@ -22,7 +22,7 @@ from jointfit_daemon.nearest_name import nearest_name
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
-    from jointfit_daemon.config._rig import Source
+    from jointfit_daemon.config._rig import Rig, Source
     from jointfit_daemon.config._tables import (
         CalibrationTable,
         ChainTable,
@@ -440,6 +440,30 @@ def heading_warning(sources: Sequence[Source]) -> str | None:
         f"{', '.join(drifts[True])}: their heading drifts, and joint rotation with it; "
         "set the same `magnetometer` for all"
     )
+
+
+def binding_warning(sources: Sequence[Source]) -> str | None:
+    """Return a warning if the cameras measure no segment; None otherwise.
+
+    The configuration is permitted: a plate alone measures the axes of the sensors.
+    """
+    for source in sources:
+        settings = source.settings
+        if source.kind != "mocap" or any(settings.markers.values()) or settings.rigid_body:
+            continue
+        only = "the plate alone is used, in the align phase" if settings.plate else "no use of it"
+        return (
+            f"[mocap] measures no segment ({only}): add markers.SEGMENT = [names] or "
+            "rigid_body.SEGMENT = name, with the names in the stream (`jointfit probe --mocap HOST`"
+            " lists them)"
+        )
+    return None
+
+
+def rig_warnings(rig: Rig) -> list[str]:
+    """Return the warnings about a rig that is permitted."""
+    found = (heading_warning(rig.sources), binding_warning(rig.sources))
+    return [*missing_files(rig.mqtt), *filter(None, found)]
 
 
 def _numbers(ids: object) -> Iterator[tuple[str, int]]:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from pydantic_core import PydanticUndefined
 
 from jointfit_daemon.driver import CONTRADICTION, CanBusError
-from jointfit_daemon.nearest_name import nearest_name
+from jointfit_daemon.nearest_name import nearest_key, nearest_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -109,16 +109,16 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
             )
         case "extra_forbidden":
             known = f"unknown key; known here: {', '.join(fields)}"
-            return Fault(path, known, detail["input"], nearest_name(loc[-1], fields))
+            return Fault(path, known, detail["input"], nearest_key(loc[-1], fields))
         case "missing":
             about = _described(fields, loc[-1])
             return Fault(path, f"missing; {about}" if about else "missing: expected a value")
         case "literal_error":
             choices = str(detail["ctx"]["expected"])
             words = choices.replace("'", "").replace(" or ", ", ").split(", ")
-            return Fault(
-                path, f"expected {choices}", detail["input"], nearest_name(detail["input"], words)
-            )
+            about = _described(fields, loc[-1])
+            expected = f"expected {choices}" + (f" ({about})" if about else "")
+            return Fault(path, expected, detail["input"], nearest_name(detail["input"], words))
         case "model_type" | "model_attributes_type" | "dict_type":
             return Fault(path, f"expected a table{_example(model, loc)}", detail["input"])
         case _:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from jointfit_daemon.config._fault_messages import Fault, join
 from jointfit_daemon.config._syntax import UNREADABLE
 from jointfit_daemon.driver import Settings
-from jointfit_daemon.nearest_name import nearest_name
+from jointfit_daemon.nearest_name import nearest_key
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -40,7 +40,7 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
     """
     fields = model.model_fields
     unknown = table.keys() - fields.keys()
-    misspelled = {nearest_name(name, fields) for name in unknown} - table.keys()
+    misspelled = {nearest_key(name, fields) for name in unknown} - table.keys()
     values = {}
     for name, field in fields.items():
         if name in table:

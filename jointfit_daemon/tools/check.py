@@ -25,7 +25,7 @@ def check(
     from rich.markup import escape
     from rich.table import Table
 
-    from jointfit_daemon.config import ConfigError, heading_warning, load_rig, missing_files
+    from jointfit_daemon.config import ConfigError, load_rig, rig_warnings
     from jointfit_daemon.driver import driver_names
 
     try:
@@ -38,8 +38,7 @@ def check(
             echo_wrapped(str(fault), err=True)
         raise typer.Exit(EXIT_MISUSE) from None
 
-    heading = heading_warning(rig.sources)
-    warnings = [*missing_files(rig.mqtt), *([] if heading is None else [heading])]
+    warnings = rig_warnings(rig)
     if json:
         result = {"ok": True, "rig": rig.table, "warnings": warnings}
         typer.echo(orjson.dumps(result, default=str))

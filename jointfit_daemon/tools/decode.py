@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
@@ -10,15 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import orjson
 import typer
 
+from jointfit_daemon.files.text import toml_value
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame, SyncPulse
 from jointfit_daemon.tools.completion import complete_driver
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from jointfit_daemon.driver import Decoder, Driver
-    from jointfit_daemon.model import Decoded
+    from jointfit_daemon.driver import Decoder, Driver, Wire
+    from jointfit_daemon.model import Chunk, Decoded
 
+MOST_SHOWN = 8
+"""Most identifiers in a message."""
 SHOWN = 60
 """Most characters of a setting quoted in a message."""
 
@@ -77,7 +81,8 @@ def decode(
     protocol: Annotated[
         str,
         typer.Argument(
-            help="Driver: xbus, xcdi, natnet, or another.", autocompletion=complete_driver
+            help="Driver of the recorded device, such as xbus; `jointfit check` lists all.",
+            autocompletion=complete_driver,
         ),
     ],
     file: Annotated[Path, typer.Argument(help="Raw bytes, pcapng, or `candump -L` log.")],
@@ -85,19 +90,23 @@ def decode(
     jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object per item.")] = False,
     summary: Annotated[bool, typer.Option("--summary", help="Print counts as JSON.")] = False,
     setting: Annotated[
-        list[str] | None, typer.Option("--set", help="Driver setting, KEY=VALUE (TOML).")
+        list[str] | None,
+        typer.Option(
+            "--set",
+            help="Key of the driver's table in rig.toml, KEY=VALUE in TOML; repeatable. Example:"
+            " --set 'ids={frame1=0x181}'.",
+        ),
     ] = None,
 ) -> None:
     """Decode a capture of an installed driver: table of counts, JSON lines, or JSON summary."""
     from jointfit_daemon.driver import find_driver
-    from jointfit_daemon.files.captures import read_capture
 
     driver = find_driver(protocol)
     decoder = driver(_settings(driver, protocol, setting or [])).decoder()
     counts = CaptureSummary()
 
     def items() -> Iterator[Decoded]:
-        for chunk in read_capture(file, driver.wire):
+        for chunk in _read(file, driver.wire):
             yield from decoder.feed(chunk)
         yield from decoder.flush()
 
@@ -109,16 +118,62 @@ def decode(
     if jsonl and not summary:
         return
     if not decoder.messages and not summary:
-        raise ValueError(
-            f"{file}: no message of protocol {protocol} found: select the driver of the recorded"
-            " device, and set CAN identifiers and other settings with --set"
-        )
+        raise ValueError(f"{file}: {_why_nothing_found(file, driver, protocol)}")
 
     found = counts.table(decoder)
     if summary:
         typer.echo(orjson.dumps(found))
     else:
         _print_table(found, counts.warnings)
+
+
+def _read(file: Path, wire: Wire) -> Iterator[Chunk]:
+    """Return the chunks of a capture; an error of another wire lists the drivers for it."""
+    from jointfit_daemon.files.captures import UnreadableCaptureError, read_capture
+    from jointfit_daemon.tools.discovery import installed_drivers
+
+    try:
+        return read_capture(file, wire)
+    except UnreadableCaptureError as error:
+        fitting = [name for name, driver in installed_drivers() if driver.wire == error.recorded]
+        if not fitting:
+            raise
+        raise ValueError(f"{error}: {', '.join(fitting)}") from None
+
+
+def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
+    """Return why a capture has no message of `driver`, with the driver that decodes it, if any."""
+    from jointfit_daemon.files.captures import frame_sizes
+    from jointfit_daemon.tools.discovery import decode_frames, decode_stream
+
+    if not file.stat().st_size:
+        return "the file is empty: record again while the device sends"
+    chunks = list(_read(file, driver.wire))
+    text, others = f"no message of {name}", []
+    if driver.wire == "can":
+        sizes = frame_sizes(b"".join(chunk.data for chunk in chunks))
+        shown = ", ".join(f"{number:#x}" for number, _ in sorted(sizes)[:MOST_SHOWN])
+        text += f" in its frames with {len(sizes)} identifiers ({shown or 'none'})"
+        others = list(decode_frames(sizes, chunks))
+    elif driver.wire == "stream":
+        text += f" in {sum(len(chunk.data) for chunk in chunks)} bytes"
+        others = [each for each in decode_stream(chunks, besides=name) if each.samples]
+
+    commands = []
+    for other in others:
+        keys = {key: value for key, value in other.settings.items() if key != "baud"}
+        options = [f"--set {shlex.quote(f'{k}={_toml(k, value)}')}" for k, value in keys.items()]
+        commands.append(
+            " ".join(["jointfit decode", other.driver, shlex.quote(str(file)), *options])
+        )
+    if commands:
+        return f"{text}. This command decodes it: {commands[0]}"
+    remedy = " and give its identifiers and other keys with --set" if driver.wire == "can" else ""
+    return f"{text}: select the driver of the recorded device{remedy}"
+
+
+def _toml(key: str, value: Any) -> str:
+    return toml_value(value, hexadecimal=key == "ids")
 
 
 def _print_table(found: dict[str, object], warnings: list[str]) -> None:
@@ -156,7 +211,14 @@ def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
             raise ValueError(f"--set {fault}")
         given |= table
 
-    return decoder_settings(driver, name, given)
+    try:
+        return decoder_settings(driver, name, given)
+    except ValueError as error:
+        if ": missing" not in str(error):
+            raise
+        raise ValueError(
+            f"{error}. Give each key with --set KEY=VALUE, as in its [[imu]] table of rig.toml"
+        ) from None
 
 
 def _row(item: Decoded) -> dict[str, object]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -30,6 +30,8 @@ def decoder_settings(driver: type[Driver], name: str, given: Mapping[str, Any]) 
             models = [k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel)]
             if CanBusSettings in models:
                 table[key] = {"interface": "virtual", "channel": "file"}
+            elif get_origin(info.annotation) is Literal and 1 not in get_args(info.annotation):
+                continue  # a choice without a stand-in is missing
             elif not models and get_origin(info.annotation) is not dict:  # no description of data
                 table[key] = "file" if str in kinds else 1
     try:

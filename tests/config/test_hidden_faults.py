@@ -9,7 +9,7 @@ import orjson
 import pytest
 from typer.testing import CliRunner
 
-from jointfit_daemon.config import ConfigError, missing_files, parse_rig
+from jointfit_daemon.config import ConfigError, missing_files, parse_rig, rig_warnings
 from jointfit_daemon.driver import find_driver
 from jointfit_daemon.tools.__main__ import app
 
@@ -264,6 +264,23 @@ def test_a_missing_file_is_a_warning_of_the_check(tmp_path: Path) -> None:
     (warning,) = orjson.loads(check(tmp_path, text, "--json").stdout)["warnings"]
     assert warning.startswith(f"mqtt.password_file = '{tmp_path}/nowhere': no such file")
     assert missing_files(parse_rig(tomllib.loads(RIG)).mqtt) == []
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ("", "no use of it"),
+        ('plate = "Plate"\n', "the plate alone"),
+        ('rigid_body.thigh = "T"\n', None),
+        ('markers.thigh = ["A", "B", "C"]\n', None),
+    ],
+)
+def test_cameras_that_measure_no_segment_are_a_warning_of_the_check(
+    keys: str, words: str | None
+) -> None:
+    warnings = rig_warnings(parse_rig(tomllib.loads(RIG + MOCAP + keys)))
+    assert [words in warning for warning in warnings if words] == [True] * (words is not None)
+    assert bool(warnings) is bool(words)
 
 
 def test_a_valid_bus_imports_drivers_in_use_only(monkeypatch: pytest.MonkeyPatch) -> None:

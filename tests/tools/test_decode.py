@@ -198,3 +198,32 @@ def test_a_capture_of_another_wire_is_refused(shared_data: Path) -> None:
     result = run(app, ["decode", "xbus", str(traffic)])
     assert result.exit_code == 2
     assert "network capture" in result.stderr
+
+
+# --- nothing found ----------------------------------------------------------------------------
+
+
+def refusal(*arguments: str) -> str:
+    result = run(app, ["decode", *arguments])
+    assert result.exit_code == 2
+    return result.stderr
+
+
+def test_an_empty_capture_and_a_capture_of_another_device_are_named(
+    shared_data: Path, tmp_path: Path
+) -> None:
+    empty = tmp_path / "empty.bin"
+    empty.touch()
+    assert "the file is empty" in refusal("mip", str(empty))
+    assert "jointfit decode xbus" in refusal("mip", str(xsens(shared_data, 5)))
+
+
+def test_frames_of_a_can_capture_lead_to_the_identifiers_and_the_command(tmp_path: Path) -> None:
+    log = tmp_path / "can.log"
+    lines = [f"({k / 100:.6f}) can0 131#0000000000004000" for k in range(50)]
+    log.write_text("\n".join(lines))
+    assert "1 identifiers (0x131)" in refusal("xcdi", str(log))
+    assert refusal("xbus", str(log)).rstrip().endswith("can-table, lpms-can, xcdi")
+    missing = refusal("lpms-can", str(log))
+    assert "lpms-can.mode: missing; `canopen`" in missing
+    assert "--set KEY=VALUE" in missing

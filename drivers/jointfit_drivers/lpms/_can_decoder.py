@@ -110,7 +110,7 @@ class LpmsCanDecoder:
         if step.rate_hz is not None:
             text = (
                 f"sends at {step.rate_hz:.4g} Hz, expected {self._rate_hz:g}: set `rate_hz`, or "
-                "change the rate of the sensor with the vendor's tool"
+                "change the rate of the sensor with LpmsControl"
             )
             out.append(DeviceEvent("warning", text, {"rate_hz": round(step.rate_hz, 2)}))
         if step.lost:
@@ -138,7 +138,7 @@ class LpmsCanDecoder:
         elif beat.state != OPERATIONAL:
             text = (
                 f"its heartbeat reports state {beat.state}, expected {OPERATIONAL} (operational): "
-                "switch its CAN output on with the vendor's tool"
+                "switch its CAN output on with LpmsControl"
             )
             out.append(DeviceEvent("warning", text, {"state": beat.state}))
 
@@ -181,6 +181,6 @@ class LpmsCanDecoder:
 _NORM_REMEDY = "change `precision` or `mapping`, and remove `scale`"
 _OUT_OF_ORDER = (
     "the frames of a quaternion do not follow each other within half a period: change `rate_hz` to "
-    "that of the sensor, and give it ascending identifiers (with the vendor's tool) and `ids`; "
+    "that of the sensor, and give it ascending identifiers (with LpmsControl) and `ids`; "
     'precision = "int16" needs one frame only'
 )

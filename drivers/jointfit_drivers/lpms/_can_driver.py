@@ -122,7 +122,7 @@ class LpmsCanImu:
                 first_s=first_s,
                 resembles=self._resembles,
                 worked=self._worked,
-                configured_by="over UART or USB, with the vendor's tool",
+                configured_by="over UART or USB, with LpmsControl",
             )
 
     def _resembles(self, data: bytes) -> bool:

@@ -28,7 +28,7 @@ _MOST_NODES = 127
 
 
 class LpmsCanIdSettings(Settings):
-    """CAN identifiers of the four channel frames, as the vendor's tool shows them."""
+    """CAN identifiers of the four channel frames, as LpmsControl shows them."""
 
     frame1: int = Field(ge=0, le=STANDARD_MAX, description="first channels")
     frame2: int = Field(ge=0, le=STANDARD_MAX, description="second frame")
@@ -54,7 +54,7 @@ class LpmsCanSettings(ImuSettings, LpmsConventionSettings):
         "different rules, so that they are never computed here",
     )
     precision: Literal["int16", "float32"] = Field(
-        description="format of its channels, set with the vendor's tool"
+        description="format of its channels, set with LpmsControl"
     )
     mapping: tuple[int, int, int, int] = Field(
         (1, 2, 3, 4), description="channels that carry w, x, y and z, counted from 1"

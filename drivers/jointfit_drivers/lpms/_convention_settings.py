@@ -14,8 +14,9 @@ class LpmsConventionSettings(Settings):
 
     direction: Literal["world_to_sensor", "sensor_to_world"] = Field(
         "world_to_sensor",
-        description="direction of its quaternions; both ROS drivers of the vendor invert them, and "
-        "[a turn by hand](devices/lpms.md#convention) settles it",
+        description="whether its quaternions map world to sensor coordinates, or the reverse; both "
+        "ROS drivers of the vendor invert them, and [a turn by "
+        "hand](devices/lpms.md#convention) settles it",
     )
     world: Literal["NWU", "ENU", "NED"] = Field(
         "NWU",

@@ -293,5 +293,5 @@ def is_text(data: bytes) -> bool:
 
 _TEXT_SHARE = 0.95
 """Least share of printable bytes in text; the first line may be cut."""
-TEXT_REMEDY = "set its output format to LP-BUS (binary) with the vendor's tool, then restart it"
-_NORM_REMEDY = "remove `scale`, and check with the vendor's tool that the quaternion is enabled"
+TEXT_REMEDY = "set its output format to LP-BUS (binary) with LpmsControl, then restart it"
+_NORM_REMEDY = "remove `scale`, and check with LpmsControl that the quaternion is enabled"

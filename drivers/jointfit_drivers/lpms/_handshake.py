@@ -181,7 +181,7 @@ class LpmsHandshake:
         if is_text(self._conversation.last_bytes):
             raise DeviceMisconfiguredError(f"{self._who}: sends text: {TEXT_REMEDY}")
         raise DeviceLostError(
-            f"{self._who}: accepts the settings but sends no data: check it with the vendor's tool"
+            f"{self._who}: accepts the settings but sends no data: check it with LpmsControl"
         )
 
     async def _explain_silence(self) -> NoReturn:

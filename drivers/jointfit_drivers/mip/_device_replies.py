@@ -93,6 +93,6 @@ def _transform_events(turn: Quaternion) -> Iterator[Decoded]:
         text = (
             f"a sensor-to-vehicle transform is stored (w x y z = {data['sensor_to_vehicle']}): "
             "sensor axes are those of the vehicle, not the printed ones. Remove it with the "
-            "vendor's tool before calibration, or leave it as it is"
+            "tool SensorConnect before calibration, or leave it as it is"
         )
         yield DeviceEvent("warning", text, data)

@@ -123,8 +123,11 @@ class TableImuSettings(GatewaySettings):
         "little", description="byte order of fields that name none"
     )
     world: Literal["ENU", "NED", "NWU"] = Field(
-        "ENU", description="world of the quaternion: first, second and third axis"
+        "ENU",
+        description="directions of the x, y and z axis of its world: E east, N north, W west, U "
+        "up, D down",
     )
     direction: Literal["sensor_to_world", "world_to_sensor"] = Field(
-        "sensor_to_world", description="direction in which the quaternion rotates vectors"
+        "sensor_to_world",
+        description="whether the quaternion maps sensor to world coordinates, or the reverse",
     )

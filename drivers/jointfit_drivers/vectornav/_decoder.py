@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 from jointfit_daemon.model import Corrupt, DeviceEvent, TickClock
 from jointfit_drivers.serial_imu import ArrivalStamps
 from jointfit_drivers.timed_samples import RawVectors, TimedReading, TimedSamples
+from jointfit_drivers.vectornav._rate_check import RateCheck
 from jointfit_protocols.orientation import canonical
 from jointfit_protocols.vectornav import (
     MAX_MESSAGE,
@@ -67,6 +68,10 @@ class VectorNavDecoder:
         Whether the quaternion maps world to sensor coordinates.
     make_raw : callable, optional
         Returns a new filter of raw measurements; None if the device sends orientations.
+    rate_hz : float, optional
+        Configured rate, Hz; None without a check.
+    output : int
+        Number of the binary output that the driver configures.
     """
 
     tick_clock = _CLOCK
@@ -77,11 +82,15 @@ class VectorNavDecoder:
         *,
         world_to_sensor: bool = False,
         make_raw: Callable[[], RawSamples] | None = None,
+        rate_hz: float | None = None,
+        output: int = 1,
     ) -> None:
         self._inverse, self._is_raw = world_to_sensor, make_raw is not None
         self._codec = VectorNavCodec()
         self._stamps = ArrivalStamps(baud, MAX_MESSAGE)
         self._samples = TimedSamples(make_raw, "add the field TimeStartup to this binary output")
+        self._rate_check = None if rate_hz is None else RateCheck(rate_hz)
+        self._register = Register.BINARY_OUTPUT + output - 1
         self._places: dict[bytes, _Places] = {}  # by header; a device sends up to three kinds
 
     @property
@@ -114,6 +123,7 @@ class VectorNavDecoder:
                 out += self._decode_output(event)
             elif isinstance(event, TextMessage):
                 out += _text_events(event)
+                self._note_divisor(event)
             else:
                 out.append(Corrupt(event.discarded, event.reason))
         return out
@@ -136,7 +146,8 @@ class VectorNavDecoder:
             field = None if places.field is None else _vector(values[places.field])
             raw = RawVectors(_vector(values[places.rate]), _vector(values[places.force]), field)
             arrival_ns = self._stamps.stamp(since)
-            return self._samples.add(TimedReading(packet.size, arrival_ns, ticks, raw=raw))
+            reading = TimedReading(packet.size, arrival_ns, ticks, raw=raw)
+            return self._check_rate(ticks) + self._samples.add(reading)
 
         if places.quaternion is None:
             return []
@@ -144,7 +155,21 @@ class VectorNavDecoder:
         native = (w, x, y, z)
         q = canonical(native, "NED", world_to_sensor=self._inverse)
         arrival_ns = self._stamps.stamp(since)
-        return self._samples.add(TimedReading(packet.size, arrival_ns, ticks, q, native))
+        reading = TimedReading(packet.size, arrival_ns, ticks, q, native)
+        return self._check_rate(ticks) + self._samples.add(reading)
+
+    def _note_divisor(self, message: TextMessage) -> None:
+        """Start the check of the rate when the device confirms its output."""
+        if self._rate_check is not None and message.register == self._register:
+            output = decode_output(message.values[1:])
+            if output is not None and output.divisor:
+                self._rate_check.start(output.divisor)
+
+    def _check_rate(self, ticks: int | None) -> list[Decoded]:
+        warning = None
+        if ticks is not None and self._rate_check is not None:
+            warning = self._rate_check.add(ticks)
+        return [] if warning is None else [warning]
 
 
 _MOST_KINDS = 16
@@ -183,7 +208,7 @@ def _text_events(message: TextMessage) -> Iterator[Decoded]:
         if not all(abs(found - expected) <= _SMALL for found, expected in pairs):
             text = (
                 f"a reference frame rotation is stored (register 26: {data['reference_frame']}): "
-                "sensor axes are not the printed ones. Reset it with the vendor's tool before "
-                "calibration, or leave it as it is"
+                "sensor axes are not the printed ones. Reset it with VectorNav Control Center "
+                "before calibration, or leave it as it is"
             )
             yield DeviceEvent("warning", text, data)

@@ -47,7 +47,13 @@ class VectorNavImu:
                 settle_s=settings.settle_s,
             )
         inverse = settings.direction == "world_to_sensor"
-        return VectorNavDecoder(settings.line_baud, world_to_sensor=inverse, make_raw=make_raw)
+        return VectorNavDecoder(
+            settings.line_baud,
+            world_to_sensor=inverse,
+            make_raw=make_raw,
+            rate_hz=settings.rate_hz,
+            output=settings.output,
+        )
 
     async def run(self, emit: Emit) -> None:
         """Open the port, make the device stream, and read until cancelled.

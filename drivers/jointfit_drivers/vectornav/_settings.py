@@ -30,7 +30,8 @@ class VectorNavSettings(GatewaySettings, SerialImuSettings):
     )
     direction: Literal["sensor_to_world", "world_to_sensor"] = SettingsField(
         "sensor_to_world",
-        description="what the quaternion maps, by the manual; see the check in docs/devices.md",
+        description="whether the quaternion maps sensor to world coordinates (the manual), or the "
+        "reverse; see the check in docs/devices.md",
     )
 
     @property

@@ -217,7 +217,7 @@ class WitMotionHandshake:
             )
             raise DeviceMisconfiguredError(
                 f"{self._who}: {'; '.join(faults)}, even on request: {remedy}enable "
-                f"{kind_names(missing)} with the vendor's tool"
+                f"{kind_names(missing)} with the WitMotion software"
             )
 
     async def _send(self, commands: list[bytes]) -> None:
@@ -274,6 +274,6 @@ class WitMotionHandshake:
         if not heard.counts:
             raise DeviceMisconfiguredError(
                 f"{self._who}: the device sends at {baud} baud and did not change to "
-                f"{settings.baud}: set baud = {baud}, or change it with the vendor's tool"
+                f"{settings.baud}: set baud = {baud}, or change it with the WitMotion software"
             )
         return heard

@@ -19,10 +19,15 @@ class WitMotionSettings(SerialImuSettings, GatewaySettings):
     """One WitMotion IMU on a serial port."""
 
     world: Literal["ENU", "NED", "NWU"] = Field(
-        "ENU", description="world of its quaternion, which the vendor does not document"
+        "ENU",
+        description="directions of the x, y and z axis of its world: E east, N north, W west, U "
+        "up, D down; the vendor does not document it, `jointfit probe --physical-test` determines "
+        "it",
     )
     direction: Literal["sensor_to_world", "world_to_sensor"] = Field(
-        "sensor_to_world", description="direction of its quaternion, which is not documented either"
+        "sensor_to_world",
+        description="whether its quaternion maps sensor to world coordinates, or the reverse; the "
+        "vendor does not document it, `jointfit probe --physical-test` determines it",
     )
     device_time: bool = Field(
         False,

@@ -163,7 +163,7 @@ class XbusHandshake:
         if not self._settings.persist:
             raise DeviceMisconfiguredError(
                 f"{self._who}: {'; '.join(faults)}{hint}: set persist = true once to write it "
-                "into the device's flash, or configure the device with the vendor's tool"
+                "into the device's flash, or configure the device with MT Manager"
             )
 
     async def _ensure_sync(self) -> None:

@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from jointfit_drivers.ports.serial_port import SerialPort
 
 REPLY_S = 0.5
-"""Longest wait for a reply, s: the time-out of the vendor's software."""
+"""Longest wait for a reply, s: the time-out of the x-IMU3 GUI."""
 TRIES = 3
-"""Number of times that a command is sent: the vendor's software retries twice."""
+"""Number of times that a command is sent: the x-IMU3 GUI retries twice."""
 _CERTAIN = 3
 """Messages with numbers that identify the protocol: a line of noise may have the form of one."""
 

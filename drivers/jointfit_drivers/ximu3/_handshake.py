@@ -96,7 +96,7 @@ class XImu3Handshake:
         if found.get(WORLD) not in _WORLDS:
             raise DeviceMisconfiguredError(
                 f"{self._who}: {WORLD} is {found.get(WORLD)}, expected 0 (NWU), 1 (ENU) or 2 "
-                "(NED): correct it with the vendor's software, or update this program"
+                "(NED): correct it with the x-IMU3 GUI, or update this program"
             )
         await self._ensure_settings(found)
 
@@ -120,7 +120,7 @@ class XImu3Handshake:
             firmware = found.get("firmware_version", "unknown")
             raise DeviceMisconfiguredError(
                 f"{self._who}: firmware {firmware} does not have {', '.join(needed)}: "
-                "install another one with the vendor's software, or set passive = true"
+                "install another one with the x-IMU3 GUI, or set passive = true"
             )
         return found
 
@@ -133,7 +133,7 @@ class XImu3Handshake:
         if not self._settings.persist:
             raise DeviceMisconfiguredError(
                 f"{self._who}: {text}{rate_hint(found, self._required)}: set persist = true once "
-                "to write it into the device, or change it with the vendor's software"
+                "to write it into the device, or change it with the x-IMU3 GUI"
             )
         log.warning("%s: writing its settings: %s", self._settings.id, text)
 

@@ -65,6 +65,20 @@ def pack_can_frame(t_ns: int, number: int, data: bytes, *, extended: bool = Fals
     return _RECORD.pack(t_ns, number, _EXTENDED * extended, len(data), data)
 
 
+def frame_sizes(records: bytes) -> dict[tuple[int, bool], int]:
+    """Return the number of data bytes of each identifier in consecutive records.
+
+    The keys are the number of an identifier and whether it has 29 bits; error and remote frames are
+    left out.
+    """
+    whole = len(records) // RECORD_BYTES * RECORD_BYTES
+    return {
+        (number, bool(flags & _EXTENDED)): size
+        for _, number, flags, size, _ in _RECORD.iter_unpack(records[:whole])
+        if not flags & (_REMOTE | _ERROR)
+    }
+
+
 def _record(line: bytes) -> tuple[int, bytes] | None:
     """Return time and record of one line; None if it is not a classic CAN frame."""
     match = _LINE.fullmatch(line)

@@ -35,7 +35,19 @@ NS_PER_BYTE = 10 * 10**9 // 921_600
 
 
 class UnreadableCaptureError(ValueError):
-    """File that is not a capture of this wire; the message names both types."""
+    """File that is not a capture of this wire; the message names both types.
+
+    Parameters
+    ----------
+    text
+        The message.
+    recorded
+        Wire that was recorded; None if unknown.
+    """
+
+    def __init__(self, text: str, recorded: Wire | None = None) -> None:
+        super().__init__(text)
+        self.recorded = recorded
 
 
 def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Chunk]:
@@ -85,7 +97,8 @@ def _require_wire(path: Path, found: str, recorded: Wire, expected: Wire) -> Non
     if recorded != expected:
         raise UnreadableCaptureError(
             f"{path}: {found}, where a {expected} is expected: name the driver of the device that"
-            " was recorded"
+            " was recorded",
+            recorded,
         )
 
 

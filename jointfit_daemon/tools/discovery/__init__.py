@@ -25,7 +25,12 @@ from jointfit_daemon.tools.discovery._serial_listening import (
 )
 from jointfit_daemon.tools.discovery._serial_ports import SerialPortInfo, find_serial_ports
 from jointfit_daemon.tools.discovery._sysfs import read_attribute
-from jointfit_daemon.tools.discovery._traffic import DecodedDevice, decode_traffic
+from jointfit_daemon.tools.discovery._traffic import (
+    DecodedDevice,
+    decode_frames,
+    decode_stream,
+    decode_traffic,
+)
 
 __all__ = [
     "CanChannel",
@@ -38,6 +43,8 @@ __all__ = [
     "SerialPortInfo",
     "SerialTraffic",
     "configured_can_channels",
+    "decode_frames",
+    "decode_stream",
     "decode_traffic",
     "find_can_interfaces",
     "find_mocap_servers",

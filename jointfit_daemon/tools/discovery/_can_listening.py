@@ -13,18 +13,18 @@ import socket
 import struct
 import time
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING
 
 from jointfit_daemon.files.captures import pack_can_frame
 from jointfit_daemon.model import Chunk
-from jointfit_daemon.tools.discovery._mocap_servers import installed_drivers
-from jointfit_daemon.tools.discovery._traffic import DecodedDevice, decode_traffic
+from jointfit_daemon.tools.discovery._traffic import (
+    DecodedDevice,
+    decode_frames,
+    used_identifiers,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
-
-    from jointfit_daemon.device_search import CanSearch
-    from jointfit_daemon.driver import Driver
+    from collections.abc import Callable
 
 _FRAME = struct.Struct("=IB3x8s")
 _EXTENDED_FLAG, _REMOTE_FLAG, _ERROR_FLAG = 1 << 31, 1 << 30, 1 << 29
@@ -104,43 +104,14 @@ def listen_can(
             chunks.append(Chunk(t_ns, pack_can_frame(t_ns, number, data, extended=extended)))
 
     sizes = {key: found[-1][1] for key, found in arrivals.items()}
-    devices = tuple(_decode(sizes, chunks))
-    owners = {key: device.driver for device in devices for key in _keys(device.settings)}
+    devices = tuple(decode_frames(sizes, chunks))
+    owners = {key: device.driver for device in devices for key in used_identifiers(device.settings)}
     identifiers = []
     for key, found in sorted(arrivals.items()):
         (first_ns, _), (last_ns, size) = found[0], found[-1]
         rate_hz = (len(found) - 1) * 1e9 / (last_ns - first_ns) if last_ns > first_ns else None
         identifiers.append(CanIdentifier(*key, size, len(found), rate_hz, owners.get(key)))
     return CanTraffic(interface, None, tuple(identifiers), devices, errors)
-
-
-def _decode(sizes: Mapping[tuple[int, bool], int], chunks: list[Chunk]) -> Iterator[DecodedDevice]:
-    """Yield the sensors that the installed drivers decode; each identifier has one owner."""
-    used: set[tuple[int, bool]] = set()
-    for name, driver in installed_drivers():
-        for table in _tables(driver, sizes):
-            keys = _keys(table)
-            device = None if keys & used else decode_traffic(driver, name, table, chunks)
-            if device is not None and device.samples:
-                used |= keys
-                yield device
-
-
-def _tables(
-    driver: type[Driver], sizes: Mapping[tuple[int, bool], int]
-) -> Iterable[Mapping[str, Any]]:
-    """Return the tables that a driver proposes; the default table if it proposes none."""
-    if driver.wire != "can" or not sizes:
-        return ()
-    if hasattr(driver, "candidate_tables"):
-        return cast("CanSearch", cast("Any", driver)).candidate_tables(sizes)
-    return ({},)
-
-
-def _keys(table: Mapping[str, Any]) -> set[tuple[int, bool]]:
-    """Return the identifiers in the key ``ids`` of a table."""
-    extended = bool(table.get("extended_ids"))
-    return {(number, extended) for number in (table.get("ids") or {}).values()}
 
 
 def _receive(

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.model import Chunk
 from jointfit_daemon.tools.discovery._mocap_servers import installed_drivers
-from jointfit_daemon.tools.discovery._traffic import DecodedDevice, decode_traffic
+from jointfit_daemon.tools.discovery._traffic import DecodedDevice, decode_stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -102,24 +102,13 @@ def listen_serial(
                     progress((k + 1) / len(tried))
                 if not received[baud]:
                     break
-                devices = _decode(baud, chunks)
+                devices = decode_stream(chunks, baud)
                 if devices:
                     return SerialTraffic(port, None, received, baud, devices)
     except OSError as error:
         text = _FAULTS.get(error.errno or 0, f"{error.strerror or error}: check the cable")
         return SerialTraffic(port, f"{port}: {text}", received)
     return SerialTraffic(port, None, received)
-
-
-def _decode(baud: int, chunks: Sequence[Chunk]) -> tuple[DecodedDevice, ...]:
-    """Return the devices that one of the installed drivers decodes; most samples first."""
-    found = []
-    for name, driver in installed_drivers():
-        if driver.wire == "stream":
-            fields = driver.Settings.model_fields
-            table: dict[str, Any] = {"baud": baud} if "baud" in fields else {}
-            found.append(decode_traffic(driver, name, table, chunks))
-    return tuple(sorted(filter(None, found), key=lambda device: -device.samples))
 
 
 @contextlib.contextmanager

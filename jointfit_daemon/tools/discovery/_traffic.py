@@ -6,13 +6,15 @@ Invariant: pure, apart from the import of drivers.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from jointfit_daemon.model import DeviceEvent, ImuSample
+from jointfit_daemon.tools.discovery._mocap_servers import installed_drivers
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    from jointfit_daemon.device_search import CanSearch
     from jointfit_daemon.driver import Driver
     from jointfit_daemon.model import Chunk
 
@@ -77,6 +79,68 @@ class DecodedDevice:
         if abs(nearest - self.rate_hz) <= _NEAR * nearest:
             return nearest
         return max(1, round(self.rate_hz))
+
+
+def decode_stream(
+    chunks: Sequence[Chunk], baud: int | None = None, *, besides: str = ""
+) -> tuple[DecodedDevice, ...]:
+    """Return the device of every installed driver that decodes a byte stream; most samples first.
+
+    Parameters
+    ----------
+    chunks
+        Received bytes.
+    baud
+        Speed of the line, baud; None if unknown.
+    besides
+        Driver that is left out.
+    """
+    found = []
+    for name, driver in installed_drivers():
+        if driver.wire == "stream" and name != besides:
+            fields = driver.Settings.model_fields
+            table = {"baud": baud} if "baud" in fields and baud is not None else {}
+            found.append(decode_traffic(driver, name, table, chunks))
+    return tuple(sorted(filter(None, found), key=lambda device: -device.samples))
+
+
+def decode_frames(
+    sizes: Mapping[tuple[int, bool], int], chunks: Sequence[Chunk]
+) -> Iterator[DecodedDevice]:
+    """Yield the sensors that the installed drivers decode; each identifier has one owner.
+
+    Parameters
+    ----------
+    sizes
+        Number of data bytes of each identifier, by number and whether it has 29 bits.
+    chunks
+        Records of the frames.
+    """
+    used: set[tuple[int, bool]] = set()
+    for name, driver in installed_drivers():
+        for table in _candidate_tables(driver, sizes):
+            keys = used_identifiers(table)
+            device = None if keys & used else decode_traffic(driver, name, table, chunks)
+            if device is not None and device.samples:
+                used |= keys
+                yield device
+
+
+def _candidate_tables(
+    driver: type[Driver], sizes: Mapping[tuple[int, bool], int]
+) -> Iterable[Mapping[str, Any]]:
+    """Return the tables that a driver proposes; the default table if it proposes none."""
+    if driver.wire != "can" or not sizes:
+        return ()
+    if hasattr(driver, "candidate_tables"):
+        return cast("CanSearch", cast("Any", driver)).candidate_tables(sizes)
+    return ({},)
+
+
+def used_identifiers(table: Mapping[str, Any]) -> set[tuple[int, bool]]:
+    """Return the identifiers in the key ``ids`` of a table, each with whether it has 29 bits."""
+    extended = bool(table.get("extended_ids"))
+    return {(number, extended) for number in (table.get("ids") or {}).values()}
 
 
 def decode_traffic(

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 from jointfit_daemon.config import (
     LATER,
     ConfigError,
-    heading_warning,
     load_rig,
-    missing_files,
     parse_rig,
+    rig_warnings,
 )
 from jointfit_daemon.tools.init._engine import without_open_places
 from jointfit_daemon.tools.init._rig_table import rig_table
@@ -74,15 +73,13 @@ def write_rig(path: Path, given: Answers, found: Found) -> WrittenRig:
     if not open_places:
         state_of(path).unlink(missing_ok=True)
 
-    heading = heading_warning(rig.sources)
-    warnings = (*missing_files(rig.mqtt), *(() if heading is None else (heading,)))
     following = _next_commands(path, rig)
     if open_places:
         command = f"jointfit init --config {shlex.quote(str(path))} --force"
         if path.name == "rig.toml":
             command = f"jointfit init {shlex.quote(str(path.parent))} --force"
         following = {command: "fill in these places later"} | following
-    return WrittenRig(path, table, tuple(open_places), warnings, following)
+    return WrittenRig(path, table, tuple(open_places), tuple(rig_warnings(rig)), following)
 
 
 def _next_commands(path: Path, rig: Rig) -> dict[str, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from jointfit_daemon.tools.probe._frame_judgement import explain_frames, fit_fra
 from jointfit_daemon.tools.probe._rest_finder import RestFinder
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Coroutine, Sequence
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.config import Source
@@ -33,6 +33,9 @@ STEPS = (
     "Turn it, as it stands, by a quarter turn, counter-clockwise seen from above.",
 )
 """Instructions; the sensor rests after each."""
+OPEN_S = 20.0
+"""Longest time from opening to the first orientation, s; a search at other speeds is included."""
+Result = TypeVar("Result")
 _KEYS = ("direction", "world")
 """Keys of a driver that change how quaternions are read."""
 
@@ -79,21 +82,28 @@ async def run_physical_test(
         The device is lost or misconfigured, or a step took longer than `step_s`.
     """
     driver = source.driver_class(source.settings)
-    decoder, finder = driver.decoder(), RestFinder()
+    decoder = driver.decoder()
+    finder: RestFinder | None = None
     chunks: list[Chunk] = []
     rests: asyncio.Queue[tuple[int, int]] = asyncio.Queue()
+    sends = asyncio.Event()
 
     def emit(chunk: Chunk) -> None:
         chunks.append(chunk)
         for item in decoder.feed(chunk):
             if isinstance(item, ImuSample):
-                rest = finder.add(item.arrival_ns, item.q_world_sensor)
-                if rest is not None:
+                sends.set()
+                if finder is not None and (
+                    rest := finder.add(item.arrival_ns, item.q_world_sensor)
+                ):
                     rests.put_nowait(rest)
 
+    tell(f"Opening {source.id} …")
     reading = asyncio.create_task(driver.run(emit))
     found: list[tuple[int, int]] = []
     try:
+        await _first_orientation(source.id, reading, sends)
+        finder = RestFinder()  # a rest before the first instruction does not count
         for step in STEPS:
             tell(step.format(id=source.id))
             found.append(await _next_rest(source.id, reading, rests, step_s))
@@ -103,11 +113,38 @@ async def run_physical_test(
     return judge_recording(source, chunks, found)
 
 
+async def _first_orientation(name: str, reading: asyncio.Task[None], sends: asyncio.Event) -> None:
+    """Wait for an orientation, so that a silent device is reported before any instruction."""
+    if await _result_of(name, reading, sends.wait(), OPEN_S) is None:
+        raise PhysicalTestError(
+            f"{name}: no orientation within {OPEN_S:g} s: `jointfit doctor` names the cause"
+        )
+
+
 async def _next_rest(
     name: str, reading: asyncio.Task[None], rests: asyncio.Queue[tuple[int, int]], step_s: float
 ) -> tuple[int, int]:
-    waiting = asyncio.create_task(rests.get())
-    await asyncio.wait({waiting, reading}, timeout=step_s, return_when=asyncio.FIRST_COMPLETED)
+    rest = await _result_of(name, reading, rests.get(), step_s)
+    if rest is None:
+        raise PhysicalTestError(
+            f"{name}: not moved and at rest within {step_s:g} s: repeat the test, and hold the "
+            "sensor still for a second after each rotation"
+        )
+    return rest
+
+
+async def _result_of(
+    name: str, reading: asyncio.Task[None], awaited: Coroutine[Any, Any, Result], limit_s: float
+) -> Result | None:
+    """Return the result of `awaited`; None after `limit_s`.
+
+    Raises
+    ------
+    PhysicalTestError
+        The driver ended before.
+    """
+    waiting = asyncio.create_task(awaited)
+    await asyncio.wait({waiting, reading}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
     if waiting.done():
         return waiting.result()
 
@@ -117,10 +154,7 @@ async def _next_rest(
         if isinstance(error, DeviceLostError | DeviceMisconfiguredError):
             raise PhysicalTestError(f"{name}: {error}") from error
         reading.result()
-    raise PhysicalTestError(
-        f"{name}: not moved and at rest within {step_s:g} s: repeat the test, and hold the sensor "
-        "still for a second after each rotation"
-    )
+    return None
 
 
 def judge_recording(

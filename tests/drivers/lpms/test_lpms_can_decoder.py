@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from jointfit_daemon.driver import CanBusSettings, DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample
-from jointfit_daemon.tools.discovery._can_listening import _decode
+from jointfit_daemon.tools.discovery import decode_frames
 from jointfit_drivers.lpms import LpmsCanDecoder, LpmsCanIdSettings, LpmsCanImu, LpmsCanSettings
 from jointfit_drivers.lpms._arrival_gaps import ArrivalGaps
 from jointfit_protocols.can import RECORD_BYTES, CanFrame, host_dropped, pack_frames
@@ -243,7 +243,7 @@ def test_a_sensor_on_a_bus_is_recognized(
     frames = recorded(30, **options)
     sizes = {(frame.can_id, False): len(frame.data) for frame in frames}
     chunks = [Chunk(frame.t_ns, pack_frames([frame])) for frame in frames]
-    (device,) = _decode(sizes, chunks)
+    (device,) = decode_frames(sizes, chunks)
     assert device.driver == "lpms-can"
     table = device.settings
     assert (table["mode"], table["ids"]["frame1"], table["precision"]) == found
@@ -259,9 +259,7 @@ async def test_overlapping_identifiers_of_neighbours_are_refused_by_name(tmp_pat
     )
     run = DriverRun(LpmsCanImu(first))
     await asyncio.sleep(0.05)
-    with pytest.raises(
-        DeviceMisconfiguredError, match=r"0x516 .*also that of S1.*the vendor's tool"
-    ):
+    with pytest.raises(DeviceMisconfiguredError, match=r"0x516 .*also that of S1.*LpmsControl"):
         await LpmsCanImu(second).run(lambda _: None)
     await run.cancel()
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample
-from jointfit_daemon.tools.discovery._serial_listening import _decode
+from jointfit_daemon.tools.discovery import decode_stream
 from jointfit_drivers.lpms import LpmsDecoder, LpmsImu, LpmsSettings
 from jointfit_protocols.lpms import encode
 from jointfit_protocols.lpms.configuration import (
@@ -249,7 +249,7 @@ def test_a_stream_is_recognized_with_any_outputs(outputs: tuple[str, ...]) -> No
         Chunk(n * PERIOD_NS, encode(9, layout.encode(5 * n, values, floats=True)))
         for n in range(1, 40)
     ]
-    found = _decode(115_200, chunks)
+    found = decode_stream(chunks, 115_200)
     assert [device.driver for device in found] == ["lpms"]
     assert (found[0].samples > 0) == (len(outputs) == 1)
     assert bool(found[0].warnings) == (len(outputs) > 1)

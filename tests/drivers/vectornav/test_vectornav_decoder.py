@@ -144,3 +144,12 @@ def test_hostile_times_never_raise(content: list[tuple[int, int]]) -> None:
 def test_hostile_registers_never_raise(text: str) -> None:
     for register in ("01", "26", "75", "76", "99", ""):
         decoded([encode_text(f"VNRRG,{register},{text}"), encode_text(f"VNERR,{text}")])
+
+
+@pytest.mark.parametrize(("period", "warned"), [(1, False), (2, True)])
+def test_a_device_whose_imu_has_another_rate_is_reported(period: int, *, warned: bool) -> None:
+    register = encode_text("VNRRG,75,3,8,01,0011")
+    stream = [output(k * period * PERIOD_NS) for k in range(40) if k % 9]  # every ninth is lost
+    warnings = events_of(decoded([register, *stream]), "warning")
+    assert [one.data for one in warnings] == [{"rate_hz": 50.0}] * warned
+    assert all("rate_hz = 50" in one.text and "800" in one.text for one in warnings)

@@ -120,7 +120,7 @@ async def test_the_command_guides_and_ends_with_the_lines_to_paste(tmp_path: Pat
         code = await process.wait()
     text = "".join(lines)
     assert code == 1
-    assert text.startswith("Lay S1 flat, its z axis up, and let go.\nTurn it")
+    assert text.startswith("Opening S1 …\nLay S1 flat, its z axis up, and let go.\nTurn it")
     assert "S1 sends: components w x y z, world to sensor" in text
     assert 'in its [[imu]] table of rig.toml:\ndirection = "world_to_sensor"' in text
 
@@ -130,6 +130,15 @@ async def test_a_sensor_that_is_not_turned_ends_the_test_in_words(tmp_path: Path
         source = load_rig(tmp_path / "rig.toml").sources[0]
         with pytest.raises(PhysicalTestError, match="S1: not moved and at rest within 4 s: repeat"):
             await run_physical_test(source, lambda _: None, step_s=4.0)
+
+
+async def test_a_device_that_is_absent_is_reported_before_any_instruction(tmp_path: Path) -> None:
+    async with held(tmp_path):
+        absent = load_rig(tmp_path / "rig.toml").sources[1]
+        lines: list[str] = []
+        with pytest.raises(PhysicalTestError, match=r"S2: .*absent"):
+            await run_physical_test(absent, lines.append, step_s=20.0)
+    assert lines == ["Opening S2 …"]
 
 
 def test_an_unknown_sensor_and_other_devices_are_refused(tmp_path: Path) -> None:
