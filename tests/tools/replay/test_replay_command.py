@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import math
+import socket
 from typing import TYPE_CHECKING
 
 import pytest
@@ -22,11 +24,15 @@ from tests.pipeline.core_feed import BEGIN_NS
 from tests.reprocessing.recorded_run import UNIX_NS, RecordedRun, record_run
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
     from pathlib import Path
 
     from typer.testing import Result
 
     from tests.broker_fixture import Broker
+
+_LINK_BYTES, _LINK_PAUSE_S = 2048, 0.01
+"""Bytes that the slow link takes at once, and the pause after them, s."""
 
 
 @pytest.fixture(scope="module")
@@ -117,11 +123,35 @@ def test_missing_driver_is_named(run: RecordedRun, monkeypatch: pytest.MonkeyPat
     assert "xbus" in ended.stderr
 
 
-@pytest.mark.parametrize("speed", [5.0, math.inf])
-async def test_replay_over_mqtt_has_its_own_topics_and_recorded_times_and_drops_nothing(
-    run: RecordedRun, broker: Broker, speed: float
-) -> None:
-    settings = MqttSettings(host=broker.host, port=broker.port, base="replay/jointfit/r")
+@contextlib.asynccontextmanager
+async def slow_link(broker: Broker) -> AsyncIterator[str]:
+    """Run a proxy in front of the broker that takes 200 kB/s at most; yield its address."""
+
+    async def forward(
+        source: asyncio.StreamReader, sink: asyncio.StreamWriter, pause_s: float
+    ) -> None:
+        with contextlib.suppress(ConnectionError):
+            while data := await source.read(_LINK_BYTES):
+                sink.write(data)
+                await sink.drain()
+                await asyncio.sleep(pause_s)
+        sink.close()
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        from_broker, to_broker = await asyncio.open_connection(broker.host, broker.port)
+        await asyncio.gather(
+            forward(reader, to_broker, _LINK_PAUSE_S), forward(from_broker, writer, 0.0)
+        )
+
+    listening = socket.create_server(("127.0.0.1", 0))
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _LINK_BYTES)
+    async with await asyncio.start_server(serve, sock=listening, limit=_LINK_BYTES):
+        yield f"127.0.0.1:{listening.getsockname()[1]}"
+
+
+@contextlib.asynccontextmanager
+async def received_poses(settings: MqttSettings) -> AsyncIterator[list[dict[str, float]]]:
+    """Subscribe to the poses of a replay; yield a list that grows."""
     poses: list[dict[str, float]] = []
     async with MqttClient(settings) as client:
         await client.subscribe("pose")
@@ -131,18 +161,45 @@ async def test_replay_over_mqtt_has_its_own_topics_and_recorded_times_and_drops_
                 poses.append(payload)
 
         listening = asyncio.create_task(listen())
+        try:
+            yield poses
+        finally:
+            listening.cancel()
+
+
+async def wait_for_poses(poses: list[dict[str, float]], number: int) -> None:
+    """Return once the broker has delivered this number of poses."""
+    async with asyncio.timeout(10):
+        while len(poses) < number:
+            await asyncio.sleep(0.01)
+
+
+@pytest.mark.parametrize("speed", [5.0, math.inf])
+async def test_replay_over_mqtt_has_its_own_topics_and_recorded_times_and_drops_nothing(
+    run: RecordedRun, broker: Broker, speed: float
+) -> None:
+    settings = MqttSettings(host=broker.host, port=broker.port, base="replay/jointfit/r")
+    async with received_poses(settings) as poses:
         address = f"{broker.host}:{broker.port}"
         summary = await play_recording(run.path, Changes(), speed, (None, address), quiet=True)
-        async with asyncio.timeout(10):
-            while len(poses) < summary.states:
-                await asyncio.sleep(0.01)
-        listening.cancel()
+        await wait_for_poses(poses, summary.states)
     retained = await retained_topics(settings)
     assert summary.took_s >= summary.seconds / speed
     assert (len(poses), summary.dropped) == (summary.states, 0)
     begin_s = (BEGIN_NS + UNIX_NS) / 1e9  # the stamps are those of the recording
     assert all(-1.0 < pose["t_us"] / 1e6 - begin_s < 6.0 for pose in poses)
     assert retained == {}
+
+
+async def test_replay_ends_after_a_slow_link_took_the_last_messages(
+    run: RecordedRun, broker: Broker
+) -> None:
+    settings = MqttSettings(host=broker.host, port=broker.port, base="replay/jointfit/r")
+    async with received_poses(settings) as poses, slow_link(broker) as address:
+        summary = await play_recording(run.path, Changes(), math.inf, (None, address), quiet=True)
+        assert summary.dropped == 0
+        await wait_for_poses(poses, summary.states)
+    assert await retained_topics(settings) == {}
 
 
 async def retained_topics(settings: MqttSettings) -> dict[str, object]:
