@@ -27,6 +27,7 @@ from jointfit_simulators.devices._natnet_port import LOOPBACK, Address, NatNetPo
 from jointfit_simulators.devices._natnet_server import NatNetServer
 from jointfit_simulators.devices._orientation_sensor import OrientationSensor
 from jointfit_simulators.devices._qtm_server import QtmServer, QtmServerOptions
+from jointfit_simulators.devices._sensor_errors import SensorErrors, VectorErrors
 from jointfit_simulators.devices._sensor_faults import SensorFaults
 from jointfit_simulators.devices._table_device import (
     CanTablePort,
@@ -79,6 +80,7 @@ __all__ = [
     "QtmServerOptions",
     "RigidBodyAsset",
     "SampleTiming",
+    "SensorErrors",
     "SensorFaults",
     "SerialTablePort",
     "SimulatedClock",
@@ -88,6 +90,7 @@ __all__ = [
     "TcpPort",
     "TextServer",
     "Vector",
+    "VectorErrors",
     "VectorNavDevice",
     "VectorNavDeviceOptions",
     "ViconServer",

@@ -5,15 +5,18 @@ They follow without noise from two successive orientations:
 .. math:: \omega = \log(q_{k-1}^{*} q_k) / T, \qquad f = R_k^{T} (0, 0, g), \qquad
     m = R_k^{T} (0, \cos\delta, -\sin\delta)
 
-The device has an orientation but no position, so the specific force contains gravity only.
+The device has an orientation but no position, so the specific force contains gravity only. A device
+with `SensorErrors` measures these signals with bias, scale errors and noise.
 """
 
 from __future__ import annotations
 
 from math import atan2, cos, radians, sin, sqrt
+from random import Random
 from typing import TYPE_CHECKING
 
 from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_simulators.devices._sensor_errors import SensorErrors, Vector, VectorErrors
 
 if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion
@@ -25,13 +28,20 @@ DIP_RAD = radians(65.0)
 _TINY = 1e-12
 """Rotation below which the small-angle limit is used, rad."""
 
-Vector = tuple[float, float, float]
-
 
 class InertialSignals:
-    """Signals of one sensor, computed from its orientations."""
+    """Signals of one sensor, computed from its orientations.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    errors
+        Errors of the sensor; by default it measures exactly.
+    """
+
+    def __init__(self, errors: SensorErrors | None = None) -> None:
+        self._errors = errors or SensorErrors()
+        self._exact = errors is None
+        self._random = Random(self._errors.seed)  # noqa: S311 - noise
         self._last: tuple[int, Quaternion] | None = None
         self._turn: Vector = (0.0, 0.0, 0.0)
         self._step_s = 0.0
@@ -50,39 +60,47 @@ class InertialSignals:
         """Angular rate over the last interval, sensor axes, rad/s; 0 before the second instant."""
         x, y, z = self._turn
         step_s = self._step_s
-        return (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)
+        true = (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)
+        return self._measured(true, self._errors.gyroscope)
 
     @property
     def force(self) -> Vector:
         """Specific force, sensor axes, m/s^2."""
-        return _to_sensor(self._q, (0.0, 0.0, GRAVITY))
+        return self._measured(_to_sensor(self._q, (0.0, 0.0, GRAVITY)), self._errors.accelerometer)
 
     @property
     def field(self) -> Vector:
         """Magnetic field, sensor axes, of magnitude 1."""
-        return _to_sensor(self._q, (0.0, cos(DIP_RAD), -sin(DIP_RAD)))
+        true = _to_sensor(self._q, (0.0, cos(DIP_RAD), -sin(DIP_RAD)))
+        return self._measured(true, self._errors.magnetometer)
+
+    def _measured(self, true: Vector, errors: VectorErrors) -> Vector:
+        return true if self._exact else errors.measure(true, self._random)
 
     def value(self, item: int) -> tuple[float, ...] | None:
         """Return an Xbus item for the last interval; None if it is not an inertial signal."""
-        x, y, z = self._turn
         step_s = self._step_s
 
         match item:
             case Item.RATE_OF_TURN:
                 return self.rate
             case Item.DELTA_Q:
+                x, y, z = self._turn if self._exact else _scaled(self.rate, step_s)
                 angle = sqrt(x * x + y * y + z * z)
                 scale = sin(angle / 2.0) / angle if angle > _TINY else 0.5
                 return (cos(angle / 2.0), scale * x, scale * y, scale * z)
             case Item.ACCELERATION:
                 return self.force
             case Item.DELTA_V:
-                x, y, z = self.force
-                return (x * step_s, y * step_s, z * step_s)
+                return _scaled(self.force, step_s)
             case Item.MAGNETIC_FIELD:
                 return self.field
             case _:
                 return None
+
+
+def _scaled(vector: Vector, scale: float) -> Vector:
+    return (vector[0] * scale, vector[1] * scale, vector[2] * scale)
 
 
 def _rotation_vector(before: Quaternion, after: Quaternion) -> Vector:

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
+    from jointfit_simulators.devices._sensor_errors import SensorErrors
     from jointfit_simulators.imu_device import Quaternion, WireNoise
     from jointfit_simulators.wires import CanWire
 
@@ -202,6 +203,8 @@ class TableDeviceOptions:
     first_ns: int = 0
     """Clock at power-up, ns."""
     first_counter: int = 0
+    errors: SensorErrors | None = None
+    """Errors of its sensors; None: it measures exactly."""
 
 
 class TableDevice:
@@ -217,7 +220,7 @@ class TableDevice:
 
     def __init__(self, port: TablePort, options: TableDeviceOptions) -> None:
         self._port, self._options = port, options
-        self._inertial = InertialSignals()
+        self._inertial = InertialSignals(options.errors)
         self.rate_hz = options.rate_hz
         """Configured samples per second."""
         self.counter = options.first_counter

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from jointfit_simulators.devices._sensor_errors import SensorErrors
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
 NORM = 1.000121
@@ -91,6 +92,8 @@ class XImu3DeviceOptions:
     battery_percent: float = 80.0
     first_tick: int = 0
     """Clock at power-up, us."""
+    errors: SensorErrors | None = None
+    """Errors of its sensors; None: it measures exactly."""
 
 
 class XImu3Device:
@@ -116,7 +119,7 @@ class XImu3Device:
         self._options = options = options or XImu3DeviceOptions()
         self._line = PtyLine(link)
         self._noise = wire_noise
-        self._inertial = InertialSignals()
+        self._inertial = InertialSignals(options.errors)
         self._codec = XImu3Codec()
         self.settings = _FACTORY | dict(options.settings)
         """Settings in force."""

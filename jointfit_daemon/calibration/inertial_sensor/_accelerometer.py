@@ -1,0 +1,241 @@
+r"""Bias, scale factors and non-orthogonality of an accelerometer from static poses.
+
+At rest an accelerometer measures gravity, in every pose with the same magnitude:
+
+.. math:: |M (f_i - b)| = g
+
+Nine poses determine bias and scale factors with three degrees of freedom to spare, twelve poses the
+non-orthogonality as well. The faces of the housing need not be exact: only magnitudes are used.
+
+Source: Frosio, Pedersini and Borghese 2009, IEEE Trans. Instrum. Meas. 58, 2034-2041; static
+detection as in Tedaldi, Pretto and Menegatti 2014, ICRA, 3042-3049.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass
+from math import cos, radians
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.inertial_sensor._directions import (
+    FACES,
+    NAMES,
+    nearest_direction,
+)
+from jointfit_daemon.calibration.inertial_sensor._ellipsoid_fit import (
+    DIAGONAL,
+    SYMMETRIC,
+    fit_unit_ellipsoid,
+    matrix_sd,
+)
+from jointfit_daemon.calibration.inertial_sensor._refusal import SensorCalibrationError
+from jointfit_daemon.calibration.inertial_sensor._rest_blocks import RestBlocks
+from jointfit_daemon.calibration.inertial_sensor._step_progress import StepProgress
+
+if TYPE_CHECKING:
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.inertial_sensor._rest_blocks import SensorReading
+
+STANDARD_GRAVITY = 9.80665
+"""Magnitude of gravity, m/s^2. An error is common to all axes, and does not change inclinations."""
+POSES = 12
+"""Poses that complete the step: six faces and six edges or corners."""
+FEWEST_POSES = 9
+"""Fewest poses of a fit: three more than bias and scale factors."""
+FEWEST_SKEWED = 12
+"""Fewest poses of a fit of the non-orthogonality."""
+LARGEST_SKEW_SD = 0.003
+"""Largest standard deviation of an off-diagonal element, rad, with which it is used."""
+LARGEST_RESIDUAL = 0.1
+"""Largest RMS of the corrected magnitudes minus g, m/s^2."""
+LARGEST_BIAS = 3.0
+"""Largest plausible bias, m/s^2."""
+LARGEST_SCALE_ERROR = 0.2
+"""Largest plausible error of a scale factor."""
+_POSE_BLOCKS = 4
+"""Blocks of a pose, 1 s."""
+_DISTINCT = cos(radians(20.0))
+"""Cosine of the smallest angle between two poses."""
+_PLANES = {"x and y": (0, 1), "x and z": (0, 2), "y and z": (1, 2)}
+_TILTED = 0.4
+"""Smallest share of gravity along both axes of a tilted pose."""
+_SATURATED = 0.5 * STANDARD_GRAVITY
+"""Specific force, m/s^2, below which no accelerometer saturates."""
+
+
+@dataclass(frozen=True, slots=True)
+class AccelerometerEstimate:
+    """Parameters of an accelerometer: the corrected specific force is `matrix` (f - `bias`)."""
+
+    bias: Array
+    """Bias, m/s^2, shape (3,)."""
+    matrix: Array
+    """Inverse scale factors and non-orthogonality, symmetric, shape (3, 3)."""
+    bias_sd: Array
+    """Standard deviations of the bias, m/s^2, shape (3,)."""
+    matrix_sd: Array
+    """Standard deviations of the elements of the matrix; NaN where they are not estimated."""
+    covariance: Array
+    """Covariance of bias (m/s^2), diagonal, and upper off-diagonal elements if estimated."""
+    degrees_of_freedom: int
+    """Number of poses minus number of parameters."""
+    poses: int
+    spread_before: float
+    """RMS of the magnitudes minus g, uncorrected, m/s^2."""
+    residual: float
+    """RMS of the magnitudes minus g, corrected, m/s^2."""
+
+
+def fit_accelerometer(forces: Array) -> AccelerometerEstimate:
+    """Estimate the parameters from the mean specific forces of static poses.
+
+    Parameters
+    ----------
+    forces
+        One pose a row, m/s^2, shape (n, 3).
+
+    Raises
+    ------
+    SensorCalibrationError
+        Too few poses, or no plausible parameters.
+    """
+    if len(forces) < FEWEST_POSES:
+        raise SensorCalibrationError(
+            f"{len(forces)} static poses, expected at least {FEWEST_POSES} that differ by 20 "
+            "degrees: repeat, and let the sensor lie still for a second in each pose"
+        )
+
+    # the elements of non-orthogonality are used only if the poses determine them
+    unit = forces / STANDARD_GRAVITY
+    fit = fit_unit_ellipsoid(unit, DIAGONAL)
+    if len(forces) >= FEWEST_SKEWED:
+        with suppress(SensorCalibrationError):  # no tilted poses
+            skewed = fit_unit_ellipsoid(unit, SYMMETRIC)
+            if np.sqrt(np.diag(skewed.covariance)[6:]).max() < LARGEST_SKEW_SD:
+                fit = skewed
+
+    units = np.ones(len(fit.covariance))
+    units[:3] = STANDARD_GRAVITY
+    covariance = fit.covariance * np.outer(units, units)
+    deviations = np.sqrt(np.diag(covariance))
+    estimate = AccelerometerEstimate(
+        bias=fit.bias * STANDARD_GRAVITY,
+        matrix=fit.matrix,
+        bias_sd=deviations[:3],
+        matrix_sd=matrix_sd(deviations[3:]),
+        covariance=covariance,
+        degrees_of_freedom=fit.degrees_of_freedom,
+        poses=len(forces),
+        spread_before=_rms(np.linalg.norm(forces, axis=1) - STANDARD_GRAVITY),
+        residual=_rms(fit.residuals * STANDARD_GRAVITY),
+    )
+    _check(estimate)
+    return estimate
+
+
+def _check(estimate: AccelerometerEstimate) -> None:
+    """Refuse parameters of no real accelerometer."""
+    if estimate.residual > LARGEST_RESIDUAL:
+        raise SensorCalibrationError(
+            f"after the correction |a| differs from gravity by {estimate.residual:.3f} m/s² (RMS), "
+            f"expected less than {LARGEST_RESIDUAL:g}: the sensor moved or was touched in a pose. "
+            "Repeat, and let go of it in each pose"
+        )
+    bias, scale = np.abs(estimate.bias).max(), np.abs(np.diag(estimate.matrix) - 1.0).max()
+    if bias > LARGEST_BIAS or scale > LARGEST_SCALE_ERROR:
+        raise SensorCalibrationError(
+            f"bias {bias:.2f} m/s² and scale error {100 * scale:.0f} %: expected at most "
+            f"{LARGEST_BIAS:g} m/s² and {100 * LARGEST_SCALE_ERROR:.0f} %. Check the unit and the "
+            "range of the acceleration in rig.toml, or replace the sensor"
+        )
+
+
+class AccelerometerStep:
+    """Collects static poses, and estimates the parameters."""
+
+    def __init__(self) -> None:
+        self._blocks = RestBlocks()
+        self._forces: list[Array] = []
+        self._constant: list[Array] = []
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether all faces and enough tilted poses are collected."""
+        return len(self._forces) >= POSES and not self._missing_faces() and not self._tilts()
+
+    @property
+    def progress(self) -> StepProgress:
+        """Share of the poses, and the missing ones."""
+        faces, tilts = self._missing_faces(), self._tilts()
+        missing = [f"{NAMES[face]} up" for face in faces]
+        missing += [f"{count} tilted between {plane}" for plane, count in tilts.items()]
+        wanted = len(faces) + sum(tilts.values())
+        if others := max(POSES - len(self._forces) - wanted, 0):
+            missing.append(f"{others} more on edges or corners")
+        return StepProgress(max(1.0 - (wanted + others) / POSES, 0.0), tuple(missing))
+
+    def add(self, reading: SensorReading) -> None:
+        """Add a reading; a pose is collected if it differs from those before."""
+        blocks = self._blocks
+        if not blocks.add(reading) or len(blocks.rest) <= _POSE_BLOCKS:
+            return
+
+        # the first block may contain the end of a movement
+        rest = blocks.rest[1 : _POSE_BLOCKS + 1]
+        force = np.mean([block.force for block in rest], axis=0)
+        unit = force / np.linalg.norm(force)
+        known = [float(unit @ other) / float(np.linalg.norm(other)) for other in self._forces]
+        if not known or max(known) < _DISTINCT:
+            self._forces.append(force)
+            self._constant.append(np.all([block.constant for block in rest], axis=0))
+
+    def finish(self) -> AccelerometerEstimate:
+        """Return the parameters.
+
+        Raises
+        ------
+        SensorCalibrationError
+            Too few poses, saturated readings, or no plausible parameters.
+        """
+        missing = self._missing_faces()
+        if len(self._forces) < FEWEST_POSES or len(missing) > 1:
+            raise SensorCalibrationError(
+                f"{len(self._forces)} static poses, expected at least {FEWEST_POSES} and five of "
+                f"the six faces; missing: {', '.join(self.progress.missing)}. Repeat, and let the "
+                "sensor lie still for two seconds in each pose"
+            )
+        forces = np.array(self._forces)
+        self._check_saturation(forces)
+        return fit_accelerometer(forces)
+
+    def _missing_faces(self) -> list[int]:
+        taken = set(nearest_direction(np.array(self._forces)).tolist()) if self._forces else set()
+        return [face for face in range(FACES) if face not in taken]
+
+    def _tilts(self) -> dict[str, int]:
+        """Return how many poses between two axes are missing; they show the non-orthogonality."""
+        units = np.abs(np.array([force / np.linalg.norm(force) for force in self._forces]))
+        found = dict.fromkeys(_PLANES, 0)
+        for unit in units:
+            for name, (one, other) in _PLANES.items():
+                found[name] += min(unit[one], unit[other]) > _TILTED
+        return {name: 2 - count for name, count in found.items() if count < 2}
+
+    def _check_saturation(self, forces: Array) -> None:
+        """Refuse poses at the end of the range: there, noise does not change the reading."""
+        for axis, name in enumerate("xyz"):
+            for end in (forces[:, axis].max(), forces[:, axis].min()):
+                at_end = (forces[:, axis] == end) & np.array(self._constant)[:, axis]
+                if at_end.sum() > 1 and abs(end) > _SATURATED:
+                    raise SensorCalibrationError(
+                        f"the acceleration along {name} is {end:.3f} m/s² in {at_end.sum()} "
+                        "different poses: it is saturated. Set a larger range of the "
+                        "accelerometer in the device, and repeat"
+                    )
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))

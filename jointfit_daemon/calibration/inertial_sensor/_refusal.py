@@ -1,0 +1,7 @@
+"""The error of a sensor calibration whose result would be worse than none."""
+
+from __future__ import annotations
+
+
+class SensorCalibrationError(Exception):
+    """The readings do not determine the parameters; the text contains cause and remedy."""

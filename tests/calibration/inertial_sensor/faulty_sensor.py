@@ -1,0 +1,108 @@
+"""A simulated sensor with known errors, moved by a script: rest, static poses, free rotation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jointfit_daemon.calibration.inertial_sensor import DIRECTIONS, SensorReading
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from jointfit_daemon.arrays import Array
+
+RATE_HZ = 50
+STEP_NS = 1_000_000_000 // RATE_HZ
+GRAVITY = 9.80665
+FIELD = 48.0
+"""Magnitude of the magnetic field, uT."""
+
+
+@dataclass(frozen=True)
+class FaultySensor:
+    """Measured = matrix true + bias + noise; the matrices are symmetric."""
+
+    gyroscope_bias: Array
+    accelerometer_bias: Array
+    accelerometer_matrix: Array
+    magnetometer_bias: Array
+    magnetometer_matrix: Array
+    noise: tuple[float, float, float] = (0.003, 0.02, 0.3)
+    """Standard deviations of rate, rad/s, force, m/s^2, and field, uT."""
+
+    @classmethod
+    def draw(cls, seed: int) -> FaultySensor:
+        """Return a sensor with errors of the size of low-cost parts."""
+        rng = np.random.default_rng(seed)
+        return cls(
+            rng.normal(0.0, 0.01, 3),
+            rng.normal(0.0, 0.3, 3),
+            symmetric(rng, 0.02, 0.004),
+            rng.normal(0.0, 25.0, 3),
+            symmetric(rng, 0.08, 0.03),
+        )
+
+    def readings(
+        self, up: Array, north: Array, rates: Array, seed: int | np.random.Generator = 0
+    ) -> list[SensorReading]:
+        """Return readings; up and north are unit vectors of gravity and field in sensor axes."""
+        rng = np.random.default_rng(seed)
+        gyr, acc, mag = (rng.normal(0.0, sd, rates.shape) for sd in self.noise)
+        rate = rates + self.gyroscope_bias + gyr
+        force = GRAVITY * up @ self.accelerometer_matrix + self.accelerometer_bias + acc
+        field = FIELD * north @ self.magnetometer_matrix + self.magnetometer_bias + mag
+        rows = np.concatenate((rate, force, field), axis=1).tolist()
+        return [
+            SensorReading(k * STEP_NS, tuple(row[:3]), tuple(row[3:6]), tuple(row[6:]))
+            for k, row in enumerate(rows)
+        ]
+
+    def at_rest(self, seconds: float, seed: int = 0) -> list[SensorReading]:
+        """Return readings of a sensor that lies still."""
+        count = round(seconds * RATE_HZ)
+        up, north = np.tile((0.0, 0.0, 1.0), (count, 1)), np.tile((0.0, 0.4, -0.917), (count, 1))
+        return self.readings(up, north, np.zeros((count, 3)), seed)
+
+    def posed(self, directions: Array, seed: int = 0, rest_s: float = 2.0) -> list[SensorReading]:
+        """Return readings of static poses with directions up, and of the movements between them."""
+        rng = np.random.default_rng(seed)
+        still = round(rest_s * RATE_HZ)
+        up, rates = [], []
+        for direction in directions:
+            up += [unit(direction + rng.normal(0.0, 0.3, (15, 3)))]
+            up += [np.tile(unit(direction + rng.normal(0.0, 0.05, 3)), (still, 1))]
+            rates += [rng.normal(0.0, 1.0, (15, 3)), np.zeros((still, 3))]
+        every = np.concatenate(up)
+        return self.readings(every, every, np.concatenate(rates), rng)
+
+    def turned(self, directions: Array, seed: int = 0, count: int = 400) -> list[SensorReading]:
+        """Return readings of a rotation that brings the field to each of some directions."""
+        rng = np.random.default_rng(seed)
+        chosen = directions[rng.integers(0, len(directions), count)]
+        north = unit(chosen + rng.normal(0.0, 0.25, (count, 3)))
+        return self.readings(north, north, rng.normal(0.0, 1.0, (count, 3)), rng)
+
+
+def unit(vectors: Array) -> Array:
+    """Return vectors of length 1."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+
+
+def symmetric(rng: np.random.Generator, scale_sd: float, skew_sd: float) -> Array:
+    """Return a symmetric matrix near the identity."""
+    skew = np.triu(rng.normal(0.0, skew_sd, (3, 3)), 1)
+    return np.diag(1.0 + rng.normal(0.0, scale_sd, 3)) + skew + skew.T
+
+
+def poses() -> Array:
+    """Return six faces and six edges, as the guide asks for."""
+    return DIRECTIONS[[0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 14, 15]]
+
+
+def draws(count: int) -> Iterator[tuple[int, FaultySensor]]:
+    """Return sensors with different errors."""
+    for seed in range(count):
+        yield seed, FaultySensor.draw(seed)
