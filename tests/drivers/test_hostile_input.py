@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from hypothesis import given, settings
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from jointfit_daemon.model import Chunk, ImuSample, TickClock
 from jointfit_daemon.timing.clock import DeviceClock
+from jointfit_drivers.gateway_orientation import RawSamples
 from jointfit_drivers.xbus import XbusDecoder
 from jointfit_drivers.xbus._raw_orientation import RawOrientation
 from jointfit_drivers.xcdi import XcdiDecoder
@@ -73,7 +75,7 @@ def test_xbus(wires: list[bytes], steps: list[int]) -> None:
 
 @given(st.lists(xbus_messages(), max_size=MOST_MESSAGES), arrivals)
 def test_xbus_with_raw_readings(wires: list[bytes], steps: list[int]) -> None:
-    raw = RawOrientation(100.0, magnetometer=False)
+    raw = RawOrientation(partial(RawSamples, 100.0, magnetometer=False))
     through_clock(XbusDecoder(None, 100.0, None, raw), stamped(wires, steps))
 
 

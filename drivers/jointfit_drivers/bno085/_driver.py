@@ -40,11 +40,7 @@ class Bno085Imu:
             return RvcDecoder(settings.line_baud, settings.euler)
         raw = None
         if settings.orientation == "gateway":
-            raw = RawSamples(
-                settings.rate_hz,
-                magnetometer=settings.magnetometer,
-                settle_s=settings.settle_s,
-            )
+            raw = RawSamples.of(settings)
         return ShtpDecoder(settings.line_baud, raw)
 
     async def run(self, emit: Emit) -> None:

@@ -14,6 +14,7 @@ from jointfit_drivers.gateway_orientation._filter import (
     turned_field,
 )
 from jointfit_drivers.gateway_orientation._raw_samples import RawSamples, RawStamp
+from jointfit_drivers.gateway_orientation._sensor_correction import SensorCorrection
 from jointfit_drivers.gateway_orientation._settings import GatewaySettings
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "RawReading",
     "RawSamples",
     "RawStamp",
+    "SensorCorrection",
     "is_installed",
     "is_plausible",
     "turned_field",

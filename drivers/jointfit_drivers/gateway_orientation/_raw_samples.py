@@ -8,7 +8,7 @@ Invariant: the output depends only on the readings fed; no clock and no port is 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 from jointfit_daemon.model import DeviceEvent, ImuSample
 from jointfit_drivers.gateway_orientation._filter import (
@@ -17,9 +17,11 @@ from jointfit_drivers.gateway_orientation._filter import (
     GatewayOrientation,
     RawReading,
 )
+from jointfit_drivers.gateway_orientation._sensor_correction import SensorCorrection
 
 if TYPE_CHECKING:
-    from jointfit_daemon.model import Decoded, Vector
+    from jointfit_daemon.model import Decoded, Quaternion, Vector
+    from jointfit_drivers.gateway_orientation._settings import GatewaySettings
 
 _REPORT_NS, _SOON_NS = 10_000_000_000, 1_000_000_000
 """Period, ns, of the filter's state events: in general, and after a change."""
@@ -29,6 +31,9 @@ _NEW_HEADING = (
     "orientation from gyroscope and accelerometer started with an arbitrary heading: "
     "repeat the static pose"
 )
+
+
+_IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
 class RawStamp(NamedTuple):
@@ -51,11 +56,24 @@ class RawSamples:
         Whether heading comes from the magnetometer.
     settle_s : float
         Longest time without output after the start of the filter, s.
+    correction : SensorCorrection, optional
+        Correction of the readings; None if the sensor is not calibrated.
+    readings_only : bool
+        Return uncorrected readings without orientation, as a calibration needs them.
     """
 
     def __init__(
-        self, rate_hz: float, *, magnetometer: bool, settle_s: float = LONGEST_SETTLE_S
+        self,
+        rate_hz: float,
+        *,
+        magnetometer: bool,
+        settle_s: float = LONGEST_SETTLE_S,
+        correction: SensorCorrection | None = None,
+        readings_only: bool = False,
     ) -> None:
+        self.readings_only = readings_only
+        """Whether uncorrected readings are returned."""
+        self._correction = None if readings_only else correction
         self.magnetometer = magnetometer
         """Whether heading comes from the magnetometer."""
         self._filter = GatewayOrientation(rate_hz, magnetometer=magnetometer, settle_s=settle_s)
@@ -66,12 +84,35 @@ class RawSamples:
         self._rate: Vector = (0.0, 0.0, 0.0)
         self._started = False
 
+    @classmethod
+    def of(cls, settings: GatewaySettings) -> Self:
+        """Return the samples of a sensor with these settings."""
+        calibration = settings.sensor_calibration
+        return cls(
+            settings.rate_hz,
+            magnetometer=settings.magnetometer,
+            settle_s=settings.settle_s,
+            correction=None if calibration is None else SensorCorrection(calibration),
+            readings_only=settings.readings_only,
+        )
+
     @property
     def period_ns(self) -> float:
         """Mean interval of the readings so far, ns."""
         return self._filter.period_ns
 
-    def take(self, stamp: RawStamp, reading: RawReading, *, clipped: bool = False) -> list[Decoded]:
+    def correct_field(self, field: Vector) -> Vector:
+        """Return a magnetic field without the errors of the sensor, if they are known."""
+        return field if self._correction is None else self._correction.correct_field(field)
+
+    def take(
+        self,
+        stamp: RawStamp,
+        reading: RawReading,
+        *,
+        clipped: bool = False,
+        field_corrected: bool = False,
+    ) -> list[Decoded]:
         """Return the warnings and samples that a plausible reading completes.
 
         Parameters
@@ -82,8 +123,15 @@ class RawSamples:
             Its measurements, at a later time than those of the reading before it.
         clipped
             Whether the device reported that a measurement is out of range.
+        field_corrected
+            Whether the magnetic field went through `correct_field`.
         """
         self._t_ns = reading.t_ns
+        if self.readings_only:
+            found = self._warnings(stamp, reading, clipped=clipped, restarted=False, missing=0)
+            return [*found, _uncorrected_sample(stamp, reading)]
+        if self._correction is not None:
+            reading = self._correction.correct(reading, field=not field_corrected)
         step = self._filter.take(reading)
         out = self._warnings(
             stamp, reading, clipped=clipped, restarted=step.restarted, missing=step.missing
@@ -149,8 +197,16 @@ class RawSamples:
             "converging": state.converging,
             "period_ms": round(self._filter.period_ns * 1e-6, 6),
         }
+        if self._correction is not None:
+            data["sensor_calibration"] = self._correction.date
         out.append(DeviceEvent("info", "orientation filter", {"orientation_filter": data}))
         return out
+
+
+def _uncorrected_sample(stamp: RawStamp, reading: RawReading) -> ImuSample:
+    arrival_ns, ticks, counter, status = stamp
+    vectors = (reading.rate, reading.force, reading.magnetic)
+    return ImuSample(arrival_ns, _IDENTITY, _IDENTITY, ticks, counter, status, *vectors)
 
 
 def _sample(

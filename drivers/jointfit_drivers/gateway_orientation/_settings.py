@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, PrivateAttr, ValidationInfo, field_validator
 
 from jointfit_daemon.driver import ImuSettings
+from jointfit_daemon.sensor_calibration import (
+    SensorCalibrationSettings,  # noqa: TC001 - pydantic reads it
+)
 from jointfit_drivers.gateway_orientation._filter import (
     LONGEST_SETTLE_S,
     PACKAGE_MISSING,
@@ -34,6 +37,23 @@ class GatewaySettings(ImuSettings):
         description='with `orientation = "gateway"`: longest time, s, after the start (or a gap) '
         "without output while the orientation is uncertain; 1.5 s at rest",
     )
+    sensor_calibration: SensorCalibrationSettings | None = Field(
+        None,
+        description='with `orientation = "gateway"`: errors of the sensor, written by `jointfit '
+        "calibrate sensor`",
+    )
+    _readings_only: bool = PrivateAttr(default=False)
+
+    @property
+    def readings_only(self) -> bool:
+        """Whether the decoder returns uncorrected readings, as `for_readings` describes."""
+        return self._readings_only
+
+    def for_readings(self) -> Self:
+        """Return settings whose decoder returns each uncorrected reading as a sample."""
+        copy = self.model_copy()
+        copy._readings_only = True  # noqa: SLF001 - of the same class
+        return copy
 
     @field_validator("orientation")
     @classmethod
@@ -42,6 +62,19 @@ class GatewaySettings(ImuSettings):
         if orientation == "gateway" and not is_installed():
             raise ValueError(PACKAGE_MISSING)
         return orientation
+
+    @field_validator("sensor_calibration")
+    @classmethod
+    def _calibration_of_readings(
+        cls, found: SensorCalibrationSettings | None, info: ValidationInfo
+    ) -> SensorCalibrationSettings | None:
+        """Refuse a calibration of readings that are not used."""
+        if found is not None and info.data.get("orientation") == "device":
+            raise ValueError(
+                'needs orientation = "gateway": the device computes its orientation from '
+                "uncorrected readings. Set it, or remove this table"
+            )
+        return found
 
     @field_validator("magnetometer")
     @classmethod

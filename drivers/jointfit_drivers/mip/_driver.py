@@ -40,12 +40,7 @@ class MipImu:
         settings = self._settings
         make_raw = None
         if settings.orientation == "gateway":
-            make_raw = partial(
-                RawSamples,
-                settings.rate_hz,
-                magnetometer=settings.magnetometer,
-                settle_s=settings.settle_s,
-            )
+            make_raw = partial(RawSamples.of, settings)
         return MipDecoder(settings.line_baud, settings.required, make_raw)
 
     async def run(self, emit: Emit) -> None:

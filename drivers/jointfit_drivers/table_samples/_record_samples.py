@@ -190,10 +190,8 @@ class RecordSamples:
 
     def _new_filter(self) -> RawSamples | None:
         """Return a filter for raw measurements; None if the device sends orientations."""
-        if self._form.gateway is None:
-            return None
-        magnetometer, settle_s = self._form.gateway
-        return RawSamples(self._form.rate_hz, magnetometer=magnetometer, settle_s=settle_s)
+        make_raw = self._form.make_raw
+        return None if make_raw is None else make_raw()
 
     def _si(self, values: Sequence[float | None]) -> tuple[float, ...]:
         """Return the measured components in SI units."""

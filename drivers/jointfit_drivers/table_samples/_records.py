@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types of fields
+from collections.abc import Callable, Mapping  # noqa: TC003 - mypyc evaluates the types of fields
 from typing import NamedTuple
 
 from jointfit_daemon.model import TickClock  # noqa: TC001 - mypyc evaluates the types of fields
+from jointfit_drivers.gateway_orientation import (
+    RawSamples,  # noqa: TC001 - mypyc evaluates the types of fields
+)
 from jointfit_protocols.orientation import World  # noqa: TC001 - mypyc evaluates the types of fields
 from jointfit_protocols.table import TableField  # noqa: TC001 - mypyc evaluates the types of fields
 
@@ -36,8 +39,8 @@ class SampleForm(NamedTuple):
     """Place of each slot, to find settings that fit; None for text lines."""
     rate_unit: float = 1.0
     """SI value of the configured unit of angular rates."""
-    gateway: tuple[bool, float] | None = None
-    """For orientations of the gateway: whether by magnetometer, and the settling time, s."""
+    make_raw: Callable[[], RawSamples] | None = None
+    """For orientations of the gateway: returns a new filter of raw measurements."""
 
 
 class TableRecord(NamedTuple):

@@ -6,9 +6,11 @@ Invariant: every fault is returned with its key and remedy; nothing is opened.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import TickClock
+from jointfit_drivers.gateway_orientation import RawSamples
 from jointfit_drivers.table_samples._records import SampleForm
 from jointfit_drivers.table_samples._units import UNITS
 from jointfit_protocols.table import (
@@ -210,7 +212,7 @@ def sample_form(form: TableForm, settings: TableImuSettings, *, is_text: bool) -
         settings.direction == "world_to_sensor",
         None if is_text else form.fields,
         _rate_unit(form),
-        (settings.magnetometer, settings.settle_s) if settings.orientation == "gateway" else None,
+        partial(RawSamples.of, settings) if settings.orientation == "gateway" else None,
     )
 
 

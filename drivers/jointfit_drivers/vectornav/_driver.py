@@ -40,12 +40,7 @@ class VectorNavImu:
         settings = self._settings
         make_raw = None
         if settings.orientation == "gateway":
-            make_raw = partial(
-                RawSamples,
-                settings.rate_hz,
-                magnetometer=settings.magnetometer,
-                settle_s=settings.settle_s,
-            )
+            make_raw = partial(RawSamples.of, settings)
         inverse = settings.direction == "world_to_sensor"
         return VectorNavDecoder(
             settings.line_baud,

@@ -36,11 +36,7 @@ class WitMotionImu:
         settings = self._settings
         raw = None
         if settings.orientation == "gateway":
-            raw = RawSamples(
-                settings.rate_hz,
-                magnetometer=settings.magnetometer,
-                settle_s=settings.settle_s,
-            )
+            raw = RawSamples.of(settings)
         return WitMotionDecoder(
             settings.line_baud,
             settings.world,

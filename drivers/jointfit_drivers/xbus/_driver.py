@@ -6,8 +6,10 @@ mode and reads until cancelled. The two share only chunks.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
+from jointfit_drivers.gateway_orientation import RawSamples
 from jointfit_drivers.ports.serial_port import SerialPort
 from jointfit_drivers.xbus._decoder import XbusDecoder
 from jointfit_drivers.xbus._handshake import LINE_SPEEDS, XbusHandshake
@@ -43,11 +45,7 @@ class XbusImu:
         baud = settings.baud if settings.transport == "uart" else None
         raw = None
         if settings.orientation == "gateway":
-            raw = RawOrientation(
-                settings.rate_hz,
-                magnetometer=settings.magnetometer,
-                settle_s=settings.settle_s,
-            )
+            raw = RawOrientation(partial(RawSamples.of, settings))
 
         return XbusDecoder(baud, settings.rate_hz, trigger_wires(settings.sync or ()), raw)
 

@@ -12,20 +12,15 @@ from __future__ import annotations
 from math import atan2, sqrt
 from typing import TYPE_CHECKING, cast
 
-from jointfit_drivers.gateway_orientation import (
-    LONGEST_SETTLE_S,
-    RawReading,
-    RawSamples,
-    RawStamp,
-    is_plausible,
-)
+from jointfit_drivers.gateway_orientation import RawReading, RawStamp, is_plausible
 from jointfit_protocols.xbus.configuration import TICK_NS
 from jointfit_protocols.xbus.mtdata2 import CLIPPING, Item
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping
 
     from jointfit_daemon.model import Decoded, Vector
+    from jointfit_drivers.gateway_orientation import RawSamples
 
 RATES = (int(Item.RATE_OF_TURN), int(Item.DELTA_Q))
 FORCES = (int(Item.ACCELERATION), int(Item.DELTA_V))
@@ -40,28 +35,19 @@ class RawOrientation:
 
     Parameters
     ----------
-    rate_hz : float
-        Nominal rate, Hz.
-    magnetometer : bool
-        Whether heading comes from the magnetometer.
-    settle_s : float
-        Longest time without output after the start of the filter, s.
+    make_samples : callable
+        Returns a new filter of raw measurements.
     """
 
-    def __init__(
-        self, rate_hz: float, *, magnetometer: bool, settle_s: float = LONGEST_SETTLE_S
-    ) -> None:
-        self._made = (rate_hz, magnetometer, settle_s)
-        self._samples = RawSamples(rate_hz, magnetometer=magnetometer, settle_s=settle_s)
+    def __init__(self, make_samples: Callable[[], RawSamples]) -> None:
+        self._make_samples = make_samples
+        self._samples = make_samples()
         self._ticks: int | None = None
         self._t_ns = 0
 
     def forget(self) -> None:
         """Start again: the device and its clock restarted."""
-        rate_hz, magnetometer, settle_s = self._made
-        self.__init__(  # type: ignore[misc] # the state of a new filter
-            rate_hz, magnetometer=magnetometer, settle_s=settle_s
-        )
+        self.__init__(self._make_samples)  # type: ignore[misc] # the state of a new filter
 
     def is_complete(self, values: Mapping[int, object]) -> bool:
         """Return whether a message contains an angular rate and a specific force."""

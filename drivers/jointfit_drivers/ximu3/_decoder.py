@@ -9,9 +9,11 @@ Invariant: the output depends only on the chunks fed; the decoder reads no clock
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
+from jointfit_drivers.gateway_orientation import RawSamples
 from jointfit_drivers.serial_imu import ArrivalStamps
 from jointfit_drivers.ximu3._continuity import XImu3Continuity, XImu3Point
 from jointfit_drivers.ximu3._device_reports import DeviceReports
@@ -61,9 +63,7 @@ class XImu3Decoder:
         self._stamps = ArrivalStamps(settings.line_baud, MAX_LINE)
         self._raw = None
         if settings.orientation == "gateway":
-            self._raw = XImu3RawOrientation(
-                settings.rate_hz, magnetometer=settings.magnetometer, settle_s=settings.settle_s
-            )
+            self._raw = XImu3RawOrientation(partial(RawSamples.of, settings))
         self._continuity = XImu3Continuity()
         self._held: _Measurement | None = None
         self._gate = OrientationGate()

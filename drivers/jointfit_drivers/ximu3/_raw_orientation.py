@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 
 from jointfit_drivers.gateway_orientation import (
     RawReading,
-    RawSamples,
     RawStamp,
     is_plausible,
     turned_field,
@@ -21,7 +20,10 @@ from jointfit_drivers.gateway_orientation import (
 from jointfit_protocols.ximu3 import TICK_NS
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from jointfit_daemon.model import Decoded, Vector
+    from jointfit_drivers.gateway_orientation import RawSamples
     from jointfit_protocols.ximu3 import XImu3Data
 
 STANDARD_GRAVITY = 9.80665
@@ -36,17 +38,13 @@ class XImu3RawOrientation:
 
     Parameters
     ----------
-    rate_hz : float
-        Nominal rate, Hz.
-    magnetometer : bool
-        Whether heading comes from the magnetometer.
-    settle_s : float
-        Longest time without output after the start of the filter, s.
+    make_samples : callable
+        Returns a new filter of raw measurements.
     """
 
-    def __init__(self, rate_hz: float, *, magnetometer: bool, settle_s: float) -> None:
-        self._made = (rate_hz, magnetometer, settle_s)
-        self._samples = RawSamples(rate_hz, magnetometer=magnetometer, settle_s=settle_s)
+    def __init__(self, make_samples: Callable[[], RawSamples]) -> None:
+        self._make_samples = make_samples
+        self._samples = make_samples()
         self._ticks: int | None = None
         self._first_ticks = 0
         self._measured_ticks = self._field_ticks = 0
@@ -54,16 +52,15 @@ class XImu3RawOrientation:
 
     def forget(self) -> None:
         """Start again: the device and its clock restarted."""
-        rate_hz, magnetometer, settle_s = self._made
-        self.__init__(  # type: ignore[misc] # the state of a new filter
-            rate_hz, magnetometer=magnetometer, settle_s=settle_s
-        )
+        self.__init__(self._make_samples)  # type: ignore[misc] # the state of a new filter
 
     def measure_field(self, message: XImu3Data) -> None:
         """Store the field of a magnetic message."""
         x, y, z = message.values
         if self._samples.magnetometer and x * x + y * y + z * z < _STRONGEST:  # False for NaN
-            self._field, self._field_ticks = (x, y, z), message.ticks
+            # A hard-iron offset turns with the sensor: it is removed before the field is rotated.
+            self._field = self._samples.correct_field((x, y, z))
+            self._field_ticks = message.ticks
             self._measured_ticks = message.ticks
 
     def samples(self, message: XImu3Data, arrived_ns: int) -> list[Decoded] | None:
@@ -81,12 +78,15 @@ class XImu3RawOrientation:
             return None
         self._ticks = ticks
         reading = reading._replace(magnetic=self._field_at(ticks, rate))
-        return self._samples.take(RawStamp(arrived_ns, ticks), reading)
+        return self._samples.take(RawStamp(arrived_ns, ticks), reading, field_corrected=True)
 
     def _field_at(self, ticks: int, rate: Vector) -> Vector | None:
         """Return the field at the time of an inertial message; None without a recent one."""
         if self._field is None or ticks - self._measured_ticks > _OLDEST_US:
             return None
+        if self._samples.readings_only:  # each measured field once, as it was measured
+            field, self._field = self._field, None
+            return field
         self._field = turned_field(self._field, rate, (ticks - self._field_ticks) * 1e-6)
         self._field_ticks = ticks
         return self._field

@@ -15,6 +15,7 @@ from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, Mo
 from jointfit_daemon.pipeline.health import ClockHealth, DeviceHealth, WireCounts
 from jointfit_daemon.pipeline.sources._latency_prior import latency_prior
 from jointfit_daemon.pipeline.sources._sync_lines import SyncLines
+from jointfit_daemon.sensor_calibration import exchanged_sensor
 from jointfit_daemon.timing.clock import DeviceClock, Edge
 
 if TYPE_CHECKING:
@@ -200,6 +201,7 @@ class SourceState:
             else:
                 self._count(item)
                 items.append(item)
+                items += self._identity_events(item)
             if clock.news:
                 items += self._clock_events()
         return items
@@ -233,6 +235,13 @@ class SourceState:
         if restarts:
             self._kept = 0
         return events
+
+    def _identity_events(self, item: Corrupt | DeviceEvent) -> list[DeviceEvent]:
+        """Return a warning if a device reports another serial number than the calibrated one."""
+        if not isinstance(item, DeviceEvent) or item.kind != "info" or "serial" not in item.data:
+            return []
+        text = exchanged_sensor(self.source.settings, item.data["serial"])
+        return [] if text is None else [DeviceEvent("warning", text)]
 
     def _count(self, item: Corrupt | DeviceEvent) -> None:
         if isinstance(item, Corrupt):

@@ -1,0 +1,128 @@
+"""The table ``[imu.sensor_calibration]``: errors of one sensor that are corrected in its readings.
+
+`jointfit calibrate sensor` writes the table. A driver whose settings have the key
+`sensor_calibration` corrects raw readings with it before it computes orientations. The table is a
+part of rig.toml, so a recording contains it, and a replay corrects in the same way.
+
+Invariant: this module names no device.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from pydantic import Field, field_validator
+from typing_extensions import override
+
+from jointfit_daemon.driver import Settings
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+Row = tuple[float, float, float]
+Rows = tuple[Row, Row, Row]
+
+LARGEST_CHANGE = 0.9
+"""Largest plausible deviation of an element of a matrix from the identity."""
+
+
+class SensorCalibrationSettings(Settings):
+    """Errors of one sensor; the corrected vector is matrix (measured - bias)."""
+
+    date: str = Field(
+        pattern=r"^\d{4}-\d{2}-\d{2}$",
+        description="day of the calibration",
+        examples=["2026-11-23"],
+    )
+    serial: str | None = Field(
+        None,
+        description="serial number of the calibrated sensor, if it reports one; another sensor on "
+        "the port causes a warning",
+    )
+    gyroscope_bias_deg_s: Row | None = Field(
+        None, description="angular rate at rest, sensor axes, deg/s"
+    )
+    accelerometer_bias: Row | None = Field(
+        None, description="bias of the acceleration, sensor axes, m/s²"
+    )
+    accelerometer_matrix: Rows | None = Field(
+        None,
+        description="inverse scale factors and non-orthogonality of the accelerometer, by rows",
+    )
+    magnetometer_bias: Row | None = Field(
+        None, description="hard-iron offset, sensor axes, in the unit of the device"
+    )
+    magnetometer_matrix: Rows | None = Field(
+        None, description="inverse soft iron and scale factors of the magnetometer, by rows"
+    )
+
+    @field_validator("accelerometer_matrix", "magnetometer_matrix")
+    @classmethod
+    def _near_the_identity(cls, matrix: Rows | None) -> Rows | None:
+        """Refuse a matrix that no calibration yields."""
+        for row, values in enumerate(matrix or ()):
+            for column, value in enumerate(values):
+                if abs(value - (row == column)) > LARGEST_CHANGE:
+                    raise ValueError(
+                        f"row {row + 1}, column {column + 1} is {value:g}, expected "
+                        f"{int(row == column)} ± {LARGEST_CHANGE:g}: repeat the calibration with "
+                        "`jointfit calibrate sensor`"
+                    )
+        return matrix
+
+    @override
+    def contradictions(self) -> Iterable[tuple[str, str]]:
+        for part in ("accelerometer", "magnetometer"):
+            keys = (f"{part}_bias", f"{part}_matrix")
+            for key, other in (keys, keys[::-1]):
+                if getattr(self, key) is None and getattr(self, other) is not None:
+                    yield key, f"is missing, and {other} is given: expected both, or neither"
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the calibrated parts."""
+        known = (self.gyroscope_bias_deg_s, self.accelerometer_bias, self.magnetometer_bias)
+        names = ("gyroscope", "accelerometer", "magnetometer")
+        return tuple(name for name, value in zip(names, known, strict=True) if value is not None)
+
+
+@runtime_checkable
+class CalibratableSettings(Protocol):
+    """Settings of a driver whose raw readings can be calibrated."""
+
+    @property
+    def orientation(self) -> str:
+        """``gateway`` if orientations are computed from raw readings, ``device`` otherwise."""
+
+    @property
+    def magnetometer(self) -> bool:
+        """Whether the magnetometer is used."""
+
+    @property
+    def sensor_calibration(self) -> SensorCalibrationSettings | None:
+        """Calibration in force."""
+
+    def for_readings(self) -> Any:
+        """Return settings whose decoder returns each uncorrected reading as a sample.
+
+        The samples contain angular rate, specific force and, if the device sent it with this
+        reading, the magnetic field; their orientation is the identity.
+        """
+
+
+def calibration_of(settings: object) -> SensorCalibrationSettings | None:
+    """Return the calibration that a driver applies; None without one."""
+    found = getattr(settings, "sensor_calibration", None)
+    return found if isinstance(found, SensorCalibrationSettings) else None
+
+
+def exchanged_sensor(settings: object, serial: object) -> str | None:
+    """Return a warning if the calibration belongs to a sensor with another serial number."""
+    calibration = calibration_of(settings)
+    if calibration is None or calibration.serial in {None, str(serial)}:
+        return None
+    return (
+        f"the sensor has serial number {serial}, but its sensor_calibration of {calibration.date} "
+        f"belongs to {calibration.serial}: connect that sensor, or repeat `jointfit calibrate "
+        f"sensor {getattr(settings, 'id', '')}`"
+    )
