@@ -23,10 +23,11 @@ all tests of the suite::
             return WrongDevice(folder / "imu")
 
 `folder` is an empty directory for each test. A device needs ``push`` (or override ``send``),
-``run``, ``unplug`` and ``plug``. If the driver yields a type other than ``ImuSample``, override
-``measurement``, ``send`` and ``matches``. Time limits for slow wires are class attributes. If a
-wire lacks a feature, return ``None`` from ``make_wrong_device``, or set ``has_noise`` or
-``has_plug`` to False; the corresponding tests are skipped with a reason.
+``run``, ``unplug`` and ``plug``. Its ``rate_hz``, if there is one, is the rate of its samples. If
+the driver yields a type other than ``ImuSample``, override ``measurement``, ``send`` and
+``matches``. Line speed and time limits are class attributes. If a wire lacks a feature, return
+``None`` from ``make_wrong_device``, or set ``baud`` to None, or ``has_noise`` or ``has_plug`` to
+False; the corresponding tests are skipped with a reason.
 """
 
 from __future__ import annotations
@@ -61,10 +62,17 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Driver
     from jointfit_simulators.imu_device import WireNoise
 
-_STEP_NS = 10_000_000
-"""Device time between two samples, ns."""
-_PACE_S = 0.002
-"""Host time between two samples, s; shorter than the device time, to shorten the suite."""
+_NS = 10**9
+_BITS = 10
+"""Bits of one byte on a serial line, 8N1."""
+_INCOMPLETE = 3
+"""Bytes that an incomplete message lacks: fewer than any message has."""
+_DELIVERY_S = 0.05
+"""Time in which the kernel delivers what a device wrote, s."""
+_PAUSE_NS = 200_000_000
+"""Pause inside a message that a busy host causes, ns."""
+_SILENCE_NS = 60 * _NS
+"""Silence after which the rest of a message is lost at any speed, ns."""
 
 
 class DriverContract(ABC):
@@ -80,6 +88,12 @@ class DriverContract(ABC):
     """Longest time from unplugging, or from the last byte, to DeviceLostError, s."""
     refused_within_s: ClassVar[float] = 15.0
     """Longest time from the start on a wrong device to DeviceMisconfiguredError, s."""
+    rate_hz: ClassVar[float] = 100.0
+    """Samples per second of device time, for a device without ``rate_hz``."""
+    pace_s: ClassVar[float] = 0.002
+    """Host time between two samples, s; shorter than the device time, to shorten the suite."""
+    baud: ClassVar[int | None] = 115_200
+    """Line speed in the driver's settings, bit/s; None if bytes take no time (USB, TCP)."""
     has_noise: ClassVar[bool] = True
     has_plug: ClassVar[bool] = True
 
@@ -99,7 +113,18 @@ class DriverContract(ABC):
 
     def send(self, device: Any, number: int) -> None:
         """Make the device send sample `number` now."""
-        device.push(number * _STEP_NS, orientation(number))
+        device.push(self.device_ns(device, number), orientation(number))
+
+    def device_ns(self, device: Any, number: int) -> int:
+        """Return the device time of sample `number`, at the rate of the device.
+
+        The rate may change during the handshake. Device time never decreases.
+        """
+        rate_hz = getattr(device, "rate_hz", None) or self.rate_hz
+        last, last_ns = self.__dict__.setdefault("_device_times", {}).get(id(device), (-1, 0))
+        t_ns = int(last_ns + max(1, number - last) * _NS / rate_hz)
+        self.__dict__["_device_times"][id(device)] = number, t_ns
+        return t_ns
 
     def matches(self, number: int, measurement: Any) -> bool:
         """Return whether `measurement` is sample `number`; by default within 0.03 rad."""
@@ -209,6 +234,90 @@ class DriverContract(ABC):
 
         asyncio.run(scene())
 
+    def test_arrival_stamps_are_those_of_the_first_byte(self, tmp_path: Path) -> None:
+        """A busy host reads many messages at once: each is back-dated by the bytes behind it."""
+
+        async def scene() -> None:
+            driver, data, t_ns, _ = await self._recorded(tmp_path)
+            byte_ns = _BITS * _NS / (self.baud or _NS)
+
+            # The same bytes arrive one by one at the speed of the line, and in one chunk.
+            single = DecodingReceiver(driver, self.measurement)
+            late_ns = []
+            for number, byte in enumerate(data, 1):
+                before, at_ns = len(single.measurements), t_ns + round(number * byte_ns)
+                single.emit(Chunk(at_ns, bytes((byte,))))
+                late_ns += [at_ns - item.arrival_ns for item in single.measurements[before:]]
+            whole = DecodingReceiver(driver, self.measurement)
+            whole.emit(Chunk(t_ns + round(len(data) * byte_ns), data))
+
+            require(
+                min(late_ns) > _INCOMPLETE * byte_ns,
+                "the arrival of a sample must be that of the first byte of its message, "
+                "not of the last",
+            )
+            errors_ns = [
+                abs(one.arrival_ns - other.arrival_ns)
+                for one, other in zip(single.measurements, whole.measurements, strict=True)
+            ]
+            require(
+                max(errors_ns) <= 2 * byte_ns,
+                "the arrival of a sample must be back-dated by the bytes behind it in its chunk, "
+                f"{_BITS} bits each at {self.baud} baud; one is wrong by {max(errors_ns)} ns",
+            )
+
+        asyncio.run(scene())
+
+    def test_silence_discards_an_incomplete_message(self, tmp_path: Path) -> None:
+        """The rest of an incomplete message does not arrive after a long silence."""
+
+        async def scene() -> None:
+            driver, data, t_ns, whole = await self._recorded(tmp_path)
+
+            again = DecodingReceiver(driver, self.measurement)
+            again.emit(Chunk(t_ns, data[:-_INCOMPLETE]))
+            again.emit(Chunk(t_ns + _PAUSE_NS, data[-_INCOMPLETE:]))
+            require(
+                len(again.measurements) == len(whole),
+                f"a pause of {_PAUSE_NS // 1_000_000} ms inside a message is a busy host and must "
+                "not discard the message",
+            )
+
+            again = DecodingReceiver(driver, self.measurement)
+            again.emit(Chunk(t_ns, data[:-_INCOMPLETE]))
+            before = again.decoder.discarded_bytes
+            again.emit(Chunk(t_ns + _SILENCE_NS, data[:1]))
+            require(
+                again.decoder.discarded_bytes > before,
+                "the first chunk after a long silence must discard an incomplete message: flush "
+                "the codec before feeding it",
+            )
+
+        asyncio.run(scene())
+
+    def test_input_from_before_the_opening_is_discarded(self, tmp_path: Path) -> None:
+        """The system buffers what a device sends while nobody reads; its time is unknown."""
+
+        async def scene() -> None:
+            device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
+            async with serve_device(device):
+                async with self._reading(device, driver, 0) as (_, number):
+                    pass
+                stale = range(number, number + 10)
+                for number in stale:
+                    self.send(device, number)
+                await asyncio.sleep(_DELIVERY_S)
+                async with self._reading(device, driver, stale.stop) as (receiver, end):
+                    received = receiver.measurements
+
+            fresh = range(stale.stop, end)
+            require(
+                all(any(self.matches(number, item) for number in fresh) for item in received),
+                "samples from before the opening must not arrive: discard the buffered input",
+            )
+
+        asyncio.run(scene())
+
     def test_random_bytes_never_raise(self, tmp_path: Path) -> None:
         """Corrupt bytes are events, and the number of pending bytes is bounded."""
         noise = random.Random(11)  # noqa: S311 - the same bytes in every run
@@ -240,7 +349,7 @@ class DriverContract(ABC):
                 noise.on = True
                 for number in range(first, first + 200):
                     self.send(device, number)
-                    await asyncio.sleep(_PACE_S)
+                    await asyncio.sleep(self.pace_s)
                 noise.on = False
 
                 # silence ends a message whose length field is damaged
@@ -342,7 +451,7 @@ class DriverContract(ABC):
                     while not task.done():
                         self.send(device, number)
                         number += 1
-                        await asyncio.sleep(_PACE_S)
+                        await asyncio.sleep(self.pace_s)
                 await require_error(ZeroDivisionError, task, self.starts_within_s)
 
         asyncio.run(scene())
@@ -380,6 +489,16 @@ class DriverContract(ABC):
         async with serve_device(device), self._reading(device, driver, 0) as state:
             yield state
 
+    async def _recorded(self, tmp_path: Path) -> tuple[Driver, bytes, int, list[Any]]:
+        """Return driver, bytes, time of the last chunk and measurements of a short recording."""
+        if self.make_driver(tmp_path).wire != "stream" or self.baud is None:
+            raise SkipTest("bytes of this wire take no time")
+        device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
+        async with self.streaming(device, driver) as (receiver, first):
+            await self._send_all(device, receiver, first, 20)
+        data = b"".join(chunk.data for chunk in receiver.chunks)
+        return driver, data, receiver.chunks[-1].t_ns, receiver.measurements
+
     @contextlib.asynccontextmanager
     async def _reading(
         self, device: Any, driver: Driver, number: int
@@ -403,7 +522,7 @@ class DriverContract(ABC):
                     require(False, "run must read until it is cancelled")
                 self.send(device, number)
                 number += 1
-                await asyncio.sleep(_PACE_S)
+                await asyncio.sleep(self.pace_s)
         await receiver.settle()
         return number
 
@@ -414,7 +533,7 @@ class DriverContract(ABC):
         before = len(receiver.measurements)
         for number in range(first, first + count):
             self.send(device, number)
-            await asyncio.sleep(_PACE_S)
+            await asyncio.sleep(self.pace_s)
         await receiver.wait_for(before + count, self.lost_within_s / 2)
         received = len(receiver.measurements) - before
         require(received == count, f"all {count} samples must arrive; {received} did")

@@ -80,8 +80,11 @@ class XImu3Handshake:
                 "`baud`"
             )
 
+        # Bytes are emitted from the first reply on: the decoder needs the world of the orientations
+        # before the first of them.
         self._conversation.reset()
-        ping = await self._conversation.request("ping")
+        world = await self._conversation.request(WORLD)
+        ping = None if world is None else await self._conversation.request("ping")
         if ping is None:
             await self._explain_silence()
         interface = ping.value.get("interface") if isinstance(ping.value, dict) else None

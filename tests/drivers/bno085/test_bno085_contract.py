@@ -68,6 +68,7 @@ class TestBno085Shtp(TestBno085Rvc):
     """The line has no checksum, so a damaged quaternion of norm 1 is not detected."""
 
     has_noise: ClassVar[bool] = False
+    baud: ClassVar[int | None] = 3_000_000
 
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> Bno085Device:

@@ -82,7 +82,9 @@ class TestNatNet(DriverContract):
     @override
     def send(self, device: NatNetServer, number: int) -> None:
         pose = ((0.1, 0.2, 0.001 * number), orientation(number))
-        device.push(number * 10_000_000, {"T1": (1.0, 2.0, 0.001 * number)}, {"Thigh": pose})
+        device.push(
+            self.device_ns(device, number), {"T1": (1.0, 2.0, 0.001 * number)}, {"Thigh": pose}
+        )
 
     @override
     def matches(self, number: int, measurement: MocapFrame) -> bool:

@@ -69,7 +69,9 @@ class TestVicon(DriverContract):
     @override
     def send(self, device: ViconServer, number: int) -> None:
         pose = ((0.1, 0.2, 0.001 * number), orientation(number))
-        device.push(number * 10_000_000, {"T1": (1.0, 2.0, 0.001 * number)}, {"Thigh": pose})
+        device.push(
+            self.device_ns(device, number), {"T1": (1.0, 2.0, 0.001 * number)}, {"Thigh": pose}
+        )
 
     @override
     def matches(self, number: int, measurement: MocapFrame) -> bool:

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.real_time
 class TestVrpn(DriverContract):
     registered_as = "vrpn"
     measurement = MocapFrame
-    has_noise = False  # TCP and UDP have checksums
+    has_noise, baud = False, None  # TCP and UDP have checksums
     test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
     options = VrpnServerOptions(bodies=("Thigh",))
     keys: ClassVar[dict[str, str]] = {}

@@ -57,12 +57,12 @@ async def test_emitted_bytes_begin_with_the_reply_and_contain_all_settings(tmp_p
     codec = XImu3Codec()
     found = [message for chunk in run.chunks for message in codec.feed(chunk.data)]
     assert isinstance(found[0], XImu3Reply)
-    assert found[0].key == "ping"
+    assert found[0].key == "ahrs_axes_convention"  # the decoder needs it for the first sample
     keys = [message.key for message in found if isinstance(message, XImu3Reply)]
     assert keys == [
-        "ping", "firmware_version", "hardware_version", "ahrs_axes_convention", "axes_alignment",
-        "ahrs_ignore_magnetometer", "serial_mode", "serial_data_messages_enabled",
-        "ahrs_message_type", "ahrs_message_rate_divisor",
+        "ahrs_axes_convention", "ping", "firmware_version", "hardware_version",
+        "ahrs_axes_convention", "axes_alignment", "ahrs_ignore_magnetometer", "serial_mode",
+        "serial_data_messages_enabled", "ahrs_message_type", "ahrs_message_rate_divisor",
     ]  # fmt: skip
     known = {
         key: value

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError, ImuSettings
 from jointfit_daemon.model import Corrupt, ImuSample, TickClock
 from jointfit_drivers.ports.serial_port import SerialPort
+from jointfit_drivers.serial_imu import ArrivalStamps
 from jointfit_protocols.orientation import OrientationGate
 from pydantic import Field
 
@@ -34,8 +35,8 @@ class BoardDecoder:
 
     def __init__(self, baud: int) -> None:
         self._codec, self._gate = BoardCodec(), OrientationGate()
-        self._byte_ns = 10e9 / baud  # ten bits each
-        self._arrival_ns = self._rejected = 0
+        self._stamps = ArrivalStamps(baud, SIZE)
+        self._rejected = 0
 
     @property
     def messages(self) -> int:
@@ -50,6 +51,9 @@ class BoardDecoder:
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the samples completed by `chunk`, in wire order; never raises."""
         out: list[Decoded] = []
+        if self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
+            out = self.flush()  # the rest of an incomplete frame was lost
+        self._stamps.start_chunk(chunk.t_ns)
         for event in self._codec.feed(chunk.data):
             if not isinstance(event, BoardFrame):
                 out.append(Corrupt(event.discarded, event.reason))
@@ -62,11 +66,9 @@ class BoardDecoder:
                 out.append(Corrupt(SIZE, "quaternion norm is not 1"))
                 continue
 
-            # back-date the arrival to the first byte of the frame; stamps never decrease
-            since = self._codec.fed - event.end + SIZE
-            at_ns = chunk.t_ns - round(since * self._byte_ns)
-            self._arrival_ns = max(self._arrival_ns, at_ns)
-            out.append(ImuSample(self._arrival_ns, q, (w, x, y, z), event.time_us, event.counter))
+            # back-date the arrival to the first byte of the frame
+            at_ns = self._stamps.stamp(self._codec.fed - event.end + SIZE)
+            out.append(ImuSample(at_ns, q, (w, x, y, z), event.time_us, event.counter))
         return out
 
     def flush(self) -> list[Decoded]:
