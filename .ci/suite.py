@@ -29,6 +29,10 @@ WORKERS_PER_CORE = 3
 """Two thirds of the time of the tests is waiting, for devices and daemons in real time."""
 EXPERIMENTS_PER_CORE = 2
 """Experiments compute, or run whole daemons with browsers: more of them starve each other."""
+WORKERS = ("-p", "tests.forked_workers", "--workers")
+"""Options of pytest that run the tests in workers; the number follows."""
+ENVIRONMENT = {key: os.environ[key] for key in os.environ if key != "PYTHONDONTWRITEBYTECODE"}
+"""Hundreds of processes import the project: none should have to compile it."""
 TESTS_FAILED = 1
 """Exit status of pytest when tests failed."""
 NO_TESTS = 5
@@ -50,8 +54,7 @@ def main(arguments: list[str]) -> int:
     cores = len(os.sched_getaffinity(0))
     workers = (EXPERIMENTS_PER_CORE if experiments else WORKERS_PER_CORE) * cores
 
-    # An idle worker takes tests from the others: there are few long ones.
-    parallel = _run(parts[0], reports, ["-n", str(workers), "--dist", "worksteal", *arguments])
+    parallel = _run(parts[0], reports, [*WORKERS, str(workers), *arguments])
     disturbed: list[str] = []
     if parallel == TESTS_FAILED:
         disturbed = _repeat_tests_in_real_time(parts[0], reports)
@@ -73,7 +76,7 @@ def main(arguments: list[str]) -> int:
 def _run(part: str, reports: Path, arguments: list[str], report: str = "") -> int:
     path = reports / f"{report or part}.xml"
     command = [sys.executable, "-m", "pytest", "--part", part, f"--junitxml={path}", *arguments]
-    return subprocess.run(command, check=False).returncode  # noqa: S603 - our own command
+    return subprocess.run(command, check=False, env=ENVIRONMENT).returncode  # noqa: S603 - our own
 
 
 def _files_of_tests_alone() -> list[str]:

@@ -7,7 +7,6 @@ import contextlib
 import functools
 import gc
 import inspect
-import itertools
 import os
 import re
 import sys
@@ -51,15 +50,6 @@ GRACE_S = 1.5
 """How long descriptors and tasks may take to close: executors, child processes and the task of an
 MQTT client that checks its connection every second end a little later.
 """
-BEGUN = pytest.StashKey[bool]()
-"""Whether this worker has begun a test."""
-QUEUES_THAT_WAIT = 2
-"""Number of workers that begin with system tests: they wait for half of their time."""
-FIT_NICE = 10
-"""Decrease of the priority of a worker that begins with tests that compute: that of a fit.
-
-Daemons and devices in real time come first, and their fits do not wait for all other tests.
-"""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -91,15 +81,15 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if ONLY_EXPERIMENTS.search(text) else None
 
 
-@pytest.hookimpl(trylast=True)  # after pytest has sorted by parameters of fixtures
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect the tests of the other parts; start the longest tests first."""
+    """Deselect the tests of the other parts."""
     part = config.getoption("part")
-    if part is not None:
-        chosen = [item for item in items if _part_of(item) == part]
+    if part is None:
+        return
+    chosen = [item for item in items if _part_of(item) == part]
+    if len(chosen) < len(items):
         config.hook.pytest_deselected(items=[item for item in items if _part_of(item) != part])
         items[:] = chosen
-    items[:] = _longest_first(items, int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1")))
 
 
 def _part_of(item: pytest.Item) -> str:
@@ -107,49 +97,6 @@ def _part_of(item: pytest.Item) -> str:
         item.get_closest_marker(name) is not None for name in ("experiment", "alone")
     )
     return PARTS[2 * experiment + alone]
-
-
-def _longest_first(items: list[pytest.Item], workers: int) -> list[pytest.Item]:
-    """Sort the tests so that the long ones, which wait, run beside those that compute.
-
-    xdist gives each worker a queue of equal length, in the order of the tests, and an idle worker
-    takes tests from the end of the longest queue. The system tests and those in real time go to
-    the beginning of two queues, file by file, those with the longest time limit first.
-    """
-
-    def limit_s(item: pytest.Item) -> float:
-        marker = item.get_closest_marker("timeout")
-        return float(marker.args[0] if marker else item.config.getini("timeout"))
-
-    def in_file(item: pytest.Item) -> tuple[float, Path]:
-        return -limit_s(item), item.path
-
-    long = sorted((item for item in items if _waits(item)), key=in_file)
-    waiting: list[list[pytest.Item]] = [[] for _ in range(min(QUEUES_THAT_WAIT, workers))]
-    for _, tests in itertools.groupby(long, key=in_file):
-        min(waiting, key=lambda queue: sum(map(limit_s, queue))).extend(tests)
-    others = iter([item for item in items if not _waits(item)])
-
-    ordered: list[pytest.Item] = []
-    for worker in range(workers):
-        length = (len(items) - len(ordered)) // (workers - worker)
-        queue = waiting[worker] if worker < len(waiting) else []
-        ordered += [*queue, *itertools.islice(others, max(0, length - len(queue)))]
-    return [*ordered, *others]
-
-
-def _waits(item: pytest.Item) -> bool:
-    return any(item.get_closest_marker(name) is not None for name in ("system", "real_time"))
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Lower the priority of a worker whose first test computes, if others run system tests."""
-    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-    first = not item.config.stash.get(BEGUN, False)
-    item.config.stash[BEGUN] = True
-    if first and workers > QUEUES_THAT_WAIT and not _waits(item):
-        os.nice(FIT_NICE)
 
 
 @pytest.fixture(scope="session")

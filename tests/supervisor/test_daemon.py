@@ -556,6 +556,7 @@ async def fit(*, cancel_after_s: float | None = None) -> list[JobFinished]:
     return ended
 
 
+@pytest.mark.real_time
 async def test_failed_fit_reports_its_reason() -> None:
     (ended,) = await fit()
     assert ended.result is None

@@ -22,6 +22,7 @@ def test_a_running_daemon_does_without_scipy() -> None:
     assert ran.stdout.strip() == "False"
 
 
+@pytest.mark.real_time
 async def test_fit_uses_one_thread_by_default(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -99,6 +99,7 @@ def error(states: list[LimbState]) -> float:
     return float(np.sqrt(np.mean(rotation.angle_between(said, true) ** 2)))
 
 
+@pytest.mark.real_time
 @pytest.mark.timeout(120)
 async def test_online_learning_improves_the_calibration_and_replays_identically() -> None:
     bench = Bench()

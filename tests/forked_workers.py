@@ -1,0 +1,238 @@
+"""Workers forked after one collection: ``pytest -p tests.forked_workers --workers 6``.
+
+A worker of pytest-xdist imports and collects thousands of tests itself. Here one process collects,
+and its forks share the modules and tests. They ask for a batch at a time: the tests of a file, in
+their order, so that fixtures of modules are set up once. Options of pytest keep their meaning.
+
+Invariant: every test is reported once; a test in which a worker dies fails, and the tests behind it
+run in a new worker.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import sys
+from collections import deque
+from dataclasses import dataclass, field
+from multiprocessing import connection, get_context
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, TypeAlias
+
+import pytest
+from _pytest.config import create_terminal_writer
+
+if TYPE_CHECKING:
+    from multiprocessing.context import ForkProcess
+    from pathlib import Path
+
+Batch: TypeAlias = list[int]
+"""Indices of tests in the order of the collection."""
+
+WORKERS_THAT_WAIT = 2
+"""Number of workers that begin with tests in real time: they wait for half of their time."""
+FIT_NICE = 10
+"""Decrease of the priority of a worker that begins with tests that compute: that of a fit.
+
+Daemons and devices in real time come first, and their fits do not wait for all other tests.
+"""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the number of workers."""
+    parser.addoption("--workers", type=int, metavar="N", help="run the tests in N forked workers")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Print no paths: the tests of all workers are reported as they end."""
+    if config.getoption("workers") and not config.option.verbose:
+        config.option.verbose = -1
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    """Run the collected tests in workers; return None where pytest itself has to act."""
+    workers: int | None = session.config.getoption("workers")
+    if not workers or not session.items or session.testsfailed or session.config.option.collectonly:
+        return None
+    _Workers(session).run(workers)
+    if session.shouldfail:
+        raise session.Failed(session.shouldfail)
+    if session.shouldstop:
+        raise session.Interrupted(session.shouldstop)
+    return True
+
+
+def waits(item: pytest.Item) -> bool:
+    """Return whether a test waits for devices or daemons in real time."""
+    return any(item.get_closest_marker(name) is not None for name in ("system", "real_time"))
+
+
+def limit_s(item: pytest.Item) -> float:
+    """Return the time limit of a test: the longest tests have the longest ones."""
+    marker = item.get_closest_marker("timeout")
+    return float(marker.args[0] if marker else item.config.getini("timeout"))
+
+
+def batches(items: list[pytest.Item], *, waiting: bool) -> deque[Batch]:
+    """Return the tests that wait, or all others, by file: those with the longest limit first."""
+    chosen = [index for index, item in enumerate(items) if waits(item) is waiting]
+    by_file = itertools.groupby(
+        chosen, key=lambda index: (items[index].path, limit_s(items[index]))
+    )
+    found = sorted(((key, list(batch)) for key, batch in by_file), key=lambda pair: -pair[0][1])
+    return deque(batch for _, batch in found)
+
+
+@dataclass
+class _Worker:
+    process: ForkProcess
+    channel: connection.Connection
+    waiting: bool
+    """Whether it takes the tests that wait first."""
+    left: Batch = field(default_factory=list)
+    """Tests of its batches that it has not finished; it runs the first."""
+
+
+class _Workers:
+    """The processes, and the tests that none of them has taken."""
+
+    def __init__(self, session: pytest.Session) -> None:
+        self._session = session
+        self._config = session.config
+        self._queues = {kind: batches(session.items, waiting=kind) for kind in (True, False)}
+        self._workers: dict[connection.Connection, _Worker] = {}
+        self._started = 0
+        self._folder = session.config._tmp_path_factory.getbasetemp()  # type: ignore[attr-defined]  # as xdist
+
+    def run(self, number: int) -> None:
+        """Run all tests in this number of workers."""
+        for _ in range(number):
+            self._start(waiting=number == 1 or self._started < WORKERS_THAT_WAIT)
+        try:
+            while self._workers:
+                for channel in connection.wait(list(self._workers)):
+                    self._serve(self._workers[channel])  # type: ignore[index]  # one of ours
+        finally:
+            for worker in self._workers.values():
+                worker.process.terminate()
+                worker.process.join()
+
+    def _start(self, *, waiting: bool) -> None:
+        ours, theirs = get_context("fork").Pipe()
+        folder = self._folder / f"worker-{self._started}"
+        process = get_context("fork").Process(
+            target=_work,
+            args=(self._session, theirs, folder, not waiting, [*self._workers, ours]),
+        )
+        sys.stdout.flush()
+        sys.stderr.flush()
+        process.start()
+        theirs.close()
+        self._workers[ours] = _Worker(process, ours, waiting)
+        self._started += 1
+
+    def _serve(self, worker: _Worker) -> None:
+        """Take one message of a worker; replace a worker that has died."""
+        try:
+            kind, content = worker.channel.recv()
+        except (EOFError, ConnectionResetError):
+            kind, content = "ended", None
+        if kind == "ended":
+            self._close(worker)
+        elif kind == "next":
+            batch = self._take(worker)
+            worker.left.extend(batch)
+            worker.channel.send(batch)
+        elif kind == "finished":
+            worker.left.remove(content)
+        else:
+            report = self._config.hook.pytest_report_from_serializable(
+                config=self._config, data=content
+            )
+            self._config.hook.pytest_runtest_logreport(report=report)
+
+    def _take(self, worker: _Worker) -> Batch:
+        if self._session.shouldfail or self._session.shouldstop:
+            return []
+        for kind in (worker.waiting, not worker.waiting):
+            while self._queues[kind]:
+                if batch := self._queues[kind].popleft():
+                    return batch
+        return []
+
+    def _close(self, worker: _Worker) -> None:
+        del self._workers[worker.channel]
+        worker.channel.close()
+        worker.process.join()
+        if worker.left:
+            self._report_death(worker)
+            self._queues[worker.waiting].appendleft(worker.left[1:])
+            self._start(waiting=worker.waiting)
+
+    def _report_death(self, worker: _Worker) -> None:
+        item = self._session.items[worker.left[0]]
+        text = f"worker died in {item.nodeid}, exit status {worker.process.exitcode}"
+        report = pytest.TestReport(
+            item.nodeid, item.location, {}, outcome="failed", longrepr=text, when="call"
+        )
+        self._config.hook.pytest_runtest_logreport(report=report)
+
+
+def _work(
+    session: pytest.Session,
+    channel: connection.Connection,
+    folder: Path,
+    nice: bool,
+    inherited: list[connection.Connection],
+) -> None:
+    """Run batches until there is none: the body of a worker."""
+    for other in inherited:  # open copies would hide the end of the first process
+        other.close()
+    if nice:
+        os.nice(FIT_NICE)
+    _become_worker(session.config, channel, folder)
+
+    def take() -> Batch:
+        channel.send(("next", None))
+        batch: Batch = channel.recv()
+        return batch
+
+    # Fixtures that the next test needs, too, stay: it must be known before a test ends.
+    indices = itertools.chain.from_iterable(iter(take, []))
+    index = next(indices, None)
+    while index is not None:
+        following = next(indices, None)
+        item = session.items[index]
+        successor = None if following is None else session.items[following]
+        item.config.hook.pytest_runtest_protocol(item=item, nextitem=successor)
+        channel.send(("finished", index))
+        index = following
+    channel.close()
+
+
+def _become_worker(config: pytest.Config, channel: connection.Connection, folder: Path) -> None:
+    """Send reports to the first process, and give the worker a folder of its own."""
+    plugins = config.pluginmanager
+    for hook in config.hook.pytest_runtest_logreport.get_hookimpls():
+        if hook.plugin_name not in {"session", "logging-plugin"}:
+            plugins.unregister(hook.plugin)
+    # pytest-timeout writes the stacks of threads that hang to the terminal.
+    terminal = SimpleNamespace(_tw=create_terminal_writer(config, sys.stderr))
+    plugins.register(terminal, "terminalreporter")
+    plugins.register(_Reporter(config, channel))
+
+    factory = config._tmp_path_factory  # type: ignore[attr-defined]  # as xdist
+    factory._given_basetemp, factory._basetemp = folder, None
+
+
+class _Reporter:
+    """Sends the reports of a worker."""
+
+    def __init__(self, config: pytest.Config, channel: connection.Connection) -> None:
+        self._config = config
+        self._channel = channel
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        data = self._config.hook.pytest_report_to_serializable(config=self._config, report=report)
+        self._channel.send(("report", data))

@@ -1,0 +1,67 @@
+"""Every test of a run in forked workers is reported once, even where a worker dies."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+TESTS = """\
+import os
+from pathlib import Path
+import pytest
+
+HERE = Path(__file__).parent
+
+@pytest.fixture(scope="module")
+def once():
+    with (HERE / "once.txt").open("a") as file:
+        file.write(f"{__name__} set-up\\n")
+    yield
+    with (HERE / "once.txt").open("a") as file:
+        file.write(f"{__name__} torn down\\n")
+
+@pytest.mark.parametrize("number", range(3))
+def test_passes(once, number, tmp_path): assert "worker-" in str(tmp_path)
+
+def test_fails(once): assert 1 == 2
+
+@pytest.mark.skip
+def test_is_skipped(): ...
+"""
+DEATH = """
+def test_kills_its_worker(): os._exit(3)
+
+def test_behind_the_killed_one(subtests):
+    with subtests.test("part"): assert 3 == 4
+"""
+
+
+def test_every_test_is_reported_once_and_a_death_of_a_worker_fails_one(tmp_path: Path) -> None:
+    for name, content in {"one": TESTS, "two": TESTS, "killed": TESTS + DEATH}.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / f"test_{name}.py").write_text(content)
+    options = ["-c", "pyproject.toml", f"--rootdir={tmp_path}", "--workers=2"]
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "tests.forked_workers", *options,
+         f"--junitxml={tmp_path}/report.xml", str(tmp_path)],
+        cwd=ROOT, check=False, capture_output=True, text=True,
+    )  # fmt: skip
+
+    summary = run.stdout.splitlines()[-1]
+    assert run.returncode == 1
+    assert summary.startswith("5 failed, 10 passed, 3 skipped"), run.stdout
+    assert (
+        "worker died in killed/test_killed.py::test_kills_its_worker, exit status 3" in run.stdout
+    )
+    cases = list(ET.parse(tmp_path / "report.xml").getroot().iter("testcase"))
+    names = [f"{case.get('classname')}::{case.get('name')}" for case in cases]
+    assert len(names) == len(set(names)) == 17
+
+    # A file stays in one worker, so that fixtures of modules are set up once.
+    for name in ("one", "two"):
+        lines = (tmp_path / name / "once.txt").read_text().splitlines()
+        assert [line.partition(" ")[2] for line in lines] == ["set-up", "torn down"]
