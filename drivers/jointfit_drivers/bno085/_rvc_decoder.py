@@ -71,7 +71,7 @@ class RvcDecoder:
     @property
     def messages(self) -> int:
         """Well-formed frames so far."""
-        return self._codec.frames
+        return self._codec.messages
 
     @property
     def discarded_bytes(self) -> int:

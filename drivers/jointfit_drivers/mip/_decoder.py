@@ -87,7 +87,7 @@ class MipDecoder:
     @property
     def messages(self) -> int:
         """Well-formed packets so far."""
-        return self._codec.packets - self._samples.refused
+        return self._codec.messages - self._samples.refused
 
     @property
     def discarded_bytes(self) -> int:

@@ -98,7 +98,7 @@ class WitMotionDecoder:
     @property
     def messages(self) -> int:
         """Well-formed frames so far."""
-        return self._codec.frames - self._refused
+        return self._codec.messages - self._refused
 
     @property
     def discarded_bytes(self) -> int:
@@ -214,7 +214,7 @@ class WitMotionDecoder:
 
     def _missing_kinds(self) -> list[Decoded]:
         """Return the warning about kinds that the settings require and the device does not send."""
-        if self._codec.frames < _CHECKED_FRAMES:
+        if self._codec.messages < _CHECKED_FRAMES:
             return []
         self._kinds_checked = True
         missing = missing_kinds(self._kinds, self._raw)

@@ -14,10 +14,12 @@ Invariant: bytes in, messages out; no port, no clock.
 
 from __future__ import annotations
 
+import re
 import struct
 from typing import NamedTuple
 
-from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.corrupt import CHECKSUM, NO_START, CorruptBytes
+from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 
 MAX_DATA = 1024
 """Most bytes of data. It bounds the wait after a corrupt length."""
@@ -28,8 +30,6 @@ _START = 0x3A
 _END = b"\r\n"
 _HEAD = 7
 _TAIL = 4
-_RUN = MAX_MESSAGE
-"""Bytes of noise after which a run is reported, so that the sum of corrupt bytes is up to date."""
 _CARRY = 0xFF
 """Difference of the two sums for each unit of a high byte in the head."""
 _HEADER = struct.Struct("<BHHH")
@@ -71,118 +71,47 @@ def encode(command: int, data: bytes = b"", sensor_id: int = 1) -> bytes:
     return head + data + _LRC.pack(lrc) + _END
 
 
-class LpBusCodec:
-    """Decoder of pieces of any size to messages; the result does not depend on the pieces.
-
-    A run of bytes without a message becomes one `CorruptBytes`: before the message that ends it, at
-    `flush`, or every 1035 bytes.
-    """
-
-    def __init__(self) -> None:
-        self._pending = b""  # under one message between calls: MAX_MESSAGE bounds it
-        self.fed = 0
-        """Bytes fed so far."""
-        self._run = 0
-        self._reason = ""
-        self.messages = 0
-        """Messages so far."""
-        self.discarded = 0
-        """Bytes without a message so far."""
-        self.checksum_failures = 0
-        """Complete candidates with a wrong sum so far."""
-
-    @property
-    def pending(self) -> int:
-        """Bytes of an incomplete message."""
-        return len(self._pending)
-
-    def feed(self, data: bytes) -> list[LpBusMessage | CorruptBytes]:
-        """Return the messages that `data` completed, in wire order; never raises."""
-        return self._scan(data, final=False)
-
-    def flush(self) -> list[LpBusMessage | CorruptBytes]:
-        """End the input, or a silence: return messages hidden in the pending bytes."""
-        found = self._scan(b"", final=True)
-        self._end_run(found)
-        return found
-
-    def _scan(self, data: bytes, *, final: bool) -> list[LpBusMessage | CorruptBytes]:
-        buffer = self._pending + data if self._pending else bytes(data)
-        base = self.fed - len(self._pending)
-        self.fed += len(data)
-        found: list[LpBusMessage | CorruptBytes] = []
-
-        at, end = 0, len(buffer)
-        while at < end:
-            if buffer[at] != _START:
-                after = buffer.find(_START, at)
-                after = end if after < 0 else after
-                self._skip(after - at, _NO_START, found)
-                at = after
-                continue
-
-            size, sensor_id, command = _HEAD, 0, 0
-            if at + _HEAD <= end:
-                _, sensor_id, command, length = _HEADER.unpack_from(buffer, at)
-                size = length + OVERHEAD if length <= MAX_DATA else _HEAD
-            if at + size > end and not final:
-                break
-
-            reason = _fault(buffer, at, size)
-            if reason:  # a valid message may start inside a corrupt one: skip one byte only
-                self._skip(1, reason, found)
-                at += 1
-                continue
-
-            if self._run:
-                self._end_run(found)
-            body = buffer[at + _HEAD : at + size - _TAIL]
-            at += size
-            found.append(LpBusMessage(sensor_id, command, body, base + at))
-            self.messages += 1
-        self._pending = buffer[at:]
-        return found
-
-    def _skip(self, count: int, reason: str, found: list[LpBusMessage | CorruptBytes]) -> None:
-        """Count bytes without a message; the first fault names the run."""
-        self.discarded += count
-        self.checksum_failures += reason == _CHECKSUM
-        if self._run == 0 or self._reason == _NO_START:
-            self._reason = reason
-        self._run += count
-        while self._run >= _RUN:
-            found.append(CorruptBytes(_RUN, self._reason))
-            self._run -= _RUN
-            self._reason = reason
-
-    def _end_run(self, found: list[LpBusMessage | CorruptBytes]) -> None:
-        if self._run:
-            found.append(CorruptBytes(self._run, self._reason))
-            self._run = 0
+_AT_START = re.compile(b"\x3a")
+_NO_START = CorruptBytes(1, NO_START)
+_CHECKSUM = CorruptBytes(1, CHECKSUM)
+_TERMINATOR = CorruptBytes(1, "terminator is not CR LF")
+_LENGTH = CorruptBytes(1, "length above 1024")
 
 
-_NO_START = "no message starts here"
-_CHECKSUM = "checksum"
-_TERMINATOR = "terminator is not CR LF"
-_LENGTH = "length above 1024"
-_CUT_OFF = "cut off"
+def _read_message(buffer: bytes, at: int, base: int) -> LpBusMessage | CorruptBytes | None:  # noqa: PLR0911 - one for each fault
+    """Return the message that begins at `at`, the reason why none does, or None if it is cut."""
+    if buffer[at] != _START:
+        return _NO_START
 
-
-def _fault(buffer: bytes, at: int, size: int) -> str:
-    """Return the reason why no message of `size` bytes starts at `at`; empty if one does."""
-    if at + size > len(buffer):
-        return _CUT_OFF
-    if size == _HEAD:
+    head = at + _HEAD
+    if head > len(buffer):
+        return None
+    _, sensor_id, command, length = _HEADER.unpack_from(buffer, at)
+    if length > MAX_DATA:
         return _LENGTH
-    tail = at + size
-    if buffer[tail - 2 : tail] != _END:
+
+    tail = head + length
+    after = tail + _TAIL
+    if after > len(buffer):
+        return None
+    if buffer[after - 2 : after] != _END:
         return _TERMINATOR
 
-    by_bytes = sum(buffer[at + 1 : tail - _TAIL])
-    lrc = buffer[tail - 4] | buffer[tail - 3] << 8
+    by_bytes = sum(buffer[at + 1 : tail])
+    lrc = buffer[tail] | buffer[tail + 1] << 8
     if (by_bytes - lrc) & 0xFFFF:
         # a vendor program sums identifier, command and length as words of 16 bits
         by_words = by_bytes + _CARRY * (buffer[at + 2] + buffer[at + 4] + buffer[at + 6])
         if (by_words - lrc) & 0xFFFF:
             return _CHECKSUM
-    return ""
+    return LpBusMessage(sensor_id, command, buffer[head:tail], base + after)
+
+
+class LpBusCodec(ResynchronizingCodec[LpBusMessage]):
+    """Decoder of pieces of any size to messages; the result does not depend on the pieces.
+
+    Runs of corrupt bytes are reported at the latest every 1035 bytes.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(_read_message, _AT_START, MAX_MESSAGE)

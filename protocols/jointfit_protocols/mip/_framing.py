@@ -15,10 +15,12 @@ Invariant: bytes in, packets out; no port, no clock.
 
 from __future__ import annotations
 
+import re
 from itertools import accumulate
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.corrupt import CHECKSUM, CorruptBytes
+from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -27,13 +29,10 @@ SYNC = b"ue"
 MAX_PAYLOAD = 255
 MAX_PACKET = MAX_PAYLOAD + 6
 _HEAD, _CHECKSUM_BYTES, _FIELD_HEAD = 4, 2, 2
-_RUN = MAX_PACKET
-"""Bytes of noise after which a run is reported, so that the sum of corrupt bytes is up to date."""
-
-_NO_START = "no packet starts here"
-_CHECKSUM = "checksum"
-_FIELDS = "fields do not fill the packet"
-_CUT_OFF = "cut off"
+_START = re.compile(SYNC + b"|" + SYNC[:1] + rb"\Z")
+_NO_START = CorruptBytes(1, "no packet starts here")
+_CHECKSUM = CorruptBytes(1, CHECKSUM)
+_FIELDS = CorruptBytes(1, "fields do not fill the packet")
 
 MipField = tuple[int, bytes]
 """Descriptor and data of one field."""
@@ -85,96 +84,31 @@ def split_fields(payload: bytes) -> tuple[MipField, ...] | None:
     return tuple(fields)
 
 
-class MipCodec:
+def _read_packet(buffer: bytes, at: int, base: int) -> MipPacket | CorruptBytes | None:
+    """Return the packet that begins at `at`, the reason why none does, or None if it is cut."""
+    end = len(buffer)
+    if not buffer.startswith(SYNC, at):  # the last byte may be the first half of a start
+        return None if at == end - 1 and buffer[at] == SYNC[0] else _NO_START
+
+    if end - at < _HEAD:
+        return None
+    tail = at + _HEAD + buffer[at + 3]
+    after = tail + _CHECKSUM_BYTES
+    if after > end:
+        return None
+
+    body = buffer[at:tail]
+    if buffer[tail:after] != _checksum(body):
+        return _CHECKSUM
+    fields = split_fields(body[_HEAD:])
+    return _FIELDS if fields is None else MipPacket(body[2], fields, after - at, base + after)
+
+
+class MipCodec(ResynchronizingCodec[MipPacket]):
     """Decoder of pieces of any size to packets; the result does not depend on the pieces.
 
-    A run of bytes without a packet becomes one `CorruptBytes`: before the packet that ends it, at
-    `flush`, or every 261 bytes.
+    Runs of corrupt bytes are reported at the latest every 261 bytes.
     """
 
     def __init__(self) -> None:
-        self._pending = b""  # under one packet between calls: MAX_PACKET bounds it
-        self.fed = 0
-        """Bytes fed so far."""
-        self._run = 0
-        self._reason = ""
-        self.packets = 0
-        """Packets so far."""
-        self.discarded = 0
-        """Bytes without a packet so far."""
-        self.checksum_failures = 0
-        """Complete candidates with a wrong checksum so far."""
-
-    @property
-    def pending(self) -> int:
-        """Bytes of an incomplete packet."""
-        return len(self._pending)
-
-    def feed(self, data: bytes) -> list[MipPacket | CorruptBytes]:
-        """Return the packets that `data` completed, in wire order; never raises."""
-        return self._scan(data, final=False)
-
-    def flush(self) -> list[MipPacket | CorruptBytes]:
-        """End the input, or a silence: return packets hidden in the pending bytes."""
-        found = self._scan(b"", final=True)
-        self._end_run(found)
-        return found
-
-    def _scan(self, data: bytes, *, final: bool) -> list[MipPacket | CorruptBytes]:
-        buffer = self._pending + data if self._pending else bytes(data)
-        base = self.fed - len(self._pending)
-        self.fed += len(data)
-        found: list[MipPacket | CorruptBytes] = []
-
-        at, end = 0, len(buffer)
-        while at < end:
-            start = buffer.find(SYNC, at)
-            if start < 0:  # the last byte may be the first half of a start
-                start = end - (buffer[-1] == SYNC[0])
-            if start > at:
-                self._skip(start - at, _NO_START, found)
-                at = start
-
-            size = buffer[at + 3] + _HEAD + _CHECKSUM_BYTES if end - at >= _HEAD else _HEAD
-            if at + size > end or end - at < _HEAD:
-                if not final or at == end:
-                    break
-                self._skip(1, _CUT_OFF, found)
-                at += 1
-                continue
-
-            body = buffer[at : at + size - _CHECKSUM_BYTES]
-            fields = None
-            if buffer[at + size - _CHECKSUM_BYTES : at + size] != _checksum(body):
-                reason = _CHECKSUM
-            else:
-                reason, fields = _FIELDS, split_fields(body[_HEAD:])
-
-            if fields is None:  # a packet may start inside a corrupt one: skip one byte only
-                self._skip(1, reason, found)
-                at += 1
-                continue
-            if self._run:
-                self._end_run(found)
-            found.append(MipPacket(body[2], fields, size, base + at + size))
-            self.packets += 1
-            at += size
-        self._pending = buffer[at:]
-        return found
-
-    def _skip(self, count: int, reason: str, found: list[MipPacket | CorruptBytes]) -> None:
-        """Count bytes without a packet; the first fault names the run."""
-        self.discarded += count
-        self.checksum_failures += reason == _CHECKSUM
-        if self._run == 0 or self._reason == _NO_START:
-            self._reason = reason
-        self._run += count
-        while self._run >= _RUN:
-            found.append(CorruptBytes(_RUN, self._reason))
-            self._run -= _RUN
-            self._reason = reason
-
-    def _end_run(self, found: list[MipPacket | CorruptBytes]) -> None:
-        if self._run:
-            found.append(CorruptBytes(self._run, self._reason))
-            self._run = 0
+        super().__init__(_read_packet, _START, MAX_PACKET, _NO_START.reason)

@@ -16,21 +16,18 @@ which the bytes arrive.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types of fields
 from typing import TYPE_CHECKING, NamedTuple
 
+from jointfit_protocols.corrupt import CHECKSUM, NO_START, CorruptBytes
+from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 from jointfit_protocols.table._checksums import Checksum, compile_checksum
 from jointfit_protocols.table._fields import ByteOrder, FieldReader, TableField
-from jointfit_protocols.table._messages import (
-    CHECKSUM,
-    CUT_OFF,
-    NO_START,
-    CorruptRun,
-    TableItem,
-    TableMessage,
-)
+from jointfit_protocols.table._messages import TableItem, TableMessage
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
 LONGEST_FRAME = 4096
 """Most bytes of a frame; it bounds the wait after a corrupt length."""
@@ -56,10 +53,18 @@ class FrameFormat(NamedTuple):
     """Type field and its value in the frames with measurements; None: all frames have them."""
 
 
-class FrameCodec:
+_NO_START = CorruptBytes(1, NO_START)
+_CHECKSUM = CorruptBytes(1, CHECKSUM)
+_LENGTH = CorruptBytes(1, "length outside the format")
+_END = CorruptBytes(1, "no end bytes")
+_ALONE = CorruptBytes(1, "no frame follows, and frames have no checksum")
+
+
+class FrameCodec(ResynchronizingCodec[TableMessage]):
     """Decoder of pieces of any size to records; never raises.
 
-    A run of bytes without a frame becomes one `CorruptBytes`.
+    A run of bytes without a frame becomes one `CorruptBytes`. Frames of other types are messages
+    that `feed` does not return.
 
     Parameters
     ----------
@@ -72,7 +77,7 @@ class FrameCodec:
         self.slots = tuple(sorted(form.fields))
         """Slots of a record, in its order."""
         self._reader = FieldReader([form.fields[slot] for slot in self.slots])
-        self._read = self._reader.read
+        self._read_fields = self._reader.read
 
         checksum = form.checksum
         self._compute = None if checksum is None else compile_checksum(checksum)
@@ -85,94 +90,59 @@ class FrameCodec:
         if not isinstance(form.length, int):
             self._read_length = FieldReader([form.length]).read
             self._head = max(self._head, form.length.end)
-        self._shortest = max(self._head + self._tail, len(form.sync) + 1)
+        self._shortest_frame = max(self._head + self._tail, len(form.sync) + 1)
         self._selects = None
         self._expected = 0
         if form.message is not None:
             self._selects, self._expected = FieldReader([form.message[0]]), form.message[1]
 
-        self._pending = b""
-        self._in_step = False  # whether a frame ended exactly before the pending bytes
-        self._run = CorruptRun(form.longest if not self._fixed else max(self._fixed, 64))
-        self.fed = 0
-        """Bytes fed so far."""
-        self.messages = 0
-        """Frames so far, those of other types included."""
+        longest_run = form.longest if not self._fixed else max(self._fixed, 64)
+        super().__init__(self._read_frame, _start_pattern(form.sync), longest_run)
+        self._in_step_at = -1  # bytes fed up to and including the previous frame
+        self._is_final = False  # whether no further bytes can decide about a frame
         self.skipped = 0
         """Valid frames of other types so far."""
-        self.checksum_failures = 0
-        """Complete candidates with a wrong checksum so far."""
-
-    @property
-    def discarded(self) -> int:
-        """Bytes without a frame so far."""
-        return self._run.discarded
-
-    @property
-    def pending(self) -> int:
-        """Bytes of an incomplete frame."""
-        return len(self._pending)
 
     @property
     def longest(self) -> int:
         """Most bytes of a frame."""
         return self._fixed or self._form.longest
 
-    def feed(self, data: bytes) -> list[TableItem]:
+    def feed(self, data: bytes) -> list[TableItem]:  # type: ignore[explicit-override]  # Python 3.12's
         """Return the frames that `data` completed, in wire order; never raises."""
-        return self._scan(data, final=False)
+        skipped = self.skipped
+        found = super().feed(data)
+        if self.skipped == skipped:
+            return found
+        return [item for item in found if not isinstance(item, TableMessage) or item.data]
 
-    def flush(self) -> list[TableItem]:
+    def flush(self) -> list[TableItem]:  # type: ignore[explicit-override]  # Python 3.12's
         """End the input, or a silence: return frames hidden in the pending bytes."""
-        found = self._scan(b"", final=True)
-        self._run.end(found)
-        self._in_step = False
+        self._is_final = True
+        found = self.feed(b"") + super().flush()
+        self._is_final, self._in_step_at = False, -1
         return found
 
-    def _scan(self, data: bytes, *, final: bool) -> list[TableItem]:
-        buffer = self._pending + data if self._pending else bytes(data)
-        base = self.fed - len(self._pending)
-        self.fed += len(data)
-        found: list[TableItem] = []
-        sync = self._form.sync
+    def _read_frame(self, buffer: bytes, at: int, base: int) -> TableMessage | CorruptBytes | None:
+        """Return the frame that begins at `at`, the reason why none does, or None if it is cut."""
+        form, end = self._form, len(buffer)
+        if not buffer.startswith(form.sync, at):
+            # the last bytes may be the first of the sync bytes
+            is_cut = end - at < len(form.sync) and form.sync.startswith(buffer[at:])
+            return None if is_cut and not self._is_final else _NO_START
 
-        at, end = 0, len(buffer)
-        while at < end:
-            if not buffer.startswith(sync, at):
-                after = self._next_start(buffer, at, final=final)
-                if after == at:  # the rest may be the first of the sync bytes
-                    break
-                self._skip(after - at, NO_START, found)
-                at = after
-                continue
-
-            size = self._size(buffer, at)
-            if size > end - at and not final:
-                break
-            reason = self._fault(buffer, at, size)
-            if reason is None:  # without checksum: the bytes behind it decide
-                if not final:
-                    break
-                reason = ""
-            if reason:
-                self._skip(1, reason, found)
-                at += 1
-            else:
-                self._take(buffer, at, size, base, found)
-                at += size
-        self._pending = buffer[at:]
-        return found
-
-    def _next_start(self, buffer: bytes, at: int, *, final: bool) -> int:
-        """Return the next place, from `at` on, where sync bytes begin, or may begin at the end."""
-        sync, end = self._form.sync, len(buffer)
-        found = buffer.find(sync, at)
-        if found >= 0 or final:
-            return found if found >= 0 else end
-        for start in range(max(at, end - len(sync) + 1), end):
-            if sync.startswith(buffer[start:]):
-                return start
-        return end
+        size = self._size(buffer, at)
+        if at + size > end:
+            return None
+        fault = _LENGTH if size < self._shortest_frame else self._fault(buffer, at, at + size)
+        if fault is None and self._compute is None and base + at != self._in_step_at:
+            # without checksum the bytes behind the frame decide
+            following = buffer[at + size : at + size + len(form.sync)]
+            if not form.sync.startswith(following):
+                return _ALONE
+            if following != form.sync and not self._is_final:
+                return None
+        return fault or self._message(buffer, at, at + size, base)
 
     def _size(self, buffer: bytes, at: int) -> int:
         """Return the bytes from `at` that are needed to decide about a frame there."""
@@ -182,54 +152,41 @@ class FrameCodec:
             return self._head
         (length,) = self._read_length(buffer, at)
         size = int(length) + self._form.length_adds
-        return size if self._shortest <= size <= self._form.longest else self._head
+        return size if self._shortest_frame <= size <= self._form.longest else self._head
 
-    def _fault(self, buffer: bytes, at: int, size: int) -> str | None:
-        """Return why no frame of `size` bytes starts at `at`; empty if one does, None: unknown."""
-        stop = at + size
-        if stop > len(buffer):
-            return CUT_OFF
-        if size < self._shortest:
-            return _LENGTH
-        form = self._form
-        if form.end and not buffer.endswith(form.end, at, stop):
+    def _fault(self, buffer: bytes, at: int, stop: int) -> CorruptBytes | None:
+        """Return the reason why the bytes from `at` to `stop` are no frame."""
+        end_bytes = self._form.end
+        if end_bytes and not buffer.endswith(end_bytes, at, stop):
             return _END
-
-        checked = stop - self._tail
         if self._compute is not None:
+            checked = stop - self._tail
             sent = int.from_bytes(buffer[checked : checked + self._width], self._order)
             if self._compute(buffer[at + self._first : checked]) != sent:
-                self.checksum_failures += 1
-                return CHECKSUM
-        elif not self._in_step:
-            following = buffer[stop : stop + len(form.sync)]
-            if following != form.sync:
-                return None if form.sync.startswith(following) else _ALONE
-        return ""
+                return _CHECKSUM
+        return None
 
-    def _take(self, buffer: bytes, at: int, size: int, base: int, found: list[TableItem]) -> None:
-        """Append the record of a valid frame."""
-        selects = self._selects
+    def _message(self, buffer: bytes, at: int, stop: int, base: int) -> TableMessage | CorruptBytes:
+        """Return the record of a valid frame; without data if the frame has another type."""
+        size, selects = stop - at, self._selects
         wanted = selects is None or (
             size >= selects.size and selects.read(buffer, at)[0] == self._expected
         )
         if wanted and size - self._tail < self._reader.size:
-            # a valid frame that is too short for the fields
-            self._skip(size, f"frame of {size} bytes is too short for the fields", found)
-            return
+            return CorruptBytes(size, f"frame of {size} bytes is too short for the fields")
 
-        self._run.end(found)
-        self._in_step = True
-        self.messages += 1
+        self._in_step_at = base + stop
         if not wanted:
             self.skipped += 1
-            return
-        data = buffer[at : at + size]
-        found.append(TableMessage(self._read(data, 0), data, base + at + size))
+            return TableMessage((), b"", base + stop)
+        data = buffer[at:stop]
+        return TableMessage(self._read_fields(data, 0), data, base + stop)
 
-    def _skip(self, count: int, reason: str, found: list[TableItem]) -> None:
-        self._in_step = False
-        self._run.add(count, reason, found)
+
+def _start_pattern(sync: bytes) -> re.Pattern[bytes]:
+    """Return a pattern of the sync bytes, or of their first ones at the end of a buffer."""
+    beginnings = (re.escape(sync[:count]) + rb"\Z" for count in range(len(sync) - 1, 0, -1))
+    return re.compile(b"|".join((re.escape(sync), *beginnings)))
 
 
 def encode_frame(form: FrameFormat, values: Sequence[float], size: int | None = None) -> bytes:
@@ -270,8 +227,3 @@ def encode_frame(form: FrameFormat, values: Sequence[float], size: int | None = 
         frame[checked : checked + width] = total.to_bytes(width, form.checksum.byte_order)
     frame[size - len(form.end) :] = form.end
     return bytes(frame)
-
-
-_LENGTH = "length outside the format"
-_END = "no end bytes"
-_ALONE = "no frame follows, and frames have no checksum"

@@ -13,14 +13,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from jointfit_protocols.corrupt import CHECKSUM, CUT_OFF, CorruptRun
 from jointfit_protocols.table._checksums import Checksum, compile_checksum
-from jointfit_protocols.table._messages import (
-    CHECKSUM,
-    CUT_OFF,
-    CorruptRun,
-    TableItem,
-    TableMessage,
-)
+from jointfit_protocols.table._messages import TableItem, TableMessage
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

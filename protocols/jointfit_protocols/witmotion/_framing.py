@@ -13,10 +13,12 @@ Invariant: bytes in, frames out; no port, no clock.
 
 from __future__ import annotations
 
+import re
 from enum import IntEnum
 from typing import NamedTuple
 
-from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.corrupt import CHECKSUM, CorruptBytes
+from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 
 FRAME_BYTES = 11
 """Bytes of every frame."""
@@ -27,8 +29,9 @@ _OTHER_SIZES = (20, 28)
 """Distances between the starts of 55 61 frames, bytes."""
 _RUN = 1024
 """Bytes of noise after which a run is reported, so that the sum of corrupt bytes is up to date."""
-_NO_START = "no frame starts here"
-_CHECKSUM = "checksum"
+_AT_START = re.compile(b"\x55")
+_NO_START = CorruptBytes(1, "no frame starts here")
+_CHECKSUM = CorruptBytes(1, CHECKSUM)
 
 
 class WitMotionFrameKind(IntEnum):
@@ -73,98 +76,33 @@ def encode(kind: int, data: bytes) -> bytes:
     return body + bytes((sum(body) & 0xFF,))
 
 
-class WitMotionCodec:
+class WitMotionCodec(ResynchronizingCodec[WitMotionFrame]):
     """Decoder of pieces of any size to frames; the result does not depend on the pieces.
 
-    A run of bytes without a frame becomes one `CorruptBytes`: before the frame that ends it, at
-    `flush`, or every 1024 bytes.
+    Runs of corrupt bytes are reported at the latest every 1024 bytes.
     """
 
     def __init__(self) -> None:
-        self._pending = b""  # under one frame between calls
-        self._run = 0
-        self._reason = ""
+        super().__init__(self._read_frame, _AT_START, _RUN, _NO_START.reason, FRAME_BYTES)
         self._other_at = -1
-        self.fed = 0
-        """Bytes fed so far."""
-        self.frames = 0
-        """Frames so far."""
-        self.discarded = 0
-        """Bytes without a frame so far."""
-        self.checksum_failures = 0
-        """Complete candidates with a wrong checksum so far."""
         self.other_frames = 0
         """Frames so far of the variant 55 61, which is not decoded."""
 
-    @property
-    def pending(self) -> int:
-        """Bytes of an incomplete frame."""
-        return len(self._pending)
+    def _read_frame(
+        self, buffer: bytes, at: int, base: int
+    ) -> WitMotionFrame | CorruptBytes | None:
+        if buffer[at] != _START:
+            return _NO_START
+        after = at + FRAME_BYTES
+        if after > len(buffer):
+            return None
 
-    def feed(self, data: bytes) -> list[WitMotionFrame | CorruptBytes]:
-        """Return the frames that `data` completed, in wire order; never raises."""
-        buffer = self._pending + data if self._pending else bytes(data)
-        base = self.fed - len(self._pending)
-        self.fed += len(data)
-        found: list[WitMotionFrame | CorruptBytes] = []
-
-        at, end = 0, len(buffer)
-        last = end - FRAME_BYTES
-        while at < end:
-            if buffer[at] != _START:
-                after = buffer.find(_START, at)
-                after = end if after < 0 else after
-                self._skip(after - at, _NO_START, found)
-                at = after
-                continue
-            if at > last:
-                break
-
-            reason = _NO_START
-            if _FIRST_KIND <= buffer[at + 1] <= _LAST_KIND:
-                if sum(buffer[at : at + 10]) & 0xFF == buffer[at + 10]:
-                    if self._run:
-                        self._end_run(found)
-                    done = at + FRAME_BYTES
-                    data = buffer[at + 2 : done - 1]
-                    found.append(WitMotionFrame(buffer[at + 1], data, base + done))
-                    self.frames += 1
-                    at = done
-                    continue
-                self.checksum_failures += 1
-                reason = _CHECKSUM
-            elif buffer[at + 1] == _OTHER_KIND:
+        kind = buffer[at + 1]
+        if not _FIRST_KIND <= kind <= _LAST_KIND:
+            if kind == _OTHER_KIND:
                 self.other_frames += base + at - self._other_at in _OTHER_SIZES
                 self._other_at = base + at
-
-            # A valid frame may start inside a corrupt one: skip one byte only.
-            self._skip(1, reason, found)
-            at += 1
-
-        self._pending = buffer[at:]
-        return found
-
-    def flush(self) -> list[WitMotionFrame | CorruptBytes]:
-        """End the input, or a silence: pending bytes are fewer than a frame and contain none."""
-        found: list[WitMotionFrame | CorruptBytes] = []
-        if self._pending:
-            self._skip(len(self._pending), "cut off", found)
-            self._pending = b""
-        if self._run:
-            self._end_run(found)
-        return found
-
-    def _skip(self, count: int, reason: str, found: list[WitMotionFrame | CorruptBytes]) -> None:
-        """Count bytes without a frame; the first fault names the run."""
-        self.discarded += count
-        if self._run == 0 or self._reason == _NO_START:
-            self._reason = reason
-        self._run += count
-        while self._run >= _RUN:
-            found.append(CorruptBytes(_RUN, self._reason))
-            self._run -= _RUN
-            self._reason = reason
-
-    def _end_run(self, found: list[WitMotionFrame | CorruptBytes]) -> None:
-        found.append(CorruptBytes(self._run, self._reason))
-        self._run = 0
+            return _NO_START
+        if sum(buffer[at : after - 1]) & 0xFF != buffer[after - 1]:
+            return _CHECKSUM
+        return WitMotionFrame(kind, buffer[at + 2 : after - 1], base + after)

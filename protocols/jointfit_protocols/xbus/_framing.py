@@ -14,10 +14,12 @@ Invariant: bytes in, messages out; no port, no clock.
 
 from __future__ import annotations
 
+import re
 from enum import IntEnum
 from typing import NamedTuple
 
-from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.corrupt import CHECKSUM, NO_START, CorruptBytes
+from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 
 PREAMBLE = 0xFA
 MASTER = 0xFF
@@ -27,8 +29,6 @@ MAX_DATA = 2048
 MAX_MESSAGE = MAX_DATA + 7
 _EXTENDED = 0xFF
 _HEAD = 4
-_RUN = MAX_MESSAGE
-"""Bytes of noise after which a run is reported, so that the sum of corrupt bytes is up to date."""
 
 
 class XbusMessageId(IntEnum):
@@ -106,122 +106,41 @@ def encode(mid: int, data: bytes = b"", bid: int = MASTER) -> bytes:
     return bytes((PREAMBLE,)) + body + bytes((-sum(body) & 0xFF,))
 
 
-class XbusCodec:
-    """Decoder of pieces of any size to messages; the result does not depend on the pieces.
-
-    A run of bytes without a message becomes one `CorruptBytes`: before the message that ends it, at
-    `flush`, or every 2055 bytes.
-    """
-
-    def __init__(self) -> None:
-        self._pending = b""  # under one message between calls: MAX_MESSAGE bounds it
-        self.fed = 0
-        """Bytes fed so far."""
-        self._run = 0
-        self._reason = ""
-        self.messages = 0
-        """Messages so far."""
-        self.discarded = 0
-        """Bytes without a message so far."""
-        self.checksum_failures = 0
-        """Complete candidates with a wrong checksum so far."""
-
-    @property
-    def pending(self) -> int:
-        """Bytes of an incomplete message."""
-        return len(self._pending)
-
-    def feed(self, data: bytes) -> list[XbusMessage | CorruptBytes]:
-        """Return the messages that `data` completed, in wire order; never raises."""
-        return self._scan(data, final=False)
-
-    def flush(self) -> list[XbusMessage | CorruptBytes]:
-        """End the input, or a silence: return messages hidden in the pending bytes."""
-        found = self._scan(b"", final=True)
-        self._end_run(found)
-        return found
-
-    def _scan(self, data: bytes, *, final: bool) -> list[XbusMessage | CorruptBytes]:
-        buffer = self._pending + data if self._pending else bytes(data)
-        base = self.fed - len(self._pending)
-        self.fed += len(data)
-        found: list[XbusMessage | CorruptBytes] = []
-
-        at, end = 0, len(buffer)
-        while at < end:
-            size = _size(buffer, at)
-            if at + size > end and not final:
-                break
-            reason = _fault(buffer, at, size)
-            if not reason:
-                if self._run:
-                    self._end_run(found)
-                head = at + (_HEAD if buffer[at + 3] != _EXTENDED else _HEAD + 2)
-                data = buffer[head : at + size - 1]
-                found.append(XbusMessage(buffer[at + 2], data, buffer[at + 1], base + at + size))
-                self.messages += 1
-                at += size
-            elif reason == _NO_START:
-                after = buffer.find(PREAMBLE, at)
-                after = end if after < 0 else after
-                self._skip(after - at, reason, found)
-                at = after
-            else:  # a valid message may start inside a corrupt one: skip one byte only
-                self._skip(1, reason, found)
-                at += 1
-        self._pending = buffer[at:]
-        return found
-
-    def _skip(self, count: int, reason: str, found: list[XbusMessage | CorruptBytes]) -> None:
-        """Count bytes without a message; the first fault names the run."""
-        self.discarded += count
-        self.checksum_failures += reason == _CHECKSUM
-        if self._run == 0 or self._reason == _NO_START:
-            self._reason = reason
-        self._run += count
-        while self._run >= _RUN:
-            found.append(CorruptBytes(_RUN, self._reason))
-            self._run -= _RUN
-            self._reason = reason
-
-    def _end_run(self, found: list[XbusMessage | CorruptBytes]) -> None:
-        if self._run:
-            found.append(CorruptBytes(self._run, self._reason))
-            self._run = 0
+_START = re.compile(b"\xfa")
+_NO_START = CorruptBytes(1, NO_START)
+_CHECKSUM = CorruptBytes(1, CHECKSUM)
+_LENGTH = CorruptBytes(1, "length outside 255..2048")
 
 
-_NO_START = "no message starts here"
-_CHECKSUM = "checksum"
-_LENGTH = "length outside 255..2048"
-_CUT_OFF = "cut off"
-
-
-def _size(buffer: bytes, at: int) -> int:
-    """Return the bytes from `at` that are needed to decide about a message there."""
+def _read_message(buffer: bytes, at: int, base: int) -> XbusMessage | CorruptBytes | None:  # noqa: PLR0911 - one for each fault
+    """Return the message that begins at `at`, the reason why none does, or None if it is cut."""
     if buffer[at] != PREAMBLE:
-        return 1
+        return _NO_START
 
     have = len(buffer) - at
     if have < _HEAD:
-        return _HEAD
+        return None
+    head, length = at + _HEAD, buffer[at + 3]
+    if length == _EXTENDED:
+        if have < _HEAD + 2:
+            return None
+        head, length = head + 2, buffer[head] << 8 | buffer[head + 1]
+        if not _EXTENDED <= length <= MAX_DATA:
+            return _LENGTH
 
-    length = buffer[at + 3]
-    if length != _EXTENDED:
-        return length + _HEAD + 1
-    if have < _HEAD + 2:
-        return _HEAD + 2
-    length = buffer[at + 4] << 8 | buffer[at + 5]
-    return length + _HEAD + 3 if _EXTENDED <= length <= MAX_DATA else _HEAD + 2
-
-
-def _fault(buffer: bytes, at: int, size: int) -> str:
-    """Return the reason why no message of `size` bytes starts at `at`; empty if one does."""
-    if buffer[at] != PREAMBLE:
-        return _NO_START
-    if at + size > len(buffer):
-        return _CUT_OFF
-    if size == _HEAD + 2 and buffer[at + 3] == _EXTENDED:
-        return _LENGTH
-    if sum(buffer[at + 1 : at + size]) & 0xFF:
+    last = head + length
+    if last >= len(buffer):
+        return None
+    if sum(buffer[at + 1 : last + 1]) & 0xFF:
         return _CHECKSUM
-    return ""
+    return XbusMessage(buffer[at + 2], buffer[head:last], buffer[at + 1], base + last + 1)
+
+
+class XbusCodec(ResynchronizingCodec[XbusMessage]):
+    """Decoder of pieces of any size to messages; the result does not depend on the pieces.
+
+    Runs of corrupt bytes are reported at the latest every 2055 bytes.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(_read_message, _START, MAX_MESSAGE)

@@ -51,7 +51,7 @@ def test_frames_do_not_depend_on_the_cut_and_every_byte_is_counted(
     assert decode([wire[a:b] for a, b in itertools.pairwise(at)])[0] == whole
     assert decode([bytes([byte]) for byte in wire])[0] == whole
     used = sum(RVC_BYTES if isinstance(item, RvcFrame) else item.discarded for item in whole)
-    assert used == len(wire) == codec.frames * RVC_BYTES + codec.discarded
+    assert used == len(wire) == codec.messages * RVC_BYTES + codec.discarded
 
 
 @given(frames)

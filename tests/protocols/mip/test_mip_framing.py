@@ -62,7 +62,7 @@ def test_every_byte_is_in_a_packet_or_counted(wire: bytes) -> None:
     lost = sum(event.discarded for event in found if isinstance(event, CorruptBytes))
     assert used + lost == len(wire)
     assert lost == codec.discarded
-    assert codec.packets == sum(isinstance(event, MipPacket) for event in found)
+    assert codec.messages == sum(isinstance(event, MipPacket) for event in found)
 
 
 @given(st.lists(st.binary(max_size=1000), max_size=5))
@@ -123,7 +123,7 @@ def test_vector(vector: dict[str, Any]) -> None:
     wire = bytes.fromhex(vector["hex"])
     found, codec = decode([wire])
     if not vector["valid"]:
-        assert (codec.packets, codec.discarded) == (0, len(wire))
+        assert (codec.messages, codec.discarded) == (0, len(wire))
         return
 
     (packet,) = found
@@ -208,7 +208,7 @@ def recording() -> bytes:
 
 def test_the_recording_has_the_counted_content(recording: bytes) -> None:
     found, codec = decode([recording])
-    assert (codec.packets, codec.discarded, codec.checksum_failures) == (8384, 0, 0)
+    assert (codec.messages, codec.discarded, codec.checksum_failures) == (8384, 0, 0)
     packets = [event for event in found if isinstance(event, MipPacket)]
     assert Counter(packet.descriptor_set for packet in packets) == {
         0x80: 7157, 0x82: 714, 0xA0: 512, 0x01: 1,
@@ -274,4 +274,4 @@ def test_a_damaged_recording_loses_damaged_packets_only(
     damage, expected = DAMAGE[case]
     wire = damage(recording)
     _, codec = decode([wire[at : at + size] for at in range(0, len(wire), size)])
-    assert (codec.packets, codec.discarded, codec.checksum_failures) == expected
+    assert (codec.messages, codec.discarded, codec.checksum_failures) == expected

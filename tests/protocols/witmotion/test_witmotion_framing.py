@@ -72,7 +72,7 @@ def test_frames_do_not_depend_on_the_cut_and_every_byte_is_counted(
     used = sum(
         FRAME_BYTES if isinstance(item, WitMotionFrame) else item.discarded for item in whole
     )
-    assert used == len(wire) == codec.frames * FRAME_BYTES + codec.discarded
+    assert used == len(wire) == codec.messages * FRAME_BYTES + codec.discarded
 
 
 @given(st.lists(frames, min_size=1, max_size=5), st.integers(1, 10))

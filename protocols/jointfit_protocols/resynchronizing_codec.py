@@ -1,0 +1,134 @@
+"""Search of a byte stream for messages whose beginning, length and checksum may be corrupt.
+
+A message is a candidate until its checksum is correct. A valid message may begin inside a corrupt
+candidate; after one, the search therefore continues at its second byte.
+
+Invariant: the result does not depend on the pieces in which the bytes arrive, and every byte
+belongs to one message or one run of corrupt bytes. At most one incomplete candidate is stored, so
+memory is bounded by the largest message that a protocol accepts.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+
+from jointfit_protocols.corrupt import CHECKSUM, CUT_OFF, NO_START, CorruptBytes, CorruptRun
+
+if TYPE_CHECKING:
+    import re
+    from collections.abc import Callable
+
+
+class StreamMessage(Protocol):
+    """Message of a byte stream."""
+
+    @property
+    def end(self) -> int:
+        """Bytes fed to the codec up to and including its last one."""
+
+
+M = TypeVar("M", bound=StreamMessage)
+
+
+class ResynchronizingCodec(Generic[M]):
+    """Decoder of pieces of any size to messages.
+
+    A run of bytes without a message becomes one `CorruptBytes`: before the message that ends it, at
+    `flush`, or every `longest_run` bytes.
+
+    Parameters
+    ----------
+    read : callable
+        Returns the message that begins at a place of a buffer; None if its last bytes are missing;
+        without a message the number of bytes to skip and the reason. Its third argument is the
+        number of bytes fed before the buffer.
+    start : re.Pattern
+        Matches every place where `read` does not return the reason `no_start`.
+    longest_run : int
+        Bytes without a message after which they are reported.
+    no_start : str
+        Reason of bytes outside all candidates.
+    shortest : int
+        Bytes at the end of the input that contain no message if they are fewer.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[bytes, int, int], M | CorruptBytes | None],
+        start: re.Pattern[bytes],
+        longest_run: int,
+        no_start: str = NO_START,
+        shortest: int = 1,
+    ) -> None:
+        self._read = read
+        self._start = start
+        self._no_start = no_start
+        self._shortest = shortest
+        self._run = CorruptRun(longest_run, no_start)
+        self._pending = b""  # under one message between calls
+        self.fed = 0
+        """Bytes fed so far."""
+        self.messages = 0
+        """Messages so far."""
+        self.checksum_failures = 0
+        """Complete candidates with a wrong checksum so far."""
+
+    @property
+    def pending(self) -> int:
+        """Bytes of an incomplete message."""
+        return len(self._pending)
+
+    @property
+    def discarded(self) -> int:
+        """Bytes without a message so far."""
+        return self._run.discarded
+
+    def feed(self, data: bytes) -> list[M | CorruptBytes]:
+        """Return the messages that `data` completed, in wire order; never raises."""
+        buffer = self._pending + data
+        end = len(buffer)
+        self.fed += len(data)
+        base = self.fed - end
+        found: list[M | CorruptBytes] = []
+
+        at = 0
+        while at < end:
+            item = self._read(buffer, at, base)
+            if item is None:
+                break
+            if type(item) is CorruptBytes:  # half the time of isinstance()
+                at += self._skip(buffer, at, item, found)
+                continue
+            if self._run.count:
+                self._run.end(found)
+            found.append(item)
+            self.messages += 1
+            at = item.end - base
+        self._pending = buffer[at:]
+        return found
+
+    def flush(self) -> list[M | CorruptBytes]:
+        """End the input, or a silence: return messages hidden in the pending bytes."""
+        found: list[M | CorruptBytes] = []
+        while self._pending:
+            # the pending bytes begin with a candidate that is cut off: search behind its first byte
+            count = len(self._pending) if len(self._pending) < self._shortest else 1
+            self._run.add(count, CUT_OFF, found)
+            rest, self._pending = self._pending[count:], b""
+            self.fed -= len(rest)
+            found += self.feed(rest)
+        self._run.end(found)
+        return found
+
+    def _skip(
+        self, buffer: bytes, at: int, fault: CorruptBytes, found: list[M | CorruptBytes]
+    ) -> int:
+        """Add the bytes without a message at `at` to the run; return their number."""
+        count, reason = fault
+        if reason == self._no_start:
+            start = self._start.search(buffer, at + 1)
+            count = (len(buffer) if start is None else start.start()) - at
+        elif reason == CHECKSUM:
+            self.checksum_failures += 1
+        self._run.add(count, reason, found)
+        return count
