@@ -15,6 +15,11 @@ from jointfit_daemon.config import ConfigError, Fault
 from jointfit_daemon.nearest_name import nearest_name
 from jointfit_daemon.pipeline.events import CalibrationSelected
 from jointfit_daemon.supervisor._calibration_store import calibration_age_s, store_directory
+from jointfit_daemon.supervisor._physical_test_handler import (
+    RUNNING_PHASES,
+    PhysicalTestHandler,
+    TestedDaemon,
+)
 from jointfit_daemon.supervisor._self_test import read_host, result_of, self_test
 from jointfit_daemon.supervisor._stored_versions import StoredVersions
 from jointfit_daemon.supervisor.requests import error_of
@@ -23,24 +28,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from jointfit_daemon.config import Rig
-    from jointfit_daemon.outputs.payloads import BridgeHealth
     from jointfit_daemon.outputs.recording import Recorder
     from jointfit_daemon.pipeline.events import Event, Reply, Request
     from jointfit_daemon.supervisor.requests import Handler
 
 
-class DaemonInterface(Protocol):
+class DaemonInterface(TestedDaemon, Protocol):
     """The operations of the daemon that the handlers use."""
-
-    @property
-    def rig(self) -> Rig:
-        """The rig in force."""
 
     def feed(self, event: Event) -> None:
         """Pass one event to the core."""
-
-    def health(self) -> BridgeHealth:
-        """Return counters and clocks of this instant."""
 
     @property
     def recorder(self) -> Recorder:
@@ -51,9 +48,6 @@ class DaemonInterface(Protocol):
 
     async def set_output_rate(self, rate_hz: float) -> None:
         """Apply the rig in force with another output rate."""
-
-    async def restart_device(self, name: str) -> None:
-        """Close the port of one device, and open it again."""
 
 
 class RequestHandlers:
@@ -70,6 +64,7 @@ class RequestHandlers:
     def __init__(self, daemon: DaemonInterface, publish: Callable[[Reply], None]) -> None:
         self._daemon, self._publish = daemon, publish
         self._stored = StoredVersions()
+        self._physical_test = PhysicalTestHandler(daemon)
 
     def table(self) -> Mapping[str, Handler]:
         """Return the handlers by the name of their request."""
@@ -81,6 +76,7 @@ class RequestHandlers:
             "use-calibration": self.use_calibration,
             "selftest": self.selftest,
             "record": self.record,
+            "physical-test": self._physical_test.handle,
         }
 
     async def reload(self, request: Request) -> Reply | None:
@@ -121,7 +117,7 @@ class RequestHandlers:
         if rate_hz > fastest_hz:
             expected = f"expected at most {fastest_hz:g}, the sample rate of the fastest sensor"
             fault = Fault("rate.hz", expected, rate_hz)
-        elif (phase := self._daemon.health().core.phase) in _RUNNING:
+        elif (phase := self._daemon.health().core.phase) in RUNNING_PHASES:
             expected = (
                 f"calibration phase {phase} is running and would be aborted: wait until it ends"
             )
@@ -188,7 +184,3 @@ class RequestHandlers:
         rig = self._daemon.rig
         host = await asyncio.to_thread(read_host, store_directory(rig))
         return request.reply("ok", result_of(self_test(rig, self._daemon.health(), host)))
-
-
-_RUNNING = ("align", "static", "functional", "fitting")
-"""Phases that a change of the configuration would abort."""

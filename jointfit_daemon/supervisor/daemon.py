@@ -92,6 +92,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig, Source
     from jointfit_daemon.outputs.mqtt import Incoming
     from jointfit_daemon.outputs.recording import Recorder
+    from jointfit_daemon.outputs.sink import Sink
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.supervisor._core_runner import CoreInterface
 
@@ -332,6 +333,14 @@ class Daemon:
     def feed(self, event: Event) -> None:
         """Pass one event to the core."""
         self._core.feed(event)
+
+    def subscribe(self, sink: Sink) -> None:
+        """Pass all further events and outputs of the core to `sink`."""
+        self._core.subscribe(sink)
+
+    def unsubscribe(self, sink: Sink) -> None:
+        """End the subscription of `sink`."""
+        self._core.unsubscribe(sink)
 
     async def set_output_rate(self, rate_hz: float) -> None:
         """Apply the rig in force with another output rate, until the next reload."""

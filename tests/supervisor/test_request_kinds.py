@@ -46,6 +46,7 @@ VALID: dict[str, dict[str, Any]] = {
     "calibrations": {},
     "use-calibration": {"version": 1},
     "selftest": {},
+    "physical-test": {"device": "S1", "action": "stop"},
 }
 
 

@@ -116,6 +116,30 @@ class RecordAnswer(Table):
     active: bool
 
 
+class PhysicalTestOutcome(Table):
+    """Outcome of a complete test."""
+
+    id: str
+    agrees: bool = Field(description="whether world, axes and direction are as configured")
+    deviations_deg: list[float] = Field(description="of each rotation from the one asked for")
+    found: str = Field(description="convention of the quaternions as received, in words")
+    rig_toml: list[str] = Field(description="lines of its [[imu]] table that correct the reading")
+    alternatives: list[str] = Field(description="other lines, with another heading")
+    lines: list[str] = Field(description="the outcome in words")
+
+
+class PhysicalTestAnswer(Table):
+    """Answer to ``physical-test``."""
+
+    device: str
+    state: Literal["opening", "turning", "finished", "failed", "stopped"]
+    step: int = Field(description="number of steps that are done")
+    steps: list[str] = Field(description="instructions")
+    rotations: list[str] = Field(description="names of the measured rotations")
+    text: str | None = Field(description="why the test failed")
+    result: PhysicalTestOutcome | None
+
+
 ANSWERS: dict[str, type[Table]] = {
     "calibrate": PhaseAnswer,
     "static": PhaseAnswer,
@@ -127,5 +151,6 @@ ANSWERS: dict[str, type[Table]] = {
     "use-calibration": UseCalibrationAnswer,
     "selftest": SelftestAnswer,
     "record": RecordAnswer,
+    "physical-test": PhysicalTestAnswer,
 }
 """Model of the ``data`` of an answer that is no error, by request."""

@@ -118,6 +118,16 @@ class RecordArguments(RequestArguments):
     )
 
 
+class PhysicalTestArguments(RequestArguments):
+    """``bridge/request/physical-test``."""
+
+    device: str = Field(min_length=1, max_length=256, description="id of a sensor in rig.toml")
+    action: Literal["start", "status", "stop"] = Field(
+        description="`start` opens the sensor again and begins; `status` changes nothing; `stop` "
+        "ends the test, as 30 s without a request do"
+    )
+
+
 class RequestKind(NamedTuple):
     """One request that the daemon accepts."""
 
@@ -148,5 +158,8 @@ REQUESTS: dict[str, RequestKind] = {
     ),
     "selftest": RequestKind(SelftestArguments, "Check devices, clocks, store, broker and host."),
     "record": RequestKind(RecordArguments, "Start or stop to record, or return the state."),
+    "physical-test": RequestKind(
+        PhysicalTestArguments, "Test world, axes and direction of a sensor by three rotations."
+    ),
 }
 """Every request by its name, the last level of its topic."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Any, cast
@@ -55,9 +56,24 @@ async def find_mocap_servers(
     OSError
         A host is unknown, or the network cannot be used.
     """
+
+    async def ask(search: ServerSearch) -> list[FoundServer] | OSError:
+        try:
+            return await search.find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
+        except OSError as error:  # the other searches continue
+            return error
+
+    # At the same time, so that their waits do not add up.
+    async with asyncio.TaskGroup() as group:
+        asked = [
+            group.create_task(ask(cast("ServerSearch", cast("Any", driver))))
+            for _, driver in installed_drivers()
+            if hasattr(driver, "find_servers")
+        ]
     found: list[FoundServer] = []
-    for _, driver in installed_drivers():
-        if hasattr(driver, "find_servers"):
-            search = cast("ServerSearch", cast("Any", driver))
-            found += await search.find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
+    for task in asked:
+        answered = task.result()
+        if isinstance(answered, OSError):
+            raise answered
+        found += answered
     return found

@@ -194,35 +194,41 @@ async def _servers(
     """Return the servers that answered, and the fault of each host that did not."""
     from jointfit_daemon.tools.discovery import find_mocap_servers
 
+    async def ask(name: str, port: int | None) -> list[FoundServer] | str:
+        """Return the servers that answered, or the fault."""
+        named = name != _NETWORK
+        try:
+            answered = await find_mocap_servers(
+                [name] if named else (), broadcast=not named, port=port, wait_s=wait_s
+            )
+        except OSError as error:
+            return str(error) if named else f"{name}: the search failed: {error}: {_CARDS}"
+        return answered or f"{name}: no motion-capture server answered: {_REMEDIES[named]}"
+
+    async with asyncio.TaskGroup() as group:
+        asked = [
+            group.create_task(ask(name, port))
+            for name, port in (*hosts, *([(_NETWORK, None)] if network else []))
+        ]
     found: list[FoundServer] = []
     faults = []
-    for host, port in hosts:
-        try:
-            answered = await find_mocap_servers([host], port=port, wait_s=wait_s)
-        except OSError as error:
-            faults.append(str(error))
-            continue
-        found += answered
-        if not answered:
-            faults.append(
-                f"{host}: no motion-capture server answered: start its streaming, check address, "
-                "port and firewall (`jointfit doctor --config rig.toml` names the cause)"
-            )
-
-    if network:
-        try:
-            answered = await find_mocap_servers(broadcast=True, wait_s=wait_s)
-        except OSError as error:
-            faults.append(f"--network: the search failed: {error}: check the network cards")
+    for answered in (task.result() for task in asked):
+        if isinstance(answered, str):
+            faults.append(answered)
         else:
             known = {(server.server, server.port) for server in found}
             found += [each for each in answered if (each.server, each.port) not in known]
-            if not answered:
-                faults.append(
-                    "--network: no motion-capture server answered: routers and firewalls stop "
-                    "broadcasts; name the server with --mocap HOST"
-                )
     return found, faults
+
+
+_NETWORK = "--network"
+_CARDS = "check the network cards"
+_REMEDIES = {
+    True: "start its streaming, check address, port and firewall (`jointfit doctor --config "
+    "rig.toml` names the cause)",
+    False: "routers and firewalls stop broadcasts; name the server with --mocap HOST",
+}
+"""Remedy where no server answered, by whether a host was named."""
 
 
 def _faults(

@@ -123,3 +123,51 @@ async def test_the_check_of_axes_names_the_axis_and_the_angle_of_a_turned_sensor
         assert await page.page.locator(".card.turned h3").all_inner_texts() == ["S1"]
         await page.page.click("text=Set all to zero")
         await page.page.wait_for_function("() => !document.querySelector('.card.turned')")
+
+
+STEPS = [
+    "Lay S1 flat, its z axis up, and let go.",
+    "Turn it on the table by a quarter turn, counter-clockwise seen from above, and let go.",
+    "Tip it by a quarter turn about its x axis, so that its y axis points up, and hold it still.",
+    "Turn it, as it stands, by a quarter turn, counter-clockwise seen from above.",
+]
+TURNING: dict[str, Any] = {
+    "device": "S1", "state": "turning", "step": 2, "steps": STEPS, "text": None, "result": None,
+    "rotations": ["about the vertical", "about its x axis", "about the vertical, tipped"],
+}  # fmt: skip
+JUDGED: dict[str, Any] = TURNING | {
+    "state": "finished", "step": 4,
+    "result": {
+        "id": "S1", "agrees": False, "deviations_deg": [180.0, 88.0, 120.0],
+        "found": "components w x y z, world to sensor, +z of the world points up, sensor axes as"
+        " printed",
+        "rig_toml": ['direction = "world_to_sensor"'], "alternatives": [],
+        "lines": ["S1: not as configured", "in its [[imu]] table of rig.toml:\n…"],
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", ["phone", "desktop"])
+async def test_the_physical_test_guides_step_by_step_and_ends_with_lines_for_rig_toml(
+    broker: Broker, size: str, scheme: str
+) -> None:
+    rig = PublishedRig()
+    rig.answers["physical-test"] = {"status": "ok", "data": TURNING}
+    async with shown(broker, rig, size=size, scheme=scheme) as page:
+        await page.show("sensors")
+        await page.page.click("text=Start the test")
+        await page.until_text("#physical-test .test-status", f"Step 3 of 4: {STEPS[2]}")
+        assert await page.text("#physical-test [aria-current]") == STEPS[2]
+        assert await page.accessibility_faults() == []
+        await page.picture(f"physical-test-{size}-{scheme}")
+
+        rig.answers["physical-test"] = {"status": "ok", "data": JUDGED}
+        await page.until_text("#physical-test .test-status", "S1: not as configured")
+        assert await page.text("#physical-test pre") == 'direction = "world_to_sensor"'
+        assert await page.page.is_visible("text=Start the test")
+        assert await page.accessibility_faults() == []
+        await page.picture(f"physical-test-outcome-{size}-{scheme}")
+        width = await page.page.evaluate("document.documentElement.scrollWidth - innerWidth")
+        assert width <= 0  # nothing to scroll sideways
+        assert page.errors == []

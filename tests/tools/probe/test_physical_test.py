@@ -4,85 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import sys
-import time
-from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
-from scipy.spatial.transform import Rotation, Slerp
 from typer.testing import CliRunner
 
 from jointfit_daemon.config import load_rig
 from jointfit_daemon.tools.__main__ import app
 from jointfit_daemon.tools.probe._physical_test import PhysicalTestError, run_physical_test
-from jointfit_simulators.devices import WitMotionDevice, WitMotionDeviceOptions
-from jointfit_simulators.devices._witmotion_device import WITH_QUATERNION
+from tests.physical_test.turning_hand import RIG, held
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
     from pathlib import Path
 
 pytestmark = pytest.mark.real_time
-
-TURN_S = 0.4
-RIG = """
-[rig]
-name = "bench"
-[chain]
-segments = ["thigh", "shank"]
-joints = ["hip", "knee", "ankle"]
-"""
-
-
-class Hand:
-    """Turns the device to the next pose at each instruction; it rests there."""
-
-    def __init__(self, device: WitMotionDevice) -> None:
-        flat = Rotation.from_euler("z", 40, degrees=True)
-        quarter = Rotation.from_euler("z", 90, degrees=True)
-        tipped = quarter * flat * Rotation.from_euler("x", 90, degrees=True)
-        self._poses = [flat, flat, quarter * flat, tipped, quarter * tipped]
-        self._device, self._step, self._begin_ns = device, 0, 0
-
-    def follow(self, line: str) -> None:
-        """Begin the next movement if the line is an instruction."""
-        if line.startswith(("Lay ", "Turn it", "Tip it")):
-            self._step, self._begin_ns = self._step + 1, time.monotonic_ns()
-
-    async def run(self) -> None:
-        """Send 100 orientations a second until cancelled."""
-        while True:
-            now_ns = time.monotonic_ns()
-            share = min((now_ns - self._begin_ns) / 1e9 / TURN_S, 1.0)
-            ends = self._poses[max(self._step - 1, 0) : self._step + 1] * (2 - (self._step > 0))
-            x, y, z, w = Slerp([0.0, 1.0], Rotation.concatenate(ends[:2]))(share).as_quat().tolist()
-            self._device.push(now_ns, (w, x, y, z))
-            await asyncio.sleep(0.01)
-
-
-@asynccontextmanager
-async def held(folder: Path, **sent: Any) -> AsyncIterator[Hand]:
-    """A hand with a device of these settings, and rig.toml with the default ones."""
-    keys = "\n".join(
-        f'[[imu]]\nid = "{name}"\nsegment = "{segment}"\ndriver = "witmotion"\nport = "{path}"\n'
-        "rate_hz = 100\n"
-        for name, segment, path in (
-            ("S1", "thigh", folder / "imu"),
-            ("S2", "shank", folder / "other"),
-        )
-    )
-    (folder / "rig.toml").write_text(RIG + keys)
-    options = WitMotionDeviceOptions(content=WITH_QUATERNION, rate_hz=100, **sent)
-    device = WitMotionDevice(folder / "imu", options=options)
-    hand = Hand(device)
-    tasks = [asyncio.create_task(work) for work in (device.run(), hand.run())]
-    try:
-        yield hand
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
-        device.unplug()
 
 
 @pytest.mark.parametrize(
@@ -136,7 +71,7 @@ async def test_a_device_that_is_absent_is_reported_before_any_instruction(tmp_pa
     async with held(tmp_path):
         absent = load_rig(tmp_path / "rig.toml").sources[1]
         lines: list[str] = []
-        with pytest.raises(PhysicalTestError, match=r"S2: .*absent"):
+        with pytest.raises(PhysicalTestError, match=r"S2: .*is not there"):
             await run_physical_test(absent, lines.append, step_s=20.0)
     assert lines == ["Opening S2 …"]
 

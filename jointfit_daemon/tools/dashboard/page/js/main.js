@@ -83,7 +83,7 @@ async function start() {
   const calibrate = createCalibrateView(store, request);
   const openAction = createActions(store, request, (name) => showView(name));
   const updateRecording = createRecordingPanel(store, access, request, openAction);
-  const views = { history: createHistoryView(store, request), sensors: createSensorsView(store, link, openAction), log: createLogView(store, request), table: createTableView(store) };
+  const views = { history: createHistoryView(store, request), sensors: createSensorsView(store, link, openAction, request), log: createLogView(store, request), table: createTableView(store) };
   const updateHeader = createHeader(link, store, configuration, {
     reconnect: () => link.connect(),
     logIn: () => dialogs.askForAccount(link.reason),

@@ -1,12 +1,13 @@
-// The Sensors view: counters and clocks of every device, the daemon, and the check of axes by hand.
+// The Sensors view: counters and clocks of every device, the daemon, and the checks of axes by hand.
 
 import { byId, createElement, createTable, patchTable } from "./dom.js";
 import { createAxesCheck } from "./axes_check.js";
+import { createPhysicalTest } from "./physical_test.js";
 import { summaryOf } from "./sensor_cards.js";
 import { UNKNOWN, formatBytes, formatNumber } from "./words.js";
 
 /** Show the health of a store's devices in a view; `openAction(name, device)` starts a request. */
-export function createSensorsView(store, link, openAction) {
+export function createSensorsView(store, link, openAction, request) {
   const view = { visible: false };
   const tables = createElement("div", { class: "stack" });
   const check = createAxesCheck(store, link);
@@ -21,6 +22,7 @@ export function createSensorsView(store, link, openAction) {
       tables,
     ),
     check.root,
+    createPhysicalTest(store, request).root,
   );
   const update = () => {
     if (view.visible) patchTable(tables, createElement("div", { class: "stack" }, ...tablesOf(store, openAction)));
