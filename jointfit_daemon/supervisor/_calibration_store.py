@@ -170,10 +170,12 @@ class CalibrationWriter:
                     loop = asyncio.get_running_loop()
                     self._next_try = loop.call_later(RETRY_S, self.retry)
                 return
-            if self._unwritten is None or self._unwritten[1] is calibration:
+            newest = self._unwritten is None or self._unwritten[1] is calibration
+            if newest:
                 self._unwritten = self.fault = None
 
-        if rig.calibration_store == self._store:  # otherwise a reload selected another store
+        # A newer calibration is in force, or a reload selected another store: not its version.
+        if newest and rig.calibration_store == self._store:
             self._deliver(CalibrationStored(time.monotonic_ns(), version, dated.created_utc))
 
     async def settle(self) -> None:

@@ -196,8 +196,12 @@ class CalibrationSession:
 
     def restart_sensor(self, t_ns: int, sensor: str) -> list[Output]:
         """Discard the static pose: the heading of a restarted sensor may have changed."""
+        recording, fit = self._recording, self._fit
+        moving = recording is not None and recording.phase != CalibrationPhase.STATIC
+        # The result of a functional phase stays useful: the notice asks for a new pose.
+        outdated = fit is not None and not isinstance(fit.work, FunctionalJob)
         outputs: list[Output] = []
-        if self._recording is not None and self._recording.phase != CalibrationPhase.STATIC:
+        if moving or outdated:
             outputs += self.abort(t_ns, f"{sensor} restarted during the phase: repeat it")
 
         posed, self._static = self._static is not None, None
@@ -238,11 +242,11 @@ class CalibrationSession:
 
     def _revert_refits(self, request: Request) -> list[Output]:
         """Restore the models from before online learning, and pause it until the next movement."""
-        now = self.calibration
-        before = None if now is None else self.refits.revert(now)
-        if before is None or self._fit is not None:
+        now, running = self.calibration, self._state not in RESTING
+        before = None if now is None or running else self.refits.revert(now)
+        if before is None:
             message = "no online learning since the daemon started: there is nothing to revert"
-            return [request.refusal("phase", message)]
+            return [request.refusal("phase", self._running_text if running else message)]
 
         self.calibration, self.version = before, None
         text = "online learning reverted and paused until the next functional calibration"
