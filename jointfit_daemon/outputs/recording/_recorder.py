@@ -101,6 +101,8 @@ class Recorder:
         self._report = report
         self._writing = asyncio.Lock()
         """Held while the thread writes: one call at a time."""
+        self._changing = asyncio.Lock()
+        """Held by a start or stop: each is answered with the state that it leaves."""
         self._writer: SessionWriter | None = None
         self._snapshot = self._before = Snapshot()
         self._t_ns = time.monotonic_ns()
@@ -201,19 +203,20 @@ class Recorder:
         OSError
             The file cannot be created: nothing is recorded.
         """
-        writer = self._writer
-        if writer is None:
-            writer = self.begin()
-            await self._write()
-            if writer.file is None and writer.fault is not None:
-                self._writer = None
-                raise OSError(writer.fault)
-            self._report(RecordingReport(f"recording started: {self._health(writer).file}"))
-        return self._health(writer)
+        async with self._changing:
+            writer = self._writer
+            if writer is None:
+                writer = self.begin()
+                await self._write()
+                if writer.file is None and writer.fault is not None:
+                    self._writer = None
+                    raise OSError(writer.fault)
+                self._report(RecordingReport(f"recording started: {self._health(writer).file}"))
+            return self._health(writer)
 
     async def stop(self) -> RecordingHealth:
         """Write the rest, close the file and return its last state; do nothing without one."""
-        async with self._writing:
+        async with self._changing, self._writing:
             writer = self._writer
             if writer is not None:
                 self._last, rest = replace(self._health(writer), active=False), self._take_rest()
@@ -225,6 +228,7 @@ class Recorder:
                     self._last,
                     written_bytes=writer.written_bytes,
                     backlog_bytes=0,
+                    lost=writer.lost,
                     failure=writer.fault,
                 )
                 size_mb = writer.written_bytes / 1e6

@@ -305,6 +305,7 @@ class SessionWriter:
             part.finish(next_sequence, reason)
         except OSError as error:
             self._report_fault(error)
+            self._lose_messages(self._saved_sequence, self._added_sequence)
         self._finished_bytes += part.size_bytes
         self.written_bytes = self._finished_bytes
 
