@@ -21,7 +21,7 @@ from typer.main import get_command
 
 from tests.broker_fixture import EmbeddedBroker, MosquittoBroker, chosen_broker
 from tests.fake_rig import fakes, table  # noqa: F401 - fixtures
-from tests.lsl_fixture import lsl  # noqa: F401 - a fixture
+from tests.lsl_fixture import lsl, lsl_network  # noqa: F401 - fixtures
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Generator, Iterator

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import pytest
@@ -23,3 +24,19 @@ def receive(lsl: Any, name: str) -> Any:
     inlet = lsl.StreamInlet(found[0])
     inlet.open_stream(timeout=10.0)
     return inlet
+
+
+@pytest.fixture(scope="session")
+def lsl_network() -> Any:
+    """Return pylsl on a host on which a stream can be found."""
+    try:
+        import pylsl  # noqa: PLC0415 - skips where its library is missing
+    except (ImportError, RuntimeError, OSError) as missing:
+        pytest.skip(f"pylsl cannot be used: {missing}")
+    info = pylsl.StreamInfo("network", "test", 1, 0.0, "double64", f"network-{os.getpid()}")
+    outlet = pylsl.StreamOutlet(info)
+    found = pylsl.resolve_byprop("source_id", info.source_id(), timeout=3.0)
+    del outlet
+    if not found:
+        pytest.skip("LSL finds no stream on this host: its network has no multicast")
+    return pylsl

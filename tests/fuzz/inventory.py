@@ -8,6 +8,7 @@ from tests.fuzz import (
     broker_targets,
     file_targets,
     lpms_targets,
+    lsl_targets,
     mip_targets,
     table_targets,
     vectornav_targets,
@@ -17,6 +18,7 @@ from tests.fuzz import (
 MODULES = (
     wire_targets,
     lpms_targets,
+    lsl_targets,
     mip_targets,
     table_targets,
     vectornav_targets,

@@ -26,12 +26,16 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.real_time
 
 
-WHOLE_FRAMES = ("natnet", "qtm", "vicon")
+WHOLE_FRAMES = ("natnet", "qtm", "vicon", "lsl-markers")
 """Families whose frames contain all markers; VRPN sends each tracker by itself."""
 
 
 @pytest.mark.parametrize("family", WHOLE_FRAMES)
-async def test_every_marker_of_the_limb_arrives_by_name(tmp_path: Path, family: str) -> None:
+async def test_every_marker_of_the_limb_arrives_by_name(
+    tmp_path: Path, family: str, request: pytest.FixtureRequest
+) -> None:
+    if family == "lsl-markers":
+        request.getfixturevalue("lsl_network")
     knobs = Knobs(occlusion=0.0)
     subject = SimulatedSubject(knobs, parse_motion_script("stand"), motion_files={})
     scene = Scene(knobs, subject, SceneOptions(tmp_path, mocap=family), now_ns=time.monotonic_ns())

@@ -14,6 +14,7 @@ from jointfit_drivers.motion_capture._reception import CHECK, Reception, content
 from jointfit_drivers.motion_capture._route import Route, find_route
 from jointfit_drivers.motion_capture._settings import ServerSettings
 from jointfit_drivers.motion_capture._tcp_link import TcpLink
+from jointfit_drivers.motion_capture._unit_check import UnitCheck
 from jointfit_drivers.motion_capture._world import (
     ABSENT,
     FARTHEST_M,
@@ -45,6 +46,7 @@ __all__ = [
     "Route",
     "ServerSettings",
     "TcpLink",
+    "UnitCheck",
     "UpAxis",
     "bind_columns",
     "binding_events",

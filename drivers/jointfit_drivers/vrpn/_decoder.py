@@ -17,6 +17,7 @@ from jointfit_drivers.motion_capture import (
     NO_POSITION,
     ColumnBinding,
     ModelEntry,
+    UnitCheck,
     bind_columns,
     binding_events,
     rows_array,
@@ -25,7 +26,6 @@ from jointfit_drivers.motion_capture import (
     world_rotation,
 )
 from jointfit_drivers.vrpn._frame_assembler import FrameAssembler, ReportedFrame
-from jointfit_drivers.vrpn._unit_check import UnitCheck
 from jointfit_protocols import vrpn
 from jointfit_protocols.corrupt import CorruptBytes
 

@@ -11,6 +11,7 @@ from jointfit_simulators.devices._clocks import (
 )
 from jointfit_simulators.devices._lpms_can_device import LpmsCanDevice, LpmsCanDeviceOptions
 from jointfit_simulators.devices._lpms_device import LpmsDevice, LpmsDeviceOptions
+from jointfit_simulators.devices._lsl_server import LslServer, LslServerOptions
 from jointfit_simulators.devices._mip_device import MipDevice, MipDeviceOptions
 from jointfit_simulators.devices._natnet_frames import (
     Bodies,
@@ -66,6 +67,8 @@ __all__ = [
     "LpmsCanDeviceOptions",
     "LpmsDevice",
     "LpmsDeviceOptions",
+    "LslServer",
+    "LslServerOptions",
     "Markers",
     "MipDevice",
     "MipDeviceOptions",

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Protocol
 
 from jointfit_simulators.devices import (
     NS,
+    LslServer,
+    LslServerOptions,
     NatNetServer,
     NatNetServerOptions,
     QtmServer,
@@ -181,7 +183,21 @@ def _vrpn(place: CameraPlace) -> tuple[VrpnServer, list[str]]:
     return server, lines
 
 
+def _lsl_markers(place: CameraPlace) -> tuple[LslServer, list[str]]:
+    server = LslServer(
+        LslServerOptions(
+            markers=tuple(name for names in place.clusters.values() for name in names),
+            bodies=tuple(place.bodies),
+            rate_hz=place.knobs.mocap_hz,
+            device_ns=place.timing.device_ns,
+        )
+    )
+    lines = [f'source_id = "{server.source_id}"', f'up_axis = "{server.options.up_axis}"']
+    return server, lines
+
+
 MOCAP_FAMILIES = {
+    "lsl-markers": MocapFamily(_lsl_markers),
     "natnet": MocapFamily(_natnet, sync_line=True),
     "qtm": MocapFamily(_qtm),
     "vicon": MocapFamily(_vicon),

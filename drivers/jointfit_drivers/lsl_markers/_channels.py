@@ -1,0 +1,203 @@
+"""Channels of a stream: which of them are coordinates of a marker, and which the pose of a body.
+
+The convention is the MoCap meta-data of XDF: each channel has a label, a marker or an object, a
+type (PositionX to Z, OrientationA to D with A the scalar, Confidence) and a unit. Where the type is
+missing, the end of the label (``T1_X``, ``Thigh.qw``) replaces it. Streams without labels have the
+names of rig.toml, x y z each.
+
+Invariant: pure; a channel that is not understood is reported, never guessed.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_drivers.motion_capture import ModelEntry
+
+if TYPE_CHECKING:
+    from jointfit_drivers.lsl_markers._settings import LslMarkersSettings
+    from jointfit_drivers.motion_capture import ColumnKey
+    from jointfit_protocols.lsl import Channel, StreamDescription
+
+_POSITION = {"positionx": "x", "positiony": "y", "positionz": "z"}
+_ORIENTATION = {
+    "orientationa": "qw", "orientationb": "qx", "orientationc": "qy", "orientationd": "qz",
+    "orientationw": "qw", "orientationx": "qx", "orientationy": "qy", "orientationz": "qz",
+}  # fmt: skip
+_EULER = {"orientationp": "euler", "orientationh": "euler", "orientationr": "euler"}
+_TYPES = _POSITION | _ORIENTATION | _EULER | {"confidence": "confidence"}
+_LABEL = re.compile(
+    r"(?P<name>.+?)[\s_.:/-]+(?:pos(?:ition)?[\s_.:/-]*)?(?P<part>q[wxyz]|[xyz])", re.IGNORECASE
+)
+_UNITS_M = {
+    "m": 1.0, "meter": 1.0, "meters": 1.0, "metre": 1.0, "metres": 1.0,
+    "cm": 0.01, "centimeter": 0.01, "centimeters": 0.01, "centimetre": 0.01, "centimetres": 0.01,
+    "mm": 0.001, "millimeter": 0.001, "millimeters": 0.001, "millimetre": 0.001,
+    "millimetres": 0.001,
+}  # fmt: skip
+_AXES, _TURN = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
+_LISTED = 5
+"""Names that a warning lists."""
+
+
+class Columns(NamedTuple):
+    """Channels of one marker or body."""
+
+    position: tuple[int, int, int]
+    orientation: tuple[int, int, int, int] | None
+    confidence: int | None
+
+
+class StreamLayout(NamedTuple):
+    """Content of a stream."""
+
+    markers: tuple[ModelEntry, ...]
+    bodies: tuple[ModelEntry, ...]
+    columns: dict[ColumnKey, Columns]
+    """Channels of each entry, by its key."""
+    scale_m: float
+    """Length of one unit of the positions, m."""
+    unit: str
+    """``m``, ``cm`` or ``mm``."""
+    warnings: tuple[str, ...]
+
+
+def stream_layout(description: StreamDescription, settings: LslMarkersSettings) -> StreamLayout:
+    """Return the content of a stream.
+
+    Parameters
+    ----------
+    description : StreamDescription
+        Description of the stream.
+    settings : LslMarkersSettings
+        The ``[mocap]`` table.
+    """
+    warnings: list[str] = []
+    if settings.names:
+        found = _named(description, settings.names, warnings)
+    else:
+        found = _described(description.channels, warnings)
+        if not description.channels:
+            warnings.append(
+                f"the stream describes none of its {description.channel_count} channels: set names "
+                "in [mocap] to the markers in their order, x y z each"
+            )
+
+    owners = {owner: 0 for owner, _, _ in found}
+    entries: tuple[list[ModelEntry], list[ModelEntry]] = ([], [])
+    columns: dict[ColumnKey, Columns] = {}
+    incomplete: list[str] = []
+    turned: list[str] = []
+    for (owner, name, _), parts in found.items():
+        if not all(axis in parts for axis in _AXES):
+            incomplete.append(name)
+            continue
+        if "euler" in parts:
+            turned.append(name)
+        whole = all(part in parts for part in _TURN)
+        qw, qx, qy, qz = (parts.get(part, 0) for part in _TURN)
+        x, y, z = (parts[axis] for axis in _AXES)
+        owners[owner] += 1
+        key = len(columns)
+        entries[whole].append(ModelEntry(key, owner, name, owners[owner]))
+        turn = (qw, qx, qy, qz) if whole else None
+        columns[key] = Columns((x, y, z), turn, parts.get("confidence"))
+
+    if incomplete:
+        warnings.append(
+            f"{_listed(incomplete)} without all three coordinates: not used; stream x, y and z"
+        )
+    if turned:
+        warnings.append(
+            f"rigid bodies {_listed(turned)} have Euler angles, whose order a stream does not "
+            "describe: they are used as markers; stream quaternions, or use markers in [mocap]"
+        )
+    unit = _unit(description, settings, columns, warnings)
+    return StreamLayout(
+        tuple(entries[0]), tuple(entries[1]), columns, _UNITS_M[unit], unit, tuple(warnings)
+    )
+
+
+_Found = dict[tuple[str, str, bool], dict[str, int]]
+"""Channel of each part, by owner, name and whether the name is that of an object."""
+
+
+def _named(description: StreamDescription, names: tuple[str, ...], warnings: list[str]) -> _Found:
+    """Return the channels of a stream that are named by rig.toml."""
+    if 3 * len(names) != description.channel_count:
+        warnings.append(
+            f"names lists {len(names)} markers, which are {3 * len(names)} channels; the stream "
+            f"has {description.channel_count}: correct names in [mocap]"
+        )
+        return {}
+    return {
+        ("", name, False): dict(zip(_AXES, range(3 * n, 3 * n + 3), strict=True))
+        for n, name in enumerate(names)
+    }
+
+
+def _described(channels: tuple[Channel, ...], warnings: list[str]) -> _Found:
+    """Return the channels by their descriptions."""
+    found: _Found = {}
+    repeated: list[str] = []
+    for number, channel in enumerate(channels):
+        part = _TYPES.get(channel.type.lower(), "")
+        by_label = _LABEL.fullmatch(channel.label)
+        if not part and by_label is not None and not channel.type.lower().startswith("orient"):
+            part = by_label["part"].lower()
+        name = channel.marker or channel.object
+        if not name and by_label is not None:
+            name = by_label["name"]
+        if not part or not name:
+            continue  # a frame number or another channel of the program
+
+        is_object = not channel.marker and bool(channel.object)
+        owner = "" if is_object else channel.object
+        parts = found.setdefault((owner, name, is_object), {})
+        if part in parts and part != "euler":
+            repeated.append(f"{name} {part}")
+        parts.setdefault(part, number)
+    if channels and not found:
+        labels = [channel.label or channel.type or "(empty)" for channel in channels]
+        warnings.append(
+            f"no channel is a coordinate by its type (PositionX) or label (T1_X); found "
+            f"{_listed(labels)}: set names in [mocap], or select another stream"
+        )
+    if repeated:
+        warnings.append(
+            f"{_listed(repeated)} described more than once: the first channel is used; give every "
+            "marker a name of its own in the camera software"
+        )
+    return found
+
+
+def _unit(
+    description: StreamDescription,
+    settings: LslMarkersSettings,
+    columns: dict[ColumnKey, Columns],
+    warnings: list[str],
+) -> str:
+    """Return the unit of the positions: as configured, as described, otherwise m."""
+    if settings.unit != "auto":
+        return settings.unit
+    described = description.channels
+    texts = {
+        described[index].unit.lower()
+        for one in columns.values()
+        if described
+        for index in one.position
+    }
+    lengths = {_UNITS_M[text] for text in texts if text in _UNITS_M}
+    if len(lengths) > 1 or (texts - {""} and not lengths):
+        warnings.append(
+            f"positions described in {_listed(sorted(texts))}: metres are assumed; set unit in "
+            "[mocap]"
+        )
+        return "m"
+    return {1.0: "m", 0.01: "cm", 0.001: "mm"}[lengths.pop()] if lengths else "m"
+
+
+def _listed(names: list[str]) -> str:
+    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
+    return ", ".join(names[:_LISTED]) + more

@@ -1,0 +1,62 @@
+"""Driver of motion capture that arrives as a stream of the Lab Streaming Layer.
+
+`LslMarkersDecoder` is the pure part. `LslMarkersMocap.run` searches the stream, and emits
+description, samples and clock comparisons as chunks, so that a replay has the same input as the
+live decoder.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from jointfit_drivers.lsl_markers._decoder import LslMarkersDecoder
+from jointfit_drivers.lsl_markers._server_search import diagnose, find_servers
+from jointfit_drivers.lsl_markers._session import LslSession
+from jointfit_drivers.lsl_markers._settings import LslMarkersSettings
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.device_search import Finding, FoundServer
+    from jointfit_daemon.driver import Emit, Wire
+
+
+class LslMarkersMocap:
+    """One stream: markers or rigid bodies, stamped by the clock of LSL on the sending PC."""
+
+    Settings: ClassVar[type[LslMarkersSettings]] = LslMarkersSettings
+    wire: ClassVar[Wire] = "datagram"
+    least_delay_ms: ClassVar[tuple[float, float]] = (15.0, 10.0)
+    """Delay from exposure to stamp, ms: most programs stamp a sample when they send it."""
+
+    def __init__(self, settings: LslMarkersSettings) -> None:
+        self._settings = settings
+
+    def decoder(self) -> LslMarkersDecoder:
+        """Return the decoder from chunks to optical frames in SI units."""
+        return LslMarkersDecoder(self._settings)
+
+    @classmethod
+    async def find_servers(
+        cls, hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
+    ) -> list[FoundServer]:
+        """Return the streams of motion capture; see `jointfit_daemon.device_search`."""
+        return await find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
+
+    @classmethod
+    async def diagnose(cls, settings: LslMarkersSettings, wait_s: float) -> list[Finding]:
+        """Return the causes of missing frames; see `jointfit_daemon.device_search`."""
+        return await diagnose(settings, wait_s)
+
+    async def run(self, emit: Emit) -> None:
+        """Search the stream and read until cancelled.
+
+        Raises
+        ------
+        DeviceLostError
+            No stream fits, its sender ended it or does not answer, or sends no sample for
+            ``silence_s``. A retry may succeed.
+        DeviceMisconfiguredError
+            pylsl is not installed, several streams fit, or the stream has no numbers.
+        """
+        await LslSession(self._settings, emit).run()

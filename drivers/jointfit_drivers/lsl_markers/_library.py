@@ -1,0 +1,119 @@
+"""The library of the Lab Streaming Layer: its import, the search for streams, and its clock.
+
+pylsl is an extra. Its calls block, so all of them run in threads of the driver.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import time
+from typing import Any, NamedTuple
+
+from jointfit_daemon.driver import DeviceMisconfiguredError
+from jointfit_protocols.lsl import RoundTrip
+
+_READINGS = 5
+"""Comparisons of LSL's clock with that of the host; the one that took the shortest time is used."""
+
+
+class FoundStream(NamedTuple):
+    """One stream of the network."""
+
+    info: Any
+    """`pylsl.StreamInfo` without description."""
+    address: str
+    """Address of the sender; empty if unknown."""
+    port: int
+
+
+def load_library() -> Any:
+    """Return the module pylsl.
+
+    Raises
+    ------
+    DeviceMisconfiguredError
+        pylsl or its library liblsl is not installed.
+    """
+    try:
+        import pylsl  # noqa: PLC0415 - an extra
+    except ModuleNotFoundError as missing:
+        raise DeviceMisconfiguredError(
+            "mocap.driver: lsl-markers needs the package pylsl: add it with pip install "
+            "'jointfitd[lsl]'"
+        ) from missing
+    except (RuntimeError, OSError) as missing:  # pylsl without its library
+        raise DeviceMisconfiguredError(
+            "mocap.driver: pylsl of lsl-markers finds no library liblsl, which its packages contain"
+            " for x86-64 only: install liblsl (https://github.com/sccn/liblsl) and set PYLSL_LIB to"
+            " its path"
+        ) from missing
+    return pylsl
+
+
+def search_streams(
+    lsl: Any, query: str, server: str | None, *, least: int, wait_s: float
+) -> list[FoundStream]:
+    """Return the streams that answer to a query; blocks for at most `wait_s`.
+
+    Parameters
+    ----------
+    lsl : module
+        pylsl.
+    query : str
+        XPath predicate.
+    server : str, optional
+        Address or name of the sender; streams of others are left out.
+    least : int
+        Number of streams after which the search ends early.
+    wait_s : float
+        Longest wait, s.
+    """
+    found = []
+    for info in lsl.resolve_bypred(query, minimum=least, timeout=wait_s):
+        text = info.as_xml()
+        address, port = _element(text, "v4address"), _element(text, "v4data_port")
+        names = {info.hostname().lower(), info.hostname().lower().split(".")[0], address}
+        if server is None or server.lower() in names or _is_loopback(server, address):
+            found.append(FoundStream(info, address, int(port) if port.isdecimal() else 0))
+    return found
+
+
+def _element(xml: str, name: str) -> str:
+    _, _, rest = xml.partition(f"<{name}>")
+    return rest.partition("</")[0].strip()
+
+
+def _is_loopback(server: str, address: str) -> bool:
+    return server in {"localhost", "127.0.0.1"} and address.startswith("127.")
+
+
+def compare_clocks(lsl: Any, inlet: Any, wait_s: float) -> RoundTrip | None:
+    """Return the latest comparison of the sender's clock with CLOCK_MONOTONIC of this host.
+
+    liblsl asks the sender every few seconds and uses the reply with the shortest round trip; its
+    uncertainty is that round-trip time. None if there is no reply within `wait_s`.
+    """
+    remote, uncertainty, code = ctypes.c_double(), ctypes.c_double(), ctypes.c_int()
+    ask = lsl.lib.lib.lsl_time_correction_ex  # `StreamInlet.time_correction` has no uncertainty
+    ask.restype = ctypes.c_double
+    offset_s = ask(
+        inlet.obj,
+        ctypes.byref(remote),
+        ctypes.byref(uncertainty),
+        ctypes.c_double(wait_s),
+        ctypes.byref(code),
+    )
+    if code.value:
+        return None
+
+    # LSL's clock is CLOCK_MONOTONIC on Linux in usual builds; the difference is measured anyway.
+    readings = []
+    for _ in range(_READINGS):
+        before_ns = time.monotonic_ns()
+        lsl_s = lsl.local_clock()
+        after_ns = time.monotonic_ns()
+        readings.append((after_ns - before_ns, (before_ns + after_ns) // 2 - round(lsl_s * 1e9)))
+    width_ns, difference_ns = min(readings)
+    middle_ns = round((remote.value + offset_s) * 1e9) + difference_ns
+    half_ns = round(uncertainty.value * 0.5e9) + width_ns // 2
+    return RoundTrip(middle_ns - half_ns, middle_ns + half_ns, remote.value)

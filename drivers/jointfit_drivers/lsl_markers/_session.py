@@ -1,0 +1,254 @@
+"""One connection to a stream: search, description, samples, and comparisons of the clocks.
+
+1. The streams that fit are searched; none is a loss, several of different sources are an error.
+2. The description is emitted, then samples as they arrive, each time in one chunk.
+3. A second thread asks for the offset of the sender's clock, because the first reply takes half a
+   second, and emits every new result.
+
+The inlet does not recover by itself: after a loss the stream is searched again, so that a changed
+description is noticed.
+
+Invariant: chunks are emitted in the event loop, in order of arrival.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.model import Chunk
+from jointfit_drivers.lsl_markers._library import compare_clocks, load_library, search_streams
+from jointfit_protocols.lsl import (
+    FORMATS,
+    MOST_CHANNELS,
+    encode_description,
+    encode_round_trip,
+    encode_samples,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.driver import Emit
+    from jointfit_drivers.lsl_markers._settings import LslMarkersSettings
+
+SEARCH_S = 3.0
+"""Time to search for a stream, s."""
+_STEP_S = 0.3
+"""Longest blocking call of the library, s: a cancelled connection ends within it."""
+_DESCRIPTION_S = 5.0
+_COMPARE_S = 1.0
+"""Interval between queries for a new clock comparison, s."""
+_MOST_SAMPLES = 256
+"""Samples in a chunk."""
+_BUFFER_S = 10
+"""Samples kept for this host while it does not read, s."""
+_FORMATS = dict(enumerate(("", "float32", "double64", "string", "int32", "int16", "int8", "int64")))
+"""Names of the formats of liblsl, by number."""
+
+
+class LslSession:
+    """One connection to a stream.
+
+    Parameters
+    ----------
+    settings : LslMarkersSettings
+        The ``[mocap]`` table.
+    emit : Emit
+        Receives every chunk.
+    """
+
+    def __init__(self, settings: LslMarkersSettings, emit: Emit) -> None:
+        self._settings = settings
+        self._emit = emit
+        self._loop = asyncio.get_running_loop()
+        self._ended: asyncio.Future[None] = self._loop.create_future()
+        self._finished = asyncio.Event()
+        """Set when the threads have ended."""
+        self._stop = threading.Event()
+        self._last_ns = 0
+
+    async def run(self) -> None:
+        """Connect and read until cancelled; raises the errors of `LslMarkersMocap.run`."""
+        lsl = load_library()
+        reading = threading.Thread(target=self._read, args=(lsl,), name="lsl reader", daemon=True)
+        reading.start()
+        try:
+            await self._ended
+        finally:
+            self._stop.set()
+            await self._finished.wait()
+
+    # --- in the event loop --------------------------------------------------------------------
+
+    def _take(self, arrival_ns: int, data: bytes) -> None:
+        if self._ended.done() or self._stop.is_set():
+            return
+        self._last_ns = max(self._last_ns, arrival_ns)
+        try:
+            self._emit(Chunk(self._last_ns, data))
+        except Exception as error:  # noqa: BLE001 - a callback passes its error to the coroutine
+            self._end(error)
+
+    def _end(self, error: Exception) -> None:
+        if not self._ended.done():
+            self._ended.set_exception(error)
+
+    # --- in threads ---------------------------------------------------------------------------
+
+    def _call(self, function: Callable[..., None], *args: object) -> None:
+        """Call a method in the event loop, unless the connection has ended."""
+        if not self._stop.is_set():
+            self._loop.call_soon_threadsafe(function, *args)
+
+    def _read(self, lsl: Any) -> None:
+        """Search, open and read the stream."""
+        comparing: threading.Thread | None = None
+        inlet: Any = None
+        try:
+            info = self._find(lsl)
+            if info is None:
+                return
+            inlet = lsl.StreamInlet(info, max_buflen=_BUFFER_S, recover=False)
+            kind = self._describe(lsl, inlet)
+            comparing = threading.Thread(
+                target=self._compare, args=(lsl, inlet), name="lsl clock", daemon=True
+            )
+            comparing.start()
+            self._pull(inlet, kind)
+        except lsl.util.LostError:
+            self._call(
+                self._end,
+                DeviceLostError(f"{self._name}: the sender ended the stream: start it again"),
+            )
+        except Exception as error:  # noqa: BLE001 - a thread passes its error to the coroutine
+            self._call(self._end, error)
+        finally:
+            self._stop.set()
+            if comparing is not None:
+                comparing.join()
+            # Its destructor closes the sockets, before the connection counts as ended.
+            inlet = None
+            with suppress(RuntimeError):  # the event loop is closed
+                self._loop.call_soon_threadsafe(self._finished.set)
+
+    @property
+    def _name(self) -> str:
+        settings = self._settings
+        what = settings.stream or settings.source_id or settings.stream_type or settings.predicate
+        named = f"LSL stream {what}" if what else "LSL stream of motion capture"
+        return f"{named} of {settings.server}" if settings.server else named
+
+    def _find(self, lsl: Any) -> Any:
+        """Return the stream that fits; None if the connection was cancelled.
+
+        Raises
+        ------
+        DeviceLostError
+            No stream fits.
+        DeviceMisconfiguredError
+            Streams of several sources fit.
+        """
+        settings, until = self._settings, time.monotonic() + SEARCH_S
+        while not self._stop.is_set():
+            found = search_streams(lsl, settings.query(), settings.server, least=2, wait_s=_STEP_S)
+            # The same source may be announced twice while it restarts: the newest is alive.
+            newest = {
+                one.info.source_id() or one.info.uid(): one.info
+                for one in sorted(found, key=lambda one: one.info.created_at())
+            }
+            if len(newest) > 1:
+                listed = ", ".join(
+                    f"{info.name()!r} of {info.hostname()} (source_id {info.source_id()!r})"
+                    for info in newest.values()
+                )
+                raise DeviceMisconfiguredError(
+                    f"{self._name}: {len(newest)} streams fit: {listed}: set stream, source_id or "
+                    "server in [mocap]"
+                )
+            if newest:
+                return next(iter(newest.values()))
+            if time.monotonic() > until:
+                raise DeviceLostError(
+                    f"{self._name}: not found within {SEARCH_S:g} s: start the program that sends "
+                    "it, check the name (`jointfit probe --network` lists streams), and that "
+                    "firewalls pass UDP 16571 and TCP 16572 to 16604"
+                )
+        return None
+
+    def _describe(self, lsl: Any, inlet: Any) -> str:
+        """Emit the description, begin to receive, and return the format of the channels.
+
+        Raises
+        ------
+        DeviceLostError
+            The sender does not answer.
+        DeviceMisconfiguredError
+            The stream has texts, or too many channels.
+        """
+        info = self._answer(lsl, inlet.info)
+        if info is None:
+            return ""
+        xml = info.as_xml()
+        kind = _FORMATS.get(info.channel_format(), "")
+        if kind not in FORMATS:
+            raise DeviceMisconfiguredError(
+                f"{self._name}: {info.name()!r} has {kind or 'unknown values'}, expected numbers:"
+                " streams of type Markers are texts of events; set stream to that of the camera "
+                "software"
+            )
+        if info.channel_count() > MOST_CHANNELS:
+            raise DeviceMisconfiguredError(
+                f"{self._name}: {info.channel_count()} channels, expected at most {MOST_CHANNELS}:"
+                " remove markers from the stream"
+            )
+        self._call(self._take, time.monotonic_ns(), encode_description(xml))
+        self._answer(lsl, inlet.open_stream)
+        return kind
+
+    def _answer(self, lsl: Any, ask: Callable[..., Any]) -> Any:
+        """Return the result of a call that waits for the sender; None if cancelled."""
+        until = time.monotonic() + _DESCRIPTION_S
+        while not self._stop.is_set():
+            try:
+                return ask(timeout=_STEP_S)
+            except lsl.util.TimeoutError:
+                if time.monotonic() > until:
+                    raise DeviceLostError(
+                        f"{self._name}: was found, but does not answer within {_DESCRIPTION_S:g} s:"
+                        " check that firewalls pass TCP 16572 to 16604, and start the sender again"
+                    ) from None
+        return None
+
+    def _pull(self, inlet: Any, kind: str) -> None:
+        """Emit samples until the connection ends."""
+        silence_s = self._settings.silence_s
+        heard_ns = time.monotonic_ns()
+        while not self._stop.is_set():
+            row, stamp_s = inlet.pull_sample(timeout=min(_STEP_S, silence_s / 4))
+            now_ns = time.monotonic_ns()
+            if stamp_s is None:
+                if now_ns - heard_ns > silence_s * 1e9:
+                    raise DeviceLostError(
+                        f"{self._name}: no sample for {silence_s:g} s: start streaming in the "
+                        "camera software"
+                    )
+                continue
+            heard_ns = now_ns
+            rows, stamps_s = inlet.pull_chunk(timeout=0.0, max_samples=_MOST_SAMPLES)
+            data = encode_samples(kind, [stamp_s, *stamps_s], [row, *rows])
+            self._call(self._take, now_ns, data)
+
+    def _compare(self, lsl: Any, inlet: Any) -> None:
+        """Emit every new comparison of the clocks."""
+        last_s: float | None = None
+        while not self._stop.is_set():
+            trip = compare_clocks(lsl, inlet, _STEP_S)
+            if trip is not None and trip.remote_s != last_s:
+                last_s = trip.remote_s
+                self._call(self._take, time.monotonic_ns(), encode_round_trip(trip))
+            self._stop.wait(_COMPARE_S if trip is not None else _STEP_S)

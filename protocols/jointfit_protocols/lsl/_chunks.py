@@ -1,0 +1,178 @@
+"""Chunks of one stream: bytes to messages, and messages to bytes.
+
+A chunk is the number of length bytes (1, 4 or 8), the length in them, a 16-bit tag and content,
+little-endian (https://github.com/sccn/xdf/wiki/Specifications). Tag 2 is the description of the
+stream, tag 3 samples. XDF stores the result of a clock comparison without its uncertainty;
+`RoundTrip` has both and a tag of its own, which readers of XDF skip.
+
+Invariant: one call of `LslCodec.feed` receives whole chunks, as a datagram. It never raises. A
+length or count that does not agree with the bytes discards the rest of the datagram.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.lsl._description import FORMATS, StreamDescription, parse_description
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+_HEADER, _SAMPLES, _ROUND_TRIP = 2, 3, 0x4A46
+_STREAM = 1
+"""Number of the only stream."""
+_LENGTHS = {1: struct.Struct("<B"), 4: struct.Struct("<I"), 8: struct.Struct("<Q")}
+_START = struct.Struct("<HI")
+"""Tag, and number of the stream."""
+_TRIP = struct.Struct("<qqd")
+_STAMPED = 8
+"""Marks a sample with a time stamp; its number of bytes."""
+
+
+class Samples(NamedTuple):
+    """Samples that were received together."""
+
+    stamps_s: tuple[float, ...]
+    """Time stamps as sent, s, clock of the sender."""
+    values: tuple[tuple[float, ...], ...]
+    """One row of `StreamDescription.channel_count` numbers for each stamp."""
+
+
+class RoundTrip(NamedTuple):
+    """One comparison of the clock of the sender with that of this host."""
+
+    sent_ns: int
+    """Request, CLOCK_MONOTONIC, ns."""
+    received_ns: int
+    """Reply, CLOCK_MONOTONIC, ns."""
+    remote_s: float
+    """Clock of the sender in the middle, s."""
+
+
+LslMessage = StreamDescription | Samples | RoundTrip
+
+
+class LslCodec:
+    """Decodes the chunks of one stream.
+
+    Attributes
+    ----------
+    description : StreamDescription or None
+        The latest description; without one, samples cannot be decoded.
+    """
+
+    def __init__(self) -> None:
+        self.description: StreamDescription | None = None
+        self._row: struct.Struct | None = None
+        self.messages = 0
+        """Samples and other well-formed chunks so far."""
+        self.discarded = 0
+        """Bytes that belong to no chunk so far."""
+        self.undescribed = 0
+        """Chunks with samples before a description so far."""
+
+    def feed(self, data: bytes) -> list[LslMessage | CorruptBytes]:
+        """Return the messages of whole chunks."""
+        out: list[LslMessage | CorruptBytes] = []
+        at = 0
+        while at < len(data):
+            found = _content(data, at)
+            message = found if isinstance(found, str) else self._message(*found[:2])
+            if isinstance(found, str) or isinstance(message, str):
+                self.discarded += len(data) - at
+                reason = found if isinstance(found, str) else str(message)
+                out.append(CorruptBytes(len(data) - at, reason))
+                return out
+            self.messages += len(message.stamps_s) if isinstance(message, Samples) else 1
+            if message is not None:
+                out.append(message)
+            at = found[2]
+        return out
+
+    def _message(self, tag: int, content: memoryview) -> LslMessage | str | None:
+        """Return the message of a chunk, the reason why it is corrupt, or None to skip it."""
+        if tag == _HEADER:
+            description = parse_description(bytes(content))
+            if not isinstance(description, str):
+                self.description = description
+                code = FORMATS.get(description.channel_format)
+                count = description.channel_count
+                self._row = None if code is None else struct.Struct(f"<Bd{count}{code}")
+            return description
+        if tag == _ROUND_TRIP:
+            if len(content) != _TRIP.size:
+                return f"round trip of {len(content)} bytes"
+            return RoundTrip(*_TRIP.unpack(content))
+        return self._samples(content) if tag == _SAMPLES else None
+
+    def _samples(self, content: memoryview) -> Samples | str | None:
+        if self._row is None:
+            self.undescribed += 1
+            return None
+        size = content[0] if content else 0
+        start = 1 + size
+        if size not in _LENGTHS or start > len(content):
+            return "samples without their number"
+        # Compared before anything is allocated.
+        count = _LENGTHS[size].unpack_from(content, 1)[0]
+        if count * self._row.size != len(content) - start:
+            return f"{count} samples in {len(content) - start} bytes"
+        rows = tuple(self._row.iter_unpack(content[start:]))
+        if any(row[0] != _STAMPED for row in rows):
+            return "sample without a time stamp"
+        return Samples(tuple(row[1] for row in rows), tuple(row[2:] for row in rows))
+
+
+def encode_description(xml: str) -> bytes:
+    """Return the chunk of a description."""
+    return _chunk(_HEADER, xml.encode("utf-8", "replace"))
+
+
+def encode_samples(
+    channel_format: str, stamps_s: Sequence[float], values: Sequence[Sequence[float]]
+) -> bytes:
+    """Return the chunk of samples.
+
+    Parameters
+    ----------
+    channel_format : str
+        A key of `FORMATS`.
+    stamps_s : sequence of float
+        Time stamps as sent, s.
+    values : sequence of sequences of float
+        One row for each stamp.
+    """
+    row = struct.Struct(f"<Bd{len(values[0]) if values else 0}{FORMATS[channel_format]}")
+    packed = (row.pack(_STAMPED, t, *one) for t, one in zip(stamps_s, values, strict=True))
+    return _chunk(_SAMPLES, _length(len(stamps_s)) + b"".join(packed))
+
+
+def encode_round_trip(trip: RoundTrip) -> bytes:
+    """Return the chunk of a clock comparison."""
+    return _chunk(_ROUND_TRIP, _TRIP.pack(*trip))
+
+
+def _content(data: bytes, at: int) -> tuple[int, memoryview, int] | str:
+    """Return tag, content and end of the chunk at `at`; or why there is none."""
+    size = data[at]
+    start = at + 1 + size
+    if size not in _LENGTHS or start + _START.size > len(data):
+        return "no XDF chunk"
+    length = _LENGTHS[size].unpack_from(data, at + 1)[0]
+    if not _START.size <= length <= len(data) - start:
+        return f"chunk of {length} bytes in {len(data) - start}"
+    tag, stream = _START.unpack_from(data, start)
+    if stream != _STREAM:
+        return f"chunk of stream {stream}"
+    return tag, memoryview(data)[start + _START.size : start + length], start + length
+
+
+def _chunk(tag: int, content: bytes) -> bytes:
+    return _length(len(content) + _START.size) + _START.pack(tag, _STREAM) + content
+
+
+def _length(number: int) -> bytes:
+    size = 1 if number < 1 << 8 else 4 if number < 1 << 32 else 8
+    return bytes([size]) + _LENGTHS[size].pack(number)

@@ -1,0 +1,144 @@
+"""Chunks of LSL streams: an independent reader, round trips, hostile lengths, random bytes."""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.lsl import (
+    FORMATS,
+    Channel,
+    LslCodec,
+    RoundTrip,
+    Samples,
+    StreamDescription,
+    encode_description,
+    encode_round_trip,
+    encode_samples,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+CHANNEL = (
+    "<channel><label>T1_X</label><marker>T1</marker><type>PositionX</type>"
+    "<unit>meters</unit></channel>"
+)
+
+
+def xml(count: int = 3, kind: str = "double64", channels: str = "") -> str:
+    return (
+        f"<?xml version='1.0'?><info><name>Cameras</name><type>MoCap</type><channel_count>{count}"
+        f"</channel_count><nominal_srate>100</nominal_srate><channel_format>{kind}</channel_format>"
+        f"<source_id>s1</source_id><desc><channels>{channels}</channels></desc></info>"
+    )
+
+
+def described(count: int = 3, kind: str = "double64") -> LslCodec:
+    codec = LslCodec()
+    (found,) = codec.feed(encode_description(xml(count, kind)))
+    assert isinstance(found, StreamDescription)
+    return codec
+
+
+def test_a_description_has_stream_and_channels() -> None:
+    (found,) = LslCodec().feed(encode_description(xml(1, channels=CHANNEL)))
+    assert isinstance(found, StreamDescription)
+    assert (found.name, found.type, found.rate_hz, found.source_id) == (
+        "Cameras",
+        "MoCap",
+        100.0,
+        "s1",
+    )
+    assert found.channels == (Channel("T1_X", "T1", "", "PositionX", "meters"),)
+
+
+@given(st.data(), st.sampled_from(["double64", "float32", "int32"]), st.integers(1, 9))
+def test_samples_are_read_as_written(data: st.DataObject, kind: str, count: int) -> None:
+    values = {
+        "double64": st.floats(),
+        "float32": st.floats(width=32),
+        "int32": st.integers(-(2**31), 2**31 - 1),
+    }[kind]
+    rows = data.draw(st.lists(st.tuples(*(values,) * count), min_size=1, max_size=5))
+    stamps = data.draw(st.tuples(*(st.floats(allow_nan=False),) * len(rows)))
+    (found,) = described(count, kind).feed(encode_samples(kind, stamps, rows))
+    assert isinstance(found, Samples)
+    assert found.stamps_s == stamps
+    np.testing.assert_array_equal(found.values, rows)
+
+
+@given(st.integers(-(2**63), 2**63 - 1), st.integers(-(2**63), 2**63 - 1), st.floats())
+def test_round_trips_are_read_as_written(sent: int, received: int, remote_s: float) -> None:
+    (found,) = LslCodec().feed(encode_round_trip(RoundTrip(sent, received, remote_s)))
+    assert isinstance(found, RoundTrip)
+    assert (found.sent_ns, found.received_ns) == (sent, received)
+    assert struct.pack("<d", found.remote_s) == struct.pack("<d", remote_s)
+
+
+def test_an_independent_reader_of_xdf_reads_the_chunks(tmp_path: Path) -> None:
+    pyxdf = pytest.importorskip("pyxdf")
+    rows = np.random.default_rng(3).normal(size=(50, 3))
+    stamps = 100.0 + 0.01 * np.arange(50)
+    header = b"<info><version>1.0</version></info>"
+    content = b"XDF:" + bytes([1, len(header) + 2]) + struct.pack("<H", 1) + header
+    content += encode_description(xml())
+    for n in range(0, 50, 10):
+        part = slice(n, n + 10)
+        content += encode_samples("double64", stamps[part].tolist(), rows[part].tolist())
+        content += encode_round_trip(RoundTrip(1, 2, 100.0))
+    (tmp_path / "stream.xdf").write_bytes(content)
+
+    (stream,), _ = pyxdf.load_xdf(
+        tmp_path / "stream.xdf", synchronize_clocks=False, dejitter_timestamps=False
+    )
+    np.testing.assert_array_equal(stream["time_series"], rows)
+    np.testing.assert_array_equal(stream["time_stamps"], stamps)
+
+
+@given(st.binary(max_size=300))
+def test_random_bytes_are_discarded_and_counted(noise: bytes) -> None:
+    codec = described()
+    found = codec.feed(noise)
+    lost = sum(item.discarded for item in found if isinstance(item, CorruptBytes))
+    assert codec.discarded == lost <= len(noise)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        struct.pack("<HI", 3, 1) + b"\x08" + struct.pack("<Q", 2**62),
+        struct.pack("<HI", 3, 1) + b"\x04\xff\xff\xff\xff",
+        struct.pack("<HI", 3, 1) + b"\x05\x01",
+        struct.pack("<HI", 3, 7) + b"\x01\x00",
+        struct.pack("<HI", 2, 1) + b"<info><channel_count>99999999</channel_count></info>",
+        struct.pack("<HI", 2, 1) + b"<!DOCTYPE a [<!ENTITY b 'c'>]><info>&b;</info>",
+        struct.pack("<HI", 2, 1) + b"<info>" * 1000,
+    ],
+)
+def test_hostile_counts_are_rejected(content: bytes) -> None:
+    data = b"\x04" + struct.pack("<I", len(content)) + content
+    (found,) = described().feed(data)
+    assert isinstance(found, CorruptBytes)
+    assert found.discarded == len(data)
+
+
+def test_a_chunk_longer_than_its_datagram_is_rejected() -> None:
+    (found,) = described().feed(b"\x08" + struct.pack("<Q", 2**63) + b"\0" * 20)
+    assert isinstance(found, CorruptBytes)
+
+
+def test_samples_before_the_description_are_counted() -> None:
+    codec = LslCodec()
+    assert codec.feed(encode_samples("float32", [1.0], [[1.0]])) == []
+    assert codec.undescribed == 1
+
+
+def test_every_format_of_numbers_has_a_size() -> None:
+    assert {struct.calcsize(f"<{code}") for code in FORMATS.values()} == {1, 2, 4, 8}
