@@ -13,6 +13,7 @@ import orjson
 
 from jointfit_daemon.files.orientations import read_orientations_npz
 from jointfit_daemon.files.sessions._bids_motion import read_bids_session, write_bids_session
+from jointfit_daemon.files.sessions._dot_csv import is_dot_csv, read_dot_session
 from jointfit_daemon.files.sessions._foxglove import write_foxglove_session
 from jointfit_daemon.files.sessions._marker_files import (
     read_c3d_session,
@@ -142,6 +143,11 @@ def _read_npz_session(path: Path) -> SessionData:
     )
 
 
+def _read_csv_file(path: Path) -> SessionData:
+    """Return the session of a table of `jointfit export`, or of a file of a DOT sensor."""
+    return read_dot_session([path], path.stem) if is_dot_csv(path) else read_csv_session(path)
+
+
 def _read_text_session(path: Path) -> SessionData:
     if not is_mtb_text(path):
         raise MalformedFileError(
@@ -157,9 +163,12 @@ def _read_folder(path: Path) -> SessionData:
     texts = [file for file in sorted(path.glob("*.txt")) if is_mtb_text(file)]
     if texts:
         return read_mtb_session(texts, path.name)
+    dots = [file for file in sorted(path.glob("*.csv")) if is_dot_csv(file)]
+    if dots:
+        return read_dot_session(dots, path.name)
     raise MalformedFileError(
-        f"{path}: a folder without a Motion-BIDS data set (sub-01) and without text files of Xsens"
-        " programs: name a file"
+        f"{path}: a folder without a Motion-BIDS data set (sub-01) and without text or CSV files of"
+        " Xsens programs: name a file"
     )
 
 
@@ -168,7 +177,7 @@ _READERS: Mapping[str, Callable[[Path], SessionData]] = {
     ".c3d": read_c3d_session,
     ".sto": read_sto_session,
     ".mot": read_mot_session,
-    ".csv": read_csv_session,
+    ".csv": _read_csv_file,
     ".parquet": read_parquet_session,
     ".xdf": read_xdf_session,
     ".npz": _read_npz_session,
@@ -179,7 +188,7 @@ SESSION_SUFFIXES = tuple(_READERS)
 
 
 def read_session(path: Path) -> SessionData:
-    """Return the session of a file, by its extension, or of a folder (Motion-BIDS, Xsens text).
+    """Return the session of a file, by its extension, or of a folder (Motion-BIDS, Xsens).
 
     Raises
     ------

@@ -13,6 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from jointfit_daemon.files.sessions._xsens_columns import (
+    axes_columns,
+    orientation_columns,
+    unwrapped,
+)
 from jointfit_daemon.files.text import (
     MalformedFileError,
     cells_of,
@@ -22,7 +27,6 @@ from jointfit_daemon.files.text import (
     separator_of,
     strip_trailing_empty,
 )
-from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.session_data import SensorSeries, SessionData
 
 if TYPE_CHECKING:
@@ -35,11 +39,6 @@ _RATE = re.compile(r"Update Rate:\s*([0-9.]+)\s*Hz", re.IGNORECASE)
 _COUNTER, _SAMPLE_TIME = "PacketCounter", "SampleTimeFine"
 _COUNTER_TURN, _SAMPLE_TIME_TURN = 1 << 16, 1 << 32
 _TICK_S = 1e-4
-_QUATERNIONS = (
-    ("Quat_q0", "Quat_q1", "Quat_q2", "Quat_q3"),
-    ("Quat_w", "Quat_x", "Quat_y", "Quat_z"),
-)
-_EULER = ("Roll", "Pitch", "Yaw")
 _SERIAL = re.compile(r"([0-9A-F]{8})$", re.IGNORECASE)
 
 
@@ -90,8 +89,8 @@ def _read_sensor(path: Path) -> tuple[float, SensorSeries]:
     rate = _RATE.search("\n".join(lines[:at]))
     start_s, t_s = _times(path, columns, None if rate is None else float(rate[1]))
     require_times(path, t_s)
-    orientation = _orientation(columns, len(t_s))
-    signals = [_vector(columns, f"{word}_{{}}") for word in ("Gyr", "Acc", "Mag")]
+    orientation = orientation_columns(columns, len(t_s))
+    signals = [axes_columns(columns, f"{word}_{{}}") for word in ("Gyr", "Acc", "Mag")]
     if np.isnan(orientation).all() and all(signal is None for signal in signals):
         raise MalformedFileError(
             f"{path}: found the columns {', '.join(names[:8])}, expected an orientation (Quat, Mat"
@@ -105,7 +104,7 @@ def _times(path: Path, columns: Mapping[str, Array], rate_hz: float | None) -> t
     """Return the first instant on its counter, s, and the instants of the rows since then, s."""
     ticks = columns.get(_SAMPLE_TIME)
     if ticks is not None and len(ticks) and np.isfinite(ticks).all():
-        return float(ticks[0]) * _TICK_S, _unwrapped(ticks, _SAMPLE_TIME_TURN) * _TICK_S
+        return float(ticks[0]) * _TICK_S, unwrapped(ticks, _SAMPLE_TIME_TURN) * _TICK_S
     counter = columns.get(_COUNTER)
     if counter is None or rate_hz is None or not rate_hz > 0.0:
         raise MalformedFileError(
@@ -113,40 +112,4 @@ def _times(path: Path, columns: Mapping[str, Array], rate_hz: float | None) -> t
             " the recording again, with its header"
         )
     first = float(counter[0]) / rate_hz if len(counter) else 0.0
-    return first, _unwrapped(counter, _COUNTER_TURN) / rate_hz
-
-
-def _unwrapped(counter: Array, turn: int) -> Array:
-    """Return a counter since its first row, without its turns."""
-    # A step beyond half a turn is one in the other direction: rows in disorder run backwards.
-    steps = np.mod(np.diff(counter) + turn / 2, turn) - turn / 2
-    counted: Array = np.concatenate([[0.0], np.cumsum(steps)])[: len(counter)]
-    return counted
-
-
-def _orientation(columns: Mapping[str, Array], count: int) -> Array:
-    """Return q_world_sensor, shape (count, 4); NaN where the file has none."""
-    for names in _QUATERNIONS:
-        if all(name in columns for name in names):
-            return rotation.normalize(np.column_stack([columns[name] for name in names]))
-    cells = [f"Mat[{row}][{column}]" for row in (1, 2, 3) for column in (1, 2, 3)]
-    if all(cell in columns for cell in cells):
-        matrices = np.column_stack([columns[cell] for cell in cells]).reshape(-1, 3, 3)
-        known = np.isfinite(matrices).all(axis=(1, 2))
-        q = np.full((count, 4), np.nan)
-        q[known] = rotation.from_matrix(matrices[known])
-        return q
-    if all(name in columns for name in _EULER):
-        # Xsens: R = Rz(yaw) Ry(pitch) Rx(roll), degrees.
-        turns = [
-            rotation.exp(np.deg2rad(columns[name])[:, None] * np.eye(3)[k])
-            for k, name in enumerate(_EULER)
-        ]
-        return rotation.multiply(turns[2], rotation.multiply(turns[1], turns[0]))
-    return np.full((count, 4), np.nan)
-
-
-def _vector(columns: Mapping[str, Array], pattern: str) -> Array | None:
-    parts = [columns.get(pattern.format(axis)) for axis in "XYZ"]
-    known = [part for part in parts if part is not None]
-    return np.column_stack(known) if len(known) == 3 else None  # noqa: PLR2004 - three axes
+    return first, unwrapped(counter, _COUNTER_TURN) / rate_hz

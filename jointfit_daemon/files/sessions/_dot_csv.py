@@ -1,0 +1,181 @@
+"""CSV files of Xsens / Movella DOT sensors: one sensor in each file, written by app or exporter.
+
+Lines ``NAME:,VALUE`` precede the column names: ``DeviceTag``, ``OutputRate`` and ``SyncStatus`` are
+read. ``SampleTimeFine`` numbers the rows: 32 bit, 1 µs, so it turns after 71.6 minutes. Angular
+rates are in degrees a second. The world is east, north, up; quaternions map sensor to world. Modes
+without rates have increments of a row, ``dq`` and ``dv``, which become mean rates over its period.
+Source: header and columns as in published files and programs; no recording of our own.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.files.sessions._xsens_columns import (
+    axes_columns,
+    orientation_columns,
+    unwrapped,
+)
+from jointfit_daemon.files.text import (
+    MalformedFileError,
+    cells_of,
+    read_lines,
+    require_times,
+    rows_of_numbers,
+    separator_of,
+    strip_trailing_empty,
+)
+from jointfit_daemon.kinematics import rotation
+from jointfit_daemon.session_data import SensorSeries, SessionData
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from jointfit_daemon.arrays import Array
+
+_TIME, _COUNTER = "SampleTimeFine", "PacketCounter"
+_TURN = 1 << 32
+_TICK_S = 1e-6
+_HEADER_LINES = 40
+"""Lines in which the column names must be found."""
+_HZ = re.compile(r"([0-9.]+)\s*Hz", re.IGNORECASE)
+_WORDS = ("Quat", "Euler", "FreeAcc", "Acc", "Gyr", "Mag", "dq", "dv", "Status")
+
+
+class _DotFile(NamedTuple):
+    """One sensor, and what its header states."""
+
+    first_ticks: float
+    synchronized: bool
+    sensor: SensorSeries
+
+
+def is_dot_csv(path: Path) -> bool:
+    """Return whether a CSV file is that of a DOT sensor."""
+    with path.open("rb") as file:
+        head = file.read(8192).decode("utf-8", "replace")
+    return any(_is_names(line) for line in head.splitlines()[:_HEADER_LINES])
+
+
+def read_dot_session(files: Sequence[Path], name: str) -> SessionData:
+    """Return the sensors of one recording, from one CSV file for each sensor.
+
+    Files of synchronized sensors have a common time; the earliest row of all is at 0 s. Otherwise
+    every sensor begins at 0 s. The id of a sensor is its ``DeviceTag``, or the name of the file.
+
+    Raises
+    ------
+    MalformedFileError
+        Without column names, without times, or without any signal.
+    """
+    read = [_read_sensor(path) for path in files]
+    together = len(read) == 1 or all(one.synchronized for one in read)
+    starts_s = np.zeros(len(read))
+    if together:
+        # The counter may turn between the starts of two sensors.
+        ticks = np.array([one.first_ticks for one in read])
+        ahead = np.mod(ticks - ticks[0] + _TURN / 2, _TURN) - _TURN / 2
+        starts_s = (ahead - ahead.min()) * _TICK_S
+
+    tags = [one.sensor.id for one in read]
+    names = tags if len(set(tags)) == len(tags) else [path.stem for path in files]
+    description = {"files": ", ".join(path.name for path in files)}
+    if not together:
+        description["synchronization"] = (
+            "SyncStatus of the files is not Synced: every sensor begins at 0 s"
+        )
+    return SessionData(
+        name,
+        sensors=tuple(
+            replace(one.sensor, id=sensor_id, t_s=one.sensor.t_s + start_s)
+            for one, sensor_id, start_s in zip(read, names, starts_s, strict=True)
+        ),
+        description=description,
+    )
+
+
+def _is_names(line: str) -> bool:
+    """Return whether a line has the column names."""
+    cells = cells_of(line, separator_of(line))
+    return _TIME in cells and any(cell.startswith(_WORDS) for cell in cells)
+
+
+def _read_sensor(path: Path) -> _DotFile:
+    lines = read_lines(path)
+    at = next((k for k, line in enumerate(lines[:_HEADER_LINES]) if _is_names(line)), None)
+    if at is None:
+        raise MalformedFileError(
+            f"{path}: no column {_TIME} in the first {_HEADER_LINES} lines: export the recording of"
+            " the DOT sensor again, with its sample time"
+        )
+    separator = separator_of(lines[at])
+    header = _header(lines[:at])
+    names = strip_trailing_empty(cells_of(lines[at], separator))
+    rows = rows_of_numbers(path, enumerate(lines[at + 1 :], at + 2), separator, len(names))
+    columns = {name: rows[:, k] for k, name in enumerate(names)}
+
+    ticks = columns[_TIME]
+    if not np.isfinite(ticks).all():
+        raise MalformedFileError(
+            f"{path}: rows without {_TIME}: export the recording again, all of them have one"
+        )
+    t_s = unwrapped(ticks, _TURN) * _TICK_S
+    require_times(path, t_s)
+
+    orientation = orientation_columns(columns, len(t_s))
+    rate, force = _rate_and_force(columns, _period_s(header, t_s))
+    magnetic = axes_columns(columns, "Mag_{}")
+    if np.isnan(orientation).all() and rate is force is magnetic is None:
+        raise MalformedFileError(
+            f"{path}: found the columns {', '.join(names[:8])}, expected an orientation (Quat or"
+            " Euler), Gyr, Acc, dq and dv, or Mag: record in another measurement mode"
+        )
+    tag = header.get("devicetag") or path.stem
+    sensor = SensorSeries(tag, "", t_s, orientation, rate, force, magnetic)
+    first = float(ticks[0]) if len(ticks) else 0.0
+    return _DotFile(first, header.get("syncstatus", "").lower() == "synced", sensor)
+
+
+def _header(lines: Sequence[str]) -> dict[str, str]:
+    """Return the values before the column names, by name in small letters."""
+    found = {}
+    for line in lines:
+        name, mark, value = line.partition(":")
+        if mark:
+            found[name.strip().lower()] = value.strip(" ,;\t")
+    return found
+
+
+def _period_s(header: Mapping[str, str], t_s: Array) -> float:
+    """Return the period of the increments, s: lost rows do not lengthen it."""
+    hz = _HZ.search(header.get("outputrate", ""))
+    try:
+        rate_hz = float(hz[1]) if hz else 0.0
+    except ValueError:
+        rate_hz = 0.0
+    if rate_hz > 0.0:
+        return 1.0 / rate_hz
+    return float(np.median(np.diff(t_s))) if len(t_s) > 1 else np.nan
+
+
+def _rate_and_force(
+    columns: Mapping[str, Array], period_s: float
+) -> tuple[Array | None, Array | None]:
+    """Return angular velocity, rad/s, and specific force, m/s², both in sensor axes."""
+    rate = axes_columns(columns, "Gyr_{}")
+    if rate is not None:
+        rate = np.deg2rad(rate)
+    elif all(f"dq_{axis}" in columns for axis in "WXYZ"):
+        turns = np.column_stack([columns[f"dq_{axis}"] for axis in "WXYZ"])
+        rate = rotation.log(rotation.normalize(turns)) / period_s
+
+    # FreeAcc is in the world and without gravity, so it is no specific force.
+    force = axes_columns(columns, "Acc_{}")
+    if force is None and all(f"dv[{k}]" in columns for k in (1, 2, 3)):
+        force = np.column_stack([columns[f"dv[{k}]"] for k in (1, 2, 3)]) / period_s
+    return rate, force
