@@ -1,4 +1,7 @@
-"""Parts that drivers of IMUs on a serial line share: connection keys and stamps of messages."""
+"""Parts that drivers of IMUs on a serial line share.
+
+These are the keys of the connection, the stamps of messages, and errors of the configuration.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,14 @@ from typing import Literal
 
 from pydantic import Field, field_validator
 
-from jointfit_daemon.driver import FASTEST_BAUD, SLOWEST_BAUD, ImuSettings, port_path_fault
+from jointfit_daemon.driver import (
+    FASTEST_BAUD,
+    SLOWEST_BAUD,
+    DeviceLostError,
+    DeviceMisconfiguredError,
+    ImuSettings,
+    port_path_fault,
+)
 
 _BITS = 10
 """Bits of one byte on the line, 8N1."""
@@ -16,6 +26,10 @@ _SILENCE_FLOOR_NS = 250_000_000
 At high speed the duration of 1.5 messages is so short that a host that reads late would look like a
 silent line.
 """
+_RATE_TOLERANCE = 1e-3
+"""Largest relative difference between a requested rate and the rate of a device."""
+_RATES_SHOWN = 12
+"""Rates that a message lists."""
 
 
 class SerialImuSettings(ImuSettings):
@@ -35,6 +49,42 @@ class SerialImuSettings(ImuSettings):
     def line_baud(self) -> int | None:
         """Speed that delays bytes, baud; None for USB."""
         return self.baud if self.transport == "uart" else None
+
+    def require_line_speed(self, speed: str = "the speed of the device") -> None:
+        """Raise DeviceMisconfiguredError if the data need more bits per second than `baud`.
+
+        `speed` is the setting of the device that corresponds to `baud`.
+        """
+        needs = self.serial_bits_per_s
+        if needs is not None and needs > self.baud:
+            raise DeviceMisconfiguredError(
+                f"{self.port}: {self.rate_hz:g} Hz need {needs:g} bit/s, baud = {self.baud}: "
+                f"lower `rate_hz`, or raise {speed} and `baud`"
+            )
+
+    def rate_divisor(self, base_hz: int, model: str) -> int:
+        """Return the divisor of the rate of a device that gives `rate_hz`.
+
+        Raises
+        ------
+        DeviceMisconfiguredError
+            `rate_hz` is no whole fraction of `base_hz`.
+        """
+        divisor = round(base_hz / self.rate_hz)
+        if divisor < 1 or abs(base_hz / divisor - self.rate_hz) > _RATE_TOLERANCE * self.rate_hz:
+            rates = [base_hz / k for k in range(1, base_hz + 1) if base_hz % k == 0]
+            shown = ", ".join(f"{rate:g}" for rate in rates[:_RATES_SHOWN])
+            raise DeviceMisconfiguredError(
+                f"{self.port}: {self.rate_hz:g} Hz is no whole fraction of the {base_hz} Hz of "
+                f"{model}: set rate_hz to one of {shown}"
+            )
+        return divisor
+
+    def stopped_answering(self) -> DeviceLostError:
+        """Return the error for a device that stopped answering during its configuration."""
+        return DeviceLostError(
+            f"{self.port}: stopped answering during configuration: check its power and cable"
+        )
 
     @field_validator("port")
     @classmethod

@@ -5,7 +5,7 @@ Invariant: a device that answers at another speed continues as before, and nothi
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 
@@ -19,6 +19,51 @@ _LISTEN_S = 0.15
 """Time at each speed of the search, s."""
 _RESUME_S = 0.5
 """Longest wait for the device to continue, s."""
+
+
+class SpeedConversation(Protocol):
+    """Conversation with a device whose speed is unknown."""
+
+    @property
+    def understood(self) -> int:
+        """Messages received since the reset."""
+
+    def reset(self) -> None:
+        """Discard received bytes."""
+
+
+async def find_other_speed(
+    port: SerialPort,
+    conversation: SpeedConversation,
+    speeds: Sequence[int],
+    baud: int,
+    answers: Callable[[], Awaitable[bool]],
+) -> int | None:
+    """Return the speed at which the device answers or sends messages; None if there is none.
+
+    Parameters
+    ----------
+    port, conversation
+        Open port, and the conversation with the device.
+    speeds
+        Speeds to search, bit/s.
+    baud
+        Configured speed, which is not searched.
+    answers
+        Returns whether the device answers at the speed of the port. The device then continues to
+        stream as before.
+    """
+    for speed in speeds:
+        if speed == baud:
+            continue
+        try:
+            port.set_baud(speed)
+        except DeviceMisconfiguredError:  # the port does not support it
+            continue
+        conversation.reset()
+        if await answers() or conversation.understood:
+            return speed
+    return None
 
 
 async def explain_silence(
@@ -64,23 +109,19 @@ async def explain_silence(
             f"{port.path}: streams but does not answer: check the wire from host to device"
         )
 
-    for speed in speeds if hunt or received else ():
-        if speed == baud:
-            continue
-        try:
-            port.set_baud(speed)
-        except DeviceMisconfiguredError:  # the port does not support it
-            continue
-        conversation.reset()
-        answered = await pause(_LISTEN_S)
-        if answered is not None:  # wait for the reply: closing the port discards unsent bytes
+    async def answers() -> bool:
+        answered = await pause(_LISTEN_S) is not None
+        if answered:  # wait for the reply: closing the port discards unsent bytes
             await resume(_RESUME_S)
-        if answered is not None or conversation.understood:
-            raise DeviceMisconfiguredError(
-                f"{port.path}: {baud} baud, but no message can be decoded; "
-                f"the device answers at {speed}: set baud = {speed}"
-            )
+        return answered
 
+    searched = speeds if hunt or received else ()
+    speed = await find_other_speed(port, conversation, searched, baud, answers)
+    if speed is not None:
+        raise DeviceMisconfiguredError(
+            f"{port.path}: {baud} baud, but no message can be decoded; "
+            f"the device answers at {speed}: set baud = {speed}"
+        )
     if not received:
         raise DeviceLostError(
             f"{port.path}: silent: check its power, and that TX and RX are not swapped"

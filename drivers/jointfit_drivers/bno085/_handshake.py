@@ -159,9 +159,7 @@ async def _interval(
     reply = await conversation.control(request, tries=3)
     found = None if reply is None else decode_interval(reply)
     if found is None:
-        raise DeviceLostError(
-            f"{settings.port}: stopped answering during configuration: check its power and cable"
-        )
+        raise settings.stopped_answering()
     return found[1]
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, NoReturn
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_drivers.lpms._conversation import LpBusConversation
 from jointfit_drivers.lpms._decoder import TEXT_REMEDY, is_text
+from jointfit_drivers.silence import find_other_speed
 from jointfit_protocols.lpms.configuration import (
     TABLES,
     LpmsCommand,
@@ -77,12 +78,7 @@ class LpmsHandshake:
             accept the settings.
         """
         settings = self._settings
-        needs = settings.serial_bits_per_s
-        if needs is not None and needs > settings.baud:
-            raise DeviceMisconfiguredError(
-                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
-                f"{settings.baud}: lower `rate_hz`, or raise the speed of the sensor and `baud`"
-            )
+        settings.require_line_speed("the speed of the sensor")
 
         self._conversation.reset()
         if not await self._conversation.enter_command_mode():
@@ -167,9 +163,7 @@ class LpmsHandshake:
         """Start the stream and wait for its first data packet."""
         started = await self._conversation.start_stream()
         if started is None:
-            raise DeviceLostError(
-                f"{self._who}: stopped answering during configuration: check its power and cable"
-            )
+            raise self._settings.stopped_answering()
         if not started:
             raise DeviceMisconfiguredError(
                 f"{self._who}: refuses to stream: change `rate_hz` or `baud`"
@@ -231,20 +225,16 @@ class LpmsHandshake:
 
     async def _other_speed(self) -> int | None:
         """Return the speed at which the sensor answers; it continues to stream as before."""
-        for baud in LINE_SPEEDS:
-            if baud == self._settings.baud:
-                continue
-            try:
-                self._port.set_baud(baud)
-            except DeviceMisconfiguredError:  # the port does not support it
-                continue
-            self._conversation.reset()
-            if await self._conversation.enter_command_mode(tries=1, wait_s=_LISTEN_S):
+
+        async def answers() -> bool:
+            entered = await self._conversation.enter_command_mode(tries=1, wait_s=_LISTEN_S)
+            if entered:
                 await self._conversation.start_stream()
-                return baud
-            if self._conversation.ids:
-                return baud
-        return None
+            return entered
+
+        return await find_other_speed(
+            self._port, self._conversation, LINE_SPEEDS, self._settings.baud, answers
+        )
 
 
 def _differing(found: LpmsConfiguration, wanted: LpmsConfiguration) -> LpmsConfiguration:

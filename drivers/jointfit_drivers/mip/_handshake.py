@@ -8,9 +8,9 @@ raises `DeviceLostError`, any other `DeviceMisconfiguredError`; the device then 
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_drivers.mip._conversation import MipConversation, MipReply
 from jointfit_drivers.silence import explain_silence
 from jointfit_protocols.mip import commands
@@ -33,8 +33,6 @@ _READ = bytes((Function.READ,))
 _FORMAT_OF_ANY_SET = CommandSet.SETUP << 8 | Setup.FORMAT
 _LEGACY_SERIES = ("GX3", "GX4", "GX5", "CX5", "CV5", "RQ1", "GQ4")
 """Parts of the names of legacy models."""
-_RATES_SHOWN = 12
-"""Rates that a message lists."""
 
 
 class MipHandshake:
@@ -74,12 +72,7 @@ class MipHandshake:
             at this rate.
         """
         settings = self._settings
-        needs = settings.serial_bits_per_s
-        if needs is not None and needs > settings.baud:
-            raise DeviceMisconfiguredError(
-                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
-                f"{settings.baud}: lower `rate_hz`, or raise the speed of the device and `baud`"
-            )
+        settings.require_line_speed()
 
         self._conversation.reset()
         if await self._conversation.command(CommandSet.BASE, Base.IDLE) is None:
@@ -129,7 +122,7 @@ class MipHandshake:
                 CommandSet.SETUP, Setup.STARTUP_SETTINGS, save, wait_s=_SAVE_S
             )
             if saved is None:
-                self._lose()
+                raise self._settings.stopped_answering()
             self._refuse(saved, "refuses to save its settings", "persist = false")
 
     async def _descriptors(self) -> frozenset[int]:
@@ -182,15 +175,7 @@ class MipHandshake:
                 f"0x{self._required.data_set:02X}: set {self._alternatives()}"
             )
 
-        rate_hz = self._settings.rate_hz
-        decimation = round(base_hz / rate_hz)
-        if decimation < 1 or abs(base_hz / decimation - rate_hz) > 1e-3 * rate_hz:
-            rates = [base_hz / k for k in range(1, base_hz + 1) if base_hz % k == 0]
-            shown = ", ".join(f"{rate:g}" for rate in rates[:_RATES_SHOWN])
-            raise DeviceMisconfiguredError(
-                f"{self._who}: {rate_hz:g} Hz is no whole fraction of the {base_hz} Hz of "
-                f"{self._model}: set rate_hz to one of {shown}"
-            )
+        decimation = self._settings.rate_divisor(base_hz, self._model)
         return tuple(Output(field, decimation) for field in fields)
 
     async def _ensure_format(self, stream: StreamCommands, wanted: tuple[Output, ...]) -> bool:
@@ -249,13 +234,8 @@ class MipHandshake:
         """Return the reply to a command that the device must answer; it may be a refusal."""
         reply = await self._conversation.command(command_set, command, data)
         if reply is None:
-            self._lose()
+            raise self._settings.stopped_answering()
         return reply
-
-    def _lose(self) -> NoReturn:
-        raise DeviceLostError(
-            f"{self._who}: stopped answering during configuration: check its power and cable"
-        )
 
     def _refuse(self, reply: MipReply, what: str, change: str = "`family`") -> None:
         if not reply.is_ok:

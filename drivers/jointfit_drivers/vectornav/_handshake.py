@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_drivers.serial_conversation import SerialConversation
 from jointfit_drivers.silence import explain_silence
 from jointfit_protocols.vectornav import (
@@ -42,8 +42,6 @@ _REPLY_S, _STORE_S = 0.5, 3.0
 _IMU_RATES = {"VN-3": 400}
 _IMU_RATE = 800
 """Rate of the IMU, Hz, by the beginning of the model name, and of all other models."""
-_RATES_SHOWN = 12
-"""Rates that a message lists."""
 
 
 class VectorNavHandshake:
@@ -82,12 +80,7 @@ class VectorNavHandshake:
             at this rate.
         """
         settings = self._settings
-        needs = settings.serial_bits_per_s
-        if needs is not None and needs > settings.baud:
-            raise DeviceMisconfiguredError(
-                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
-                f"{settings.baud}: lower `rate_hz`, or raise the speed of the device and `baud`"
-            )
+        settings.require_line_speed()
 
         self._conversation.reset()
         if await self._ask("VNASY,0", tries=3) is None:
@@ -168,17 +161,8 @@ class VectorNavHandshake:
 
     def _divisor(self) -> int:
         """Return the divisor of the requested rate."""
-        rate_hz = self._settings.rate_hz
         imu_hz = next((hz for name, hz in _IMU_RATES.items() if name in self._model), _IMU_RATE)
-        divisor = round(imu_hz / rate_hz)
-        if divisor < 1 or abs(imu_hz / divisor - rate_hz) > 1e-3 * rate_hz:
-            rates = [imu_hz / k for k in range(1, imu_hz + 1) if imu_hz % k == 0]
-            shown = ", ".join(f"{rate:g}" for rate in rates[:_RATES_SHOWN])
-            raise DeviceMisconfiguredError(
-                f"{self._who}: {rate_hz:g} Hz is no whole fraction of the {imu_hz} Hz of "
-                f"{self._model}: set rate_hz to one of {shown}"
-            )
-        return divisor
+        return self._settings.rate_divisor(imu_hz, self._model)
 
     async def _ask(
         self, request: str, *, tries: int, wait_s: float = _REPLY_S
@@ -202,9 +186,7 @@ class VectorNavHandshake:
         """Return the reply to a request that the device must answer; it may be an error."""
         reply = await self._ask(request, tries=3, wait_s=wait_s)
         if reply is None:
-            raise DeviceLostError(
-                f"{self._who}: stopped answering during configuration: check its power and cable"
-            )
+            raise self._settings.stopped_answering()
         return reply
 
     def _refuse(self, reply: TextMessage, what: str, change: str = "`rate_hz` or `baud`") -> None:

@@ -102,12 +102,7 @@ class WitMotionHandshake:
             frames even on request.
         """
         settings = self._settings
-        needs = settings.serial_bits_per_s
-        if needs is not None and needs > settings.baud:
-            raise DeviceMisconfiguredError(
-                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
-                f"{settings.baud}: lower `rate_hz`, or raise the speed of the device and `baud`"
-            )
+        settings.require_line_speed()
 
         self._flush()  # system and bridge buffer a few kilobytes of an earlier run
         heard = await self._listen(_LISTEN_S, self._is_complete)

@@ -12,6 +12,7 @@ import logging
 from typing import TYPE_CHECKING, NoReturn
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.silence import find_other_speed
 from jointfit_drivers.xbus import _sync_lines
 from jointfit_drivers.xbus._conversation import OUTSTANDING_S, XbusConversation
 from jointfit_drivers.xbus._required_outputs import ORIENTATION, required_outputs
@@ -78,12 +79,7 @@ class XbusHandshake:
             differs and may not be written.
         """
         settings = self._settings
-        needs = settings.serial_bits_per_s
-        if needs is not None and needs > settings.baud:
-            raise DeviceMisconfiguredError(
-                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
-                f"{settings.baud}: lower `rate_hz`, or raise the speed of the device and `baud`"
-            )
+        settings.require_line_speed()
 
         self._conversation.reset()
         entered = await self._conversation.enter_config(
@@ -119,9 +115,7 @@ class XbusHandshake:
         """Return the reply to a request that the device must answer; it may be an error."""
         reply = await self._conversation.request(mid, data, tries=3)
         if reply is None:
-            raise DeviceLostError(
-                f"{self._who}: stopped answering during configuration: check its power and cable"
-            )
+            raise self._settings.stopped_answering()
         return reply
 
     async def _ensure_outputs(self) -> None:
@@ -242,18 +236,16 @@ class XbusHandshake:
 
     async def _other_speed(self) -> int | None:
         """Return the speed at which the device answers; it continues to measure as before."""
-        for baud in LINE_SPEEDS:
-            if baud == self._settings.baud:
-                continue
-            try:
-                answered = await self._listen_at(baud)
-            except DeviceMisconfiguredError:  # the port does not support it
-                continue
+
+        async def answers() -> bool:
+            answered = await self._conversation.enter_config(tries=1, wait_s=_LISTEN_S)
             if answered:  # wait for the reply: closing the port discards unsent bytes
                 await self._conversation.request(XbusMessageId.GOTO_MEASUREMENT)
-            if answered or self._conversation.understood:
-                return baud
-        return None
+            return answered
+
+        return await find_other_speed(
+            self._port, self._conversation, LINE_SPEEDS, self._settings.baud, answers
+        )
 
     async def _listen_at(self, baud: int) -> bool:
         self._port.set_baud(baud)

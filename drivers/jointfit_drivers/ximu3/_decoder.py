@@ -111,8 +111,8 @@ class XImu3Decoder:
             elif event.channel is None:
                 world = self._reports.world
                 out += self._reports.reply_events(event)
-                if self._reports.world != world:
-                    self._forget_motion()
+                if self._reports.world != world:  # orientations begin again
+                    self._continuity.forget()
         return out
 
     def _take_data(self, message: XImu3Data) -> list[Decoded]:
@@ -218,10 +218,6 @@ class XImu3Decoder:
         self._norm_checked = True
         text = f"median quaternion norm is {norm:.4g}, expected 1: order or scale is wrong"
         return [DeviceEvent("warning", text, {"median_norm": norm})]
-
-    def _forget_motion(self) -> None:
-        """Start again with the next measurement: the world of the orientations changed."""
-        self._continuity.forget()
 
     def _refuse(self, message: XImu3Data, reason: str) -> Corrupt:
         self._refused += 1

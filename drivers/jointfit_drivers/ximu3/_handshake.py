@@ -11,6 +11,7 @@ import logging
 from typing import TYPE_CHECKING, NoReturn
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.silence import find_other_speed
 from jointfit_drivers.ximu3._conversation import XImu3Conversation
 from jointfit_drivers.ximu3._required_settings import (
     REPORTED,
@@ -23,7 +24,6 @@ from jointfit_drivers.ximu3._required_settings import (
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit
     from jointfit_drivers.ports.serial_port import SerialPort
-    from jointfit_drivers.ximu3._required_settings import RequiredSetting
     from jointfit_drivers.ximu3._settings import XImu3Settings
 
 log = logging.getLogger(__name__)
@@ -72,13 +72,7 @@ class XImu3Handshake:
             be written.
         """
         settings = self._settings
-        needs = settings.serial_bits_per_s
-        if needs is not None and needs > settings.baud:
-            raise DeviceMisconfiguredError(
-                f"{self._who}: {settings.rate_hz:g} Hz need {needs:g} bit/s, baud = "
-                f"{settings.baud}: lower `rate_hz`, or raise serial_baud_rate of the device and "
-                "`baud`"
-            )
+        settings.require_line_speed("serial_baud_rate of the device")
 
         # Bytes are emitted from the first reply on: the decoder needs the world of the orientations
         # before the first of them.
@@ -110,10 +104,7 @@ class XImu3Handshake:
         for key in dict.fromkeys(keys):
             reply = await self._conversation.request(key)
             if reply is None:
-                raise DeviceLostError(
-                    f"{self._who}: stopped answering during configuration: check its power and "
-                    "cable"
-                )
+                raise self._settings.stopped_answering()
             if reply.error is not None:
                 refused.append(f"{key} ({reply.error})")
             else:
@@ -150,16 +141,16 @@ class XImu3Handshake:
                     )
         await self._conversation.request("apply")
 
-        left = differences(await self._read(list(faults)), self._required_of(faults))
+        left = differences(
+            await self._read(list(faults)),
+            tuple(one for one in self._required if one.key in faults),
+        )
         if left:
             raise DeviceMisconfiguredError(
                 f"{self._who}: does not accept its settings: {'; '.join(left.values())}: correct "
                 "rig.toml, or update the firmware of the device"
             )
         await self._conversation.request("save")
-
-    def _required_of(self, keys: dict[str, str]) -> tuple[RequiredSetting, ...]:
-        return tuple(one for one in self._required if one.key in keys)
 
     async def _explain_silence(self) -> NoReturn:
         """Raise the error for a device that does not answer a ping."""
@@ -188,15 +179,11 @@ class XImu3Handshake:
 
     async def _other_speed(self) -> int | None:
         """Return the speed at which the device answers, or sends its messages."""
-        for baud in LINE_SPEEDS:
-            if baud == self._settings.baud:
-                continue
-            try:
-                self._port.set_baud(baud)
-            except DeviceMisconfiguredError:  # the port does not support it
-                continue
-            self._conversation.reset()
+
+        async def answers() -> bool:
             reply = await self._conversation.request("ping", tries=1, wait_s=_LISTEN_S)
-            if reply is not None or self._conversation.understood:
-                return baud
-        return None
+            return reply is not None
+
+        return await find_other_speed(
+            self._port, self._conversation, LINE_SPEEDS, self._settings.baud, answers
+        )
