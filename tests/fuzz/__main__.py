@@ -28,6 +28,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from tests.fuzz.byte_costs import ByteCosts
     from tests.fuzz.target import Target
 
 CASES = 10_000_000
@@ -62,28 +63,39 @@ class Tally:
     growth: int = 0
     slowest_s: float = 0.0
     findings: dict[str, str] = field(default_factory=dict)
+    costs: ByteCosts = field(init=False)
+
+    def __post_init__(self) -> None:
+        from tests.fuzz.byte_costs import ByteCosts
+
+        self.costs = ByteCosts(self.target)
 
     def case(self, data: bytes) -> None:
         """Run one case and count it; end the process after the last one."""
+        from tests.fuzz.inventory import DECODERS
         from tests.fuzz.target import run_case
 
         outcome = run_case(self.target, data)
+        uneven = self.costs.add(data, outcome.seconds)
+        if self.target.name in DECODERS:
+            self._report_finding(data, uneven)
         self.cases += 1
         self.growth = max(self.growth, outcome.growth)
         self.slowest_s = max(self.slowest_s, outcome.seconds)
-        first_line = outcome.finding.partition("\n")[0]
-        if first_line and first_line.split(":")[0] not in self.findings:
-            self._store(data, outcome.finding)
+        self._report_finding(data, outcome.finding)
         if self.cases >= self.most_cases or time.monotonic() > self.until:
             self.end()
 
-    def _store(self, data: bytes, finding: str) -> None:
+    def _report_finding(self, data: bytes, finding: str) -> None:
+        """Store an input whose finding is new."""
+        first_line = finding.partition("\n")[0]
+        if not first_line or first_line.split(":")[0] in self.findings:
+            return
         folder = OUT / self.target.name
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / hashlib.sha256(data).hexdigest()[:16]
         path.write_bytes(data)
         path.with_suffix(".txt").write_text(finding, encoding="utf-8", errors="replace")
-        first_line = finding.partition("\n")[0]
         self.findings[first_line.split(":")[0]] = f"{path}: {first_line}"
         if len(self.findings) >= MOST_FINDINGS:
             self.end()
@@ -102,6 +114,7 @@ class Tally:
             "findings": list(self.findings.values()),
             "growth_mb": round(self.growth / 1e6, 2),
             "slowest_ms": round(1e3 * self.slowest_s, 1),
+            "worst_byte": None if self.costs.ratio is None else round(self.costs.ratio, 1),
         }
         OUT.mkdir(parents=True, exist_ok=True)
         (OUT / f"{self.target.name}.json").write_text(json.dumps(result), encoding="utf-8")
@@ -184,6 +197,9 @@ def run_target(name: str, cases: int, seconds: float) -> dict[str, Any]:
         "findings": guided["findings"] + mutated["findings"],
         "growth_mb": max(guided["growth_mb"], mutated["growth_mb"]),
         "slowest_ms": max(guided["slowest_ms"], mutated["slowest_ms"]),
+        "worst_byte": max(
+            (part["worst_byte"] for part in (guided, mutated) if part["worst_byte"]), default=None
+        ),
     }
 
 
@@ -203,14 +219,15 @@ def _run_child(name: str, mode: str, cases: int, seconds: float) -> dict[str, An
         found: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
         return found
     text = f"ended with exit code {done.returncode}: see {path}"
-    return {"cases": 0, "seconds": 0, "findings": [text], "growth_mb": 0, "slowest_ms": 0}
+    nothing = {"cases": 0, "seconds": 0, "growth_mb": 0, "slowest_ms": 0, "worst_byte": None}
+    return nothing | {"findings": [text]}
 
 
 def row(name: str, result: dict[str, Any]) -> str:
     """Return one line of the table."""
     cells = (
         result["cases"], result["guided"], result["seconds"], len(result["findings"]),
-        result["growth_mb"], result["slowest_ms"],
+        result["growth_mb"], result["slowest_ms"], result["worst_byte"] or "-",
     )  # fmt: skip
     return f"| {name:19} | " + " | ".join(f"{cell:>9}" for cell in cells) + " |"
 
@@ -219,7 +236,7 @@ def fuzz_all(names: Sequence[str], cases: int, seconds: float, jobs: int) -> int
     """Fuzz every target, print the table and return the exit code."""
     OUT.mkdir(parents=True, exist_ok=True)
     by_cases = shares(names, cases)
-    heads = ("cases", "guided", "seconds", "findings", "growth MB", "slow ms")
+    heads = ("cases", "guided", "seconds", "findings", "growth MB", "slow ms", "byte x")
     print(f"| {'target':19} | " + " | ".join(f"{head:>9}" for head in heads) + " |")
     print("|---|" + "--:|" * len(heads))
     most_s = jobs * seconds / len(names) if seconds else _DAY_S

@@ -26,6 +26,15 @@ MODULES = (
     file_targets,
 )
 TARGETS = {target.name: target for module in MODULES for target in module.TARGETS}
+_FILES = (broker_targets, file_targets)
+_NO_DECODERS = ("-core", "-settings")
+DECODERS = frozenset(
+    target.name
+    for module in MODULES
+    for target in module.TARGETS
+    if module not in _FILES and not target.name.endswith(_NO_DECODERS)
+)
+"""Targets that decode the bytes of a device: their cost per byte is even."""
 REPRODUCERS = Path(__file__).parent / "reproducers"
 """One folder a target; every input in it failed once, and must not fail again."""
 

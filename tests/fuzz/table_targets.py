@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
@@ -27,17 +28,33 @@ from tests.drivers.table_samples.test_fitting_settings import messages_of
 from tests.fuzz.target import Target, UnaccountedError
 from tests.fuzz.wire_targets import cut, records
 
+if TYPE_CHECKING:
+    from jointfit_daemon.driver import Driver
+    from jointfit_drivers.can_table import CanTableSettings
+
 PERIOD_NS = 10_000_000
 TABLES: tuple[dict[str, Any], ...] = (INTEGERS, FLOATS, LINES, CSV)
 HEAD = {"id": "S1", "segment": "thigh", "driver": "serial-table", "port": "/dev/ttyUSB0"}
 
 
+@cache
+def serial_tables() -> list[tuple[SerialTableSettings, Driver]]:
+    """Return settings and driver of each serial table; their validation costs more than a case."""
+    found = [serial_settings("/dev/ttyUSB0", table) for table in TABLES]
+    return [(settings, find_driver("serial-table")(settings)) for settings in found]
+
+
+@cache
+def can_tables() -> list[tuple[CanTableSettings, Driver]]:
+    """Return settings and driver of each CAN table."""
+    found = [can_settings("virtual", "fuzz", table) for table in (SBG, HALVES)]
+    return [(settings, find_driver("can-table")(settings)) for settings in found]
+
+
 def run_table_bytes(data: bytes) -> None:
     """Decode serial bytes by four tables; every byte belongs to a message or is counted."""
-    for table in TABLES:
-        settings = serial_settings("/dev/ttyUSB0", table)
-        codec, decoder = open_codec(settings.wire_format()), find_driver("serial-table")(settings)
-        samples = decoder.decoder()
+    for settings, driver in serial_tables():
+        codec, samples = open_codec(settings.wire_format()), driver.decoder()
         found: list[Any] = []
         for number, piece in enumerate(cut(data)):
             found += codec.feed(piece)
@@ -53,10 +70,8 @@ def run_table_bytes(data: bytes) -> None:
 
 def run_table_frames(data: bytes) -> None:
     """Decode CAN frames of records ``u8 identifier, u8 size, data`` by two tables."""
-    for table in (SBG, HALVES):
-        settings = can_settings("virtual", "fuzz", table)
-        decoder = find_driver("can-table")(settings).decoder()
-        keys = settings.keys()
+    for settings, driver in can_tables():
+        decoder, keys = driver.decoder(), settings.keys()
         for number, (kind, content) in enumerate(records(data)):
             key, extended = keys[kind % len(keys)]
             frame = CanFrame(number * PERIOD_NS, key, content[:8], extended)

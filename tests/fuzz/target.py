@@ -22,7 +22,8 @@ PER_BYTE_S = 100e-6
 """Processor time beyond it for each byte, s: under coverage all code runs several times slower."""
 MOST_GROWTH = 20_000_000
 """Resident memory that one case may add to that before it, bytes."""
-_REPEATS = 3
+REPEATS = 3
+"""Repetitions of a case that cost too much, of which the cheapest counts."""
 
 
 class UnaccountedError(AssertionError):
@@ -70,21 +71,22 @@ class Outcome:
 
 def run_case(target: Target, data: bytes) -> Outcome:
     """Run one case and return what it cost and whether it failed."""
-    seconds, growth, finding = _measured(target, data)
+    seconds, growth, finding = measure_case(target, data)
     allowed_s = LEAST_S + PER_BYTE_S * len(data)
     if not finding and seconds > allowed_s:
         # A first slow case may pay for an import or a garbage collection.
-        seconds = min(_measured(target, data)[0] for _ in range(_REPEATS))
+        seconds = min(measure_case(target, data)[0] for _ in range(REPEATS))
         if seconds > allowed_s:
             finding = f"slow: {seconds:.2f} s for {len(data)} bytes, allowed {allowed_s:.2f} s"
     if not finding and growth > MOST_GROWTH:
-        growth = min(_measured(target, data)[1] for _ in range(_REPEATS))  # without imports
+        growth = min(measure_case(target, data)[1] for _ in range(REPEATS))  # without imports
     if not finding and growth > MOST_GROWTH:
         finding = f"memory: grew by {growth / 1e6:.0f} MB for {len(data)} bytes"
     return Outcome(seconds, growth, finding)
 
 
-def _measured(target: Target, data: bytes) -> tuple[float, int, str]:
+def measure_case(target: Target, data: bytes) -> tuple[float, int, str]:
+    """Return processor time in seconds, added memory in bytes, and the finding of one run."""
     _forget_largest()
     before, began, finding = _largest_bytes(), time.process_time(), ""
     try:
