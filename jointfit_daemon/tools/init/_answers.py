@@ -10,7 +10,7 @@ from jointfit_daemon.tools.init._limbs import LIMBS
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.tools.init._found import Found, ImuDriver, MocapDriver
+    from jointfit_daemon.tools.init._found import Found, ImuDriver, KeyChoice, MocapDriver
     from jointfit_daemon.tools.init._limbs import Limb
 
 Key = tuple[str, str]
@@ -56,15 +56,52 @@ def driver_of(answers: Mapping[Key, Any], found: Found, sensor: str) -> ImuDrive
     """Return the driver of `sensor`."""
     fitting = drivers_for(answers, found, sensor)
     named = {driver.name: driver for driver in fitting}
+    recognized = found.recognized.get(str(answers.get(("device", sensor))))
+    if ("driver", sensor) not in answers and recognized in named:
+        return named[str(recognized)]
+
     # unanswered: most rigs have sensors of one family, so that of the sensor before
     sensors = list(sensors_of(answers))
     known = [answers.get(("driver", name)) for name in sensors[: sensors.index(sensor) + 1]]
     return next((named[name] for name in reversed(known) if name in named), fitting[0])
 
 
+def settings_asked(answers: Mapping[Key, Any], found: Found) -> tuple[str, ...]:
+    """Return ``SENSOR.KEY`` of every key with few values that a driver needs."""
+    return tuple(
+        f"{name}.{choice.key}"
+        for name in sensors_of(answers)
+        if is_connected(answers, name)
+        for choice in driver_of(answers, found, name).choices
+    )
+
+
+def choice_of(answers: Mapping[Key, Any], found: Found, subject: str) -> KeyChoice:
+    """Return the key that ``SENSOR.KEY`` means."""
+    sensor, _, key = subject.rpartition(".")
+    choices = driver_of(answers, found, sensor).choices
+    return next(choice for choice in choices if choice.key == key)
+
+
+def previous_answer(answers: Mapping[Key, Any], found: Found, question: str, subject: str) -> Any:
+    """Return the answer for the last sensor with the same driver, None without one.
+
+    `subject` is a sensor, or ``SENSOR.KEY`` for a key of its driver.
+    """
+    sensors = list(sensors_of(answers))
+    sensor, key = (subject, "") if subject in sensors else subject.rpartition(".")[::2]
+    driver = driver_of(answers, found, sensor)
+    for before in reversed(sensors[: sensors.index(sensor)]):
+        given = answers.get((question, f"{before}.{key}" if key else before))
+        if given is not None and driver_of(answers, found, before) == driver:
+            return given
+    return None
+
+
 def mocap_driver_of(answers: Mapping[Key, Any], found: Found) -> MocapDriver:
     """Return the driver of the cameras."""
-    name = answers.get(("mocap_driver", ""))
+    announced = next(iter(found.server_drivers.values()), None)
+    name = answers.get(("mocap_driver", ""), announced)
     known = found.mocap_drivers
     return next((driver for driver in known if driver.name == name), known[0])
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import LATER
 from jointfit_daemon.nearest_name import did_you_mean
-from jointfit_daemon.tools.init._answers import split_address
+from jointfit_daemon.tools.init._answers import driver_of, split_address
 from jointfit_daemon.tools.init._engine import accept, complete, next_question
 from jointfit_daemon.tools.init._parsing import AnswerError
 
@@ -113,6 +113,10 @@ class Dialogue:
         self._take_stored()
 
     def _accept(self, asked: Asked, given: Any) -> None:
+        if asked.question.key == "layout" and (given or asked.default):
+            path = str(given or asked.default)
+            driver = driver_of(self.answers, self.found, asked.subject)
+            self.found = self.search.layout(self.found, path, driver.name)
         self.answers = accept(asked, given, self.answers, self.found)
         self.store(self.known)
         value = self.answers[asked.key]
@@ -149,8 +153,7 @@ class Dialogue:
             self.accept_answer(asked, None)
         except AnswerError as error:
             raise UnansweredError(
-                f"{asked.name} is missing, and there is no proposal: {asked.text}:"
-                f" {asked.question.help}"
+                f"{asked.name} is missing, and there is no proposal: {asked.text}: {asked.help}"
             ) from error
 
     def _refuse_unused(self) -> None:
@@ -176,7 +179,7 @@ class Dialogue:
         while True:
             line = self.read_line(self._prompt(asked)).strip()
             if line == HELP:
-                self.show(f"  {asked.question.help}")
+                self.show(f"  {asked.help}")
                 proposal = "Enter takes the proposal in brackets, "
                 self.show(f"  {proposal if answer_text(asked.proposal) else ''}'<' returns.")
                 continue
@@ -218,6 +221,12 @@ class Dialogue:
             self._read_stream()
             if not self.found.markers:
                 raise AnswerError("no names of markers: type them, separated by commas")
+            return
+
+        if asked.question.finder == "traffic":
+            port = self.answers["device", asked.subject]
+            self.found, text = self.search.recognized_driver(self.found, port)
+            self.show(f"  {text}")
             return
 
         if asked.question.finder == "identifiers":

@@ -12,7 +12,12 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import LATER, ConfigError, parse_rig
-from jointfit_daemon.tools.init._answers import drivers_for, limb_of, wiring_of
+from jointfit_daemon.tools.init._answers import (
+    drivers_for,
+    limb_of,
+    sensors_of,
+    wiring_of,
+)
 from jointfit_daemon.tools.init._parsing import NEEDED, AnswerError, parse_answer
 from jointfit_daemon.tools.init._proposals import is_optional
 from jointfit_daemon.tools.init._questions import QUESTIONS, Question
@@ -36,6 +41,7 @@ class Asked:
     """Answer if nothing is typed; None without a proposal."""
     choices: tuple[FoundDevice, ...]
     optional: bool
+    help: str
 
     @property
     def key(self) -> Key:
@@ -70,6 +76,7 @@ def next_question(answers: Mapping[Key, Any], found: Found) -> Asked | None:
                 question.default(answers, found, subject),
                 question.choices(answers, found, subject),
                 _is_optional(question, answers, subject),
+                question.explain(answers, found, subject) or question.help,
             )
     return None
 
@@ -83,6 +90,9 @@ def _spoken(answers: Mapping[Key, Any], subject: str) -> str:
     if not subject:
         return ""
     limb = limb_of(answers)
+    sensor, _, key = subject.rpartition(".")
+    if sensor in sensors_of(answers) and subject not in sensors_of(answers):
+        return f"{key} of the sensor {sensor}"
     is_ours = subject in (*limb.segments, *limb.optional_parts)
     return subject.replace("_", " ") if is_ours else subject
 

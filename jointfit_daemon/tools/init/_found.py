@@ -3,13 +3,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
 Wiring = Literal["serial", "can"]
 """Connection of an IMU."""
+
+
+@dataclass(frozen=True, slots=True)
+class KeyChoice:
+    """A key without default that has few values."""
+
+    key: str
+    values: tuple[Any, ...]
+    help: str
+    """Its description."""
+
+    def meaning(self, value: Any) -> str:
+        """Return the part of the description that begins with `value`; empty without one."""
+        starts = [(self.help.find(f"{mark}:"), mark) for mark in (f"`{value}`", f"{value}")]
+        at, mark = max(starts)
+        if at < 0:
+            return ""
+        text = self.help[at + len(mark) + 1 :]
+        others = [f"; {form}:" for other in self.values for form in (f"`{other}`", f"{other}")]
+        ends = [end for other in (*others, ". ") if (end := text.find(other)) >= 0]
+        return text[: min(ends, default=len(text))].strip()
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +43,12 @@ class ImuDriver:
     """Default of its key ``baud``; None without that key."""
     ids: Mapping[str, int] = field(default_factory=dict)
     """Names and defaults of the CAN identifiers in its table ``ids``; empty without that table."""
+    text: str = ""
+    """Description of its devices."""
+    choices: tuple[KeyChoice, ...] = ()
+    """Keys without default that have few values."""
+    needs_layout: bool = False
+    """Whether its table describes the frames of the device."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +57,13 @@ class MocapDriver:
 
     name: str
     port: int | None = None
-    """Default of its key ``command_port``; None without that key."""
+    """Default of its key `port_key`; None without that key."""
     up_axis: str = "y"
     """Default of its key ``up_axis``; ``auto`` if the server announces the axis."""
+    port_key: str = "command_port"
+    """Key with the port of the server."""
+    text: str = ""
+    """Description of its systems."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +89,12 @@ class Found:
     """Sets of CAN identifiers of sensors that were received, by bus."""
     bauds: Mapping[str, int] = field(default_factory=dict)
     """Speeds at which devices answered, by serial port, baud."""
+    recognized: Mapping[str, str] = field(default_factory=dict)
+    """Drivers that decoded the data of a device, by serial port."""
+    server_drivers: Mapping[str, str] = field(default_factory=dict)
+    """Drivers of the servers that were found, by their address."""
+    layouts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """Keys of ``[[imu]]`` that describe frames, by the file that they were read from."""
     markers: tuple[str, ...] = ()
     """Names of the markers in the stream of the cameras."""
     bodies: tuple[str, ...] = ()

@@ -106,6 +106,8 @@ def _device(given: Any, choices: Sequence[str]) -> str:
 
 
 def _choice(given: Any, choices: Sequence[str]) -> str:
+    if str(given) in choices:  # a value that is a number is no number of the list
+        return str(given)
     chosen = _device(given, choices)
     if chosen not in choices:
         near = did_you_mean(chosen, choices)

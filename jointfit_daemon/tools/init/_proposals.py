@@ -14,6 +14,7 @@ from jointfit_daemon.tools.init._answers import (
     is_connected,
     limb_of,
     marked_parts,
+    previous_answer,
     sensors_of,
 )
 from jointfit_daemon.tools.init._found import FoundDevice
@@ -85,6 +86,20 @@ def baud(answers: Given, found: Found, sensor: str) -> int:
     needed = answers["sensor_rate_hz", ""] * _BITS_PER_SAMPLE
     fitting = [speed for speed in (usual, *_USUAL_BAUDS) if speed >= max(needed, usual)]
     return fitting[0] if fitting else _USUAL_BAUDS[-1]
+
+
+def setting(answers: Given, found: Found, subject: str) -> str | None:
+    """Return the value of the last sensor with the same driver; None without one."""
+    value = previous_answer(answers, found, "setting", subject)
+    return None if value is None else str(value)
+
+
+def layout(answers: Given, found: Found, sensor: str) -> str | None:
+    """Return the file of the last sensor with the same driver; on CAN, identifiers differ."""
+    if driver_of(answers, found, sensor).wiring == "can":
+        return None
+    value = previous_answer(answers, found, "layout", sensor)
+    return None if value is None else str(value)
 
 
 def _ids_in_use(answers: Given, bus: str) -> list[tuple[int, ...]]:

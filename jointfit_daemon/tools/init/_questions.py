@@ -14,6 +14,7 @@ from jointfit_daemon.config import is_this_host
 from jointfit_daemon.tools.init import _proposals
 from jointfit_daemon.tools.init._answers import (
     Key,
+    choice_of,
     driver_of,
     drivers_for,
     has_cameras,
@@ -23,6 +24,7 @@ from jointfit_daemon.tools.init._answers import (
     marked_parts,
     mocap_driver_of,
     sensors_of,
+    settings_asked,
     split_address,
 )
 from jointfit_daemon.tools.init._found import Found, FoundDevice
@@ -31,9 +33,9 @@ from jointfit_daemon.tools.init._limbs import LIMBS
 if TYPE_CHECKING:
     from jointfit_daemon.tools.init._parsing import Kind
 
-Finder = Literal["movement", "identifiers", "stream"]
-"""Search that the word ``find`` starts: a sensor by its movement, identifiers on a CAN bus, names
-in the stream of the cameras."""
+Finder = Literal["movement", "traffic", "identifiers", "stream"]
+"""Search that the word ``find`` starts: a sensor by its movement, its driver by its data,
+identifiers on a CAN bus, names in the stream of the cameras."""
 
 Given = Mapping[Key, Any]
 Propose = Callable[[Given, Found, str], Any]
@@ -69,6 +71,8 @@ class Question:
     postponable: bool = False
     """Whether the word ``later`` is an answer, and the proposal where there is no other one."""
     finder: Finder | None = None
+    explain: Propose = _nothing
+    """Help for this subject; None for `help`."""
 
 
 def _if(condition: Callable[[Given], bool]) -> Callable[[Given, Found], tuple[str, ...]]:
@@ -192,7 +196,8 @@ QUESTIONS: tuple[Question, ...] = (
         "driver",
         "choice",
         "Driver of the sensor {subject}",
-        "Several installed drivers read this connection.",
+        "Several installed drivers read this connection. 'find' receives on the serial port,"
+        " without sending, and proposes the driver that decodes the data.",
         group="sensor",
         subjects=lambda answers, found: tuple(
             name
@@ -201,8 +206,9 @@ QUESTIONS: tuple[Question, ...] = (
         ),
         default=lambda answers, found, sensor: driver_of(answers, found, sensor).name,
         choices=lambda answers, found, sensor: tuple(
-            FoundDevice(driver.name) for driver in drivers_for(answers, found, sensor)
+            FoundDevice(driver.name, driver.text) for driver in drivers_for(answers, found, sensor)
         ),
+        finder="traffic",
     ),
     Question(
         "baud",
@@ -239,6 +245,36 @@ QUESTIONS: tuple[Question, ...] = (
         finder="identifiers",
     ),
     Question(
+        "setting",
+        "choice",
+        "Setting {subject}",
+        "A property of the device that its data do not show.",
+        subjects=settings_asked,
+        default=_proposals.setting,
+        stand_in=lambda answers, found, subject: str(choice_of(answers, found, subject).values[0]),
+        choices=lambda answers, found, subject: tuple(
+            FoundDevice(str(value), choice_of(answers, found, subject).meaning(value))
+            for value in choice_of(answers, found, subject).values
+        ),
+        explain=lambda answers, found, subject: choice_of(answers, found, subject).help,
+    ),
+    Question(
+        "layout",
+        "text",
+        "File with the layout of the data of the sensor {subject}",
+        "TOML file with the keys of its [[imu]] table that describe its frames or lines: `frame` or"
+        " `text`, `ids`, `dbc` and `fields`. The pages on serial-table and can-table in the"
+        " documentation have examples; a rig.toml with such a table is accepted, too. A DBC file"
+        " is named by its key `dbc`.",
+        subjects=lambda answers, found: tuple(
+            name
+            for name in sensors_of(answers)
+            if is_connected(answers, name) and driver_of(answers, found, name).needs_layout
+        ),
+        default=_proposals.layout,
+        stand_in=_always(""),
+    ),
+    Question(
         "cameras",
         "yes_no",
         "Is there an optical motion-capture system?",
@@ -257,15 +293,15 @@ QUESTIONS: tuple[Question, ...] = (
         ),
         default=lambda answers, found, _: mocap_driver_of(answers, found).name,
         choices=lambda _answers, found, _subject: tuple(
-            FoundDevice(driver.name) for driver in found.mocap_drivers
+            FoundDevice(driver.name, driver.text) for driver in found.mocap_drivers
         ),
     ),
     Question(
         "server",
         "address",
         "Computer of the motion-capture system",
-        "Name or address of the computer that runs Motive, with :PORT if its command port is not"
-        " 1510. 'later' leaves the place open.",
+        "Name or address of the computer that runs the camera software, with :PORT if its port is"
+        " not the usual one. 'later' leaves the place open.",
         postponable=True,
         subjects=_if(has_cameras),
         default=lambda _answers, found, _: next((s.address for s in found.servers), None),

@@ -14,13 +14,15 @@ from jointfit_daemon.tools.init._answers import (
     limb_of,
     marked_parts,
     mocap_driver_of,
+    previous_answer,
     sensors_of,
     split_address,
     wiring_of,
 )
+from jointfit_daemon.tools.init._proposals import layout
 
 if TYPE_CHECKING:
-    from jointfit_daemon.tools.init._found import Found
+    from jointfit_daemon.tools.init._found import Found, Wiring
 
 Given = Mapping[Key, Any]
 
@@ -115,7 +117,26 @@ def _imu(answers: Given, found: Found, buses: Mapping[str, str], name: str) -> d
         table["ids"] = dict(zip(driver.ids, answers["ids", name], strict=True))
         if any(number > _STANDARD_MAX for number in answers["ids", name]):
             table["extended_ids"] = True
+
+    for choice in driver.choices:
+        given = answers.get(("setting", f"{name}.{choice.key}"))
+        given = given or previous_answer(answers, found, "setting", f"{name}.{choice.key}")
+        by_text = {str(value): value for value in choice.values}
+        table[choice.key] = by_text.get(str(given), choice.values[0])
+    if driver.needs_layout:
+        file = answers.get(("layout", name)) or layout(answers, found, name)
+        at = list(sensors_of(answers)).index(name)
+        stand_in = _layout_stand_in(driver.wiring, at)
+        table |= found.layouts.get(str(file), stand_in)
     return table | {"rate_hz": answers["sensor_rate_hz", ""]}
+
+
+def _layout_stand_in(wiring: Wiring, at: int) -> dict[str, Any]:
+    """Return a layout for the check of answers before that of the sensor with number `at`."""
+    if wiring == "serial":
+        return {"text": {}, "fields": {"quaternion": {"column": 1}}}
+    quaternion = {"offset": 0, "type": "i16", "divisor": 32767}
+    return {"ids": {"quaternion": 0x300 + at}, "fields": {"quaternion": quaternion}}
 
 
 _STANDARD_MAX = 0x7FF
@@ -127,7 +148,7 @@ def _mocap(answers: Given, found: Found) -> dict[str, Any]:
     host, port = split_address(answers["server", ""])
     table: dict[str, Any] = {"driver": driver.name, "server": host}
     if port and driver.port is not None:
-        table["command_port"] = port
+        table[driver.port_key] = port
     if driver.up_axis != "auto":  # otherwise the driver reads it from the stream
         table["up_axis"] = answers["up_axis", ""]
     if answers.get(("plate", "")) is not None:

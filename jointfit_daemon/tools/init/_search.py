@@ -9,18 +9,27 @@ import asyncio
 import contextlib
 import os
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 from jointfit_daemon.driver import ImuSettings, MocapSettings
+from jointfit_daemon.files.text import parse_toml
 from jointfit_daemon.tools.discovery import (
     find_can_interfaces,
     find_mocap_servers,
     find_serial_ports,
     installed_drivers,
     listen_can,
+    listen_serial,
 )
 from jointfit_daemon.tools.init._answers import wiring_of
-from jointfit_daemon.tools.init._found import Found, FoundDevice, ImuDriver, MocapDriver
+from jointfit_daemon.tools.init._found import (
+    Found,
+    FoundDevice,
+    ImuDriver,
+    KeyChoice,
+    MocapDriver,
+)
 from jointfit_daemon.tools.init._movement import find_moved
 from jointfit_daemon.tools.init._parsing import AnswerError
 
@@ -29,12 +38,21 @@ if TYPE_CHECKING:
 
     from pydantic.fields import FieldInfo
 
+    from jointfit_daemon.driver import Driver
     from jointfit_daemon.tools.init._answers import Answers
 
-_DIALOGUE_KEYS = {"id", "segment", "driver", "port", "can", "ids", "server"}
-"""Keys without default that the dialogue can answer; drivers with others are not offered."""
+_DIALOGUE_KEYS = {"id", "segment", "driver", "port", "can", "ids", "fields", "server"}
+"""Keys without default that the dialogue can answer, beside those with few values; drivers with
+others are not offered."""
+_LAYOUT_KEYS = (
+    "frame", "text", "ids", "extended_ids", "sequence", "dbc", "fields", "byte_order", "world",
+    "direction", "orientation", "magnetometer",
+)  # fmt: skip
+"""Keys of ``[[imu]]`` that a file with a layout may have."""
 _PROPOSED_FIRST = ("xbus", "xcdi", "natnet")
 """Drivers that lead the list of their kind; the others follow by name."""
+LISTEN_S = 1.0
+"""Time to receive at each speed of a serial port, s."""
 SERVER_WAIT_S = 1.0
 """Time to wait for motion-capture servers, s."""
 
@@ -46,14 +64,40 @@ def drivers_found() -> Found:
     for name, driver in known:
         fields: Mapping[str, FieldInfo] = driver.Settings.model_fields
         required = {key for key, field in fields.items() if field.is_required()}
-        if not required <= _DIALOGUE_KEYS:
+        choices = _key_choices(fields)
+        if not required <= _DIALOGUE_KEYS | {choice.key for choice in choices}:
+            continue
+        if "ids" in required and "fields" not in required:  # identifiers without default
             continue
         if issubclass(driver.Settings, ImuSettings) and required & {"port", "can"}:
-            imu.append(_imu_driver(name, fields))
+            about = replace(_imu_driver(name, fields), text=_devices_of(driver), choices=choices)
+            imu.append(replace(about, needs_layout="fields" in required))
         elif issubclass(driver.Settings, MocapSettings) and "server" in fields:
-            port = fields["command_port"].default if "command_port" in fields else None
-            mocap.append(MocapDriver(name, port, fields["up_axis"].default))
+            key = "command_port" if "command_port" in fields else "port"
+            port = fields[key].default if key in fields else None
+            text = _devices_of(driver)
+            mocap.append(MocapDriver(name, port, fields["up_axis"].default, key, text))
     return Found(imu_drivers=tuple(imu), mocap_drivers=tuple(mocap))
+
+
+_ARTICLES = ("One ", "The ``[mocap]`` table for ")
+"""Beginnings of descriptions of tables; the devices follow."""
+
+
+def _devices_of(driver: type[Driver]) -> str:
+    """Return the description of the devices of a driver, from that of its table."""
+    text = (driver.Settings.__doc__ or "").strip().partition("\n")[0].rstrip(".")
+    for article in _ARTICLES:
+        text = text.removeprefix(article)
+    return text
+
+
+def _key_choices(fields: Mapping[str, FieldInfo]) -> tuple[KeyChoice, ...]:
+    return tuple(
+        KeyChoice(key, get_args(field.annotation), str(field.description or ""))
+        for key, field in fields.items()
+        if field.is_required() and get_origin(field.annotation) is Literal
+    )
 
 
 def _imu_driver(name: str, fields: Mapping[str, FieldInfo]) -> ImuDriver:
@@ -79,17 +123,19 @@ class DeviceSearch:
 
     def start(self, servers: Sequence[FoundDevice] | None = None) -> Found:
         """Return drivers and devices; `servers` are those of an earlier search."""
-        known = {info.path: info.description for info in find_serial_ports()}
-        known |= {os.path.abspath(port): "named by --port" for port in self.ports}  # noqa: PTH100 - keeps links
+        known = {os.path.abspath(port): "named by --port" for port in self.ports}  # noqa: PTH100 - keeps links
+        known = {**known, **{info.path: info.description for info in find_serial_ports()}}
         interfaces = [
             FoundDevice(each.name, f"CAN interface, {'up' if each.up else 'down'}")
             for each in find_can_interfaces()
         ]
+        found = self._servers() if servers is None else [(each, "") for each in servers]
         return replace(
             drivers_found(),
             ports=tuple(FoundDevice(path, text) for path, text in known.items()),
             interfaces=tuple(interfaces),
-            servers=tuple(self._servers() if servers is None else servers),
+            servers=tuple(device for device, _ in found),
+            server_drivers={device.address: driver for device, driver in found if driver},
         )
 
     def refresh(self, found: Found) -> Found:
@@ -101,7 +147,8 @@ class DeviceSearch:
         """Return whether a device file or a CAN interface exists."""
         return address in found.addresses or ("/" in address and os.path.exists(address))  # noqa: PTH110 - NUL returns False
 
-    def _servers(self) -> list[FoundDevice]:
+    def _servers(self) -> list[tuple[FoundDevice, str]]:
+        """Return the servers of the networks, each with its driver."""
         if not self.network:
             return []
         try:
@@ -109,15 +156,69 @@ class DeviceSearch:
         except OSError:
             return []  # no network: nothing is found
         usual = {driver.name: driver.port for driver in drivers_found().mocap_drivers}
-        return [
-            FoundDevice(
-                server.server
-                if server.port == usual.get(server.driver)
-                else f"{server.server}:{server.port}",
-                f"{server.application} {server.version}, {server.protocol}",
+        found = []
+        for server in servers:
+            is_usual = server.port == usual.get(server.driver)
+            address = server.server if is_usual else f"{server.server}:{server.port}"
+            text = f"{server.application} {server.version}, {server.protocol}"
+            found.append((FoundDevice(address, text), server.driver))
+        return found
+
+    def recognized_driver(self, found: Found, port: str) -> tuple[Found, str]:
+        """Return the driver that decodes the data of a serial port, and a description.
+
+        Nothing is sent to the device.
+
+        Raises
+        ------
+        AnswerError
+            The port cannot be opened or is silent, or no driver decodes its data.
+        """
+        if "/" not in port:
+            raise AnswerError(f"{port} is a CAN interface: choose from the list")
+        self.show(f"  Receiving on {port} …")
+        traffic = listen_serial(port, listen_s=LISTEN_S)
+        if traffic.fault is not None:
+            raise AnswerError(traffic.fault)
+        if not any(traffic.received_bytes.values()):
+            raise AnswerError(f"{port} is silent: check the power of the sensor, or choose one")
+        if not traffic.devices or traffic.baud is None:
+            raise AnswerError(f"{port}: no driver decodes its data: choose from the list")
+        device = traffic.devices[0]
+        known = replace(
+            found,
+            recognized={**found.recognized, port: device.driver},
+            bauds={**found.bauds, port: traffic.baud},
+        )
+        return known, f"{port}: {device.driver} at {traffic.baud} baud"
+
+    def layout(self, found: Found, path: str, driver: str) -> Found:
+        """Return `found` with the layout in a TOML file, or in a rig for `driver`.
+
+        Raises
+        ------
+        AnswerError
+            The file cannot be read, or has no such keys.
+        """
+        file = Path(path).expanduser()
+        try:
+            table = parse_toml(file.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise AnswerError(f"{path}: {error.strerror}: expected a TOML file") from error
+        except (ValueError, RecursionError) as error:
+            raise AnswerError(f"{path}: {error}: expected TOML in UTF-8") from error
+        imus = table.get("imu", [])
+        sensors = [each for each in imus if isinstance(each, dict) and each.get("driver") == driver]
+        keys = sensors[0] if sensors else table
+        layout = {key: value for key, value in keys.items() if key in _LAYOUT_KEYS}
+        if not layout:
+            raise AnswerError(
+                f"{path}: found {', '.join(table) or 'nothing'}, expected `fields` and the other "
+                f"keys of an [[imu]] table of {driver}"
             )
-            for server in servers
-        ]
+        if isinstance(layout.get("dbc"), str):
+            layout["dbc"] = str(file.absolute().parent / layout["dbc"])
+        return replace(found, layouts={**found.layouts, path: layout})
 
     def stream_names(self, found: Found, host: str, port: int) -> tuple[Found, str]:
         """Return the names in the stream of a server, and a description of the result."""
@@ -207,7 +308,8 @@ class DeviceSearch:
         for address in (choice.address for choice in choices):
             if wiring_of(answers, address) == "serial":
                 if serial:
-                    tables[address] = {"driver": serial[0], "port": address}
+                    name = found.recognized.get(address, serial[0])
+                    tables[address] = {"driver": name, "port": address}
             elif "/" not in address:
                 with contextlib.suppress(AnswerError):  # a bus that is down has no sensor
                     for driver, ids in self._sensors_on(found, address):

@@ -161,7 +161,7 @@ def _question(asked: Asked) -> dict[str, Any]:
     return {
         "name": asked.name,
         "text": asked.text,
-        "help": question.help,
+        "help": asked.help,
         "default": answer_text(asked.proposal),
         "optional": asked.optional,
         "finder": question.finder,

@@ -5,6 +5,7 @@ import { byId, createElement, setText } from "./dom.js";
 const RETRY_MS = 2000;
 let socket = null;
 const FINDERS = {
+  traffic: { text: "Find by its data", wait: "Receiving on the port …" },
   movement: {
     text: "Find by moving it",
     wait: "Hold all sensors still until this page asks you to turn one.",
