@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.model import Chunk, Decoded, DeviceEventKind
+    from jointfit_drivers.xbus._legacy_measurements import LegacyMeasurements
     from jointfit_drivers.xbus._raw_orientation import RawOrientation
     from jointfit_protocols.corrupt import CorruptBytes
     from jointfit_protocols.xbus.mtdata2 import Value
@@ -75,6 +76,8 @@ class XbusDecoder:
         Number of the sync wire of the rig, by the data item that reports its edges.
     raw : RawOrientation, optional
         Computes orientations from raw measurements; None if the device sends orientations.
+    legacy : LegacyMeasurements, optional
+        Fields of MTData; None for a device that sends MTData2.
     """
 
     def __init__(
@@ -83,9 +86,12 @@ class XbusDecoder:
         rate_hz: float,
         wires: Mapping[int, int] | None = None,
         raw: RawOrientation | None = None,
+        legacy: LegacyMeasurements | None = None,
     ) -> None:
         self._wires = wires or {}
         self._raw = raw
+        self._legacy = legacy
+        self._other_format_reported = False
         self._wanted = {*_WANTED, *self._wires, *(RAW if raw is not None else ())}
         self._layouts: dict[int, MTData2Layout | None] = {}
         """MTData2Layout of the first message of each length; a device sends one or two lengths."""
@@ -143,6 +149,8 @@ class XbusDecoder:
                 out.append(Corrupt(event.discarded, event.reason))
             elif event.mid == XbusMessageId.MT_DATA2:
                 out += self._decode_measurement(event)
+            elif event.mid == XbusMessageId.MT_DATA:
+                out += self._decode_legacy(event)
             else:
                 out += self._device_events(event)
         return out
@@ -182,6 +190,24 @@ class XbusDecoder:
         if len(data) not in self._layouts:
             self._layouts[len(data)] = MTData2Layout.of(items, self._wanted)
         return self._decode_values(message, values, world_id)
+
+    def _decode_legacy(self, message: XbusMessage) -> list[Decoded]:
+        """Return the content of an MTData, or why it cannot be decoded."""
+        legacy = self._legacy
+        if legacy is None or legacy.fault:
+            if self._other_format_reported:
+                return []
+            self._other_format_reported = True
+            text = 'the device sends MTData, the format of older devices: set format = "mtdata"'
+            if legacy is not None:
+                text = f"{legacy.fault}: set output_mode and output_settings"
+            return [DeviceEvent("warning", text)]
+
+        values = legacy.read(message.data)
+        if values is None:
+            size = len(message.data)
+            return [self._refuse(message, f"MTData of {size} bytes contradicts the output mode")]
+        return self._decode_values(message, values, legacy.world_id)
 
     def _decode_values(
         self, message: XbusMessage, values: Mapping[int, Any], world_id: int
@@ -297,6 +323,8 @@ class XbusDecoder:
 
         if mid == XbusMessageId.PRODUCT_CODE:
             self._continuity.modulus = setup.fine_time_modulus(setup.decode_text(data))
+        if self._legacy is not None:
+            self._legacy.reply(mid, data)
 
         known = _device_property(mid, data)
         text = ", ".join(f"{key} {value}" for key, value in known.items())
@@ -344,6 +372,10 @@ def _sync(data: bytes) -> list[str] | None:
     return None if entries is None else [describe_entry(entry) for entry in entries]
 
 
+def _hexadecimal(data: bytes) -> str:
+    return f"0x{data.hex().upper()}"
+
+
 _PROPERTIES: dict[int, tuple[str, Callable[[bytes], object]]] = {
     XbusMessageId.DEVICE_ID: ("serial", setup.decode_device_id),
     XbusMessageId.PRODUCT_CODE: ("model", setup.decode_text),
@@ -351,4 +383,6 @@ _PROPERTIES: dict[int, tuple[str, Callable[[bytes], object]]] = {
     XbusMessageId.FILTER_PROFILE_ACK: ("filter_profile", setup.decode_filter_profile),
     XbusMessageId.OUTPUT_CONFIGURATION_ACK: ("outputs", _outputs),
     XbusMessageId.SYNC_SETTINGS_ACK: ("sync", _sync),
+    XbusMessageId.OUTPUT_MODE_ACK: ("output_mode", _hexadecimal),
+    XbusMessageId.OUTPUT_SETTINGS_ACK: ("output_settings", _hexadecimal),
 }

@@ -13,6 +13,7 @@ from jointfit_drivers.gateway_orientation import RawSamples
 from jointfit_drivers.ports.serial_port import SerialPort
 from jointfit_drivers.xbus._decoder import XbusDecoder
 from jointfit_drivers.xbus._handshake import LINE_SPEEDS, XbusHandshake
+from jointfit_drivers.xbus._legacy_measurements import LegacyMeasurements
 from jointfit_drivers.xbus._raw_orientation import RawOrientation
 from jointfit_drivers.xbus._settings import XbusSettings
 from jointfit_drivers.xbus._sync_lines import trigger_wires
@@ -47,7 +48,13 @@ class XbusImu:
         if settings.orientation == "gateway":
             raw = RawOrientation(partial(RawSamples.of, settings))
 
-        return XbusDecoder(baud, settings.rate_hz, trigger_wires(settings.sync or ()), raw)
+        legacy = None
+        if settings.format == "mtdata":
+            legacy = LegacyMeasurements(
+                settings.output_mode, settings.output_settings, settings.legacy_world
+            )
+        wires = trigger_wires(settings.sync or ())
+        return XbusDecoder(baud, settings.rate_hz, wires, raw, legacy)
 
     async def run(self, emit: Emit) -> None:
         """Open the port, bring the device into measurement mode, and read until cancelled.

@@ -16,7 +16,7 @@ from jointfit_drivers.silence import find_other_speed
 from jointfit_drivers.xbus import _sync_lines
 from jointfit_drivers.xbus._conversation import OUTSTANDING_S, XbusConversation
 from jointfit_drivers.xbus._required_outputs import ORIENTATION, required_outputs
-from jointfit_protocols.xbus import XbusMessage, XbusMessageId
+from jointfit_protocols.xbus import XbusMessage, XbusMessageId, mtdata
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item, real_id
 
@@ -37,6 +37,10 @@ _RESETS, _RESET_WAIT_S = 50, 0.1
 """Requests after a reset, 0.1 s apart. A stuck MTi-G-700 answered 1.8 s after its reset."""
 _FRAMES = (0, 1)
 """Frames of the alignment rotations: sensor, local."""
+_UNKNOWN_MESSAGE = b"\x04"
+"""Error code of a device that does not know a message."""
+_RATE_SHARE = 0.01
+"""Largest difference between the rate of an older device and `rate_hz`: periods are rounded."""
 _NO_SYNC = bytes(12)
 """An entry that is off. A request without data would only read the settings."""
 
@@ -106,10 +110,35 @@ class XbusHandshake:
         for frame in _FRAMES:
             await self._conversation.request(XbusMessageId.ALIGNMENT_ROTATION, bytes((frame,)))
 
-        await self._ensure_outputs()
-        await self._ensure_sync()
+        if settings.format == "mtdata":
+            await self._check_legacy()
+        else:
+            await self._ensure_outputs()
+            await self._ensure_sync()
         reply = await self._answer(XbusMessageId.GOTO_MEASUREMENT)
         self._refuse_error(reply, "refuses to start measuring")
+
+    async def _check_legacy(self) -> None:
+        """Compare output mode, settings and rate of an older device; nothing is written."""
+        replies = {
+            mid: await self._answer(mid)
+            for mid in (XbusMessageId.OUTPUT_MODE, XbusMessageId.OUTPUT_SETTINGS)
+        }
+        for reply in replies.values():
+            self._refuse_error(reply, "has no MTData", '`format`: set it to "mtdata2"')
+        period = await self._answer(XbusMessageId.PERIOD)
+        skip = await self._answer(XbusMessageId.OUTPUT_SKIP)
+
+        mode = mtdata.decode_output_mode(replies[XbusMessageId.OUTPUT_MODE].data)
+        stored = mtdata.decode_output_settings(replies[XbusMessageId.OUTPUT_SETTINGS].data)
+        found_hz = mtdata.rate_hz(period.data, b"")
+        skipped = skip.mid != XbusMessageId.ERROR and any(skip.data)
+        faults = legacy_differences(self._settings, mode, stored, found_hz, skipped=skipped)
+        if faults:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: {'; '.join(faults)}: change the settings here, or configure the "
+                "device with MT Manager"
+            )
 
     async def _answer(self, mid: int, data: bytes = b"") -> XbusMessage:
         """Return the reply to a request that the device must answer; it may be an error."""
@@ -122,6 +151,11 @@ class XbusHandshake:
         """Configure the required outputs at the requested rate."""
         rate = int(self._settings.rate_hz)
         reply = await self._answer(XbusMessageId.OUTPUT_CONFIGURATION)
+        if reply.mid == XbusMessageId.ERROR and reply.data[:1] == _UNKNOWN_MESSAGE:
+            raise DeviceMisconfiguredError(
+                f"{self._who}: does not know output configurations, as older devices: set format ="
+                ' "mtdata"'
+            )
         found = _outputs_of(reply)
         faults = output_differences(found, rate, self._triggers, self._needs)
         if not faults:
@@ -251,6 +285,40 @@ class XbusHandshake:
         self._port.set_baud(baud)
         self._conversation.reset()
         return await self._conversation.enter_config(tries=1, wait_s=_LISTEN_S)
+
+
+def legacy_differences(
+    settings: XbusSettings,
+    mode: int | None,
+    stored: int | None,
+    found_hz: float | None,
+    *,
+    skipped: bool,
+) -> list[str]:
+    """Return the differences between an older device and the settings; empty if none.
+
+    Required are orientations and the sample counter at ``rate_hz``, without samples left out.
+    """
+    if mode is None or stored is None:
+        return ["it does not report its output mode"]
+    try:
+        layout = mtdata.MTDataLayout(mode, stored)
+    except ValueError as fault:
+        return [str(fault)]
+    faults = []
+    for key, found in (("output_mode", mode), ("output_settings", stored)):
+        asked = getattr(settings, key)
+        if asked is not None and asked != found:
+            faults.append(f"its {key} is 0x{found:X}, not 0x{asked:X}")
+    if not layout.items & {Item.QUATERNION, Item.EULER_ANGLES, Item.ROTATION_MATRIX}:
+        faults.append("it sends no orientation (output mode 0x0004)")
+    if Item.PACKET_COUNTER not in layout.items:
+        faults.append("it sends no sample counter (output settings 0x00000001)")
+    if skipped:
+        faults.append("it leaves samples out (output skip factor): lower its sample rate instead")
+    if found_hz is not None and abs(found_hz - settings.rate_hz) > _RATE_SHARE * found_hz:
+        faults.append(f"it measures at {found_hz:g} Hz: set rate_hz = {found_hz:.0f}")
+    return faults
 
 
 def output_differences(

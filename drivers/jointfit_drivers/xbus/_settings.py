@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, field_validator
 from typing_extensions import override
@@ -11,6 +11,9 @@ from jointfit_drivers.gateway_orientation import GatewaySettings
 from jointfit_drivers.serial_imu import SerialImuSettings
 from jointfit_drivers.xbus._required_outputs import message_bytes, required_outputs
 from jointfit_drivers.xbus._sync_lines import XbusSyncSettings  # noqa: TC001 - pydantic reads it
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 MAX_RATE_HZ = 400
 """Highest output rate of orientation of the supported devices, Hz."""
@@ -37,6 +40,42 @@ class XbusSettings(GatewaySettings, SerialImuSettings):
     reset_if_stuck: bool = Field(
         False, description="reset a device that streams but does not answer; its clock restarts"
     )
+
+    format: Literal["mtdata2", "mtdata"] = Field(
+        "mtdata2",
+        description="message of the measurements: `mtdata2`, or `mtdata` of older devices, whose"
+        " configuration is read and never written",
+    )
+    output_mode: int | None = Field(
+        None,
+        ge=0,
+        le=0xFFFF,
+        description="fields of MTData; default: as the device reports, which a capture may lack",
+    )
+    output_settings: int | None = Field(
+        None, ge=0, le=0xFFFF_FFFF, description="format of MTData; default: as the device reports"
+    )
+    legacy_world: Literal["NWU", "ENU"] = Field(
+        "NWU",
+        description="world of MTData unless its settings say NED: `NWU` is that of MTi and MTx of "
+        "the first generations, `ENU` that of later devices",
+    )
+
+    @override
+    def contradictions(self) -> Iterable[tuple[str, str]]:
+        """Yield keys that MTData does not allow."""
+        yield from super().contradictions()
+        if self.format != "mtdata":
+            for key in ("output_mode", "output_settings"):
+                if getattr(self, key) is not None:
+                    yield key, 'only MTData has it: set format = "mtdata", or remove it'
+            return
+        if self.orientation == "gateway":
+            yield "orientation", 'MTData has no device time: set orientation = "device"'
+        if self.persist:
+            yield "persist", "the configuration of MTData is never written: remove it"
+        if self.sync is not None:
+            yield "sync", "sync lines need MTData2: remove it"
 
     @property
     @override

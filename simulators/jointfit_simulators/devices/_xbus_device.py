@@ -19,6 +19,7 @@ from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_protocols.xbus.sync_lines import IN1
 from jointfit_simulators.devices._inertial_signals import InertialSignals
+from jointfit_simulators.devices._xbus_legacy import legacy_content, legacy_reply
 from jointfit_simulators.devices._xbus_sync_inputs import SyncInputs
 from jointfit_simulators.imu_device import clean_wire
 from jointfit_simulators.wires import PtyLine
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from jointfit_protocols.orientation import World
+    from jointfit_protocols.xbus.mtdata import MTDataLayout
     from jointfit_protocols.xbus.mtdata2 import Trigger, Value
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
@@ -46,6 +49,7 @@ _PARAMETER = b"\x21"
 """Error code for a parameter out of range."""
 _INVALID = b"\x04"
 """Error code for an invalid message."""
+_UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 _MEASURED = (Item.QUATERNION, Item.RATE_OF_TURN, Item.DELTA_Q)
 """Items that define the sample rate."""
 
@@ -77,6 +81,12 @@ class XbusDeviceOptions:
     """Whether the device starts with WakeUp and `WAKE_UP_S` for the reply."""
     stuck: bool = False
     """Whether the device streams and ignores all requests except Reset, which ends the fault."""
+    legacy: MTDataLayout | None = None
+    """Fields of MTData of an older device, which knows no output configuration."""
+    legacy_world: World = "NWU"
+    legacy_hz: float = 100.0
+    legacy_skip: int = 0
+    """Samples left out after each message of MTData."""
     gnss: bool = False
     """Whether messages of a GNSS receiver, with its own time and no orientation, are inserted."""
     config_delay_s: float = 0.0
@@ -135,6 +145,8 @@ class XbusDevice:
     @property
     def rate_hz(self) -> float:
         """Configured samples per second; 0 without an item that defines it."""
+        if self._options.legacy is not None:
+            return self._options.legacy_hz
         for data_id, rate in self.outputs:
             if data_id & 0xFFF0 in _MEASURED:
                 return float(FILTER_RATE_HZ if rate in {0, setup.MAX_RATE} else rate)
@@ -225,7 +237,7 @@ class XbusDevice:
                 self._after(self._options.config_delay_s, lambda: self._configure(message.bid))
             else:
                 self._configure(message.bid)
-        elif not self.streaming and (reply := self._reply(message.mid, message.data)):
+        elif not self.streaming and (reply := self._reply_of_age(message.mid, message.data)):
             self._send(*reply, message.bid)
 
     def _configure(self, bid: int) -> None:
@@ -236,6 +248,18 @@ class XbusDevice:
         self.streaming = self._waking = False
         if self._timer is not None:
             self._timer.cancel()
+
+    def _reply_of_age(self, mid: int, data: bytes) -> tuple[int, bytes] | None:
+        """Return the answer of an older or a newer device; neither knows the other's requests."""
+        options = self._options
+        if options.legacy is None:
+            unknown = mid in {XbusMessageId.OUTPUT_MODE, XbusMessageId.OUTPUT_SETTINGS}
+        else:
+            unknown = mid == XbusMessageId.OUTPUT_CONFIGURATION
+            rate_hz, skip = options.legacy_hz, options.legacy_skip
+            if (reply := legacy_reply(options.legacy, rate_hz, skip, mid)) is not None:
+                return reply
+        return (XbusMessageId.ERROR, _INVALID) if unknown else self._reply(mid, data)
 
     def _reply(self, mid: int, data: bytes) -> tuple[int, bytes] | None:
         """Return identifier and data of the answer in configuration mode."""
@@ -322,6 +346,10 @@ class XbusDevice:
         if self._to_lose:
             self._to_lose -= 1
             return False
+        layout, world = self._options.legacy, self._options.legacy_world
+        if layout is not None:
+            content = legacy_content(layout, world, counter, q or _UPRIGHT, self._inertial)
+            return self._send(XbusMessageId.MT_DATA, content)
         edges = self._sync.next_triggers([data_id for data_id, _ in self.outputs])
         data = self._content(counter, ticks % self._modulus, q, edges)
         return self._send(XbusMessageId.MT_DATA2, data)

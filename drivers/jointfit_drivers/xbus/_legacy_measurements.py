@@ -1,0 +1,114 @@
+"""Measurements of older devices: MTData, whose fields the output mode and settings define.
+
+The device reports both in its replies to the handshake, or rig.toml has them, as for a capture
+without the handshake. Euler angles and matrices become quaternions.
+
+Invariant: the result depends only on the messages fed.
+"""
+
+from __future__ import annotations
+
+from math import cos, radians, sin, sqrt
+from typing import TYPE_CHECKING, Any
+
+from jointfit_protocols.xbus import XbusMessageId
+from jointfit_protocols.xbus.mtdata import (
+    NED,
+    MTDataLayout,
+    decode_output_mode,
+    decode_output_settings,
+)
+from jointfit_protocols.xbus.mtdata2 import Item, real_id
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from jointfit_protocols.orientation import Quaternion, World
+
+_QUATERNION = int(Item.QUATERNION)
+
+
+class LegacyMeasurements:
+    """Fields of the MTData messages of one device.
+
+    Parameters
+    ----------
+    output_mode, output_settings : int, optional
+        As in rig.toml; None: as the device reports them.
+    world : {"NWU", "ENU"}
+        World of the device, unless its settings say NED.
+    """
+
+    def __init__(self, output_mode: int | None, output_settings: int | None, world: World) -> None:
+        self._mode, self._settings, self._world = output_mode, output_settings, world
+        self._layout: MTDataLayout | None = None
+        self.fault = ""
+        """Why messages cannot be decoded; empty if they can."""
+        self._update()
+
+    @property
+    def world_id(self) -> int:
+        """Identifier of a quaternion of MTData2 in the same world."""
+        ned = self._layout is not None and self._layout.settings & NED
+        return real_id(Item.QUATERNION, world="NED" if ned else self._world)
+
+    def reply(self, mid: int, data: bytes) -> None:
+        """Take the output mode or the output settings from a reply of the device."""
+        if mid == XbusMessageId.OUTPUT_MODE_ACK:
+            self._mode = decode_output_mode(data) if data else self._mode
+        elif mid == XbusMessageId.OUTPUT_SETTINGS_ACK:
+            self._settings = decode_output_settings(data) if data else self._settings
+        else:
+            return
+        self._update()
+
+    def read(self, data: bytes) -> Mapping[int, Any] | None:
+        """Return the values of a message by the identifiers of MTData2; None if it has others."""
+        if self._layout is None:
+            return None
+        values: dict[int, Any] | None = self._layout.read(data)
+        if values is None:
+            return None
+        if Item.EULER_ANGLES in values:
+            values[_QUATERNION] = _of_euler(*values.pop(Item.EULER_ANGLES))
+        elif Item.ROTATION_MATRIX in values:
+            values[_QUATERNION] = _of_matrix(values.pop(Item.ROTATION_MATRIX))
+        return values
+
+    def _update(self) -> None:
+        self._layout, self.fault = None, "output mode and settings of MTData are unknown"
+        if self._mode is None or self._settings is None:
+            return
+        try:
+            self._layout, self.fault = MTDataLayout(self._mode, self._settings), ""
+        except ValueError as fault:
+            self.fault = str(fault)
+
+
+def _of_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """Return the quaternion of R = Rz(yaw) Ry(pitch) Rx(roll), degrees."""
+    r, p, y = (0.5 * radians(angle) for angle in (roll, pitch, yaw))
+    cr, sr, cp, sp, cy, sy = cos(r), sin(r), cos(p), sin(p), cos(y), sin(y)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+def _of_matrix(by_columns: tuple[float, ...]) -> Quaternion:
+    """Return the quaternion of a matrix by columns; its norm shows whether it is a rotation."""
+    a, d, g, b, e, h, c, f, i = by_columns
+    # Shepperd (1978): the largest component is the most exact.
+    squares = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
+    rows = (
+        (squares[0], h - f, c - g, d - b),
+        (h - f, squares[1], b + d, c + g),
+        (c - g, b + d, squares[2], f + h),
+        (d - b, c + g, f + h, squares[3]),
+    )
+    largest = max(range(4), key=squares.__getitem__)
+    scale = 0.5 / sqrt(squares[largest]) if squares[largest] > 0.0 else 0.0
+    w, x, y, z = (scale * value for value in rows[largest])
+    return w, x, y, z

@@ -1,0 +1,82 @@
+"""Messages of a simulated older Xbus device: MTData, and its replies about them."""
+
+from __future__ import annotations
+
+import struct
+from math import asin, atan2, degrees
+from typing import TYPE_CHECKING
+
+from jointfit_protocols.orientation import native_of
+from jointfit_protocols.xbus import XbusMessageId
+from jointfit_protocols.xbus.mtdata import NED, PERIOD_HZ, MTDataLayout
+from jointfit_protocols.xbus.mtdata2 import FILTER_VALID, Item
+
+if TYPE_CHECKING:
+    from jointfit_protocols.orientation import World
+    from jointfit_protocols.xbus.mtdata2 import Value
+    from jointfit_simulators.devices._inertial_signals import InertialSignals
+    from jointfit_simulators.imu_device import Quaternion
+
+
+def legacy_content(
+    layout: MTDataLayout, world: World, counter: int, q: Quaternion, inertial: InertialSignals
+) -> bytes:
+    """Return the data of one MTData.
+
+    Parameters
+    ----------
+    layout : MTDataLayout
+        Fields of the message.
+    world : World
+        World of the device, unless its settings say NED.
+    counter : int
+        Sample counter.
+    q : Quaternion
+        Orientation, sensor to ENU world.
+    inertial : InertialSignals
+        Rates, accelerations and magnetic field.
+    """
+    native = native_of(q, "NED" if layout.settings & NED else world)
+    values: dict[int, Value] = {
+        Item.PACKET_COUNTER: counter,
+        Item.STATUS_BYTE: FILTER_VALID,
+        Item.QUATERNION: native,
+        Item.EULER_ANGLES: _euler(native),
+        Item.ROTATION_MATRIX: _matrix(native),
+    }
+    for item in (Item.ACCELERATION, Item.RATE_OF_TURN, Item.MAGNETIC_FIELD):
+        value = inertial.value(item)
+        if value is not None:
+            values[item] = value
+    return layout.write(values)
+
+
+def legacy_reply(
+    layout: MTDataLayout, rate_hz: float, skip: int, mid: int
+) -> tuple[int, bytes] | None:
+    """Return the answer to a request about MTData; None for other requests."""
+    replies: dict[int, bytes] = {
+        XbusMessageId.OUTPUT_MODE: struct.pack(">H", layout.mode),
+        XbusMessageId.OUTPUT_SETTINGS: struct.pack(">I", layout.settings),
+        XbusMessageId.PERIOD: struct.pack(">H", round(PERIOD_HZ / rate_hz)),
+        XbusMessageId.OUTPUT_SKIP: struct.pack(">H", skip),
+    }
+    data = replies.get(mid)
+    return None if data is None else (mid + 1, data)
+
+
+def _matrix(q: Quaternion) -> tuple[float, ...]:
+    """Return R(q) by columns."""
+    w, x, y, z = q
+    return (
+        1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
+        2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
+        2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+
+
+def _euler(q: Quaternion) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw, degrees."""
+    r = _matrix(q)
+    pitch = asin(max(-1.0, min(1.0, -r[2])))
+    return degrees(atan2(r[5], r[8])), degrees(pitch), degrees(atan2(r[1], r[0]))

@@ -1,0 +1,119 @@
+"""MTData of older devices: fields by output mode and settings, in every format of reals."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jointfit_protocols.xbus import mtdata
+from jointfit_protocols.xbus.mtdata import (
+    EULER,
+    FORMAT_SHIFT,
+    MATRIX,
+    NED,
+    NO_ACCELERATION,
+    NO_INPUT_1,
+    NO_MAGNETIC,
+    SAMPLE_COUNTER,
+    UTC_TIME,
+    MTDataLayout,
+    OutputMode,
+    decode_output_mode,
+    decode_output_settings,
+    rate_hz,
+)
+from jointfit_protocols.xbus.mtdata2 import Item
+
+CALIBRATED_QUATERNION = OutputMode.CALIBRATED | OutputMode.ORIENTATION
+MODES = st.lists(st.sampled_from(list(OutputMode)), unique=True).map(sum)
+SETTINGS = st.builds(
+    lambda stamps, kind, left_out, reals, inputs, ned: (
+        stamps | kind | left_out << 4 | reals << FORMAT_SHIFT | inputs << 10 | ned
+    ),
+    st.integers(0, 3),
+    st.sampled_from([0, EULER, MATRIX]),
+    st.integers(0, 7),
+    st.integers(0, 2),
+    st.integers(0, 3),
+    st.sampled_from([0, NED]),
+)
+
+
+def test_calibrated_data_quaternion_and_counter_are_at_their_places() -> None:
+    data = struct.pack(">9f4fH", *range(9), 0.5, -0.5, 0.5, 0.5, 65_535)
+    layout = MTDataLayout(CALIBRATED_QUATERNION, SAMPLE_COUNTER)
+    assert layout.size == len(data) == 54
+    assert layout.read(data) == {
+        Item.ACCELERATION: (0.0, 1.0, 2.0),
+        Item.RATE_OF_TURN: (3.0, 4.0, 5.0),
+        Item.MAGNETIC_FIELD: (6.0, 7.0, 8.0),
+        Item.QUATERNION: (0.5, -0.5, 0.5, 0.5),
+        Item.PACKET_COUNTER: 65_535,
+    }
+    assert layout.read(data + b"\0") is None
+
+
+def test_fields_that_are_not_used_are_skipped_by_their_size() -> None:
+    mode = (OutputMode.RAW_INERTIAL | OutputMode.TEMPERATURE | OutputMode.CALIBRATED
+            | OutputMode.ORIENTATION | OutputMode.AUXILIARY | OutputMode.STATUS)  # fmt: skip
+    settings = SAMPLE_COUNTER | UTC_TIME | EULER | NO_ACCELERATION | NO_MAGNETIC | NO_INPUT_1
+    data = bytes(20) + struct.pack(">f3f3fHBH", 25.0, 1, 2, 3, 10, 20, 30, 7, 2, 400) + bytes(12)
+    assert MTDataLayout(mode, settings).read(data) == {
+        Item.RATE_OF_TURN: (1.0, 2.0, 3.0),
+        Item.EULER_ANGLES: (10.0, 20.0, 30.0),
+        Item.STATUS_BYTE: 2,
+        Item.PACKET_COUNTER: 400,
+    }
+
+
+@pytest.mark.parametrize(
+    ("reals", "wire"),
+    [(1, "00180000 fff80000 00000000 00100000"),
+     (2, "800000000001 80000000ffff 000000000000 000000000001")],
+)  # fmt: skip
+def test_fixed_point_reals_are_decoded(reals: int, wire: str) -> None:
+    values = MTDataLayout(OutputMode.ORIENTATION, reals << FORMAT_SHIFT).read(bytes.fromhex(wire))
+    assert values == {Item.QUATERNION: (1.5, -0.5, 0.0, 1.0)}
+
+
+@given(MODES, SETTINGS, st.data())
+def test_every_mode_is_read_as_written(mode: int, settings: int, data: st.DataObject) -> None:
+    layout = MTDataLayout(mode, settings)
+    values = {
+        field.item: (
+            data.draw(st.tuples(*(st.integers(-2000, 2000).map(lambda n: n / 8),) * field.reals))
+            if field.reals
+            else data.draw(st.integers(0, 256**field.size - 1))
+        )
+        for field in layout.fields
+    }
+    wire = layout.write(values)
+    assert layout.read(wire) == values
+    assert layout.items == set(values)
+
+
+@given(MODES, SETTINGS, st.binary(max_size=120))
+def test_random_bytes_are_values_or_refused_by_their_length(
+    mode: int, settings: int, noise: bytes
+) -> None:
+    layout = MTDataLayout(mode, settings)
+    assert (layout.read(noise) is None) == (len(noise) != layout.size)
+
+
+@pytest.mark.parametrize(("mode", "settings"), [(0x0100, 0), (0x0004, 3 << FORMAT_SHIFT)])
+def test_unknown_modes_are_refused(mode: int, settings: int) -> None:
+    with pytest.raises(ValueError, match="is unknown"):
+        MTDataLayout(mode, settings)
+
+
+def test_replies_of_the_device_have_mode_settings_and_rate() -> None:
+    assert decode_output_mode(b"\x00\x06") == 6
+    assert decode_output_settings(b"\x80\x00\x00\x01") == NED | SAMPLE_COUNTER
+    assert decode_output_mode(b"") is decode_output_settings(b"\x00") is None
+    assert rate_hz(struct.pack(">H", 1152), b"") == 100.0
+    assert rate_hz(struct.pack(">H", 1152), b"\x00\x01") == 50.0
+    assert rate_hz(b"\x00\x00", b"") is rate_hz(b"", b"") is None
+    assert mtdata.COUNTS == 1 << 16
