@@ -1,8 +1,8 @@
 """Workers forked after one collection: ``pytest -p tests.forked_workers --workers 6``.
 
 A worker of pytest-xdist imports and collects thousands of tests itself. Here one process collects,
-and its forks share the modules and tests. They ask for a batch at a time: the tests of a file, in
-their order, so that fixtures of modules are set up once. Options of pytest keep their meaning.
+and its forks share the modules and tests. They ask for a batch at a time. Tests that share
+fixtures of a module are in one batch, so that these are set up once.
 
 Invariant: every test is reported once; a test in which a worker dies fails, and the tests behind it
 run in a new worker.
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 Batch: TypeAlias = list[int]
 """Indices of tests in the order of the collection."""
 
+LARGEST = 20
+"""Largest number of tests in a batch of those that share no fixtures."""
 WORKERS_THAT_WAIT = 2
 """Number of workers that begin with tests in real time: they wait for half of their time."""
 FIT_NICE = 10
@@ -65,7 +67,11 @@ def pytest_runtestloop(session: pytest.Session) -> bool | None:
 
 def waits(item: pytest.Item) -> bool:
     """Return whether a test waits for devices or daemons in real time."""
-    return any(item.get_closest_marker(name) is not None for name in ("system", "real_time"))
+    return _marked(item, "system", "real_time")
+
+
+def _marked(item: pytest.Item, *names: str) -> bool:
+    return any(item.get_closest_marker(name) is not None for name in names)
 
 
 def limit_s(item: pytest.Item) -> float:
@@ -75,13 +81,30 @@ def limit_s(item: pytest.Item) -> float:
 
 
 def batches(items: list[pytest.Item], *, waiting: bool) -> deque[Batch]:
-    """Return the tests that wait, or all others, by file: those with the longest limit first."""
+    """Return the tests that wait, or all others, in batches: those with the longest limit first.
+
+    The tests of a file stay together if they share fixtures. Others are divided: an experiment or a
+    test with a time limit of its own is long, so it is a batch.
+    """
     chosen = [index for index, item in enumerate(items) if waits(item) is waiting]
-    by_file = itertools.groupby(
-        chosen, key=lambda index: (items[index].path, limit_s(items[index]))
-    )
-    found = sorted(((key, list(batch)) for key, batch in by_file), key=lambda pair: -pair[0][1])
-    return deque(batch for _, batch in found)
+    found: list[Batch] = []
+    for _, indices in itertools.groupby(chosen, key=lambda index: items[index].path):
+        of_file = list(indices)
+        if any(_shares_fixtures(items[index]) for index in of_file):
+            found.append(of_file)
+            continue
+        long = [index for index in of_file if _marked(items[index], "timeout", "experiment")]
+        short = [index for index in of_file if index not in long]
+        found += [[index] for index in long]
+        found += [short[begin : begin + LARGEST] for begin in range(0, len(short), LARGEST)]
+    return deque(sorted(found, key=lambda batch: -max(limit_s(items[index]) for index in batch)))
+
+
+def _shares_fixtures(item: pytest.Item) -> bool:
+    fixtures: dict[str, list[pytest.FixtureDef[object]]]
+    fixtures = item._fixtureinfo.name2fixturedefs  # type: ignore[attr-defined]  # no public way
+    scopes = {definitions[-1].scope for definitions in fixtures.values()}
+    return not scopes.isdisjoint({"class", "module", "package"})
 
 
 @dataclass
