@@ -7,7 +7,7 @@ depends on last bits shows itself by a test that passes in one of these runs and
 A run has the kernels (``OPENBLAS_CORETYPE``) and the loops (``NPY_DISABLE_CPU_FEATURES``) of one
 processor. The newest one is left out where `make test` runs on it anyway, and one that this
 processor cannot execute is skipped with its reason. After a failure, or with ``--all``, two more
-runs combine the oldest with the newest: they tell whether kernels or loops are the cause.
+runs combine the oldest with the newest, which separates kernels from loops as the cause.
 
 Exit status: 0 if every run passed, 1 otherwise.
 """

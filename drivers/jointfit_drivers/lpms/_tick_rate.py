@@ -1,7 +1,7 @@
 """Check of the configured unit of device time against the arrivals.
 
-Nobody has measured on hardware how many ticks a second each model counts, and old firmware sends
-seconds in place of ticks. Arrivals over spans of seconds show both.
+The ticks per second of each model are not verified on hardware, and old firmware sends seconds in
+place of ticks. Arrivals over spans of seconds show both.
 
 Invariant: pure arithmetic on ticks and arrival stamps.
 """

@@ -35,7 +35,7 @@ class TcpLink:
     name : str
         Name of the server for messages, with its port.
     remedy : str
-        What to do if no program listens.
+        Advice for the case that no program listens.
     take : callable
         Called with all received bytes, in order of arrival.
     """

@@ -1,7 +1,7 @@
 """Driver of IMUs on a serial port that rig.toml describes.
 
-The driver only receives: a table does not describe how a device is configured. Data in which no
-message is found are a fault of the table or of the speed, and are reported with what was found.
+The driver only receives: a table does not describe how a device is configured. Data without any
+message are a fault of the table or of the speed; the error describes the received bytes.
 """
 
 from __future__ import annotations

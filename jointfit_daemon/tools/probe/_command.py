@@ -1,4 +1,4 @@
-"""Command `jointfit probe`: lists devices, and listens where it is told to."""
+"""Command `jointfit probe`: lists devices, and decodes the data of named ports."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def probe(
     Opens only the named ports, interfaces and hosts, and changes no setting of a device. A port is
     read at the usual speeds of the installed drivers until one of them decodes the data. Prints
     lines for rig.toml. With --physical-test it opens that sensor as the daemon does, guides through
-    three rotations, and prints what to correct. Exit codes: 0 everything named was recognized, or
+    three rotations, and prints the corrections. Exit codes: 0 everything named was recognized, or
     the frames are as configured; 1 something was not, or they are not; 2 invalid options.
     """
     if physical_test is not None:
@@ -109,11 +109,11 @@ def _test_by_hand(name: str, config: Path, step_s: float, *, json: bool) -> None
     if name not in sensors:
         raise ValueError(f"--physical-test: {unknown_name('sensor', name, list(sensors))}")
 
-    def tell(text: str) -> None:
+    def print_step(text: str) -> None:
         typer.echo(text, err=json)
 
     try:
-        result = asyncio.run(run_physical_test(sensors[name], tell, step_s=step_s))
+        result = asyncio.run(run_physical_test(sensors[name], print_step, step_s=step_s))
     except PhysicalTestError as error:
         typer.echo(error, err=True)
         raise typer.Exit(EXIT_FAILED) from None
@@ -161,7 +161,7 @@ def _report(
             task = bar.add_task(f"listening on {name}", total=1.0)
             return {"progress": lambda share: bar.update(task, completed=share)}
 
-        heard = [
+        ports_read = [
             discovery.listen_serial(port, listen_s=listen_s, **listen_at(port))  # type: ignore[arg-type]  # one key
             for port in ports
         ]
@@ -170,7 +170,7 @@ def _report(
             for name in interfaces
         ]
         servers: list[FoundServer] = []
-        faults = _faults(heard, buses, listen_s)
+        faults = _faults(ports_read, buses, listen_s)
         if hosts or network:
             bar.add_task("asking motion-capture servers", total=None)
             servers, unanswered = asyncio.run(_servers(hosts, network=network, wait_s=listen_s))
@@ -180,11 +180,11 @@ def _report(
         serial_ports=found_ports,
         can_interfaces=discovery.find_can_interfaces(),
         can_channels=discovery.configured_can_channels(),
-        serial=heard,
+        serial=ports_read,
         can=buses,
         mocap_servers=servers,
         faults=faults,
-        rig_toml=rig_lines(found_ports, heard, buses, servers),
+        rig_toml=rig_lines(found_ports, ports_read, buses, servers),
     )
 
 

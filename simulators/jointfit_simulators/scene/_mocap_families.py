@@ -73,7 +73,7 @@ class MocapServer(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class CameraPlace:
-    """What a scene streams through a server."""
+    """Camera data that a scene streams through a server."""
 
     knobs: Knobs
     """Camera rate and random seed."""
@@ -97,12 +97,12 @@ class CameraPlace:
 
 @dataclass(frozen=True, slots=True)
 class MocapFamily:
-    """How a scene creates the server of one driver."""
+    """Motion-capture family of a scene, by its driver."""
 
     create: Callable[[CameraPlace], tuple[MocapServer, list[str]]]
-    """Server, and the lines of the ``[mocap]`` table after its driver."""
+    """Returns a server, and the lines of the ``[mocap]`` table after its driver."""
     sync_line: bool = False
-    """Whether ``sync_line`` may be set: its frames tell which exposures cause an edge."""
+    """Whether ``sync_line`` may be set: its frames mark the exposures that cause an edge."""
 
 
 def _natnet(place: CameraPlace) -> tuple[NatNetServer, list[str]]:
