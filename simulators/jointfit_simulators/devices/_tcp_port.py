@@ -48,6 +48,13 @@ class TcpClient:
             sent = self.socket.send(self._unsent)
             del self._unsent[:sent]
 
+        # no later frame may follow to continue this one, so the event loop continues it
+        with contextlib.suppress(RuntimeError, ValueError, OSError):  # no loop, or closed
+            loop = asyncio.get_running_loop()
+            loop.remove_writer(self.socket)
+            if self._unsent:
+                loop.add_writer(self.socket, self._flush)
+
 
 class TcpPort:
     """Listening socket that can be unplugged and plugged in again.
@@ -96,6 +103,7 @@ class TcpPort:
             self.clients.remove(client)
         with contextlib.suppress(RuntimeError, ValueError):
             asyncio.get_running_loop().remove_reader(client.socket)
+            asyncio.get_running_loop().remove_writer(client.socket)
         client.socket.close()
 
     async def serve(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from jointfit_simulators.scene._imu_families import BUS, IMU_FAMILIES, CanFamily, SensorPlace
+from jointfit_simulators.scene._opened_port import OpenedPort
 from jointfit_simulators.scene._streams import ImuStream
 from jointfit_simulators.wires import CanWire, PythonCanWire, SlcanAdapter, line_noise
 
@@ -88,6 +89,7 @@ def create_hardware(
             latency_ms=knobs.latency_can_ms if on_can else knobs.latency_uart_ms,
             shared_wire=on_can,
             now_ns=now_ns,
+            port=None if on_can else OpenedPort(directory / f"tty{name}"),
         )
         head = [f'id = "{name}"', f'segment = "{segment}"', f'driver = "{wires[name]}"']
         rate = f"rate_hz = {knobs.rate_hz:g}"

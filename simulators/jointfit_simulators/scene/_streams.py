@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_simulators.imu_device import Quaternion
+    from jointfit_simulators.scene._opened_port import OpenedPort
     from jointfit_simulators.settings import Knobs
 
 
@@ -74,6 +75,8 @@ class ImuStream:
         Whether other devices use the wire; unplugging then only stops this sensor.
     now_ns
         Host time of the start of the run, ns.
+    port
+        Serial port of the device; None on a wire that tells whether the host listens.
     """
 
     def __init__(
@@ -85,6 +88,7 @@ class ImuStream:
         latency_ms: float,
         shared_wire: bool,
         now_ns: int,
+        port: OpenedPort | None = None,
     ) -> None:
         self.name, self.device = name, device
         self.on_sample: SampleCallback | None = None
@@ -94,12 +98,14 @@ class ImuStream:
         self.timing = SampleTiming(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
         self._default_hz, self._shared = knobs.rate_hz, shared_wire
         self._unplugged = False
+        self._port = port
         self._planned: deque[tuple[int, int, Quaternion | None]] = deque()
         self._edges: deque[int] = deque(maxlen=_MOST_EDGES)
         self.dropped_out = 0
         """Number of samples dropped by `Knobs.dropout` while measuring."""
         self.unheard = 0
-        """Number of samples taken while unplugged, paused or not measuring."""
+        """Number of samples taken while unplugged, paused or not measuring, or before the first
+        opening of the port."""
         self.refused = 0
         """Number of samples rejected by a full line."""
 
@@ -133,7 +139,7 @@ class ImuStream:
         while self._edges and self._edges[0] <= true_ns:
             self.device.edge(self.timing.device_ns(self._edges.popleft()))
 
-        if self._unplugged or not sending or not self.device.streaming:
+        if self._unplugged or not sending or not self.device.streaming or not self._is_read():
             self.unheard += 1
             return
         if q is None:
@@ -148,6 +154,11 @@ class ImuStream:
             self.refused += 1
         elif self.on_sample is not None:
             self.on_sample(self.name, number, true_ns)
+
+    def _is_read(self) -> bool:
+        if self._port is not None and self._port.is_read:
+            self._port = None  # read from now on
+        return self._port is None
 
     def discard(self) -> None:
         """Discard the samples that are planned but not sent."""

@@ -1,0 +1,34 @@
+"""A rig of four IMU families with each family of cameras: the accuracy and account of the demo."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from jointfit_daemon.tools.demo._command import _run, missed_targets
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(300)]
+
+# Two on UARTs and two on CAN. What a streaming device sends before the first reply of its
+# handshake is discarded: these are silent until then, or have no handshake.
+FAMILIES = {"S1": "bno085", "S2": "lpms-can", "S3": "serial-table", "S4": "can-table"}
+
+
+@pytest.mark.parametrize("cameras", ["natnet", "qtm", "vicon", "vrpn"])
+async def test_four_families_meet_the_targets_of_the_demo_with_each_camera_system(
+    tmp_path: Path, cameras: str
+) -> None:
+    pytest.importorskip("iotcore")
+    options = [word for name, driver in FAMILIES.items() for word in ("--imu", f"{name}={driver}")]
+    options += ["--mocap", cameras]
+    figures, stopped = await _run(tmp_path, 8.0, "leg", options, headless=True, picture=None)
+    assert stopped is None
+    assert missed_targets(figures) == []
+    assert figures["corrupt"] == 0
+    rig = (tmp_path / "rig.toml").read_text(encoding="utf-8")
+    for driver in (*FAMILIES.values(), cameras):
+        assert rig.count(f'driver = "{driver}"') == 1
