@@ -6,24 +6,15 @@ pylsl is an extra. Its calls block, so all of them run in threads of the driver.
 from __future__ import annotations
 
 import ctypes
+import socket
 import time
-from typing import Any, NamedTuple
+from typing import Any
 
 from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_protocols.lsl import RoundTrip
 
 _READINGS = 5
 """Comparisons of LSL's clock with that of the host; the one that took the shortest time is used."""
-
-
-class FoundStream(NamedTuple):
-    """One stream of the network."""
-
-    info: Any
-    """`pylsl.StreamInfo` without description."""
-    address: str
-    """Address of the sender; empty if unknown."""
-    port: int
 
 
 def load_library() -> Any:
@@ -52,8 +43,8 @@ def load_library() -> Any:
 
 def search_streams(
     lsl: Any, query: str, server: str | None, *, least: int, wait_s: float
-) -> list[FoundStream]:
-    """Return the streams that answer to a query; blocks for at most `wait_s`.
+) -> list[Any]:
+    """Return the `pylsl.StreamInfo` of the streams that answer; blocks for at most `wait_s`.
 
     Parameters
     ----------
@@ -68,23 +59,26 @@ def search_streams(
     wait_s : float
         Longest wait, s.
     """
-    found = []
-    for info in lsl.resolve_bypred(query, minimum=least, timeout=wait_s):
-        text = info.as_xml()
-        address, port = _element(text, "v4address"), _element(text, "v4data_port")
-        names = {info.hostname().lower(), info.hostname().lower().split(".")[0], address}
-        if server is None or server.lower() in names or _is_loopback(server, address):
-            found.append(FoundStream(info, address, int(port) if port.isdecimal() else 0))
-    return found
+    found = lsl.resolve_bypred(query, minimum=least, timeout=wait_s)
+    return [info for info in found if server is None or _is_sender(server, info.hostname())]
 
 
-def _element(xml: str, name: str) -> str:
-    _, _, rest = xml.partition(f"<{name}>")
-    return rest.partition("</")[0].strip()
+def _is_sender(server: str, hostname: str) -> bool:
+    """Return whether `server` is the PC with this name; a stream has no address."""
+    name = hostname.lower()
+    if server.lower() in {name, name.partition(".")[0]}:
+        return True
+    if hostname == socket.gethostname() and server in {"localhost", "127.0.0.1"}:
+        return True
+    return bool(addresses_of(server) & addresses_of(hostname))
 
 
-def _is_loopback(server: str, address: str) -> bool:
-    return server in {"localhost", "127.0.0.1"} and address.startswith("127.")
+def addresses_of(host: str) -> set[str]:
+    """Return the IPv4 addresses of a host; empty if its name is unknown here."""
+    try:
+        return {str(one[4][0]) for one in socket.getaddrinfo(host, None, family=socket.AF_INET)}
+    except (OSError, UnicodeError):
+        return set()
 
 
 def compare_clocks(lsl: Any, inlet: Any, wait_s: float) -> RoundTrip | None:

@@ -13,7 +13,7 @@ from jointfit_daemon.device_search import Finding, FoundServer
 from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_drivers.lsl_markers._channels import stream_layout
 from jointfit_drivers.lsl_markers._decoder import LslMarkersDecoder
-from jointfit_drivers.lsl_markers._library import load_library, search_streams
+from jointfit_drivers.lsl_markers._library import addresses_of, load_library, search_streams
 from jointfit_drivers.lsl_markers._session import SEARCH_S, LslSession
 from jointfit_drivers.lsl_markers._settings import LslMarkersSettings
 from jointfit_drivers.motion_capture import CHECK, Reception, content_findings
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 _REMEDY = "start the LSL program of the camera software, and select markers or rigid bodies in it"
 _MOST_STREAMS = 32
+_PORT = 16_572
+"""First port of LSL; senders use it and the next ones."""
 
 
 async def find_servers(
@@ -51,17 +53,17 @@ def _search(lsl: Any, hosts: Sequence[str], broadcast: bool, wait_s: float) -> l
     found = {}
     for server in [None] if broadcast else list(hosts):
         # The search lasts as long as its time, because any number of streams may answer.
-        for one in search_streams(lsl, query, server, least=_MOST_STREAMS, wait_s=wait_s):
-            found[one.info.uid()] = one
-    return [_described(lsl, one, wait_s) for one in found.values()]
+        for info in search_streams(lsl, query, server, least=_MOST_STREAMS, wait_s=wait_s):
+            found[info.uid()] = info
+    return [_described(lsl, info, wait_s) for info in found.values()]
 
 
-def _described(lsl: Any, one: Any, wait_s: float) -> FoundServer:
+def _described(lsl: Any, info: Any, wait_s: float) -> FoundServer:
     """Return a stream with the names of its markers and bodies."""
     markers: tuple[str, ...] = ()
     bodies: tuple[str, ...] = ()
     try:
-        inlet = lsl.StreamInlet(one.info, recover=False)
+        inlet = lsl.StreamInlet(info, recover=False)
         description = parse_description(inlet.info(timeout=wait_s).as_xml().encode())
     except RuntimeError:  # the sender has just ended
         description = ""
@@ -71,16 +73,24 @@ def _described(lsl: Any, one: Any, wait_s: float) -> FoundServer:
         bodies = tuple(entry.name for entry in layout.bodies)
     return FoundServer(
         driver="lsl-markers",
-        server=one.address or one.info.hostname(),
-        port=one.port,
-        interface=local_address(one.address, None) if one.address else "",
-        application=f"LSL stream {one.info.name()}",
-        version="",
-        protocol=f"LSL {lsl.protocol_version() / 100:.2f}",
+        server=info.hostname(),
+        port=_PORT,
+        interface=_interface(info.hostname()),
+        application=f"LSL stream {info.name()}",
+        version=f"{info.version() / 100:.2f}",
+        protocol="LSL",
         transport="unicast",
         bodies=bodies,
         markers=markers,
     )
+
+
+def _interface(hostname: str) -> str:
+    """Return the address of this host's network card towards a sender."""
+    try:
+        return local_address(min(addresses_of(hostname)), None)
+    except (OSError, ValueError):
+        return "an unknown network card"
 
 
 async def diagnose(settings: LslMarkersSettings, wait_s: float) -> list[Finding]:

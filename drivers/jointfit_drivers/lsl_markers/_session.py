@@ -158,8 +158,8 @@ class LslSession:
             found = search_streams(lsl, settings.query(), settings.server, least=2, wait_s=_STEP_S)
             # The same source may be announced twice while it restarts: the newest is alive.
             newest = {
-                one.info.source_id() or one.info.uid(): one.info
-                for one in sorted(found, key=lambda one: one.info.created_at())
+                info.source_id() or info.uid(): info
+                for info in sorted(found, key=lambda info: info.created_at())
             }
             if len(newest) > 1:
                 listed = ", ".join(

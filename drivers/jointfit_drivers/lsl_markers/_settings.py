@@ -17,7 +17,9 @@ class LslMarkersSettings(MocapSettings):
     """The ``[mocap]`` table for every program that sends markers or rigid bodies to LSL."""
 
     server: str | None = Field(
-        None, description="address or name of the sending PC; default: any in the network"
+        None,
+        description="host name of the sending PC, or an address to which its name resolves;"
+        " default: any in the network",
     )
     stream: str | None = Field(None, min_length=1, description="name of the stream; default: any")
     stream_type: str | None = Field(

@@ -148,6 +148,9 @@ async def test_search_and_diagnosis_name_the_content(lsl_network: Any) -> None:
     mine = [one for one in found if one.markers == ("T1", "T2")]
     assert [one.bodies for one in mine] == [("Thigh",)]
     assert mine[0].application == "LSL stream Simulated cameras"
+    for host, known in ((mine[0].server, True), ("127.0.0.1", True), ("192.0.2.7", False)):
+        named = await LslMarkersMocap.find_servers([host], broadcast=False, port=None, wait_s=0.3)
+        assert any(one.markers == ("T1", "T2") for one in named) == known
 
     findings = asyncio.create_task(LslMarkersMocap.diagnose(settings(), 0.5))
     while not findings.done():
