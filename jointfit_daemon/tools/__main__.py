@@ -13,6 +13,7 @@ import typer
 from jointfit_daemon.tools import fuse
 from jointfit_daemon.tools.batch import batch
 from jointfit_daemon.tools.calibrate import calibrate
+from jointfit_daemon.tools.calibrate_sensor import calibrate_sensor
 from jointfit_daemon.tools.center import center
 from jointfit_daemon.tools.center_study import center_study
 from jointfit_daemon.tools.check import check
@@ -49,6 +50,7 @@ for command in (
     report, batch, replay,
 ):  # fmt: skip
     app.command()(command)
+app.command("calibrate sensor")(calibrate_sensor)
 app.add_typer(fuse.app)
 
 

@@ -12,6 +12,8 @@ from jointfit_daemon.tools.command_group import EXIT_MISUSE
 from jointfit_daemon.tools.text_output import echo_wrapped
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     from jointfit_daemon.config import Source
 
 
@@ -67,9 +69,21 @@ def check(
         )
         for remark in model.remarks:
             console.print(f"[dim]note:[/] {escape(remark)}")
-    for warning in warnings:
-        console.print(f"[yellow]warning:[/] {escape(warning)}")
+    known = map(escape, _calibration_lines(rig.sources))
+    for line in (*known, *(f"[yellow]warning:[/] {escape(each)}" for each in warnings)):
+        console.print(line)
     console.print(f"installed drivers: {', '.join(driver_names())}")
+
+
+def _calibration_lines(sources: Iterable[Source]) -> Iterator[str]:
+    """Yield a line for each sensor whose readings are corrected."""
+    from jointfit_daemon.sensor_calibration import calibration_of
+
+    for source in sources:
+        if (known := calibration_of(source.settings)) is not None:
+            serial = "" if known.serial is None else f", serial {known.serial}"
+            parts = ", ".join(known.parts) or "nothing"
+            yield f"{source.id}: sensor calibration of {known.date}: {parts}{serial}"
 
 
 def _rate(source: Source) -> str:

@@ -57,6 +57,20 @@ class CommandGroup(TyperGroup):
     """Runs a command and converts errors that a user can correct into a message."""
 
     @override
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return name, command and arguments; a name may have two words."""
+        two = " ".join(args[:2])
+        if " " in two and two in self.commands:
+            return two, self.commands[two], args[2:]
+        return super().resolve_command(ctx, args)
+
+    @override
+    def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
+        """Return the completions of one word; a shell would split a name of two."""
+        found = super().shell_complete(ctx, incomplete)
+        return [item for item in found if " " not in item.value]
+
+    @override
     def invoke(self, ctx: Any) -> Any:
         """Run the selected command; on failure print a message and exit with 1, 2 or 130."""
         try:

@@ -57,6 +57,8 @@ FEWEST_ON_SPHERE = 20
 """Readings from which the center is estimated."""
 _EVERY = 20
 """Kept readings between two computations of the missing directions."""
+_MOST_NAMES = 6
+"""Most directions that an error names."""
 _SPACING = 0.05
 """Smallest difference of successive readings, as a share of their range: readings at rest carry no
 information."""
@@ -196,9 +198,15 @@ def _check_coverage(missing: set[int]) -> None:
         raise SensorCalibrationError(
             f"the field was measured in {covered} of {len(DIRECTIONS)} directions, expected at "
             f"least {FEWEST_DIRECTIONS} and five of the six axes; missing in sensor axes: "
-            f"{', '.join(direction_names(missing))}. Turn each of these sides towards the field "
+            f"{_first_names(missing)}. Turn each of these sides towards the field "
             "(north and down, in the southern hemisphere north and up)"
         )
+
+
+def _first_names(missing: set[int]) -> str:
+    names = direction_names(missing)
+    more = len(names) - _MOST_NAMES
+    return ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _check_saturation(fields: Array) -> None:
@@ -250,7 +258,7 @@ class MagnetometerStep:
         missing = self._missing
         directions = (len(DIRECTIONS) - len(missing)) / COMPLETE
         share = min(directions, len(self._fields) / FEWEST_READINGS, 1.0)
-        return StepProgress(share, direction_names(missing))
+        return StepProgress(share, () if self.is_complete else direction_names(missing))
 
     def add(self, reading: SensorReading) -> None:
         """Add a reading; it is kept if its field differs from the last one."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from operator import mul
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ class VectorErrors:
     def measure(self, true: Vector, random: Random) -> Vector:
         """Return the measurement of a vector in sensor axes."""
         x, y, z = (
-            sum(map(float.__mul__, row, true)) + bias + self._noise(random)
+            sum(map(mul, row, true)) + bias + self._noise(random)
             for row, bias in zip(self.matrix, self.bias, strict=True)
         )
         return (self._limited(x), self._limited(y), self._limited(z))
