@@ -281,6 +281,20 @@ class HomeAssistantSettings(Settings):
         return prefix
 
 
+class SpoolSettings(Settings):
+    """``[mqtt.spool]``: if present, events and poses of a broker outage are published after it."""
+
+    pose_hz: float = Field(
+        1.0, ge=0, le=10, description="poses stored per second of an outage, Hz; 0: none"
+    )
+    keep_mb: float = Field(
+        16.0,
+        ge=1,
+        le=1000,
+        description="size of the stored messages, MB, above which the oldest are deleted",
+    )
+
+
 class MqttSettings(Settings):
     """``[mqtt]``."""
 
@@ -345,6 +359,9 @@ class MqttSettings(Settings):
     health_s: float = Field(10.0, gt=0, le=60, description="interval of the topic bridge/health, s")
     home_assistant: HomeAssistantSettings | None = Field(
         None, description="discovery by Home Assistant; default: none"
+    )
+    spool: SpoolSettings | None = Field(
+        None, description="messages of a broker outage are published after it; default: not"
     )
 
     @field_validator("host")

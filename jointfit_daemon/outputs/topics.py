@@ -50,11 +50,14 @@ SENSORS_POSE = Topic("sensors/pose", 0)
 OPTICAL_CENTERS = Topic("optical/centers", 0)
 OPTICAL_STICKS = Topic("optical/sticks", 0)
 JOINT = Topic("joint/NAME", 0)
+LATE_EVENT = Topic("late/event", 1)
+LATE_POSE = Topic("late/pose", 1)
 
 TOPICS = (
     BRIDGE_STATE, BRIDGE_INFO, BRIDGE_HEALTH, BRIDGE_EVENT, BRIDGE_LOG, REQUEST, RESPONSE,
     CALIBRATION, CALIBRATION_PROGRESS, DEVICE_AVAILABILITY, DEVICE_INFO, POSE, POSE_UI,
     OPTICAL_POSE, OPTICAL_CHAIN, SENSORS_POSE, OPTICAL_CENTERS, OPTICAL_STICKS, JOINT,
+    LATE_EVENT, LATE_POSE,
 )  # fmt: skip
 """All topics, in the order of docs/mqtt.md."""
 

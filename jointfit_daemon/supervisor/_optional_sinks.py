@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import logging
 import math
+from operator import attrgetter
 from typing import TYPE_CHECKING, Protocol
 
 from jointfit_daemon.config import RecordingSettings
 from jointfit_daemon.outputs.recording import Recorder, RecordingLimits, RecordingReport
+from jointfit_daemon.outputs.spool import Spool, SpoolFiles
 from jointfit_daemon.pipeline.events import NoticeKind, NoticeLevel
 from jointfit_daemon.supervisor.state_directory import state_directory
 
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.config import Rig
+    from jointfit_daemon.outputs.mqtt import MqttPublisher
     from jointfit_daemon.outputs.payloads import BridgeHealth
     from jointfit_daemon.supervisor._core_runner import CoreRunner
 
@@ -51,6 +54,23 @@ def create_recorder(rig: Rig, core: CoreRunner, tasks: TaskGroup, report: Report
     core.subscribe(recorder)
     tasks.create_task(recorder.run(), name="recording")
     return recorder
+
+
+def create_spool(rig: Rig, link: Callable[[], MqttPublisher]) -> Spool | None:
+    """Return the spool of `rig`, if rig.toml has the table ``[mqtt.spool]``."""
+    settings = rig.mqtt.spool
+    if settings is None:
+        return None
+    folder = state_directory() / "spool" / rig.name
+    return Spool(SpoolFiles(folder, round(settings.keep_mb * 1e6)), link)
+
+
+def report_changes(before: Rig, rig: Rig, report: Report) -> None:
+    """Report the sinks whose settings a reload has changed in vain."""
+    for key in ("recording", "metrics", "lsl", "mqtt.spool"):
+        if attrgetter(key)(before) != attrgetter(key)(rig):
+            text = f"a change of [{key}] requires a restart"
+            report(NoticeKind.RELOAD, text, NoticeLevel.WARNING)
 
 
 def start_metrics(

@@ -9,6 +9,7 @@ Invariant: the daemon ends by cancellation or by a bug only.
     ready            notifies systemd when every source is known       once notified
     health           publishes health, resets the watchdog             never
     recording        writes the recording, in a thread                 never
+    spool            writes and sends messages of an outage            never
     metrics          answers Prometheus, in a thread                   never
     fit KIND         runs one calibration fit in a worker process      with its result
     store            writes one calibration                            when written
@@ -55,6 +56,7 @@ from jointfit_daemon.pipeline.events import (
     NoticeLevel,
     Reply,
 )
+from jointfit_daemon.supervisor import _optional_sinks as sinks
 from jointfit_daemon.supervisor._calibration_store import (
     CalibrationWriter,
     calibration_age_s,
@@ -63,7 +65,6 @@ from jointfit_daemon.supervisor._calibration_store import (
 from jointfit_daemon.supervisor._core_runner import CoreRunner
 from jointfit_daemon.supervisor._fit_runner import FitRunner
 from jointfit_daemon.supervisor._notice_log import LEVELS, NoticeLog
-from jointfit_daemon.supervisor._optional_sinks import create_recorder, start_lsl, start_metrics
 from jointfit_daemon.supervisor._overload_monitor import STALL_S, OverloadMonitor
 from jointfit_daemon.supervisor._process_statistics import ProcessStatistics
 from jointfit_daemon.supervisor._progress_monitor import ProgressMonitor
@@ -152,12 +153,13 @@ class Daemon:
         self._calibrations: CalibrationWriter
         self._state_check: asyncio.Task[None]
         self._mqtt: asyncio.Task[None]
+        self._spool = sinks.create_spool(rig, lambda: self._link)
         self._use_broker(rig)
 
     def _use_broker(self, rig: Rig) -> None:
         self._outbox = Outbox(topics.BRIDGE_STATE.name(rig.mqtt.base))
         self._link = MqttPublisher(rig.mqtt, self._outbox, self._receive_request)
-        self._topics = TopicWriter(rig, self._outbox, self._clock)
+        self._topics = TopicWriter(rig, self._outbox, self._clock, self._spool)
         self._core.subscribe(self._topics)
         self._read_request_key(rig)
 
@@ -216,9 +218,11 @@ class Daemon:
             handlers.table(),
         )
         rig, core, report = self._rig, self._core, self._report
-        self._recorder = create_recorder(rig, core, tasks, report)
-        start_metrics(rig, self.health, core, tasks, report)
-        start_lsl(rig, core, report)
+        self._recorder = sinks.create_recorder(rig, core, tasks, report)
+        if self._spool is not None:
+            tasks.create_task(self._spool.run(), name="spool")
+        sinks.start_metrics(rig, self.health, core, tasks, report)
+        sinks.start_lsl(rig, core, report)
         self._state_check = tasks.create_task(self._check_state(), name="state check")
         self._mqtt = tasks.create_task(self._link.run(), name="mqtt")
 
@@ -393,7 +397,8 @@ class Daemon:
         link = self._link.health(self._loop_errors.dropped)
         state = StateHealth(self._state_fault, self._calibrations.fault)
         recording = None if self._recorder is None else self._recorder.health()
-        return BridgeHealth(core, self._process_health, link, state, recording)
+        spool = None if self._spool is None else self._spool.health()
+        return BridgeHealth(core, self._process_health, link, state, recording, spool)
 
     def _publish_health_soon(self) -> None:
         self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
@@ -481,10 +486,7 @@ class Daemon:
     async def _change_to(self, rig: Rig) -> None:
         """Apply `rig`; sources and connections without changes continue."""
         before, self._rig = self._rig, rig
-        for key in ("recording", "metrics", "lsl"):
-            if getattr(before, key) != getattr(rig, key):
-                text = f"a change of [{key}] requires a restart"
-                self._report(NoticeKind.RELOAD, text, NoticeLevel.WARNING)
+        sinks.report_changes(before, rig, self._report)
         await self._sources.retire(rig.sources)
 
         self._notices.configure(rig)

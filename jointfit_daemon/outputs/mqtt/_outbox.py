@@ -2,18 +2,21 @@
 
 Invariant: the size is limited, the oldest message is dropped first, and drops are counted.
 
-Four kinds wait separately and are sent in this order. A client waits for a response. State is
+Five kinds wait separately and are sent in this order. A client waits for a response. State is
 retained: the last value of a topic replaces earlier ones, and all state is sent again on every
-connection. Events are sent in order. Stream messages are useless when late. All but state are
-dropped when they have waited longer than their expiry.
+connection. Events are sent in order. Stream messages are useless when late. Late messages are those
+of the spool, which waits for their delivery. All but state and late messages are dropped when they
+have waited longer than their expiry.
 
 Several messages can be sent before the first one is acknowledged. After a loss of the connection,
-responses and events without an acknowledgement are sent again, so they may arrive twice.
+responses, events and late messages without an acknowledgement are sent again, so they may arrive
+twice.
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections import deque
 from functools import partial
@@ -61,6 +64,7 @@ class Outbox:
         self._responses: deque[_Waiting] = deque()
         self._events: deque[_Waiting] = deque()
         self._streams: deque[_Waiting] = deque()
+        self._late: deque[_Waiting] = deque()
         self._unacknowledged: dict[int, tuple[deque[_Waiting], _Waiting] | None] = {}
         """Messages being sent, in order, with the queue that they came from; None for state."""
         self._numbers = count()
@@ -69,7 +73,7 @@ class Outbox:
     @property
     def queued(self) -> int:
         """Number of waiting messages."""
-        queues = (self._responses, self._events, self._streams)
+        queues = (self._responses, self._events, self._streams, self._late)
         return len(self._unsent) + sum(map(len, queues))
 
     @property
@@ -78,7 +82,16 @@ class Outbox:
         if self._responses or self._unsent or self._events:
             return True
         sending = self._unacknowledged.values()
-        return any(origin is None or origin[0] is not self._streams for origin in sending)
+        unimportant = (id(self._streams), id(self._late))
+        return any(origin is None or id(origin[0]) not in unimportant for origin in sending)
+
+    @property
+    def late_waiting(self) -> int:
+        """Number of late messages that the broker has not acknowledged."""
+        sending = self._unacknowledged.values()
+        return len(self._late) + sum(
+            origin is not None and origin[0] is self._late for origin in sending
+        )
 
     @property
     def is_empty(self) -> bool:
@@ -117,6 +130,11 @@ class Outbox:
         message = Outgoing(topic, payload, 0, False, STREAM_EXPIRY_S)
         self._push(self._streams, _STREAM_CAPACITY, message)
 
+    def late(self, topic: str, payload: bytes) -> None:
+        """Queue a message of the past, at QoS 1; the caller limits their number."""
+        self._late.append((math.inf, Outgoing(topic, payload, 1, False)))
+        self._wake.set()
+
     def _push(self, queue: deque[_Waiting], limit: int, message: Outgoing) -> None:
         if len(queue) >= limit:
             queue.popleft()
@@ -147,7 +165,7 @@ class Outbox:
                 return waiting[1], self._hand_out((self._responses, waiting))
             if self._unsent:
                 return self._next_state()
-            for queue in (self._events, self._streams):
+            for queue in (self._events, self._streams, self._late):
                 if (waiting := self._take(queue)) is not None:
                     return waiting[1], self._hand_out((queue, waiting))
             self._wake.clear()

@@ -136,6 +136,16 @@ class MqttPublisher:
         self._correcting = False
         outbox.retain(outbox.state_topic, ONLINE)
 
+    @property
+    def outbox(self) -> Outbox:
+        """Messages to publish."""
+        return self._outbox
+
+    @property
+    def base(self) -> str:
+        """First levels of all topics."""
+        return self._base
+
     def health(self, noise: int = 0) -> LinkHealth:
         """Return the state of the connection; `noise` is the count of `DisconnectErrorFilter`."""
         echoed = self._echoes[self._outbox.state_topic].arrived.is_set()

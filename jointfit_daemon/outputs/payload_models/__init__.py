@@ -70,6 +70,8 @@ PAYLOADS: dict[Topic, type[Payload]] = {
     topics.OPTICAL_CENTERS: _streams.OpticalCenters,
     topics.OPTICAL_STICKS: _streams.OpticalSticks,
     topics.JOINT: _streams.JointScalars,
+    topics.LATE_EVENT: _state.Event,
+    topics.LATE_POSE: _streams.Pose,
 }
 """Model of every topic that the daemon publishes."""
 

@@ -8,6 +8,7 @@ from pydantic import ConfigDict, Field
 
 from jointfit_daemon.outputs.mqtt import LinkHealth  # noqa: TC001 - pydantic reads it
 from jointfit_daemon.outputs.payload_models._streams import Number, Payload, Table, Time
+from jointfit_daemon.outputs.spool import SpoolHealth  # noqa: TC001 - pydantic reads it
 from jointfit_daemon.pipeline.events import (  # noqa: TC001 - pydantic reads them
     CalibrationPhase,
     NoticeKind,
@@ -179,6 +180,7 @@ class Health(Payload):
     link: LinkHealth
     state: StateFaults
     recording: Recording | None = None
+    spool: SpoolHealth | None = None
 
 
 class Event(Payload):

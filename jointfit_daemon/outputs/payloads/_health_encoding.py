@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jointfit_daemon.outputs.mqtt import LinkHealth
     from jointfit_daemon.outputs.recording import RecordingHealth
+    from jointfit_daemon.outputs.spool import SpoolHealth
     from jointfit_daemon.pipeline.health import (
         ClockHealth,
         CoreHealth,
@@ -51,6 +52,7 @@ class BridgeHealth:
     link: LinkHealth
     state: StateHealth
     recording: RecordingHealth | None = None
+    spool: SpoolHealth | None = None
 
 
 def health_payload(health: BridgeHealth) -> dict[str, Any]:
@@ -62,6 +64,8 @@ def health_payload(health: BridgeHealth) -> dict[str, Any]:
     }
     if health.recording is not None:
         parts["recording"] = asdict(health.recording)
+    if health.spool is not None:
+        parts["spool"] = asdict(health.spool)
     return core_payload(health.core) | parts
 
 

@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain
     from jointfit_daemon.outputs.mqtt import Outbox
     from jointfit_daemon.outputs.payloads._health_encoding import BridgeHealth
+    from jointfit_daemon.outputs.spool import Spool
     from jointfit_daemon.outputs.topics import Topic
     from jointfit_daemon.outputs.unix_clock import UnixClock
     from jointfit_daemon.pipeline.events import Event, Output
@@ -85,10 +86,15 @@ class TopicWriter:
         Receives the messages.
     clock
         Converts stamps to UNIX time.
+    spool
+        Receives events and decimated poses, in case of an outage; None without a spool.
     """
 
-    def __init__(self, rig: Rig, outbox: Outbox, clock: UnixClock) -> None:
+    def __init__(
+        self, rig: Rig, outbox: Outbox, clock: UnixClock, spool: Spool | None = None
+    ) -> None:
         self._base, self._outbox, self._clock = rig.mqtt.base, outbox, clock
+        self._spool = spool
         self._pose_topic = topics.POSE.name(self._base)
         self._pose_ui_topic = topics.POSE_UI.name(self._base)
         self._devices: tuple[str, ...] = ()
@@ -100,6 +106,8 @@ class TopicWriter:
         """Publish the layout of `rig`, and clear the retained topics of removed devices."""
         self._pose_ui_rate = RateDivider(rig.mqtt.pose_ui_hz)
         self._joint_rate = RateDivider(rig.mqtt.joint_hz)
+        late_hz = 0.0 if rig.mqtt.spool is None else rig.mqtt.spool.pose_hz
+        self._late_rate = RateDivider(late_hz) if late_hz > 0.0 else None
 
         devices = tuple(source.id for source in rig.sources)
         for removed in set(self._devices) - set(devices):
@@ -185,6 +193,8 @@ class TopicWriter:
 
         if self._pose_ui_rate.is_due(state.t_ns):
             self._outbox.stream(self._pose_ui_topic, pose)
+        if self._spool and self._late_rate and self._late_rate.is_due(state.t_ns):
+            self._spool.add(topics.LATE_POSE.pattern, pose)
         if self._joint_rate.is_due(state.t_ns):
             t_us = (state.t_ns + offset_ns) // 1000
             for i, joint in enumerate(state.joints):
@@ -199,7 +209,10 @@ class TopicWriter:
             "text": printable(notice.text),
             "data": printable_data(notice.data),
         }
-        self._publish(topics.BRIDGE_EVENT, self._stamped(payload, notice.t_ns))
+        event = self._stamped(payload, notice.t_ns)
+        self._publish(topics.BRIDGE_EVENT, event)
+        if self._spool is not None:
+            self._spool.add(topics.LATE_EVENT.pattern, event)
 
     def _publish_calibration(self, status: CalibrationStatus) -> None:
         payload: dict[str, Any] = {

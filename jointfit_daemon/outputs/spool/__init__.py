@@ -1,0 +1,6 @@
+"""Spool: events and decimated poses of a broker outage, on disk until the broker has them."""
+
+from jointfit_daemon.outputs.spool._spool import Spool, SpoolHealth
+from jointfit_daemon.outputs.spool._spool_files import SpoolFiles
+
+__all__ = ["Spool", "SpoolFiles", "SpoolHealth"]

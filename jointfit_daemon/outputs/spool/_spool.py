@@ -1,0 +1,221 @@
+"""Delivers events and decimated poses of a broker outage after it, also after a restart.
+
+While the daemon is connected, only the messages of the last seconds are stored, in memory: a loss
+of the connection is noticed late, and what was sent before may not have arrived. During an outage
+messages are written to disk; after it they are sent in order, at least once, behind all others.
+
+Invariant: `Spool.add` appends to a list of limited size and returns. Messages that exceed a limit
+are counted, the oldest ones first.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Protocol, TypeVar
+
+from jointfit_daemon.outputs.spool._spool_files import SpooledMessage, SpoolFiles
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from jointfit_daemon.outputs.mqtt import Outbox
+
+T = TypeVar("T")
+
+BEFORE_S = 10.0
+"""Age of the messages that are stored when the connection is lost, s: a silent loss is noticed
+within 8 s."""
+START_S = 3.0
+"""Time after the start within which a first connection is no outage, s."""
+WRITE_S = 0.5
+"""Interval between two writes during an outage, s: a kill loses this."""
+SUBSCRIBE_S = 5.0
+"""Time of a connection before the delivery begins, s: after a restart of the broker its readers
+connect and subscribe again, too."""
+MOST_PENDING = 2000
+"""Messages that wait for the disk."""
+BATCH = 16
+"""Messages in delivery at once."""
+_POLL_S = 0.02
+"""Interval between checks whether a batch was delivered, s."""
+
+
+@dataclass(frozen=True, slots=True)
+class SpoolHealth:
+    """State of the spool; the payload of ``bridge/health`` contains these fields."""
+
+    __pydantic_config__: ClassVar = {"extra": "forbid"}
+
+    waiting: int
+    """Messages that wait for the broker."""
+    stored_bytes: int
+    delivered: int
+    """Messages that the broker has accepted since the start."""
+    dropped: int
+    """Messages deleted because the spool was full."""
+    damaged: int
+    """Lines of the files that cannot be read."""
+    failure: str | None
+    """Why messages are not stored at present; None while they are."""
+
+
+class Link(Protocol):
+    """The connection to a broker."""
+
+    connected: bool
+    connects: int
+    """Number of connections so far."""
+
+    @property
+    def outbox(self) -> Outbox:
+        """Messages to publish."""
+
+    @property
+    def base(self) -> str:
+        """Base topic."""
+
+
+class Spool:
+    """The spool of one rig.
+
+    Parameters
+    ----------
+    files
+        Its files.
+    link
+        Returns the connection to the present broker.
+    """
+
+    def __init__(self, files: SpoolFiles, link: Callable[[], Link]) -> None:
+        self._files, self._link = files, link
+        self._recent: deque[tuple[float, SpooledMessage]] = deque(maxlen=MOST_PENDING)
+        self._pending: deque[SpooledMessage] = deque()
+        self._using_files = asyncio.Lock()
+        self._starting_until_s = time.monotonic() + START_S
+        self._began = False
+        """Whether the daemon was connected, or has waited for the broker too long."""
+        self._delivered = self._dropped = 0
+        self._position = (0, 0)
+        """File in delivery, and the number of its messages that the broker has."""
+        self._failure: str | None = None
+
+    def add(self, topic: str, payload: bytes) -> None:
+        """Store a message in case of an outage; `topic` is the name below the base."""
+        now_s, message = time.monotonic(), SpooledMessage(topic, payload)
+        if not self._link().connected:
+            self._begin_outage(now_s)
+            self._keep(message)
+            return
+        self._begin()
+        self._recent.append((now_s, message))
+        while self._recent[0][0] < now_s - BEFORE_S:
+            self._recent.popleft()
+
+    def _begin(self) -> None:
+        """Note a connection: what waited for the first one is sent by the outbox."""
+        if not self._began:
+            self._began = True
+            self._pending.clear()
+
+    def _begin_outage(self, now_s: float) -> None:
+        for sent_s, message in self._recent:
+            if sent_s >= now_s - BEFORE_S:
+                self._keep(message)
+        self._recent.clear()
+
+    def _keep(self, message: SpooledMessage) -> None:
+        while len(self._pending) >= MOST_PENDING:
+            self._pending.popleft()
+            self._dropped += 1
+        self._pending.append(message)
+
+    def health(self) -> SpoolHealth:
+        """Return the state of the spool."""
+        return SpoolHealth(
+            waiting=self._files.waiting + len(self._pending),
+            stored_bytes=self._files.size_bytes,
+            delivered=self._delivered,
+            dropped=self._files.dropped + self._dropped,
+            damaged=self._files.damaged,
+            failure=self._failure,
+        )
+
+    async def run(self) -> None:
+        """Write and deliver until cancelled; then write the rest of an outage."""
+        await self._with_files(self._files.load)
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._write_regularly(), name="spool writer")
+                tasks.create_task(self._deliver_regularly(), name="spool delivery")
+        finally:
+            if not self._link().connected:
+                self._begin_outage(time.monotonic())
+                self._store_pending()
+
+    async def _write_regularly(self) -> None:
+        while True:
+            now_s, connected = time.monotonic(), self._link().connected
+            if connected:
+                self._begin()
+            elif self._began or now_s > self._starting_until_s:
+                self._began = True
+                self._begin_outage(now_s)
+            if self._began and self._pending:
+                await self._with_files(self._store_pending)
+            await asyncio.sleep(WRITE_S)
+
+    def _store_pending(self) -> None:
+        """Write the messages that wait; what the disk does not take waits further."""
+        pending, self._pending = self._pending, deque()
+        try:
+            self._files.append(pending)
+        except OSError as error:
+            self._failure = f"{error.filename or 'spool'}: {error.strerror}"
+            self._pending.extendleft(reversed(pending))
+        else:
+            self._failure = None
+
+    async def _deliver_regularly(self) -> None:
+        connection, since_s = 0, 0.0
+        while True:
+            link, now_s = self._link(), time.monotonic()
+            if not link.connected or link.connects != connection:
+                connection, since_s = link.connects, now_s
+            elif now_s - since_s >= SUBSCRIBE_S and self._files.waiting:
+                await self._deliver_file()
+            await asyncio.sleep(WRITE_S)
+
+    async def _deliver_file(self) -> None:
+        """Send the oldest file, and delete it once the broker has all of its messages."""
+        found = await self._with_files(self._files.oldest)
+        if found is None:
+            return
+        number, messages = found
+        done = self._position[1] if self._position[0] == number else 0
+        link = self._link()
+        for begin in range(done, len(messages), BATCH):
+            batch = messages[begin : begin + BATCH]
+            for topic, payload in batch:
+                link.outbox.late(f"{link.base}/{topic}", payload)
+            while link.outbox.late_waiting:
+                if link is not self._link():  # another broker: it gets the whole batch
+                    return
+                await asyncio.sleep(_POLL_S)
+            self._delivered += len(batch)
+            self._position = (number, begin + len(batch))
+        await self._with_files(lambda: self._files.remove(number))
+
+    async def _with_files(self, work: Callable[[], T]) -> T | None:
+        """Run `work` in a thread, one at a time; a failure of the disk is noted."""
+        async with self._using_files:
+            running = asyncio.create_task(asyncio.to_thread(work), name="spool files")
+            try:
+                return await asyncio.shield(running)
+            except OSError as error:
+                self._failure = f"{error.filename or 'spool'}: {error.strerror}"
+                return None
+            finally:
+                await asyncio.wait([running])

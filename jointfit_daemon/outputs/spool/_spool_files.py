@@ -1,0 +1,182 @@
+"""Files of the spool: messages in the order of their writing, in files of limited size.
+
+A line is the CRC-32 of the rest in hexadecimal digits, the topic below the base, and the payload,
+separated by spaces. A process appends to files of its own only, so a line that a power cut tore is
+the last one of its file.
+
+Invariant: the files take `keep_bytes` at most, up to one file; the oldest one is deleted for a new
+one, and its messages are counted. A line with a wrong CRC is counted and skipped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from typing import TYPE_CHECKING, NamedTuple
+from zlib import crc32
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+FILES = 16
+"""Number of files of a full spool: so much of it is deleted at once."""
+_NUMBERED = re.compile(r"(\d{8})\.spool")
+
+
+class SpooledMessage(NamedTuple):
+    """One message that waits for the broker."""
+
+    topic: str
+    """Name below the base."""
+    payload: bytes
+
+
+class SpoolFiles:
+    """The spool of one rig; its methods block.
+
+    Parameters
+    ----------
+    folder
+        Folder of the files; created by the first message.
+    keep_bytes
+        Largest size of all files.
+    """
+
+    def __init__(self, folder: Path, keep_bytes: int) -> None:
+        self._folder, self._keep_bytes = folder, keep_bytes
+        self._counts: dict[int, int] = {}
+        """Messages by the number of their file, oldest first."""
+        self._sizes: dict[int, int] = {}
+        self._open: int | None = None
+        """File to which this process appends."""
+        self._last = 0
+        self.dropped = 0
+        """Messages deleted because the spool was full."""
+        self.damaged = 0
+        """Lines that cannot be read."""
+
+    @property
+    def waiting(self) -> int:
+        """Number of messages."""
+        return sum(self._counts.values())
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all files."""
+        return sum(self._sizes.values())
+
+    def load(self) -> None:
+        """Find the files of earlier processes.
+
+        Raises
+        ------
+        OSError
+            They cannot be read.
+        """
+        if not self._folder.is_dir():
+            return
+        found = (_NUMBERED.fullmatch(path.name) for path in self._folder.iterdir())
+        for number in sorted(int(match[1]) for match in found if match):
+            messages, damaged = self._read(number)
+            self._last = number
+            self.damaged += damaged
+            if messages:
+                self._counts[number] = len(messages)
+                self._sizes[number] = self._path(number).stat().st_size
+            else:
+                self._path(number).unlink()
+
+    def append(self, messages: Iterable[SpooledMessage]) -> None:
+        """Write messages to durable storage.
+
+        Raises
+        ------
+        OSError
+            The disk does not take them; none is written.
+        """
+        lines = [_line(message) for message in messages]
+        if not lines:
+            return
+        self._folder.mkdir(parents=True, exist_ok=True)
+        number = self._open or self._last + 1
+        before = self._sizes.get(number, 0)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+        descriptor = os.open(self._path(number), flags, 0o600)
+        try:
+            data = b"".join(lines)
+            while data:
+                data = data[os.write(descriptor, data) :]
+            os.fdatasync(descriptor)
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(descriptor, before)
+            raise
+        finally:
+            os.close(descriptor)
+
+        self._last = self._open = number
+        self._counts[number] = self._counts.get(number, 0) + len(lines)
+        self._sizes[number] = before + sum(map(len, lines))
+        if self._sizes[number] >= self._keep_bytes // FILES:
+            self._open = None
+        self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        while self.size_bytes > self._keep_bytes and len(self._counts) > 1:
+            oldest = next(iter(self._counts))
+            self.dropped += self._counts[oldest]
+            self.remove(oldest)
+
+    def oldest(self) -> tuple[int, list[SpooledMessage]] | None:
+        """Return the number and the messages of the oldest file; nothing is appended to it then.
+
+        Raises
+        ------
+        OSError
+            It cannot be read.
+        """
+        if not self._counts:
+            return None
+        number = next(iter(self._counts))
+        if number == self._open:
+            self._open = None
+        return number, self._read(number)[0]
+
+    def remove(self, number: int) -> None:
+        """Delete a file.
+
+        Raises
+        ------
+        OSError
+            It cannot be deleted.
+        """
+        self._path(number).unlink(missing_ok=True)
+        self._counts.pop(number, None)
+        self._sizes.pop(number, None)
+
+    def _path(self, number: int) -> Path:
+        return self._folder / f"{number:08d}.spool"
+
+    def _read(self, number: int) -> tuple[list[SpooledMessage], int]:
+        """Return the messages of a file, and the number of damaged lines."""
+        with self._path(number).open("rb") as file:
+            lines = file.read(2 * self._keep_bytes).splitlines(keepends=True)
+        found = [_message(line) for line in lines]
+        messages = [message for message in found if message is not None]
+        return messages, len(found) - len(messages)
+
+
+def _line(message: SpooledMessage) -> bytes:
+    rest = b"%s %s" % (message.topic.encode(), message.payload)
+    return b"%08x %s\n" % (crc32(rest), rest)
+
+
+def _message(line: bytes) -> SpooledMessage | None:
+    """Return the message of a line; None if it is damaged."""
+    digits, _, rest = line.removesuffix(b"\n").partition(b" ")
+    topic, _, payload = rest.partition(b" ")
+    if not line.endswith(b"\n") or digits != b"%08x" % crc32(rest) or not topic.isascii():
+        return None
+    return SpooledMessage(topic.decode(), payload)
