@@ -37,6 +37,8 @@ HEALTHY_S = 5.0
 """Duration of operation after which a loss is retried with the first wait again, s."""
 PAUSE_S = 60.0
 """Pause of a misconfigured source, s: a device may be reconfigured without being unplugged."""
+PLUGGED_S = 0.05
+"""Interval between checks whether an absent port is back before the next retry, s."""
 CHECK_S = 0.5
 """Interval between checks of the port of a paused source, s; each is one stat(2)."""
 
@@ -138,8 +140,18 @@ async def run_source(
             raise
 
         # Full jitter: sources that are lost together do not retry together.
-        await asyncio.sleep(random.uniform(0, delay))  # noqa: S311 - not security-relevant
+        await _wait_for_retry(path, random.uniform(0, delay))  # noqa: S311 - not security-relevant
         delay = min(2 * delay, LAST_RETRY_S)
+
+
+async def _wait_for_retry(path: str | None, delay_s: float) -> None:
+    """Wait for `delay_s`, or until a device is plugged in at `path` if there is none."""
+    absent = path is not None and _device_identity(path) is None
+    until_s = time.monotonic() + delay_s
+    while (left_s := until_s - time.monotonic()) > 0.0:
+        await asyncio.sleep(min(left_s, PLUGGED_S) if absent else left_s)
+        if absent and _device_identity(path) is not None:
+            return
 
 
 async def _wait_for_change(path: str | None, device: object) -> None:
