@@ -17,7 +17,7 @@ import numpy as np
 from jointfit_daemon.calibration import CalibrationTrial, OpticalTrack, SensorTrack
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.config import parse_rig
-from jointfit_simulators.body import CLUSTERS, SENSORS, SimulatedSubject, Step
+from jointfit_simulators.body import LIMBS, SENSORS, SimulatedSubject, Step
 from jointfit_simulators.devices import CameraFrames, Cameras, OrientationSensor
 from jointfit_simulators.scene import RigOptions, rig_toml
 from jointfit_simulators.settings import Knobs
@@ -31,7 +31,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 NS = 1_000_000_000
-MOVES = ("functional", "walk", "squat", "sit_to_stand")
+MOVES = {
+    "leg": ("functional", "walk", "squat", "sit_to_stand"),
+    "legs": ("functional", "walk", "squat", "sit_to_stand"),
+    "arm": ("functional",),
+    "trunk": ("functional",),
+}
+"""Motions of the functional calibration, of equal length, by limb."""
 PLATE_S, STAND_S, FUNCTIONAL_S = 24.0, 9.0, 60.0
 _LEAD_S = 2.0  # the transition between two motions has ended
 
@@ -46,19 +52,20 @@ class Phases:
 
 
 @cache
-def phases(seed: int = 1, rate_hz: float = 100.0) -> Phases:
+def phases(seed: int = 1, rate_hz: float = 100.0, limb: str = "leg") -> Phases:
     """Return the trials of one wearer: 22 s of plate, 7 s of standing, 60 s of movement."""
     knobs = Knobs(seed=seed, rate_hz=rate_hz)
+    moves = MOVES[limb]
     steps = [Step("plate", PLATE_S), Step("stand", STAND_S)]
-    steps += [Step(name, FUNCTIONAL_S / len(MOVES)) for name in MOVES]
-    wearer = SimulatedSubject(knobs, steps)
+    steps += [Step(name, FUNCTIONAL_S / len(moves)) for name in moves]
+    wearer = SimulatedSubject(knobs, steps, limb=limb)
     end_s = PLATE_S + STAND_S + FUNCTIONAL_S
     imu_s = np.arange(0.0, end_s, 1 / rate_hz)
     camera_s = np.arange(0.0, end_s, 1 / knobs.mocap_hz)
-    seen = wearer.observe([imu_s] * len(SENSORS), camera_s, imu_s[:1])
+    seen = wearer.observe([imu_s] * len(wearer.sensors), camera_s, imu_s[:1])
     said = {
         name: OrientationSensor(knobs, name).report(imu_s, q)
-        for name, q in zip(SENSORS, seen.sensors, strict=True)
+        for name, q in zip(wearer.sensors, seen.sensors, strict=True)
     }
     cameras = Cameras(knobs, wearer, rate_hz=knobs.mocap_hz)
     frames = cameras.capture(seen)
@@ -102,12 +109,12 @@ def fitted(rig: Rig, seed: int = 1) -> Calibration:
     return fit_calibration(trials.static, trials.functional, alignment, settings, rig.chain)
 
 
-def bench_rig(rate_hz: float = 100.0) -> Rig:
-    """Return the rig of the simulated leg, with ports that are never opened."""
+def bench_rig(rate_hz: float = 100.0, limb: str = "leg") -> Rig:
+    """Return the rig of a simulated limb, with ports that are never opened."""
     baud = 115_200 if rate_hz <= 100.0 else 921_600  # 400 Hz need 188 kbit/s
 
     tables = ['[can.can0]\ninterface = "slcan"\nchannel = "/dev/null"\n']
-    for number, (name, segment) in enumerate(SENSORS.items(), 1):
+    for number, (name, segment) in enumerate(LIMBS[limb].sensors.items(), 1):
         head = f'[[imu]]\nid = "{name}"\nsegment = "{segment}"\nrate_hz = {rate_hz:g}\n'
         if number % 2:
             tables.append(f'{head}driver = "xbus"\nport = "/dev/{name}"\nbaud = {baud}\n')
@@ -119,9 +126,10 @@ def bench_rig(rate_hz: float = 100.0) -> Rig:
         RigOptions(name="bench"),
         devices=tables,
         mocap='[mocap]\ndriver = "natnet"\nserver = "127.0.0.1"\nup_axis = "y"',
-        clusters=CLUSTERS,
+        clusters=LIMBS[limb].clusters,
         bones=(),
         plate=True,
+        chain=LIMBS[limb].chain,
     )
     return parse_rig(tomllib.loads(text))
 

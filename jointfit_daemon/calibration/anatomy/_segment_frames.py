@@ -29,6 +29,7 @@ from jointfit_daemon.calibration.anatomy._standing_prior import apply_standing_p
 from jointfit_daemon.center_of_rotation import hinge_axis_sd
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import (
+    angle_convention,
     body_parts,
     branch_runs,
     configured_length,
@@ -39,7 +40,7 @@ from jointfit_daemon.limb_model import (
     joint_parts,
     visible,
 )
-from jointfit_daemon.model import FrameFlag
+from jointfit_daemon.model import AngleConvention, FrameFlag
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -106,6 +107,8 @@ class FlexionAxis:
     """RMS rotation about the axis, rad."""
     off: float
     """RMS angle between the long axis and the plane of the rotation, rad."""
+    bend: float
+    """Mean of angle times absolute angle, rad^2: small in a movement to both sides alike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,8 +377,9 @@ def flexion_axis(
     if rms < MIN_FLEXION_RAD:
         return None
     # Large rotations determine the sign, not small ones about the static pose.
-    flip = sign * (1.0 if (angle * np.abs(angle)).sum() > 0 else -1.0)
-    return FlexionAxis(x * flip, rms, float(s[2] / np.sqrt(len(swung))))
+    bend = float((angle * np.abs(angle)).mean())
+    flip = sign * (1.0 if bend > 0 else -1.0)
+    return FlexionAxis(x * flip, rms, float(s[2] / np.sqrt(len(swung))), abs(bend))
 
 
 def _flexion_axes(
@@ -386,14 +390,41 @@ def _flexion_axes(
         i = chain.joints.index(joint)
         distal = z[i] if i < len(z) else _UP  # the distal body part has no long axis
         found[joint] = flexion_axis(above, below, distal, flexion_sign(joint))
-    return {joint: axis for joint, axis in found.items() if axis is not None}
+    axes = {joint: axis for joint, axis in found.items() if axis is not None}
+
+    # In the static pose all axes point to the right. A joint that moved to both sides alike, such
+    # as a wrist or an ankle, does not determine its sign: it takes that of the most bent joint.
+    hinges = [axis for joint, axis in axes.items() if joint not in _shoulders(chain)]
+    if not hinges:
+        return axes
+    right = max(hinges, key=lambda axis: axis.bend).axis
+    return {
+        joint: replace(axis, axis=-axis.axis) if axis.axis @ right < 0.0 else axis
+        for joint, axis in axes.items()
+    }
+
+
+def _shoulders(chain: Chain) -> set[str]:
+    """Return the joints that move in every direction, so that their axis is that of no plane."""
+    return {
+        chain.joints[joint.number]
+        for joint in inner_joints(chain)
+        if angle_convention(chain, joint.number) is AngleConvention.ELEVATION
+    }
 
 
 def _right_axis(chain: Chain, i: int, axes: Mapping[str, FlexionAxis]) -> Array | None:
-    """Return the flexion axis of a segment: from inner joints if possible, else from outer ones."""
-    inner = {joint.name for joint in inner_joints(chain)}
+    """Return the flexion axis of a segment: of inner joints if possible, else of outer ones.
+
+    Beside a shoulder the axes of elbow and wrist are preferred, also for the thorax.
+    """
+    inner, shoulders = {joint.name for joint in inner_joints(chain)}, _shoulders(chain)
     ends = [chain.joints[k] for k in (i, *distal_joints(chain, i))]
-    for wanted in ([j for j in ends if j in inner], ends, sorted(inner)):
+    hinges = inner - shoulders
+    beside = [j for j in ends if j in hinges]
+    farther = sorted(hinges) if shoulders.intersection(ends) else []
+
+    for wanted in (beside, farther, [j for j in ends if j in inner], ends, sorted(inner)):
         if usable := [axes[j].axis * axes[j].rms for j in wanted if j in axes]:
             mean = np.sum(usable, axis=0)
             return np.asarray(mean / np.linalg.norm(mean))

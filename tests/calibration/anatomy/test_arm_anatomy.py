@@ -1,0 +1,57 @@
+"""Segment frames of an arm from markers, whatever direction the shoulder moves in."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bench.subjects.simulated_wearer import bench_rig
+from jointfit_daemon.calibration import CalibrationSettings, OpticalTrack
+from jointfit_daemon.calibration.anatomy import (
+    Anatomy,
+    find_anatomy,
+    static_cluster,
+    track_clusters,
+)
+from jointfit_simulators.body import LIMBS, SimulatedSubject, Step
+from jointfit_simulators.settings import Knobs, perfect
+
+KIND = LIMBS["arm"]
+CHAIN = bench_rig(limb="arm").chain
+STAND_S, MOVE_S, HZ = 3.0, 8.0, 20.0
+
+
+def anatomy(*motions: str) -> Anatomy:
+    """Return the anatomy of a subject without soft-tissue artefact after some motions."""
+    steps = [Step("stand", STAND_S + 2.0), *(Step(name, MOVE_S) for name in motions)]
+    subject = SimulatedSubject(perfect(Knobs()), steps, limb="arm")
+    parts = [part for part in KIND.clusters if part != "plate"]
+    names = tuple(name for cluster in KIND.clusters.values() for name in cluster)
+    settings = CalibrationSettings(markers={part: KIND.clusters[part] for part in parts})
+
+    def track(begin_s: float, end_s: float) -> OpticalTrack:
+        t_s = np.arange(begin_s, end_s, 1 / HZ)
+        markers = subject.observe([np.empty(0)] * len(subject.sensors), t_s, np.empty(0)).markers
+        nothing = np.empty((len(t_s), 0, 3))
+        t_ns = np.round(t_s * 1e9).astype(np.int64)
+        return OpticalTrack(t_ns, names, markers, (), nothing, np.empty((len(t_s), 0, 4)))
+
+    still = track(0.0, STAND_S)
+    clusters = {part: static_cluster(still, part, settings) for part in parts}
+    moved = track(STAND_S + 3.0, STAND_S + 2.0 + MOVE_S * len(motions))
+    return find_anatomy(CHAIN, track_clusters(moved, clusters))
+
+
+@pytest.mark.parametrize("raising", ["arm_swings", "abduction", "reach"])
+def test_the_frames_of_an_arm_do_not_depend_on_the_direction_of_the_shoulder(raising: str) -> None:
+    found = anatomy(raising, "elbow_flexion", "wrist_circles")
+    for segment in CHAIN.segments:  # every frame of an upright subject equals the world
+        turn = Rotation.from_quat(found.q_static[segment], scalar_first=True)
+        assert np.degrees(turn.magnitude()) < 6.0, segment
+
+
+def test_without_a_movement_of_the_elbow_the_shoulder_determines_the_frames() -> None:
+    found = anatomy("arm_swings")
+    turn = Rotation.from_quat(found.q_static["thorax"], scalar_first=True)
+    assert np.degrees(turn.magnitude()) < 10.0
