@@ -27,6 +27,7 @@ from jointfit_daemon.tools.discovery._serial_ports import SerialPortInfo, find_s
 from jointfit_daemon.tools.discovery._sysfs import read_attribute
 from jointfit_daemon.tools.discovery._traffic import (
     DecodedDevice,
+    Layouts,
     decode_frames,
     decode_stream,
     decode_traffic,
@@ -39,6 +40,7 @@ __all__ = [
     "CanTraffic",
     "DecodedDevice",
     "FoundServer",
+    "Layouts",
     "RunCommand",
     "SerialPortInfo",
     "SerialTraffic",

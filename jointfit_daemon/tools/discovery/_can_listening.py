@@ -26,6 +26,8 @@ from jointfit_daemon.tools.discovery._traffic import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from jointfit_daemon.tools.discovery._traffic import Layouts
+
 _FRAME = struct.Struct("=IB3x8s")
 _EXTENDED_FLAG, _REMOTE_FLAG, _ERROR_FLAG = 1 << 31, 1 << 30, 1 << 29
 _STANDARD_MASK, _EXTENDED_MASK = 0x7FF, 0x1FFF_FFFF
@@ -71,7 +73,11 @@ class CanTraffic:
 
 
 def listen_can(
-    interface: str, *, listen_s: float = 1.5, progress: Callable[[float], None] | None = None
+    interface: str,
+    *,
+    listen_s: float = 1.5,
+    progress: Callable[[float], None] | None = None,
+    layouts: Layouts | None = None,
 ) -> CanTraffic:
     """Receive on a SocketCAN interface, and decode the frames with the installed drivers.
 
@@ -83,6 +89,8 @@ def listen_can(
         Time to listen, s.
     progress
         Called with the share of the work that is done, 0 to 1.
+    layouts
+        Tables to try beside those that the drivers propose, by driver.
     """
     try:
         received = _receive(interface, listen_s, progress)
@@ -104,7 +112,7 @@ def listen_can(
             chunks.append(Chunk(t_ns, pack_can_frame(t_ns, number, data, extended=extended)))
 
     sizes = {key: found[-1][1] for key, found in arrivals.items()}
-    devices = tuple(decode_frames(sizes, chunks))
+    devices = tuple(decode_frames(sizes, chunks, layouts=layouts))
     owners = {key: device.driver for device in devices for key in used_identifiers(device.settings)}
     identifiers = []
     for key, found in sorted(arrivals.items()):

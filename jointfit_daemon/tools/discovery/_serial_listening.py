@@ -23,6 +23,8 @@ from jointfit_daemon.tools.discovery._traffic import DecodedDevice, decode_strea
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from jointfit_daemon.tools.discovery._traffic import Layouts
+
 _DEFAULT_BAUDS = (115_200,)
 _READ_BYTES = 4096
 _POLL_S = 0.05
@@ -73,6 +75,7 @@ def listen_serial(
     listen_s: float = 1.5,
     bauds: Sequence[int] | None = None,
     progress: Callable[[float], None] | None = None,
+    layouts: Layouts | None = None,
 ) -> SerialTraffic:
     """Receive on a port at one speed after the other until a driver decodes the data.
 
@@ -89,6 +92,8 @@ def listen_serial(
         Speeds to try; default: those of the installed drivers.
     progress
         Called with the share of the work that is done, 0 to 1.
+    layouts
+        Tables to try beside the drivers, by driver.
     """
     tried = tuple(usual_bauds() if bauds is None else bauds)
     received: dict[int, int] = {}
@@ -102,7 +107,7 @@ def listen_serial(
                     progress((k + 1) / len(tried))
                 if not received[baud]:
                     break
-                devices = decode_stream(chunks, baud)
+                devices = decode_stream(chunks, baud, layouts=layouts)
                 if devices:
                     return SerialTraffic(port, None, received, baud, devices)
     except OSError as error:

@@ -6,7 +6,7 @@ Invariant: pure, apart from the import of drivers.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from jointfit_daemon.model import DeviceEvent, ImuSample
 from jointfit_daemon.tools.discovery._mocap_servers import installed_drivers
@@ -51,6 +51,10 @@ _NEAR = 0.06
 """Largest relative difference between a measured and a usual rate."""
 
 
+Layouts: TypeAlias = "Mapping[str, Sequence[Mapping[str, Any]]]"
+"""Tables that describe the data of a device, by driver."""
+
+
 @dataclass(frozen=True, slots=True)
 class DecodedDevice:
     """One device whose data a driver decodes."""
@@ -82,7 +86,11 @@ class DecodedDevice:
 
 
 def decode_stream(
-    chunks: Sequence[Chunk], baud: int | None = None, *, besides: str = ""
+    chunks: Sequence[Chunk],
+    baud: int | None = None,
+    *,
+    besides: str = "",
+    layouts: Layouts | None = None,
 ) -> tuple[DecodedDevice, ...]:
     """Return the device of every installed driver that decodes a byte stream; most samples first.
 
@@ -94,18 +102,27 @@ def decode_stream(
         Speed of the line, baud; None if unknown.
     besides
         Driver that is left out.
+    layouts
+        Tables to try beside that of each driver.
     """
     found = []
     for name, driver in installed_drivers():
         if driver.wire == "stream" and name != besides:
             fields = driver.Settings.model_fields
             table = {"baud": baud} if "baud" in fields and baud is not None else {}
-            found.append(decode_traffic(driver, name, table, chunks))
+            described = (layouts or {}).get(name, ())
+            found += [
+                decode_traffic(driver, name, {**table, **layout}, chunks)
+                for layout in ({}, *described)
+            ]
     return tuple(sorted(filter(None, found), key=lambda device: -device.samples))
 
 
 def decode_frames(
-    sizes: Mapping[tuple[int, bool], int], chunks: Sequence[Chunk]
+    sizes: Mapping[tuple[int, bool], int],
+    chunks: Sequence[Chunk],
+    *,
+    layouts: Layouts | None = None,
 ) -> Iterator[DecodedDevice]:
     """Yield the sensors that the installed drivers decode; each identifier has one owner.
 
@@ -115,10 +132,13 @@ def decode_frames(
         Number of data bytes of each identifier, by number and whether it has 29 bits.
     chunks
         Records of the frames.
+    layouts
+        Tables to try beside those that the drivers propose.
     """
     used: set[tuple[int, bool]] = set()
     for name, driver in installed_drivers():
-        for table in _candidate_tables(driver, sizes):
+        described = (layouts or {}).get(name, ()) if driver.wire == "can" else ()
+        for table in (*_candidate_tables(driver, sizes), *described):
             keys = used_identifiers(table)
             device = None if keys & used else decode_traffic(driver, name, table, chunks)
             if device is not None and device.samples:

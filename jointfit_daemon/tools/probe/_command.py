@@ -14,7 +14,12 @@ from jointfit_daemon.tools.completion import complete_can_interface, complete_se
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from jointfit_daemon.tools.discovery import CanTraffic, FoundServer, SerialTraffic
+    from jointfit_daemon.tools.discovery import (
+        CanTraffic,
+        FoundServer,
+        Layouts,
+        SerialTraffic,
+    )
     from jointfit_daemon.tools.probe._probe_report import ProbeReport
 
 _MOST_PORT = 65_535
@@ -41,7 +46,9 @@ _PhysicalTest = Annotated[
         help="Sensor of rig.toml to test by three rotations, ID; the daemon must be stopped."
     ),
 ]
-_Config = Annotated[Path, typer.Option(help="Configuration of the sensor, for --physical-test.")]
+_Config = Annotated[
+    Path, typer.Option(help="Rig of the sensor for --physical-test, and of layouts to try.")
+]
 _Step = Annotated[
     float, typer.Option("--step", help="Longest time for a rotation, s.", min=2.0, max=600.0)
 ]
@@ -68,10 +75,11 @@ def probe(
     """List serial ports, CAN interfaces and motion-capture servers; listen where requested.
 
     Opens only the named ports, interfaces and hosts, and changes no setting of a device. A port is
-    read at the usual speeds of the installed drivers until one of them decodes the data. Prints
-    lines for rig.toml. With --physical-test it opens that sensor as the daemon does, guides through
-    three rotations, and prints the corrections. Exit codes: 0 everything named was recognized, or
-    the frames are as configured; 1 something was not, or they are not; 2 invalid options.
+    read at the usual speeds of the installed drivers until one of them decodes the data; layouts of
+    serial-table and can-table in rig.toml are tried, too. Prints lines for rig.toml. With
+    --physical-test it opens that sensor as the daemon does, guides through three rotations, and
+    prints the corrections. Exit codes: 0 everything named was recognized, or the frames are as
+    configured; 1 something was not, or they are not; 2 invalid options.
     """
     if physical_test is not None:
         if serial or can or mocap or network:
@@ -84,9 +92,13 @@ def probe(
 
     import orjson
 
+    from jointfit_daemon.tools.probe._described_layouts import described_layouts
     from jointfit_daemon.tools.probe._probe_report import report_lines
 
-    report = _report(serial or (), can or (), hosts, network=network, listen_s=listen_s)
+    layouts = described_layouts(config) if serial or can else {}
+    report = _report(
+        serial or (), can or (), hosts, network=network, listen_s=listen_s, layouts=layouts
+    )
     if json:
         typer.echo(orjson.dumps(report, option=orjson.OPT_NON_STR_KEYS))
     else:
@@ -145,6 +157,7 @@ def _report(
     *,
     network: bool,
     listen_s: float,
+    layouts: Layouts,
 ) -> ProbeReport:
     from rich.console import Console
     from rich.progress import Progress
@@ -162,11 +175,11 @@ def _report(
             return {"progress": lambda share: bar.update(task, completed=share)}
 
         ports_read = [
-            discovery.listen_serial(port, listen_s=listen_s, **listen_at(port))  # type: ignore[arg-type]  # one key
+            discovery.listen_serial(port, listen_s=listen_s, layouts=layouts, **listen_at(port))  # type: ignore[arg-type]  # one key
             for port in ports
         ]
         buses = [
-            discovery.listen_can(name, listen_s=listen_s, **listen_at(name))  # type: ignore[arg-type]  # one key
+            discovery.listen_can(name, listen_s=listen_s, layouts=layouts, **listen_at(name))  # type: ignore[arg-type]  # one key
             for name in interfaces
         ]
         servers: list[FoundServer] = []
@@ -247,7 +260,8 @@ def _faults(
         elif not port.devices:
             faults.append(
                 f"{port.port}: {sum(port.received_bytes.values())} bytes, but no installed driver "
-                "decodes them: check the speed of the device, or write a driver"
+                "decodes them: check the speed of the device, or describe its data by a "
+                "serial-table in rig.toml and repeat this with --config"
             )
 
     for bus in can:

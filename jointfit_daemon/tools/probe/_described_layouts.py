@@ -1,0 +1,37 @@
+"""Layouts of devices without a driver of their own, as an existing rig.toml describes them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from jointfit_daemon.files.text import parse_toml
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from jointfit_daemon.tools.discovery import Layouts
+
+_CONNECTION = ("id", "segment", "driver", "port", "can", "baud", "transport", "silence_s")
+"""Keys of ``[[imu]]`` that do not describe data."""
+
+
+def described_layouts(rig: Path) -> Layouts:
+    """Return the described layouts of a rig by driver; none if it is absent or cannot be read.
+
+    Faults of the rig are the subject of `jointfit check`.
+    """
+    try:
+        imus = parse_toml(rig.read_text(encoding="utf-8")).get("imu", [])
+    except (OSError, ValueError, RecursionError):
+        return {}
+    found: dict[str, list[dict[str, Any]]] = {}
+    for imu in imus if isinstance(imus, list) else ():
+        if not isinstance(imu, dict) or not isinstance(imu.get("fields"), dict):
+            continue
+        layout = {key: value for key, value in imu.items() if key not in _CONNECTION}
+        if isinstance(layout.get("dbc"), str):
+            layout["dbc"] = str(rig.absolute().parent / layout["dbc"])
+        known = found.setdefault(str(imu.get("driver")), [])
+        if layout not in known:
+            known.append(layout)
+    return found
