@@ -124,3 +124,22 @@ async def test_the_wall_clock_steps() -> None:
         found = await answers(server, encode(Cookie()))
     pose = next(item for item in found if isinstance(item, TrackerPose))
     assert abs(pose.time_us - time.time_ns() // 1000 - 10_000_000) < 2_000_000
+
+
+async def test_stamps_increase_over_frames_that_are_sent_at_once() -> None:
+    loop, codec = asyncio.get_running_loop(), VrpnCodec()
+    found: list[Any] = []
+    async with serving(spread_us=1000) as server:
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as client:
+            client.setblocking(False)
+            await loop.sock_connect(client, ("127.0.0.1", server.command_port))
+            await loop.sock_sendall(client, encode(Cookie()))
+            while not server.clients:
+                await asyncio.sleep(0.005)
+            for _ in range(3):  # a busy host makes up for time that it lost
+                server.push(0, {}, POSES)
+            async with asyncio.timeout(2):
+                while len([item for item in found if isinstance(item, TrackerPose)]) < 6:
+                    found += codec.feed(await loop.sock_recv(client, 65536))
+    stamps_us = [item.time_us for item in found if isinstance(item, TrackerPose)]
+    assert stamps_us == sorted(set(stamps_us))

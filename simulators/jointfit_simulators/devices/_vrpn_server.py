@@ -92,6 +92,7 @@ class VrpnServer:
         self.number = 0
         self.stepped_ns = 0
         self._sent_before = 0
+        self._made_ns = 0  # host time after the last message
 
     @property
     def clients(self) -> int:
@@ -129,7 +130,8 @@ class VrpnServer:
 
     def push(self, exposure_host_ns: int, markers: Markers, bodies: Bodies) -> None:
         """Send one frame now; see `NatNetServer.push`."""
-        made_ns = max(time.monotonic_ns(), exposure_host_ns)
+        # Messages are made one after the other, also those of frames that are sent at once.
+        made_ns = max(time.monotonic_ns(), exposure_host_ns, self._made_ns)
         server_ns = self.options.device_ns(made_ns) + self._epoch_ns + self.stepped_ns
         poses: dict[str, Pose] = {name: pose for name, pose in bodies.items() if pose is not None}
         poses |= {name: (at, _UPRIGHT) for name, at in markers.items() if at is not None}
@@ -149,6 +151,8 @@ class VrpnServer:
                     VELOCITY, time_us, sender, sensor, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.01
                 )
                 messages.append((tracker, motion))
+
+        self._made_ns = made_ns + 1000 * self.options.spread_us * len(messages)
 
         self.number += 1
         for client in list(self._clients):
