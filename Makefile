@@ -41,7 +41,7 @@ compiled: $(STAMP)  ## compile the modules of the frame's path, into build/compi
 test-compiled: compiled  ## the tests of the core, on the compiled modules
 	@JOINTFIT_TEST_VARIANT=compiled PYTHONPATH=$(CURDIR)/build/compiled $(BIN)/python -m pytest -q \
 	  -o pythonpath="build/compiled ." --junitxml=build/compiled-tests.xml \
-	  tests/pipeline/test_core.py tests/timing/alignment tests/timing/clock tests/drivers/xbus tests/drivers/xcdi tests/packaging/test_variants.py \
+	  tests/pipeline/test_core.py tests/pipeline/test_label_monitor.py tests/fusion/test_cluster_pose.py tests/timing/alignment tests/timing/clock tests/drivers/xbus tests/drivers/xcdi tests/packaging/test_variants.py \
 	  -m "not experiment and not system and not alone"
 
 test-cpu: $(STAMP)  ## the numerical tests as on other processors (ARGS=--all: all combinations)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from jointfit_daemon.arrays import Array  # noqa: TC001 - mypyc evaluates the types of fields
 from jointfit_daemon.kinematics.rotation_scalar import (
     as_quaternion,
     conjugate_one,
@@ -22,7 +23,6 @@ from jointfit_daemon.kinematics.rotation_scalar import (
 from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MIN_MARKERS, is_line
 
 if TYPE_CHECKING:
-    from jointfit_daemon.arrays import Array
     from jointfit_daemon.limb_model import MarkerCluster
     from jointfit_daemon.model import MocapFrame, MocapLayout, Quaternion, Vector
 

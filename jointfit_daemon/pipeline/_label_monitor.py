@@ -10,6 +10,7 @@ it. Hidden markers neither begin nor end a fault.
 from __future__ import annotations
 
 from collections import Counter, deque
+from collections.abc import Mapping  # noqa: TC003 - mypyc evaluates the types of fields
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -30,7 +31,7 @@ from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.timing.alignment import RateDivider
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
 
     from numpy.typing import NDArray
 
@@ -163,7 +164,7 @@ class LabelMonitor:
             fault
             for one in self._examined
             if t_ns - one.t_ns <= FAULT_NS
-            for fault in one.faults - self.faults.keys()
+            for fault in one.faults.difference(self.faults)
         )
         notices: list[Output] = []
         for fault, count in sorted(recent.items()):

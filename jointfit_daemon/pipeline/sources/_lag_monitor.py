@@ -9,9 +9,11 @@ fit, and a replay takes the same steps. It only observes: the lags in use come f
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Generator  # noqa: TC003 - mypyc evaluates the types of fields
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray  # noqa: TC002 - mypyc evaluates the types of fields
 
 from jointfit_daemon.driver import ImuSettings
 from jointfit_daemon.limb_model import restore_cluster, rigid_fit
@@ -26,9 +28,7 @@ from jointfit_daemon.timing.lag import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Mapping
-
-    from numpy.typing import NDArray
+    from collections.abc import Mapping
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration, MarkerCluster
