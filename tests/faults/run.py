@@ -1,0 +1,91 @@
+"""Runs fault scenarios, stores their results, and writes docs/reliability.md from them."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import statistics
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tests.faults.gateway import running_gateway
+
+if TYPE_CHECKING:
+    from tests.broker_fixture import Broker
+    from tests.faults.scenario import Outcome, Scenario
+
+FOLDER = Path(__file__).parent
+RESULTS = FOLDER / "results.json"
+PAGE = FOLDER.parents[1] / "docs" / "reliability.md"
+TEMPLATE = FOLDER / "page.md"
+
+
+def scenarios() -> dict[str, Scenario]:
+    """Return all scenarios by the name of their file."""
+    names = sorted(path.stem for path in (FOLDER / "scenarios").glob("[a-z]*.py"))
+    found = (importlib.import_module(f"tests.faults.scenarios.{name}") for name in names)
+    return {name: module.SCENARIO for name, module in zip(names, found, strict=True)}
+
+
+async def run_all(
+    folder: Path,
+    broker: Broker,
+    names: list[str],
+    repeat: int,
+    outcomes: dict[str, list[Outcome]],
+) -> None:
+    """Run scenarios on one gateway, each `repeat` times in a row; add the outcomes of each."""
+    known = scenarios()
+    async with running_gateway(folder, broker) as gateway:
+        for name in names:
+            found = [await known[name].run(gateway) for _ in range(repeat)]
+            outcomes[name] = found
+            recovered_s = statistics.median(outcome.recovered_s for outcome in found)
+            print(f"{name}: recovered in {recovered_s:.2f} s", flush=True)
+
+
+def summary(outcomes: list[Outcome]) -> dict[str, Any]:
+    """Return the stored figures of one scenario."""
+    noticed = [outcome.noticed_s for outcome in outcomes]
+    recovered = [outcome.recovered_s for outcome in outcomes]
+    return {
+        "runs": len(outcomes),
+        "noticed_median_s": round(statistics.median(noticed), 3),
+        "noticed_most_s": round(max(noticed), 3),
+        "recovered_median_s": round(statistics.median(recovered), 3),
+        "recovered_most_s": round(max(recovered), 3),
+        "pose_gap_most_s": round(max(outcome.pose_gap_s for outcome in outcomes), 3),
+        "lost_most": max(outcome.lost for outcome in outcomes),
+    }
+
+
+def render(results: dict[str, Any]) -> str:
+    """Return the page."""
+    rows = [
+        "| fault | runs | noticed, s: median, maximum (limit) | reported | continues |"
+        " recovered, s: median, maximum (limit) | largest loss | lost, and where counted |",
+        "| --- | --: | --: | --- | --- | --: | --: | --- |",
+    ]
+    for name, scenario in scenarios().items():
+        found = results["scenarios"].get(name)
+        if found is None:
+            continue
+        limit = f"({scenario.noticed_limit_s:g})"
+        noticed = f"{found['noticed_median_s']:.2f}, {found['noticed_most_s']:.2f} {limit}"
+        if found["noticed_most_s"] == 0.0:
+            noticed = "–"
+        recovered = f"{found['recovered_median_s']:.2f}, {found['recovered_most_s']:.2f}"
+        rows.append(
+            f"| {scenario.title} | {found['runs']} | {noticed} | {scenario.reported} |"
+            f" {scenario.continues} | {recovered} ({scenario.recovered_limit_s:g}) |"
+            f" {found['lost_most']} | {scenario.counted} |"
+        )
+    machine = f"Machine: {results['machine']}."
+    template = TEMPLATE.read_text("utf-8")
+    return template.replace("{table}", "\n".join(rows)).replace("{machine}", machine)
+
+
+def stored() -> dict[str, Any]:
+    """Return the stored results."""
+    found: dict[str, Any] = json.loads(RESULTS.read_text("utf-8"))
+    return found

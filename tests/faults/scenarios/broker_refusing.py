@@ -1,0 +1,40 @@
+"""Something accepts connections on the broker's port and closes them."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from tests.faults.scenario import Outcome, Scenario
+
+if TYPE_CHECKING:
+    from tests.faults.gateway import Gateway
+
+
+async def run(gateway: Gateway) -> Outcome:
+    """Replace the broker by a server that closes every connection."""
+    gateway.broker.stop()
+
+    async def refuse(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.close()
+
+    server = await asyncio.start_server(
+        refuse, "127.0.0.1", gateway.broker.port, reuse_address=True
+    )
+    async with server:
+        noticed_s = await gateway.disconnected()
+        await asyncio.sleep(1.0)
+    gateway.broker.start()
+    recovered_s = await gateway.used("S1", "S2")
+    return Outcome(noticed_s, recovered_s, 0.0, 0)
+
+
+SCENARIO = Scenario(
+    title="broker that closes every connection",
+    reported="log",
+    continues="acquisition, fusion and recording",
+    counted="poses of the outage",
+    run=run,
+    noticed_limit_s=1.5,
+    recovered_limit_s=1.0,
+)

@@ -1,0 +1,44 @@
+"""Every fault is reported and overcome within its limits; the page shows the stored results."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import pytest
+
+from tests.faults.run import PAGE, render, run_all, scenarios, stored
+from tests.system.station import load_factor
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.broker_fixture import Broker
+    from tests.faults.scenario import Outcome
+
+
+def test_the_page_shows_the_stored_result_of_every_scenario() -> None:
+    results = stored()
+    assert results["scenarios"].keys() == scenarios().keys()
+    assert PAGE.read_text("utf-8") == render(results)
+
+
+def test_stored_results_are_within_the_limits() -> None:
+    for name, scenario in scenarios().items():
+        found = stored()["scenarios"][name]
+        assert found["noticed_most_s"] <= scenario.noticed_limit_s, name
+        assert found["recovered_most_s"] <= scenario.recovered_limit_s, name
+
+
+@pytest.mark.experiment
+@pytest.mark.system
+@pytest.mark.timeout(300)
+async def test_every_fault_is_overcome_within_its_limits(tmp_path: Path, broker: Broker) -> None:
+    outcomes: dict[str, list[Outcome]] = {}
+    await run_all(tmp_path, broker, list(scenarios()), 1, outcomes)
+    exceeded = [
+        text
+        for name, scenario in scenarios().items()
+        for outcome in outcomes[name]
+        for text in scenario.faults(outcome, 2.0 * load_factor())
+    ]
+    assert exceeded == []
