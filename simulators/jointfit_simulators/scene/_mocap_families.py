@@ -189,7 +189,7 @@ def _lsl_markers(place: CameraPlace) -> tuple[LslServer, list[str]]:
             markers=tuple(name for names in place.clusters.values() for name in names),
             bodies=tuple(place.bodies),
             rate_hz=place.knobs.mocap_hz,
-            device_ns=place.timing.device_ns,
+            # liblsl sends its own clock, which the scene cannot change: stamps must be on it.
         )
     )
     lines = [f'source_id = "{server.source_id}"', f'up_axis = "{server.options.up_axis}"']
