@@ -85,6 +85,16 @@ class ResynchronizingCodec(Generic[M]):
 
     def feed(self, data: bytes) -> list[M | CorruptBytes]:
         """Return the messages that `data` completed, in wire order; never raises."""
+        # The usual piece is one message.
+        if data and not self._pending and not self._run.count:
+            fed = self.fed
+            whole = self._read(data, 0, fed)
+            fed += len(data)
+            if whole is not None and type(whole) is not CorruptBytes and whole.end == fed:
+                self.fed = fed
+                self.messages += 1
+                return [whole]
+
         buffer = self._pending + data
         end = len(buffer)
         self.fed += len(data)

@@ -60,12 +60,10 @@ def encode_rvc(frame: RvcFrame) -> bytes:
 
 def _read_frame(buffer: bytes, at: int, base: int) -> RvcFrame | CorruptBytes | None:
     """Return the frame that begins at `at`, the reason why none does, or None if it is cut."""
-    if buffer[at] != _MARK:
-        return _NO_START
     after = at + RVC_BYTES
     if after > len(buffer):
-        return None
-    if buffer[at + 1] != _MARK:
+        return None if buffer[at] == _MARK else _NO_START
+    if buffer[at] != _MARK or buffer[at + 1] != _MARK:
         return _NO_START
     if sum(buffer[at + 2 : after - 1]) & 0xFF != buffer[after - 1]:
         return _CHECKSUM
