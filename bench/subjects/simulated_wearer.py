@@ -39,6 +39,8 @@ MOVES = {
 }
 """Motions of the functional calibration, of equal length, by limb."""
 PLATE_S, STAND_S, FUNCTIONAL_S = 24.0, 9.0, 60.0
+_CAN_BLOCKS = 7
+"""Blocks of 256 identifiers with 11 bits."""
 _LEAD_S = 2.0  # the transition between two motions has ended
 
 
@@ -116,7 +118,7 @@ def bench_rig(rate_hz: float = 100.0, limb: str = "leg") -> Rig:
     tables = ['[can.can0]\ninterface = "slcan"\nchannel = "/dev/null"\n']
     for number, (name, segment) in enumerate(LIMBS[limb].sensors.items(), 1):
         head = f'[[imu]]\nid = "{name}"\nsegment = "{segment}"\nrate_hz = {rate_hz:g}\n'
-        if number % 2:
+        if number % 2 or number > _CAN_BLOCKS:
             tables.append(f'{head}driver = "xbus"\nport = "/dev/{name}"\nbaud = {baud}\n')
             continue
         block = number << 8
