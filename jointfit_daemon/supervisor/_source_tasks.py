@@ -147,8 +147,9 @@ async def run_source(
 async def _wait_for_retry(path: str | None, delay_s: float) -> None:
     """Wait for `delay_s`, or until a device is plugged in at `path` if there is none."""
     absent = path is not None and _device_identity(path) is None
-    until_s = time.monotonic() + delay_s
-    while (left_s := until_s - time.monotonic()) > 0.0:
+    loop = asyncio.get_running_loop()
+    until_s = loop.time() + delay_s
+    while (left_s := until_s - loop.time()) > 0.0:
         await asyncio.sleep(min(left_s, PLUGGED_S) if absent else left_s)
         if absent and _device_identity(path) is not None:
             return
