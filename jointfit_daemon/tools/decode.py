@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import orjson
 import typer
 
-from jointfit_daemon.files.text import toml_value
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame, SyncPulse
 from jointfit_daemon.tools.completion import complete_driver
 
@@ -173,6 +172,8 @@ def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
 
 
 def _toml(key: str, value: Any) -> str:
+    from jointfit_daemon.files.text import toml_value  # it loads numpy, a quarter of the start
+
     return toml_value(value, hexadecimal=key == "ids")
 
 
