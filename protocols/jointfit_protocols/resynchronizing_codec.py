@@ -85,35 +85,37 @@ class ResynchronizingCodec(Generic[M]):
 
     def feed(self, data: bytes) -> list[M | CorruptBytes]:
         """Return the messages that `data` completed, in wire order; never raises."""
-        # The usual piece is one message.
-        if data and not self._pending and not self._run.count:
-            fed = self.fed
-            whole = self._read(data, 0, fed)
-            fed += len(data)
-            if whole is not None and type(whole) is not CorruptBytes and whole.end == fed:
-                self.fed = fed
-                self.messages += 1
-                return [whole]
-
+        if not data:
+            return []
         buffer = self._pending + data
         end = len(buffer)
         self.fed += len(data)
         base = self.fed - end
-        found: list[M | CorruptBytes] = []
+        item = self._read(buffer, 0, base)
+        if (  # the usual piece is one message
+            item is not None
+            and type(item) is not CorruptBytes
+            and item.end == self.fed
+            and not self._run.count
+        ):
+            self._pending = b""
+            self.messages += 1
+            return [item]
 
+        found: list[M | CorruptBytes] = []
         at = 0
-        while at < end:
-            item = self._read(buffer, at, base)
-            if item is None:
-                break
+        while item is not None:
             if type(item) is CorruptBytes:  # half the time of isinstance()
                 at += self._skip(buffer, at, item, found)
-                continue
-            if self._run.count:
-                self._run.end(found)
-            found.append(item)
-            self.messages += 1
-            at = item.end - base
+            else:
+                if self._run.count:
+                    self._run.end(found)
+                found.append(item)
+                self.messages += 1
+                at = item.end - base
+            if at == end:
+                break
+            item = self._read(buffer, at, base)
         self._pending = buffer[at:]
         return found
 
