@@ -46,7 +46,7 @@ PARTS = ("parallel", "alone", "experiments", "experiments-alone")
 """Which tests run together: by the markers `experiment` and `alone`."""
 ONLY_EXPERIMENTS = re.compile(r"^pytestmark = .*\bmark\.experiment\b", re.MULTILINE)
 """Line of a file whose tests are all experiments."""
-GRACE_S = 1.5
+GRACE_S = 6.0
 """How long descriptors and tasks may take to close: executors, child processes and the task of an
 MQTT client that checks its connection every second end a little later.
 """

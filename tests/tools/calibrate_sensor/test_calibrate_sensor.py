@@ -175,6 +175,8 @@ async def run_command(folder: Path, hand: Any, *options: str, stop_at: str = "")
     process = await asyncio.create_subprocess_exec(
         sys.executable, *COMMAND, "--rig", str(folder / "rig.toml"), *options,
         stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.STDOUT,
+        # The tests themselves may run in the background of a shell that ignores SIGINT.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     assert process.stdout is not None
     lines = []
