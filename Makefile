@@ -8,7 +8,7 @@ STAMP  := $(VENV)/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install compiled demo test test-compiled test-experiments test-cpu test-root faults fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
+.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root faults fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -34,6 +34,9 @@ test: $(STAMP)  ## all tests that this machine can run, on all cores; what is sk
 
 test-experiments: $(STAMP)  ## the short experiments of bench against their targets
 	@$(BIN)/python .ci/suite.py --experiments $(ARGS)
+
+test-cameras: $(STAMP)  ## a rig of four IMU families with each family of cameras, in real time, eight minutes
+	@JOINTFIT_ALL_CAMERAS=1 $(BIN)/python -m pytest -q --part experiments tests/system/test_camera_families.py
 
 compiled: $(STAMP)  ## compile the modules of the frame's path, into build/compiled (C compiler); nothing else uses them
 	@$(BIN)/python packaging/compiled.py $(ARGS)

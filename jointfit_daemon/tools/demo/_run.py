@@ -74,6 +74,8 @@ MATURE_NS = 300_000_000
 """Age, ns, at which the ground truth of a pose is written and the pose is evaluated."""
 CALIBRATIONS = "state/calibrations"
 """Calibration store of the demo, relative to its folder."""
+RECENT = 200
+"""Number of the last poses whose largest latency is the present delay of the daemon."""
 OUTCOMES = ("used", "decimated", "idle", "late", "duplicate", "dropped")
 
 
@@ -230,6 +232,10 @@ class DemoRun:
         """Stop the simulator, then wait until all samples in transit are counted."""
         self._evaluate()
         self._evaluating = False
+
+        # Closing a port loses what the daemon has not read: on a busy machine it may be behind.
+        await self.simulator.say("pause on")
+        await asyncio.sleep(2e-3 * max(self.latencies_ms[-RECENT:], default=0.0))
         totals = await self.simulator.quit()
         wanted = {source.id for source in self.rig.sources}
         before = self._healths
