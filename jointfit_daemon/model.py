@@ -104,6 +104,8 @@ class MocapFrame:
     """q_world_body, shape (len(layout.bodies), 4)."""
     live: bool = True
     """False if the server plays back a recording."""
+    counted: bool = True
+    """False if the server sends no frame numbers: `number` then shows no loss."""
 
 
 @dataclass(frozen=True, slots=True)

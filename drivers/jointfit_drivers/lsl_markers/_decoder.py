@@ -225,6 +225,7 @@ class LslMarkersDecoder:
                     rows_array(markers, 3),
                     rows_array([position for position, _ in poses], 3),
                     rows_array([turn for _, turn in poses], 4),
+                    counted=False,
                 )
             )
 

@@ -199,6 +199,7 @@ class VrpnDecoder:
                 rows_array([poses.get(k, (NO_POSITION,))[0] for k in binding.markers], 3),
                 rows_array([position for position, _ in whole], 3),
                 rows_array([turn for _, turn in whole], 4),
+                counted=False,
             )
         )
 

@@ -219,7 +219,8 @@ class SourceState:
                 item, clock.feed_sample(item.ticks, item.counter, arrival_ns, tick_clock)
             )
 
-        stamp = clock.feed_sample(item.ticks, item.number, item.arrival_ns, tick_clock)
+        counter = item.number if item.counted else None
+        stamp = clock.feed_sample(item.ticks, counter, item.arrival_ns, tick_clock)
         number = getattr(self.source.settings, "sync_line", None)
         if number is not None and stamp.synced and item.live and clock.last_u is not None:
             edge = Edge(clock.host_ns(clock.last_u), clock.last_u)

@@ -133,7 +133,7 @@ def test_a_clock_that_was_never_set_is_accepted_and_impossible_times_are_not() -
     assert time_of(bytes.fromhex("1a0304050607e803")) is None
 
 
-@pytest.mark.skipif(not VECTORS, reason="the shared vectors are not there")
+@pytest.mark.skipif(not VECTORS, reason="vectors.json is not here")
 @pytest.mark.parametrize("name", sorted(VECTORS))
 def test_vectors(name: str) -> None:
     vector = VECTORS[name]
