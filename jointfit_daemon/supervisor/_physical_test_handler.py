@@ -1,7 +1,7 @@
 """The request `physical-test`: the guided test of one sensor, beside its normal operation.
 
-Invariant: a test that is not asked for its state any more ends by itself, so that its chunks do not
-accumulate.
+Invariant: a test that is not completed, or not asked for its state any more, ends by itself, so
+that its chunks do not accumulate.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 ABANDONED_S = 30.0
 """Time without a request after which a test ends, s: a page asks every second."""
+LONGEST_S = 300.0
+"""Longest duration of a test, s: a page may stay open in the middle of one."""
 OPEN_S = 20.0
 """Longest time from opening to the first orientation, s; a search at other speeds is included."""
 RUNNING_PHASES = ("align", "static", "functional", "fitting")
@@ -57,17 +59,29 @@ class RunningPhysicalTest:
         self.test = PhysicalTest(source)
         self.failure: str | None = None
         self.result: dict[str, object] | None = None
+        self._began_ns: int | None = None
 
     def event(self, event: Event) -> None:
         """Take the chunks of the sensor; its loss ends the test."""
         name = self.test.source.id
         if isinstance(event, ChunkArrived) and event.source == name and self.failure is None:
+            if self._began_ns is None:
+                self._began_ns = event.chunk.t_ns
+            if event.chunk.t_ns - self._began_ns > LONGEST_S * 1e9:
+                self._end_incomplete()
+                return
             had_orientation = self.test.has_orientation
             self.test.add(event.chunk)
             if self.test.has_orientation and not had_orientation:
                 self.test.begin()
         elif isinstance(event, SourceClosed) and event.source == name:
             self.failure = self.failure or event.text
+
+    def _end_incomplete(self) -> None:
+        """End a test that takes too long, and release its chunks."""
+        if len(self.test.rests) < len(STEPS):
+            self.failure = f"not completed within {LONGEST_S / 60:g} minutes: start the test again"
+            self.test = PhysicalTest(self.test.source)
 
     def output(self, output: Output) -> None:
         """Ignore the outputs of the core."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.model import Chunk
 from jointfit_daemon.outputs.payload_models import ANSWERS
 from jointfit_daemon.pipeline.events import ChunkArrived, SourceClosed
 from jointfit_daemon.supervisor import _physical_test_handler
-from jointfit_daemon.supervisor._physical_test_handler import RunningPhysicalTest
+from jointfit_daemon.supervisor._physical_test_handler import LONGEST_S, RunningPhysicalTest
 from tests.physical_test.turned_sensor import guided_chunks, turned_source
 from tests.supervisor.request_gateway import gateway_fixture  # noqa: F401 - a fixture
 
@@ -44,6 +45,20 @@ async def test_a_lost_sensor_ends_the_test_in_words() -> None:
     running.event(SourceClosed(0, "S1", "lost", "/dev/ttyUSB0: unplugged"))
     answer = await running.state()
     assert (answer["state"], answer["text"]) == ("failed", "/dev/ttyUSB0: unplugged")
+
+
+async def test_a_test_that_is_never_completed_ends_and_releases_its_chunks() -> None:
+    running = RunningPhysicalTest(turned_source())
+    first = next(iter(guided_chunks()))
+    after_ns = round((LONGEST_S + 1.0) * 1e9)
+    for chunk in (first, Chunk(first.t_ns + after_ns, first.data)):
+        running.event(ChunkArrived("S1", chunk))
+    answer = await running.state()
+    assert (answer["state"], answer["text"]) == (
+        "failed",
+        "not completed within 5 minutes: start the test again",
+    )
+    assert not running.test.has_orientation
 
 
 async def test_the_sensor_is_opened_again_and_the_test_follows_it_until_stopped(
