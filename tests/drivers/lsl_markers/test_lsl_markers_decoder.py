@@ -109,6 +109,11 @@ def test_markers_and_bodies_have_their_names_and_si_units() -> None:
     assert feed.texts("warning", "error") == ""
 
 
+def test_frames_of_a_stream_without_numbers_are_not_compared_with_a_counter() -> None:
+    feed = Feeder(marker("T1"), markers={"thigh": ["T1"]})
+    assert [feed(1.0, 2.0, 3.0, at_s=at_s).counted for at_s in (0.0, 0.01)] == [False, False]
+
+
 def test_the_unit_of_the_channels_is_used() -> None:
     for unit, length_m in (("meters", 1.0), ("mm", 0.001), ("Centimeters", 0.01), ("", 1.0)):
         assert Feeder(marker("T1", unit))(1.0, 0.0, 0.0).markers[0, 0] == pytest.approx(length_m)
