@@ -36,7 +36,7 @@ class LegacyMeasurements:
     output_mode, output_settings : int, optional
         As in rig.toml; None: as the device reports them.
     world : {"NWU", "ENU"}
-        World of the device, unless its settings say NED.
+        World of the device, unless its settings select NED.
     """
 
     def __init__(self, output_mode: int | None, output_settings: int | None, world: World) -> None:

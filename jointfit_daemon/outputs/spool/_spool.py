@@ -1,7 +1,7 @@
 """Delivers events and decimated poses of a broker outage after it, also after a restart.
 
 While the daemon is connected, only the messages of the last seconds are stored, in memory: a loss
-of the connection is noticed late, and what was sent before may not have arrived. During an outage
+of the connection is noticed late, and messages sent before may not have arrived. During an outage
 messages are written to disk; after it they are sent in order, at least once, behind all others.
 
 Invariant: `Spool.add` appends to a list of limited size and returns. Messages that exceed a limit
@@ -115,7 +115,7 @@ class Spool:
             self._recent.popleft()
 
     def _begin(self) -> None:
-        """Note a connection: what waited for the first one is sent by the outbox."""
+        """Note a connection: the outbox sends the messages that waited for the first one."""
         if not self._began:
             self._began = True
             self._pending.clear()
@@ -168,7 +168,7 @@ class Spool:
             await asyncio.sleep(WRITE_S)
 
     def _store_pending(self) -> None:
-        """Write the messages that wait; what the disk does not take waits further."""
+        """Write the messages that wait; those that the disk refuses wait further."""
         pending, self._pending = self._pending, deque()
         try:
             self._files.append(pending)

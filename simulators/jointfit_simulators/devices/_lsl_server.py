@@ -1,7 +1,8 @@
 """Simulated program that sends motion capture to the Lab Streaming Layer: a real outlet of liblsl.
 
-Invariant: what is not seen is NaN, or what `LslServerOptions.absent` selects. A sample is stamped
-with its exposure, on the clock of LSL plus the difference of the simulated sender.
+Invariant: coordinates of an occluded marker or body are NaN, or `LslServerOptions.absent`.
+A sample is stamped with its exposure, on the clock of LSL plus the difference of the simulated
+sender.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class LslServerOptions:
     """Channels with marker, object, type and unit, with labels alone, or without description."""
     channel_format: Literal["float32", "double64", "string"] = "double64"
     absent: float = math.nan
-    """Value of every channel of what is not seen."""
+    """Value of every channel of an occluded marker or body."""
     device_ns: Callable[[int], int] = same_clock
     """Conversion from host CLOCK_MONOTONIC to the clock of the stamps, both in ns."""
 

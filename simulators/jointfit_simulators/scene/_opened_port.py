@@ -1,6 +1,6 @@
 """First opening of a simulated serial port by a host.
 
-The bytes of a serial device that nobody reads are lost, but a pty stores them for the first reader,
+The bytes of a serial device without a reader are lost, but a pty stores them for the first reader,
 which discards an unknown part of them. A device that sends without being asked therefore begins
 when its port has been opened, as boards do that DTR restarts: every sample that counts as sent then
 reaches the reader.
