@@ -5,21 +5,27 @@ libFuzzer) and collects the inputs that reach new code in build/fuzz/corpus/TARG
 run continues. The second changes these inputs at random without coverage, which is about five times
 faster. A finding is stored under build/fuzz/TARGET/ and fuzzing goes on. The exit code is 1 if
 there was a finding.
+
+To instrument the modules takes ten seconds, more than a short run of a target. Therefore the guided
+processes are forks of one process a job, which has imported everything.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import gc
 import hashlib
 import json
 import math
 import os
+import queue
 import random
 import shutil
 import subprocess
 import sys
 import time
+import traceback
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -40,6 +46,7 @@ NOT_INSTALLED = 3
 GUIDED, MUTATED = "guided", "mutated"
 GUIDED_PART = 0.2
 """Part of the cases of a target that is guided by coverage; of the seconds it is one half."""
+ENVIRONMENT = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
 _DAY_S = 86_400.0
 _EXTRA_S = 60
 """Processor start, imports and seeds of one target, s."""
@@ -120,11 +127,38 @@ class Tally:
         (OUT / f"{self.target.name}.json").write_text(json.dumps(result), encoding="utf-8")
 
 
+def serve_guided() -> None:
+    """Import everything instrumented, then fuzz one target in a fork for each line of the input.
+
+    A line holds name, cases and seconds; the answer is a line with the exit code.
+    """
+    import atheris
+
+    with atheris.instrument_imports(include=PACKAGES, enable_loader_override=False):
+        from tests.fuzz import inventory  # noqa: F401 - imports all targets
+    gc.freeze()  # what the forks share is not copied to count references
+
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
+    for line in sys.stdin:
+        name, cases, seconds = line.split()
+        fork = os.fork()
+        if fork == 0:
+            log = os.open(OUT / f"{name}-{GUIDED}.log", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(log, sys.stdout.fileno())
+            os.dup2(log, sys.stderr.fileno())
+            try:
+                fuzz_one(name, GUIDED, int(cases), float(seconds))
+            finally:  # only after an error: a fork must not read the next line
+                traceback.print_exc()
+                os._exit(1)
+        _, status = os.waitpid(fork, 0)
+        print(os.waitstatus_to_exitcode(status), file=answers, flush=True)
+
+
 def fuzz_one(name: str, mode: str, cases: int, seconds: float) -> None:
     """Fuzz one target in this process; does not return."""
-    with _instrumented() if mode == GUIDED else contextlib.nullcontext():
-        from tests.fuzz.broker_targets import folder
-        from tests.fuzz.inventory import TARGETS, reproducers
+    from tests.fuzz.broker_targets import folder
+    from tests.fuzz.inventory import TARGETS, reproducers
 
     target, corpus = TARGETS[name], OUT / "corpus" / name
     corpus.mkdir(parents=True, exist_ok=True)
@@ -141,15 +175,6 @@ def fuzz_one(name: str, mode: str, cases: int, seconds: float) -> None:
     if mode == GUIDED:
         _follow_coverage(tally, corpus, longest)
     _mutate_corpus(tally, corpus, longest)
-
-
-def _instrumented() -> contextlib.AbstractContextManager[None]:
-    import atheris
-
-    imports: contextlib.AbstractContextManager[None] = atheris.instrument_imports(
-        include=PACKAGES, enable_loader_override=False
-    )
-    return imports
 
 
 def _follow_coverage(tally: Tally, corpus: Path, longest: int) -> None:
@@ -184,12 +209,20 @@ def shares(names: Sequence[str], whole: float) -> dict[str, float]:
     return {name: whole * TARGETS[name].share / total for name in names}
 
 
-def run_target(name: str, cases: int, seconds: float) -> dict[str, Any]:
+def run_target(
+    name: str, cases: int, seconds: float, guided_server: subprocess.Popen[str]
+) -> dict[str, Any]:
     """Fuzz one target, first guided by coverage, and return the result of both parts."""
-    guided = _run_child(name, GUIDED, math.ceil(GUIDED_PART * cases), seconds / 2)
+    result = OUT / f"{name}.json"
+    result.unlink(missing_ok=True)
+    exit_code = _run_guided(name, math.ceil(GUIDED_PART * cases), seconds / 2, guided_server)
+    guided = _read_result(name, GUIDED, exit_code)
     if guided["cases"] >= cases:
         return guided | {"guided": guided["cases"]}
-    mutated = _run_child(name, MUTATED, cases - guided["cases"], seconds - guided["seconds"])
+
+    result.unlink(missing_ok=True)
+    exit_code = _run_mutated(name, cases - guided["cases"], seconds - guided["seconds"])
+    mutated = _read_result(name, MUTATED, exit_code)
     return {
         "cases": guided["cases"] + mutated["cases"],
         "guided": guided["cases"],
@@ -203,22 +236,39 @@ def run_target(name: str, cases: int, seconds: float) -> dict[str, Any]:
     }
 
 
-def _run_child(name: str, mode: str, cases: int, seconds: float) -> dict[str, Any]:
-    result = OUT / f"{name}.json"
-    result.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "tests.fuzz", "--child", mode, name]
-    command += ["--cases", str(cases), "--seconds", str(seconds)]
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1"}
-    path = OUT / f"{name}-{mode}.log"
-    with path.open("wb") as log:
-        done = subprocess.run(
-            command, env=environment, stdout=log, stderr=log, check=False,
-            timeout=seconds + 10 * _EXTRA_S,
+def start_guided_server() -> subprocess.Popen[str]:
+    """Start the process of `serve_guided`."""
+    with (OUT / f"{GUIDED}.log").open("ab") as log:  # lists every instrumented module
+        return subprocess.Popen(
+            [sys.executable, "-m", "tests.fuzz", "--serve-guided"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=ENVIRONMENT,
         )  # fmt: skip
+
+
+def _run_guided(name: str, cases: int, seconds: float, server: subprocess.Popen[str]) -> int:
+    if server.stdin is None or server.stdout is None:
+        raise RuntimeError("the server of guided runs has no pipes")
+    server.stdin.write(f"{name} {cases} {seconds}\n")
+    server.stdin.flush()
+    return int(server.stdout.readline() or -1)
+
+
+def _run_mutated(name: str, cases: int, seconds: float) -> int:
+    command = [sys.executable, "-m", "tests.fuzz", "--mutate", name]
+    command += ["--cases", str(cases), "--seconds", str(seconds)]
+    with (OUT / f"{name}-{MUTATED}.log").open("wb") as log:
+        return subprocess.run(
+            command, env=ENVIRONMENT, stdout=log, stderr=log, check=False,
+            timeout=seconds + 10 * _EXTRA_S,
+        ).returncode  # fmt: skip
+
+
+def _read_result(name: str, mode: str, exit_code: int) -> dict[str, Any]:
+    result = OUT / f"{name}.json"
     if result.exists():
         found: dict[str, Any] = json.loads(result.read_text(encoding="utf-8"))
         return found
-    text = f"ended with exit code {done.returncode}: see {path}"
+    text = f"ended with exit code {exit_code}: see {OUT}/{name}-{mode}.log"
     nothing = {"cases": 0, "seconds": 0, "growth_mb": 0, "slowest_ms": 0, "worst_byte": None}
     return nothing | {"findings": [text]}
 
@@ -241,13 +291,21 @@ def fuzz_all(names: Sequence[str], cases: int, seconds: float, jobs: int) -> int
     print("|---|" + "--:|" * len(heads))
     most_s = jobs * seconds / len(names) if seconds else _DAY_S
 
+    servers: queue.SimpleQueue[subprocess.Popen[str]] = queue.SimpleQueue()
+    for _ in range(jobs):
+        servers.put(start_guided_server())
+
     def run(name: str) -> dict[str, Any]:
-        result = run_target(name, max(1, round(by_cases[name])), most_s)
+        server = servers.get()
+        result = run_target(name, max(1, round(by_cases[name])), most_s, server)
+        servers.put(server)
         print(row(name, result), flush=True)
         return result
 
     with ThreadPoolExecutor(jobs) as pool:
         results = dict(zip(names, pool.map(run, names), strict=True))
+    for _ in range(jobs):
+        servers.get().communicate()
 
     total, guided = (sum(result[key] for result in results.values()) for key in ("cases", "guided"))
     findings = [line for result in results.values() for line in result["findings"]]
@@ -268,10 +326,14 @@ def main() -> int:
     parser.add_argument("--cases", type=int, default=CASES, help="in all (default %(default)s)")
     parser.add_argument("--seconds", type=float, default=0, help="at most, in all; 0: no limit")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="targets at a time")
-    parser.add_argument("--child", choices=(GUIDED, MUTATED), help=argparse.SUPPRESS)
+    parser.add_argument("--serve-guided", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--mutate", action="store_true", help=argparse.SUPPRESS)
     given = parser.parse_args()
-    if given.child:
-        fuzz_one(given.targets[0], given.child, given.cases, given.seconds)
+    if given.serve_guided:
+        serve_guided()
+        return 0
+    if given.mutate:
+        fuzz_one(given.targets[0], MUTATED, given.cases, given.seconds)
     try:
         import atheris  # noqa: F401 - in the dependency group `fuzz` only
     except ImportError:
