@@ -15,9 +15,6 @@ from jointfit_drivers.lsl_markers._session import LslSession
 from jointfit_drivers.lsl_markers._settings import LslMarkersSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jointfit_daemon.device_search import Finding, FoundServer
     from jointfit_daemon.driver import Emit, Wire
 
 
@@ -29,24 +26,15 @@ class LslMarkersMocap:
     least_delay_ms: ClassVar[tuple[float, float]] = (15.0, 10.0)
     """Delay from exposure to stamp, ms: most programs stamp a sample when they send it."""
 
+    find_servers = staticmethod(find_servers)
+    diagnose = staticmethod(diagnose)
+
     def __init__(self, settings: LslMarkersSettings) -> None:
         self._settings = settings
 
     def decoder(self) -> LslMarkersDecoder:
         """Return the decoder from chunks to optical frames in SI units."""
         return LslMarkersDecoder(self._settings)
-
-    @classmethod
-    async def find_servers(
-        cls, hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
-    ) -> list[FoundServer]:
-        """Return the streams of motion capture; see `jointfit_daemon.device_search`."""
-        return await find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
-
-    @classmethod
-    async def diagnose(cls, settings: LslMarkersSettings, wait_s: float) -> list[Finding]:
-        """Return the causes of missing frames; see `jointfit_daemon.device_search`."""
-        return await diagnose(settings, wait_s)
 
     async def run(self, emit: Emit) -> None:
         """Search the stream and read until cancelled.

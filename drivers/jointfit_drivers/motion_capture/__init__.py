@@ -10,9 +10,19 @@ from jointfit_drivers.motion_capture._binding import (
     wanted_names,
 )
 from jointfit_drivers.motion_capture._continuity import FrameContinuity, FrameStep
-from jointfit_drivers.motion_capture._reception import CHECK, Reception, content_findings
-from jointfit_drivers.motion_capture._route import Route, find_route
+from jointfit_drivers.motion_capture._reception import (
+    CHECK,
+    Reception,
+    content_findings,
+    run_until,
+    summary,
+    tracking_findings,
+)
+from jointfit_drivers.motion_capture._route import Route, find_route, host_address
+from jointfit_drivers.motion_capture._server_output import ServerOutput
+from jointfit_drivers.motion_capture._server_search import gather_servers
 from jointfit_drivers.motion_capture._settings import ServerSettings
+from jointfit_drivers.motion_capture._socket_link import SocketLink
 from jointfit_drivers.motion_capture._tcp_link import TcpLink
 from jointfit_drivers.motion_capture._unit_check import UnitCheck
 from jointfit_drivers.motion_capture._world import (
@@ -44,7 +54,9 @@ __all__ = [
     "ModelEntry",
     "Reception",
     "Route",
+    "ServerOutput",
     "ServerSettings",
+    "SocketLink",
     "TcpLink",
     "UnitCheck",
     "UpAxis",
@@ -52,9 +64,14 @@ __all__ = [
     "binding_events",
     "content_findings",
     "find_route",
+    "gather_servers",
+    "host_address",
     "is_near",
     "matrix_quaternion",
     "rows_array",
+    "run_until",
+    "summary",
+    "tracking_findings",
     "unit_quaternion",
     "wanted_names",
     "world_rotation",

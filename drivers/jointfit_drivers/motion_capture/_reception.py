@@ -12,7 +12,7 @@ from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import DeviceEvent, MocapFrame
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Coroutine
+    from collections.abc import Callable, Coroutine, Sequence
     from typing import Any
 
     from jointfit_daemon.driver import Decoder, Emit, MocapSettings
@@ -24,6 +24,43 @@ CHECK = "mocap"
 """Subject of the findings."""
 FRAMES_S = 1.0
 """Time to receive after the first frame, s."""
+
+
+async def run_until(
+    connection: Coroutine[Any, Any, None],
+    arrived: asyncio.Event,
+    limit_s: float,
+    *,
+    further_s: float = 0.0,
+) -> DeviceLostError | DeviceMisconfiguredError | None:
+    """Run a connection; return the error of the device that ended it.
+
+    Parameters
+    ----------
+    connection : coroutine
+        Cancelled at the end.
+    arrived : asyncio.Event
+        Set when the expected data have arrived.
+    limit_s : float
+        Longest wait for it, s.
+    further_s : float
+        Time after it, s.
+    """
+    running = asyncio.create_task(connection, name="connection")
+    waiting = asyncio.create_task(arrived.wait(), name="expected data")
+    try:
+        await asyncio.wait({running, waiting}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
+        if arrived.is_set():
+            await asyncio.sleep(further_s)
+    finally:
+        running.cancel()
+        waiting.cancel()
+        await asyncio.wait({running, waiting})
+
+    error = None if running.cancelled() else running.exception()
+    if error is None or isinstance(error, DeviceLostError | DeviceMisconfiguredError):
+        return error
+    raise error
 
 
 class Reception:
@@ -44,7 +81,6 @@ class Reception:
         self.frames: list[MocapFrame] = []
         self.failure: DeviceLostError | DeviceMisconfiguredError | None = None
         """Error that ended the connection."""
-        self._arrived = asyncio.Event()
 
     @property
     def warnings(self) -> list[str]:
@@ -62,31 +98,17 @@ class Reception:
 
     async def receive(self, limit_s: float) -> None:
         """Receive until `FRAMES_S` after the first frame, at most for `limit_s`."""
-        running = asyncio.create_task(self._connect(self._take), name="diagnosis")
-        first = asyncio.create_task(self._arrived.wait(), name="first frame")
-        try:
-            await asyncio.wait(
-                {running, first}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED
-            )
-            if self.frames:
-                await asyncio.sleep(FRAMES_S)
-        finally:
-            running.cancel()
-            first.cancel()
-            await asyncio.wait({running, first})
-        error = None if running.cancelled() else running.exception()
-        if isinstance(error, DeviceLostError | DeviceMisconfiguredError):
-            self.failure = error
-        elif error is not None:
-            raise error
+        arrived = asyncio.Event()
 
-    def _take(self, chunk: Chunk) -> None:
-        for item in self._decoder.feed(chunk):
-            if isinstance(item, MocapFrame):
-                self.frames.append(item)
-                self._arrived.set()
-            elif isinstance(item, DeviceEvent):
-                self.events.append(item)
+        def take(chunk: Chunk) -> None:
+            for item in self._decoder.feed(chunk):
+                if isinstance(item, MocapFrame):
+                    self.frames.append(item)
+                    arrived.set()
+                elif isinstance(item, DeviceEvent):
+                    self.events.append(item)
+
+        self.failure = await run_until(self._connect(take), arrived, limit_s, further_s=FRAMES_S)
 
 
 def content_findings(
@@ -118,15 +140,41 @@ def content_findings(
         text = "the frames are those of a recording, not of the cameras"
         findings.append(Finding(CHECK, name, "warning", text, "switch to live measurement"))
 
+    findings += tracking_findings(settings, frames, name, "check its definition")
+    return findings or [summary(frames, name)]
+
+
+def tracking_findings(
+    settings: MocapSettings, frames: Sequence[MocapFrame], name: str, remedy: str
+) -> list[Finding]:
+    """Return a finding for each rigid body of rig.toml that no frame contains.
+
+    Parameters
+    ----------
+    settings : MocapSettings
+        The ``[mocap]`` table.
+    frames : sequence of MocapFrame
+        At least one frame.
+    name : str
+        Name of the server.
+    remedy : str
+        How the camera software shows the definition of a body.
+    """
+    findings = []
+    bodies = frames[-1].layout.bodies
     for segment, body in settings.rigid_body.items():
-        if body in layout.bodies:
-            column = layout.bodies.index(body)
+        if body in bodies:
+            column = bodies.index(body)
             if all(np.isnan(frame.body_positions[column]).any() for frame in frames):
                 text = f"rigid body {body!r} of {segment} was not tracked in {len(frames)} frames"
-                remedy = "put it in view of the cameras, and check its definition"
-                findings.append(Finding(CHECK, name, "warning", text, remedy))
+                view = f"put it in view of the cameras, and {remedy}"
+                findings.append(Finding(CHECK, name, "warning", text, view))
+    return findings
 
-    span_s = (frames[-1].arrival_ns - frames[0].arrival_ns) / 1e9
+
+def summary(frames: Sequence[MocapFrame], name: str) -> Finding:
+    """Return the rate and the content of frames without a fault."""
+    layout, span_s = frames[-1].layout, (frames[-1].arrival_ns - frames[0].arrival_ns) / 1e9
     rate = f"{(len(frames) - 1) / span_s:.0f} frames a second, " if span_s > 0 else ""
     content = f"{rate}{len(layout.bodies)} rigid bodies, {len(layout.markers)} markers"
-    return findings or [Finding(CHECK, name, "ok", content)]
+    return Finding(CHECK, name, "ok", content)

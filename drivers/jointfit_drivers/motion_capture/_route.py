@@ -20,6 +20,24 @@ class Route(NamedTuple):
     local: str
 
 
+async def host_address(name: str) -> str:
+    """Return the IPv4 address of a host.
+
+    Raises
+    ------
+    OSError
+        The name is unknown.
+    """
+    try:
+        found = await asyncio.get_running_loop().getaddrinfo(name, None, family=socket.AF_INET)
+    except (OSError, UnicodeError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise OSError(
+            f"{name}: no such host ({why}): set the address of the server, such as 192.168.1.20"
+        ) from None
+    return str(found[0][4][0])
+
+
 async def find_route(kind: str, settings: ServerSettings) -> Route:
     """Return the route to the server of a ``[mocap]`` table.
 
@@ -39,12 +57,11 @@ async def find_route(kind: str, settings: ServerSettings) -> Route:
     """
     name, interface = settings.server, settings.interface
     try:
-        found = await asyncio.get_running_loop().getaddrinfo(name, None, family=socket.AF_INET)
-    except (OSError, UnicodeError) as error:
+        host = await host_address(name)
+    except OSError as error:
         raise DeviceLostError(
             f"{kind} server {name}: no such host: correct server, or enter its IPv4 address"
         ) from error
-    host = str(found[0][4][0])
 
     try:
         return Route(host, local_address(host, interface))

@@ -15,19 +15,22 @@ The connection is that of the driver: it connects, receives for a while, and dis
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
-import socket
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from jointfit_daemon.device_search import Finding
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
-from jointfit_daemon.model import DeviceEvent, MocapFrame
+from jointfit_daemon.driver import DeviceMisconfiguredError
+from jointfit_drivers.motion_capture import (
+    CHECK,
+    Reception,
+    Route,
+    host_address,
+    summary,
+    tracking_findings,
+)
 from jointfit_drivers.natnet._bitstream import FRAME_START
 from jointfit_drivers.natnet._decoder import NatNetDecoder
-from jointfit_drivers.natnet._network_findings import CHECK, card_findings, multicast_arrivals
+from jointfit_drivers.natnet._network_findings import card_findings, multicast_arrivals
 from jointfit_drivers.natnet._server_checks import NEWEST_MAJOR
 from jointfit_drivers.natnet._session import CONNECT_S, MODEL_S, NatNetSession
 from jointfit_drivers.ports.network_cards import network_cards
@@ -35,11 +38,12 @@ from jointfit_drivers.ports.udp_socket import local_address
 from jointfit_protocols.natnet import OLDEST
 
 if TYPE_CHECKING:
+    from jointfit_daemon.driver import Emit
     from jointfit_daemon.model import Chunk
     from jointfit_drivers.natnet._settings import NatNetSettings
 
-_FRAMES_S = 1.0
-"""Time to receive after the first frame, s."""
+_MULTICAST_S = 1.0
+"""Time to receive multicast frames at all network cards, s."""
 _NEWEST = "4.2"
 """Newest bitstream with a description; sections of later ones are skipped by their size."""
 _STILL = 3
@@ -50,51 +54,41 @@ _STREAMING = (
 )
 
 
-class _Reception:
-    """Everything that the server sent, decoded."""
+class NatNetReception(Reception):
+    """Everything that a server sent, decoded.
 
-    def __init__(self, settings: NatNetSettings) -> None:
-        self.decoder = NatNetDecoder(settings)
-        self.events: list[DeviceEvent] = []
-        self.frames: list[MocapFrame] = []
-        self.arrived = asyncio.Event()
-        """Set by the first decoded frame."""
+    Parameters
+    ----------
+    settings : NatNetSettings
+        The ``[mocap]`` table.
+    route : Route
+        Addresses of the server and of the network card.
+    """
+
+    def __init__(self, settings: NatNetSettings, route: Route) -> None:
         self.datagrams = 0
         """Datagrams with a frame, decoded or not."""
 
-    def emit(self, chunk: Chunk) -> None:
-        self.datagrams += chunk.data.startswith(FRAME_START)
-        for item in self.decoder.feed(chunk):
-            if isinstance(item, MocapFrame):
-                self.frames.append(item)
-                self.arrived.set()
-            elif isinstance(item, DeviceEvent):
-                self.events.append(item)
+        async def connect(emit: Emit) -> None:
+            def take(chunk: Chunk) -> None:
+                self.datagrams += chunk.data.startswith(FRAME_START)
+                emit(chunk)
 
-    @property
-    def server(self) -> dict[str, Any] | None:
-        """Description of the server; None before its answer."""
-        found = [dict(event.data) for event in self.events if "natnet" in event.data]
-        return found[-1] if found else None
+            await NatNetSession(settings, route, take).run()
 
-    @property
-    def warnings(self) -> list[str]:
-        """Warnings about the model, each once."""
-        texts = [event.text for event in self.events if event.kind in ("warning", "error")]
-        return list(dict.fromkeys(texts))
+        self.decoder = NatNetDecoder(settings)
+        super().__init__(self.decoder, connect)
 
 
 async def diagnose(settings: NatNetSettings, wait_s: float) -> list[Finding]:
     """Return the findings for a ``[mocap]`` table; see `Diagnosis.diagnose`."""
     name = settings.server
-    loop = asyncio.get_running_loop()
     try:
-        addresses = await loop.getaddrinfo(name, None, family=socket.AF_INET)
-    except (OSError, UnicodeError):
+        host = await host_address(name)
+    except OSError:
         text = f"no such host: {name!r} has no IPv4 address"
         remedy = "set server in [mocap] to the address that Motive's PC has: ipconfig"
         return [Finding(CHECK, name, "error", text, remedy)]
-    host = str(addresses[0][4][0])
 
     cards = network_cards()
     try:
@@ -110,44 +104,20 @@ async def diagnose(settings: NatNetSettings, wait_s: float) -> list[Finding]:
     routed = None
     with contextlib.suppress(OSError):
         routed = local_address(host, None)
-    reception = _Reception(settings)
-    failure = await _receive(settings, host, local, reception, wait_s)
+
+    patient = settings.model_copy(update={"silence_s": wait_s})
+    reception = NatNetReception(patient, Route(host, local))
+    await reception.receive(CONNECT_S + MODEL_S + wait_s)
     findings = card_findings(
         name, host, local, routed, cards,
         chosen=settings.interface is not None, arrived=bool(reception.frames),
     )  # fmt: skip
     if reception.frames:
         return [*findings, *_stream_findings(settings, reception)]
-    if reception.server is None:
-        return [*findings, _unanswered(settings, failure)]
-    missing = await _missing_frames(settings, host, local, reception, failure)
+    if "natnet" not in reception.facts:
+        return [*findings, _unanswered(settings, reception.failure)]
+    missing = await _missing_frames(settings, Route(host, local), reception)
     return [*findings, *missing]
-
-
-async def _receive(
-    settings: NatNetSettings, host: str, local: str, reception: _Reception, wait_s: float
-) -> Exception | None:
-    """Receive as the driver does; return the error that ended the connection."""
-    patient = settings.model_copy(update={"silence_s": wait_s})
-    session = NatNetSession(patient, host, local, reception.emit)
-    task = asyncio.create_task(session.run(), name="natnet diagnosis")
-    first_frame = asyncio.create_task(reception.arrived.wait(), name="natnet first frame")
-    tasks = {task, first_frame}
-    limit_s = CONNECT_S + MODEL_S + wait_s
-    try:
-        await asyncio.wait(tasks, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)
-        if reception.frames:
-            await asyncio.sleep(_FRAMES_S)
-    finally:
-        for each in tasks:
-            each.cancel()
-        await asyncio.wait(tasks)
-    if task.cancelled():
-        return None
-    failure = task.exception()
-    if failure is not None and not isinstance(failure, DeviceLostError | DeviceMisconfiguredError):
-        raise failure
-    return failure if isinstance(failure, Exception) else None
 
 
 def _unanswered(settings: NatNetSettings, failure: Exception | None) -> Finding:
@@ -169,14 +139,10 @@ def _unanswered(settings: NatNetSettings, failure: Exception | None) -> Finding:
 
 
 async def _missing_frames(
-    settings: NatNetSettings,
-    host: str,
-    local: str,
-    reception: _Reception,
-    failure: Exception | None,
+    settings: NatNetSettings, route: Route, reception: NatNetReception
 ) -> list[Finding]:
     """Return the findings for a server that answers, but sends no usable frame."""
-    name, server = settings.server, reception.server or {}
+    name, server, failure = settings.server, reception.facts, reception.failure
     natnet = ".".join(str(server["natnet"]).split(".")[:2])
     major = int(natnet.partition(".")[0])
     oldest = ".".join(map(str, OLDEST))
@@ -198,19 +164,20 @@ async def _missing_frames(
         text = f"the server sends {server['transport']}, transport = {settings.transport!r}"
         return [Finding(CHECK, name, "error", text, 'set transport = "auto" in [mocap]')]
     if multicast:
-        return [await _missing_multicast(settings, host, local, server)]
+        return [await _missing_multicast(settings, route, server)]
     text = "streaming off: the server answers, but sends no frame"
     return [Finding(CHECK, name, "error", text, _STREAMING)]
 
 
 async def _missing_multicast(
-    settings: NatNetSettings, host: str, local: str, server: dict[str, Any]
+    settings: NatNetSettings, route: Route, server: dict[str, Any]
 ) -> Finding:
     """Return whether the frames arrive at another card, or at none."""
+    host, local = route
     name, group = settings.server, str(server["group"])
     port = settings.data_port or int(server["data_port"])
     cards = network_cards()
-    arrivals = await multicast_arrivals(group, port, host, cards, _FRAMES_S)
+    arrivals = await multicast_arrivals(group, port, host, cards, _MULTICAST_S)
     other = next((c for c in cards if arrivals[c.address] and c.address != local), None)
     if other is not None:
         text = (
@@ -229,7 +196,7 @@ async def _missing_multicast(
     return Finding(CHECK, name, "error", text, remedy)
 
 
-def _stream_findings(settings: NatNetSettings, reception: _Reception) -> list[Finding]:
+def _stream_findings(settings: NatNetSettings, reception: NatNetReception) -> list[Finding]:
     """Return the findings about the content of the stream."""
     name, frames = settings.server, reception.frames
     layout = frames[-1].layout
@@ -258,15 +225,6 @@ def _stream_findings(settings: NatNetSettings, reception: _Reception) -> list[Fi
         text = "the frame number stands still: the cameras are paused"
         findings.append(Finding(CHECK, name, "error", text, "resume the cameras in Motive"))
 
-    for segment, body in settings.rigid_body.items():
-        if body in layout.bodies:
-            column = layout.bodies.index(body)
-            if all(np.isnan(frame.body_positions[column]).any() for frame in frames):
-                text = f"rigid body {body!r} of {segment} was not tracked in {len(frames)} frames"
-                remedy = "put it in view of the cameras, and check its marker positions in Motive"
-                findings.append(Finding(CHECK, name, "warning", text, remedy))
-
-    span_s = (frames[-1].arrival_ns - frames[0].arrival_ns) / 1e9
-    rate = f"{(len(frames) - 1) / span_s:.0f} frames a second, " if span_s > 0 else ""
-    content = f"{rate}{len(layout.bodies)} rigid bodies, {len(layout.markers)} markers"
-    return findings or [Finding(CHECK, name, "ok", content)]
+    remedy = "check its marker positions in Motive"
+    findings += tracking_findings(settings, frames, name, remedy)
+    return findings or [summary(frames, name)]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from jointfit_drivers.motion_capture import find_route
+from jointfit_drivers.motion_capture import ServerOutput, find_route
 from jointfit_drivers.natnet._decoder import NatNetDecoder
 from jointfit_drivers.natnet._diagnosis import diagnose
 from jointfit_drivers.natnet._server_search import find_servers
@@ -17,9 +17,6 @@ from jointfit_drivers.natnet._session import NatNetSession
 from jointfit_drivers.natnet._settings import NatNetSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jointfit_daemon.device_search import Finding, FoundServer
     from jointfit_daemon.driver import Emit, Wire
 
 
@@ -29,25 +26,16 @@ class NatNetMocap:
     Settings: ClassVar[type[NatNetSettings]] = NatNetSettings
     wire: ClassVar[Wire] = "datagram"
 
+    find_servers = staticmethod(find_servers)
+    diagnose = staticmethod(diagnose)
+
     def __init__(self, settings: NatNetSettings) -> None:
         self._settings = settings
-        self._silent = False
+        self._output = ServerOutput()
 
     def decoder(self) -> NatNetDecoder:
         """Return the decoder from datagrams to optical frames in SI units."""
         return NatNetDecoder(self._settings)
-
-    @classmethod
-    async def find_servers(
-        cls, hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
-    ) -> list[FoundServer]:
-        """Return the NatNet servers that answer; see `jointfit_daemon.device_search`."""
-        return await find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
-
-    @classmethod
-    async def diagnose(cls, settings: NatNetSettings, wait_s: float) -> list[Finding]:
-        """Return the causes of missing frames; see `jointfit_daemon.device_search`."""
-        return await diagnose(settings, wait_s)
 
     async def run(self, emit: Emit) -> None:
         """Connect to the server and read until cancelled.
@@ -61,9 +49,5 @@ class NatNetMocap:
             The host is no NatNet server, its bitstream is not supported, or the network card is
             unknown.
         """
-        host, local = await find_route("NatNet", self._settings)
-        session = NatNetSession(self._settings, host, local, emit, after_silence=self._silent)
-        try:
-            await session.run()
-        finally:
-            self._silent = session.silent
+        route = await find_route("NatNet", self._settings)
+        await NatNetSession(self._settings, route, emit, self._output).run()

@@ -1,8 +1,6 @@
 """Sockets to one NatNet server in the event loop.
 
-The event loop calls the reader callbacks, so they cannot raise an error in the driver's coroutine.
-Their error is stored, and `NatNetLink.pause`, in which the coroutine waits, raises it. Failures of
-the network are raised as `DeviceLostError`, other exceptions unchanged.
+Failures of the network are raised as `DeviceLostError`, other exceptions unchanged.
 
 Frames are accepted from any port of the server, because multicast frames leave its data port.
 Control messages are accepted on the command socket only, and only from the server's command port.
@@ -10,14 +8,16 @@ Control messages are accepted on the command socket only, and only from the serv
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import time
-from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING
+
+from typing_extensions import override
 
 from jointfit_daemon.driver import DeviceLostError
 from jointfit_daemon.model import Chunk
+from jointfit_drivers.motion_capture import SocketLink
 from jointfit_drivers.natnet._bitstream import FRAME_START
 from jointfit_drivers.ports.udp_socket import UdpSocket
 from jointfit_protocols.natnet import encode
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from typing import Self
 
+    from jointfit_drivers.motion_capture import Route
     from jointfit_protocols.natnet import Message
 
 _FLEETING = {errno.ENOBUFS, errno.EMSGSIZE, errno.EINTR}
@@ -36,45 +37,40 @@ _FORGED_NS = 100_000_000
 A server that has just sent a datagram does not refuse: the ICMP message is forged or stale."""
 
 
-class NatNetLink:
+class NatNetLink(SocketLink):
     """Command socket, and a data socket for multicast frames.
 
     Parameters
     ----------
-    host, port : str, int
-        Numeric address and command port of the server.
-    local : str
-        Address of this host's network card.
+    route : Route
+        Addresses of the server and of this host's network card.
+    port : int
+        Command port of the server.
     take : callable
         Called with every chunk from the server, in order of arrival.
     """
 
-    def __init__(self, host: str, port: int, local: str, take: Callable[[Chunk], None]) -> None:
-        self._server = (host, port)
-        self._local = local
+    def __init__(self, route: Route, port: int, take: Callable[[Chunk], None]) -> None:
+        super().__init__()
+        self._server = (route.host, port)
+        self._local = route.local
         self._take = take
-        self._loop = asyncio.get_running_loop()
-        self._sockets: list[UdpSocket] = []
-        self._arrived = asyncio.Event()
-        self._failure: Exception | None = None
         self._received_ns = 0
         self.foreign = 0
         """Number of datagrams that this class dropped because of their source.
 
         The kernel drops most datagrams of other hosts before, and these are not counted."""
 
+    @override
     def __enter__(self) -> Self:
-        self._command = self._open(UdpSocket(self._local, 0, sender=self._server[0]))
+        self._command = UdpSocket(self._local, 0, sender=self._server[0])
+        self.watch(self._command, partial(self._read, self._command))
         return self
-
-    def __exit__(self, *_: object) -> None:
-        for opened in self._sockets:
-            self._loop.remove_reader(opened)
-            opened.close()
 
     def join(self, group: str, port: int) -> None:
         """Open the data socket of a multicast server; raises the system's OSError."""
-        self._open(UdpSocket.in_group(group, port, self._local, sender=self._server[0]))
+        data = UdpSocket.in_group(group, port, self._local, sender=self._server[0])
+        self.watch(data, partial(self._read, data))
 
     def send(self, message: Message) -> None:
         """Send one message to the server's command port.
@@ -89,34 +85,6 @@ class NatNetLink:
         except OSError as error:
             if error.errno not in _FLEETING and not self._forged(error):
                 raise self._lost(error) from error
-
-    def wake(self) -> None:
-        """End the current `pause`: a message arrived."""
-        self._arrived.set()
-
-    async def pause(self, seconds: float) -> None:
-        """Wait for a message, at most `seconds`; raise errors of the callbacks."""
-        if seconds > 0:
-            with suppress(TimeoutError):
-                async with asyncio.timeout(seconds):
-                    await self._arrived.wait()
-
-        self._arrived.clear()
-        if self._failure is not None:
-            raise self._failure
-
-    def _open(self, opened: UdpSocket) -> UdpSocket:
-        self._sockets.append(opened)
-        self._loop.add_reader(opened, self._readable, opened)
-        return opened
-
-    def _readable(self, source: UdpSocket) -> None:
-        try:
-            self._read(source)
-        except Exception as error:  # noqa: BLE001 - a callback passes its error to the coroutine
-            self._failure = self._failure or error
-            self._loop.remove_reader(source)
-            self._arrived.set()
 
     def _read(self, source: UdpSocket) -> None:
         try:

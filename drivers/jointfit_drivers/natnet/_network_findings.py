@@ -7,6 +7,7 @@ import contextlib
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.device_search import Finding
+from jointfit_drivers.motion_capture import CHECK
 from jointfit_drivers.natnet._bitstream import FRAME_START
 from jointfit_drivers.ports.udp_socket import UdpSocket
 
@@ -14,8 +15,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from jointfit_drivers.ports.network_cards import NetworkCard
-
-CHECK = "mocap"
 
 
 def card_findings(

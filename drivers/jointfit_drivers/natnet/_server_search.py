@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import socket
 from typing import TYPE_CHECKING
 
 from typing_extensions import override
 
 from jointfit_daemon.device_search import FoundServer
+from jointfit_drivers.motion_capture import gather_servers, host_address
 from jointfit_drivers.natnet._binding import bind_model
-from jointfit_drivers.ports.network_cards import network_cards
+from jointfit_drivers.ports.network_cards import broadcast_networks
 from jointfit_drivers.ports.udp_socket import local_address
 from jointfit_protocols import natnet
 from jointfit_protocols.natnet import NatNetMessageId
@@ -27,7 +27,6 @@ COMMAND_PORT = 1510
 """Usual command port of Motive."""
 _TRIES = 3
 """Requests to a host or network, because a datagram may be lost."""
-_LOOPBACK = "127.0.0.1"
 _REQUEST = natnet.Connect(264, "jointfitd", (1, 0, 0, 0), (3, 0, 0, 0))
 
 
@@ -59,38 +58,13 @@ async def find_servers(
     hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
 ) -> list[FoundServer]:
     """Return the NatNet servers that answer; see `ServerSearch.find_servers`."""
-    loop = asyncio.get_running_loop()
-    targets = []
-    for host in hosts:
-        try:
-            addresses = await loop.getaddrinfo(host, None, family=socket.AF_INET)
-        except (OSError, UnicodeError) as error:
-            why = getattr(error, "strerror", None) or error
-            raise OSError(
-                f"{host}: no such host ({why}): set the address of the server, such as 192.168.1.20"
-            ) from None
-        address = str(addresses[0][4][0])
-        targets.append((local_address(address, None), address))
+    addresses = [await host_address(host) for host in hosts]
+    targets = [(local_address(address, None), address) for address in addresses]
 
-    # Local and broadcast address of each network; a server may also run on this host.
-    networks: list[tuple[str, str]] = []
-    if broadcast:
-        cards = [(card.address, card.broadcast) for card in network_cards()]
-        networks = [(_LOOPBACK, _LOOPBACK), *((local, to) for local, to in cards if to is not None)]
-
-    async with asyncio.TaskGroup() as group:
-        named = [
-            group.create_task(_ask_host(local, address, port or COMMAND_PORT, wait_s))
-            for local, address in targets
-        ]
-        searched = [
-            group.create_task(_ask_network(local, address, port or COMMAND_PORT, wait_s))
-            for local, address in networks
-        ]
-    # A named host also answers the broadcast; the first answer has its names.
-    found = [server for task in (*named, *searched) for server in task.result()]
-    unique = {(server.server, server.port): server for server in reversed(found)}
-    return sorted(unique.values(), key=lambda server: (server.server, server.port))
+    port = port or COMMAND_PORT
+    named = [_ask_host(*target, port, wait_s) for target in targets]
+    networks = broadcast_networks() if broadcast else []
+    return await gather_servers(named, [_ask_network(*each, port, wait_s) for each in networks])
 
 
 async def _ask_host(local: str, address: str, port: int, wait_s: float) -> list[FoundServer]:

@@ -22,6 +22,7 @@ import time
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.motion_capture import ServerOutput
 from jointfit_drivers.natnet._bitstream import FRAME_START, BitstreamTracker
 from jointfit_drivers.natnet._link import NatNetLink
 from jointfit_drivers.natnet._open_requests import OpenRequests
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.driver import Emit
     from jointfit_daemon.model import Chunk
+    from jointfit_drivers.motion_capture import Route
     from jointfit_drivers.natnet._settings import NatNetSettings
 
 RETRY_S = 0.5
@@ -71,31 +73,22 @@ class NatNetSession:
     ----------
     settings : NatNetSettings
         The ``[mocap]`` table.
-    host, local : str
-        Numeric addresses of the server and of this host's network card.
+    route : Route
+        Addresses of the server and of this host's network card.
     emit : Emit
         Receives every accepted datagram of the server.
-    after_silence : bool
-        Whether the last connection ended without frames. The answers of the server are then
-        emitted with the first frame, because a server that only answers is still lost.
+    output : ServerOutput, optional
+        That of the connections before.
     """
 
     def __init__(
-        self,
-        settings: NatNetSettings,
-        host: str,
-        local: str,
-        emit: Emit,
-        *,
-        after_silence: bool = False,
+        self, settings: NatNetSettings, route: Route, emit: Emit, output: ServerOutput | None = None
     ) -> None:
         self._settings = settings
         self._name = f"NatNet server {settings.server}:{settings.command_port}"
-        self._emit = emit
-        self.silent = after_silence
-        """Whether frames have stopped and none has arrived since, in any connection."""
-        self._held: list[Chunk] = []
-        self._link = NatNetLink(host, settings.command_port, local, self._take)
+        self._output = output or ServerOutput()
+        self._output.begin(emit)
+        self._link = NatNetLink(route, settings.command_port, self._take)
         self._open_requests = OpenRequests()
         self._info: natnet.ServerInfo | None = None
         self._bitstream = BitstreamTracker(settings.wanted_version)
@@ -149,16 +142,10 @@ class NatNetSession:
 
     def _take(self, chunk: Chunk) -> None:
         if chunk.data.startswith(FRAME_START):
-            self.silent = False
-            while self._held:
-                self._emit(self._held.pop(0))
-            self._emit(chunk)
+            self._output.emit_frame(chunk)
             self._frame(chunk)
         elif self._open_requests.accept(chunk.data, chunk.t_ns):
-            if self.silent:
-                self._held.append(chunk)
-            else:
-                self._emit(chunk)
+            self._output.emit_answer(chunk)
             self._message(chunk)
 
     def _frame(self, chunk: Chunk) -> None:
@@ -286,7 +273,7 @@ class NatNetSession:
                 f"NatNet {version}: check that Motive streams the bitstream it announces"
             )
 
-        self.silent, hint = True, ""
+        self._output.silent, hint = True, ""
         if unicast == info.multicast:
             announced = "multicast" if info.multicast else "unicast"
             hint = f"; it announces {announced}, but transport = {self._settings.transport!r}"

@@ -57,3 +57,10 @@ def network_cards() -> list[NetworkCard]:
 
 def _read(control: socket.socket, number: int, request: bytes) -> str:
     return socket.inet_ntoa(fcntl.ioctl(control, number, request)[_ADDRESS])
+
+
+def broadcast_networks() -> list[tuple[str, str]]:
+    """Return this host's address and the broadcast address in each network, the loopback first."""
+    loopback = "127.0.0.1"
+    cards = [(card.address, card.broadcast) for card in network_cards()]
+    return [(loopback, loopback), *((local, to) for local, to in cards if to is not None)]

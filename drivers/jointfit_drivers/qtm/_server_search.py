@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 from typing_extensions import override
 
 from jointfit_daemon.device_search import FoundServer
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
-from jointfit_drivers.motion_capture import Route, find_route
-from jointfit_drivers.ports.network_cards import network_cards
+from jointfit_daemon.driver import DeviceLostError
+from jointfit_drivers.motion_capture import Route, find_route, gather_servers, run_until
+from jointfit_drivers.ports.network_cards import broadcast_networks
 from jointfit_drivers.qtm._binding import bind_settings
 from jointfit_drivers.qtm._session import QtmSession
 from jointfit_drivers.qtm._settings import PORT, QtmSettings
@@ -29,7 +29,6 @@ DISCOVERY_PORT = 22226
 """UDP port at which QTM answers to discovery."""
 _TRIES = 3
 """Requests to a network, because a datagram may be lost."""
-_LOOPBACK = "127.0.0.1"
 
 
 class _Announcements(asyncio.DatagramProtocol):
@@ -63,18 +62,9 @@ async def find_servers(
         except DeviceLostError as error:
             raise OSError(str(error)) from None
 
-    networks: list[tuple[str, str]] = []
-    if broadcast:
-        cards = [(card.address, card.broadcast) for card in network_cards()]
-        networks = [(_LOOPBACK, _LOOPBACK), *((local, to) for local, to in cards if to is not None)]
-
-    async with asyncio.TaskGroup() as group:
-        named = [group.create_task(_ask_host(*table, wait_s)) for table in tables]
-        searched = [group.create_task(_ask_network(*network, wait_s)) for network in networks]
-    # A named host also answers the broadcast; the first answer has its names.
-    found = [server for task in (*named, *searched) for server in task.result()]
-    unique = {(server.server, server.port): server for server in reversed(found)}
-    return sorted(unique.values(), key=lambda server: (server.server, server.port))
+    named = [_ask_host(*table, wait_s) for table in tables]
+    networks = broadcast_networks() if broadcast else []
+    return await gather_servers(named, [_ask_network(*each, wait_s) for each in networks])
 
 
 async def _ask_host(settings: QtmSettings, route: Route, wait_s: float) -> list[FoundServer]:
@@ -90,17 +80,7 @@ async def _ask_host(settings: QtmSettings, route: Route, wait_s: float) -> list[
             described.set()
 
     session = QtmSession(settings, route, take)
-    running = asyncio.create_task(session.run(), name="qtm search")
-    waiting = asyncio.create_task(described.wait(), name="qtm settings")
-    try:
-        await asyncio.wait({running, waiting}, timeout=wait_s, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        running.cancel()
-        waiting.cancel()
-        await asyncio.wait({running, waiting})
-    error = None if running.cancelled() else running.exception()
-    if error is not None and not isinstance(error, DeviceLostError | DeviceMisconfiguredError):
-        raise error
+    await run_until(session.run(), described, wait_s)
     if session.version is None:
         return []
 

@@ -13,13 +13,13 @@ Invariant: one command awaits its answer at a time. Events, errors and frames ma
 
 from __future__ import annotations
 
-import asyncio
 import time
+from functools import partial
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
-from jointfit_drivers.motion_capture import TcpLink
+from jointfit_drivers.motion_capture import ServerOutput, TcpLink
 from jointfit_drivers.ports.udp_socket import UdpSocket
 from jointfit_protocols import qtm
 from jointfit_protocols.corrupt import CorruptBytes
@@ -61,25 +61,22 @@ class QtmSession:
         Addresses of the server and of this host's network card.
     emit : Emit
         Receives every packet of the server.
-    after_silence : bool
-        Whether the last connection ended without frames. The answers of the server are then
-        emitted with the first frame, because a server that only answers is still lost.
+    output : ServerOutput, optional
+        That of the connections before.
     """
 
     def __init__(
-        self, settings: QtmSettings, route: Route, emit: Emit, *, after_silence: bool = False
+        self, settings: QtmSettings, route: Route, emit: Emit, output: ServerOutput | None = None
     ) -> None:
         self._settings = settings
         self._route = route
-        self._emit = emit
-        self.silent = after_silence
-        """Whether frames have stopped and none has arrived since, in any connection."""
+        self._output = output or ServerOutput()
+        self._output.begin(emit)
         self.version: str | None = None
         """Version of the protocol in use."""
         self._name = f"QTM server {settings.server}:{settings.command_port}"
         self._link = TcpLink(self._name, f"{START}, and check command_port", self._read)
         self._stream = qtm.QtmStream()
-        self._held: list[Chunk] = []
         self._answers: list[qtm.Message] = []
         self._greeted = False
         self._described: qtm.QtmSettingsXml | None = None
@@ -90,41 +87,34 @@ class QtmSession:
 
     async def run(self) -> None:
         """Connect and read until cancelled; raises the errors of `QtmMocap.run`."""
-        loop = asyncio.get_running_loop()
-        udp: UdpSocket | None = None
-        try:
+        with self._link as link:
             # The data port is bound before QTM is told to send there.
-            if self._settings.transport == "udp":
-                udp = self._open_udp()
-                loop.add_reader(udp, self._read_udp, udp)
-            with self._link as link:
-                await link.open(self._route, self._settings.command_port)
-                await self._greet()
-                await self._negotiate()
-                await self._ask("GetState", qtm.Event)
-                await self._stream_frames(None if udp is None else udp.port)
-        finally:
-            if udp is not None:
-                loop.remove_reader(udp)
-                udp.close()
+            udp_port = self._open_udp() if self._settings.transport == "udp" else None
+            await link.open(self._route, self._settings.command_port)
+            await self._greet()
+            await self._negotiate()
+            await self._ask("GetState", qtm.Event)
+            await self._stream_frames(udp_port)
 
-    def _open_udp(self) -> UdpSocket:
+    def _open_udp(self) -> int:
+        """Open the socket of the frames; return its port."""
         port = self._settings.data_port or 0
         try:
-            return UdpSocket(self._route.local, port, sender=self._route.host)
+            udp = UdpSocket(self._route.local, port, sender=self._route.host)
         except OSError as error:
             raise DeviceLostError(
                 f"{self._name}: cannot receive at UDP port {port} ({error.strerror or error}): "
                 "another program uses it; remove data_port"
             ) from error
+        self._link.watch(udp, partial(self._read_udp, udp))
+        return udp.port
 
     # --- received packets ---------------------------------------------------------------------
 
     def _read(self, segment: Segment) -> None:
         for packet in self._stream.feed(segment.data):
             if isinstance(packet, CorruptBytes):
-                self._link.fail(self._unreadable(segment.data))
-                return
+                raise self._unreadable(segment.data)
             self._take(Chunk(segment.t_ns, packet))
 
     def _unreadable(self, data: bytes) -> Exception:
@@ -141,29 +131,22 @@ class QtmSession:
 
     def _read_udp(self, udp: UdpSocket) -> None:
         try:
-            for arrival in udp.receive():
-                if arrival.host == self._route.host and _packet_type(arrival.data) in _DATA_TYPES:
-                    self._take(Chunk(arrival.t_ns, arrival.data))
+            arrivals = udp.receive()
         except OSError:  # an ICMP refusal: nothing is sent from this socket
             return
-        except Exception as error:  # noqa: BLE001 - a callback passes its error to the coroutine
-            self._link.fail(error)
+        for arrival in arrivals:
+            if arrival.host == self._route.host and _packet_type(arrival.data) in _DATA_TYPES:
+                self._take(Chunk(arrival.t_ns, arrival.data))
 
     def _take(self, chunk: Chunk) -> None:
         kind = _packet_type(chunk.data)
         if kind == PacketType.DATA:
-            self.silent = self._waiting = False
-            self._started_ns = None
-            while self._held:
-                self._emit(self._held.pop(0))
-            self._emit(chunk)
+            self._waiting, self._started_ns = False, None
+            self._output.emit_frame(chunk)
             self._check_frame(chunk)
             return
 
-        if self.silent:
-            self._held.append(chunk)
-        else:
-            self._emit(chunk)
+        self._output.emit_answer(chunk)
         match qtm.decode(chunk.data):
             case qtm.NoMoreData():
                 self._waiting = True
@@ -307,7 +290,7 @@ class QtmSession:
         """Raise DeviceLostError without frames, except while QTM waits for a measurement."""
         if self._waiting or (time.monotonic_ns() - heard_ns) / 1e9 < self._settings.silence_s:
             return
-        self.silent = True
+        self._output.silent = True
         hint = "" if udp_port is None else ", and allow UDP in firewalls or set transport = 'tcp'"
         raise DeviceLostError(
             f"{self._name}: no frame for {self._settings.silence_s:g} s: {START}{hint}, or let "

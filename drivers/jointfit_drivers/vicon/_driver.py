@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from jointfit_drivers.motion_capture import find_route
+from jointfit_drivers.motion_capture import ServerOutput, find_route
 from jointfit_drivers.vicon._decoder import ViconDecoder
 from jointfit_drivers.vicon._diagnosis import diagnose, find_servers
 from jointfit_drivers.vicon._session import ViconSession
 from jointfit_drivers.vicon._settings import ViconSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jointfit_daemon.device_search import Finding, FoundServer
     from jointfit_daemon.driver import Emit, Wire
 
 
@@ -28,25 +25,16 @@ class ViconMocap:
     wire: ClassVar[Wire] = "datagram"
     """A chunk is one packet of the protocol."""
 
+    find_servers = staticmethod(find_servers)
+    diagnose = staticmethod(diagnose)
+
     def __init__(self, settings: ViconSettings) -> None:
         self._settings = settings
-        self._silent = False
+        self._output = ServerOutput()
 
     def decoder(self) -> ViconDecoder:
         """Return the decoder from packets to optical frames in SI units."""
         return ViconDecoder(self._settings)
-
-    @classmethod
-    async def find_servers(
-        cls, hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
-    ) -> list[FoundServer]:
-        """Return the DataStream servers that answer; see `jointfit_daemon.device_search`."""
-        return await find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
-
-    @classmethod
-    async def diagnose(cls, settings: ViconSettings, wait_s: float) -> list[Finding]:
-        """Return the causes of missing frames; see `jointfit_daemon.device_search`."""
-        return await diagnose(settings, wait_s)
 
     async def run(self, emit: Emit) -> None:
         """Connect to the server and read until cancelled.
@@ -61,8 +49,4 @@ class ViconMocap:
             is unknown.
         """
         route = await find_route("Vicon", self._settings)
-        session = ViconSession(self._settings, route, emit, after_silence=self._silent)
-        try:
-            await session.run()
-        finally:
-            self._silent = session.silent
+        await ViconSession(self._settings, route, emit, self._output).run()

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
-from jointfit_drivers.motion_capture import TcpLink
+from jointfit_drivers.motion_capture import ServerOutput, TcpLink
 from jointfit_protocols import vicon
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.vicon import ObjectId
@@ -50,25 +50,22 @@ class ViconSession:
         Addresses of the server and of this host's network card.
     emit : Emit
         Receives every packet of the server.
-    after_silence : bool
-        Whether the last connection ended without frames. The first packets are then emitted with
-        the first frame, because a server that only answers is still lost.
+    output : ServerOutput, optional
+        That of the connections before.
     """
 
     def __init__(
-        self, settings: ViconSettings, route: Route, emit: Emit, *, after_silence: bool = False
+        self, settings: ViconSettings, route: Route, emit: Emit, output: ServerOutput | None = None
     ) -> None:
         self._settings = settings
         self._route = route
-        self._emit = emit
-        self.silent = after_silence
-        """Whether frames have stopped and none has arrived since, in any connection."""
+        self._output = output or ServerOutput()
+        self._output.begin(emit)
         self.offered: frozenset[int] | None = None
         """Ids that the server offers."""
         self._name = f"Vicon server {settings.server}:{settings.command_port}"
         self._link = TcpLink(self._name, f"{START}, and check command_port", self._read)
         self._stream = vicon.ViconStream()
-        self._held: list[Chunk] = []
         self._frame_ns = 0
 
     async def run(self) -> None:
@@ -85,8 +82,15 @@ class ViconSession:
                 if now >= ping_at:
                     link.send(vicon.encode(vicon.Ping(time.monotonic_ns())))
                     ping_at = now + PING_S
-                self._check_alive(max(self._frame_ns, began_ns))
-                await link.pause(min(ping_at - now, self._settings.silence_s / 4))
+
+                silence_s = self._settings.silence_s
+                if (time.monotonic_ns() - max(self._frame_ns, began_ns)) / 1e9 >= silence_s:
+                    self._output.silent = True
+                    raise DeviceLostError(
+                        f"{self._name}: no frame for {silence_s:g} s: {START}, or let "
+                        "`jointfit doctor` name the cause"
+                    )
+                await link.pause(min(ping_at - now, silence_s / 4))
 
     async def _wait_for_offer(self) -> frozenset[int]:
         until = time.monotonic() + OFFER_S
@@ -107,18 +111,15 @@ class ViconSession:
 
     def _read(self, segment: Segment) -> None:
         for packet in self._stream.feed(segment.data):
-            if isinstance(packet, CorruptBytes):
-                self._link.fail(self._unreadable())
-                return
-            self._take(Chunk(segment.t_ns, packet))
-
-    def _unreadable(self) -> Exception:
-        if self.offered is not None:
-            return DeviceLostError(f"{self._name}: invalid packet header: connecting again")
-        return DeviceMisconfiguredError(
-            f"{self._name}: the program that answers is not a Vicon DataStream: check server and "
-            "command_port (801 unless changed)"
-        )
+            if not isinstance(packet, CorruptBytes):
+                self._take(Chunk(segment.t_ns, packet))
+            elif self.offered is not None:
+                raise DeviceLostError(f"{self._name}: invalid packet header: connecting again")
+            else:
+                raise DeviceMisconfiguredError(
+                    f"{self._name}: the program that answers is not a Vicon DataStream: check "
+                    "server and command_port (801 unless changed)"
+                )
 
     def _take(self, chunk: Chunk) -> None:
         if self.offered is None:
@@ -130,21 +131,10 @@ class ViconSession:
                         self._link.wake()
 
         if _FRAME_MARK in chunk.data:
-            self._frame_ns, self.silent = chunk.t_ns, False
-            while self._held:
-                self._emit(self._held.pop(0))
-        if self.silent:
-            self._held.append(chunk)
+            self._frame_ns = chunk.t_ns
+            self._output.emit_frame(chunk)
         else:
-            self._emit(chunk)
-
-    def _check_alive(self, heard_ns: int) -> None:
-        if (time.monotonic_ns() - heard_ns) / 1e9 >= self._settings.silence_s:
-            self.silent = True
-            raise DeviceLostError(
-                f"{self._name}: no frame for {self._settings.silence_s:g} s: {START}, or let "
-                "`jointfit doctor` name the cause"
-            )
+            self._output.emit_answer(chunk)
 
 
 def wanted_ids(offered: frozenset[int]) -> frozenset[int]:

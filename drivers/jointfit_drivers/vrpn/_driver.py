@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from jointfit_drivers.motion_capture import find_route
+from jointfit_drivers.motion_capture import ServerOutput, find_route
 from jointfit_drivers.vrpn._decoder import VrpnDecoder
 from jointfit_drivers.vrpn._server_search import diagnose, find_servers
 from jointfit_drivers.vrpn._session import VrpnSession
 from jointfit_drivers.vrpn._settings import VrpnSettings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from jointfit_daemon.device_search import Finding, FoundServer
     from jointfit_daemon.driver import Emit, Wire
 
 
@@ -29,25 +26,16 @@ class VrpnMocap:
     least_delay_ms: ClassVar[tuple[float, float]] = (15.0, 10.0)
     """Delay from exposure to arrival, ms: the stamp is that of the message, not of the exposure."""
 
+    find_servers = staticmethod(find_servers)
+    diagnose = staticmethod(diagnose)
+
     def __init__(self, settings: VrpnSettings) -> None:
         self._settings = settings
-        self._silent = False
+        self._output = ServerOutput()
 
     def decoder(self) -> VrpnDecoder:
         """Return the decoder from messages to optical frames in SI units."""
         return VrpnDecoder(self._settings)
-
-    @classmethod
-    async def find_servers(
-        cls, hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
-    ) -> list[FoundServer]:
-        """Return the VRPN servers that answer; see `jointfit_daemon.device_search`."""
-        return await find_servers(hosts, broadcast=broadcast, port=port, wait_s=wait_s)
-
-    @classmethod
-    async def diagnose(cls, settings: VrpnSettings, wait_s: float) -> list[Finding]:
-        """Return the causes of missing poses; see `jointfit_daemon.device_search`."""
-        return await diagnose(settings, wait_s)
 
     async def run(self, emit: Emit) -> None:
         """Connect to the server and read until cancelled.
@@ -61,8 +49,4 @@ class VrpnMocap:
             The host is no VRPN server, its major version differs, or the network card is unknown.
         """
         route = await find_route("VRPN", self._settings)
-        session = VrpnSession(self._settings, route, emit, after_silence=self._silent)
-        try:
-            await session.run()
-        finally:
-            self._silent = session.silent
+        await VrpnSession(self._settings, route, emit, self._output).run()

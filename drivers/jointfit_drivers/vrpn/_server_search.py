@@ -7,11 +7,16 @@ of the driver.
 from __future__ import annotations
 
 import asyncio
-import socket
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.device_search import Finding, FoundServer
-from jointfit_drivers.motion_capture import CHECK, Reception, content_findings, find_route
+from jointfit_drivers.motion_capture import (
+    CHECK,
+    Reception,
+    content_findings,
+    find_route,
+    host_address,
+)
 from jointfit_drivers.ports.udp_socket import local_address
 from jointfit_drivers.vrpn._decoder import VrpnDecoder
 from jointfit_drivers.vrpn._session import CONNECT_S, VrpnSession
@@ -41,17 +46,8 @@ async def find_servers(
     hosts: Sequence[str], *, broadcast: bool, port: int | None, wait_s: float
 ) -> list[FoundServer]:
     """Return the VRPN servers that answer; see `ServerSearch.find_servers`."""
-    loop = asyncio.get_running_loop()
     addresses = ["127.0.0.1"] if broadcast else []
-    for host in hosts:
-        try:
-            found = await loop.getaddrinfo(host, None, family=socket.AF_INET)
-        except (OSError, UnicodeError) as error:
-            why = getattr(error, "strerror", None) or error
-            raise OSError(
-                f"{host}: no such host ({why}): set the address of the server, such as 192.168.1.20"
-            ) from None
-        addresses.append(str(found[0][4][0]))
+    addresses += [await host_address(host) for host in hosts]
 
     unique = list(dict.fromkeys(addresses))
     async with asyncio.TaskGroup() as group:

@@ -7,8 +7,7 @@
 4. Poses. Before the server counts as silent, it is asked for an answer once a second, so that the
    report names the cause: no server, or no visible body.
 
-Invariant: every chunk is emitted in order of arrival, so that a replay has the same input. After a
-silence, answers are emitted with the first pose, because a server that only answers is still lost.
+Invariant: every chunk is emitted in order of arrival, so that a replay has the same input.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ import time
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_drivers.motion_capture import ServerOutput
 from jointfit_drivers.ports.tcp_connection import TcpConnection, TcpListener
 from jointfit_drivers.ports.udp_socket import UdpSocket
 from jointfit_drivers.vrpn._link import VrpnLink
@@ -48,20 +48,18 @@ class VrpnSession:
         Numeric addresses of the server and of this host's network card.
     emit : Emit
         Receives every chunk of the server.
-    after_silence : bool
-        Whether the last connection ended without poses.
+    output : ServerOutput, optional
+        That of the connections before.
     """
 
     def __init__(
-        self, settings: VrpnSettings, route: Route, emit: Emit, *, after_silence: bool = False
+        self, settings: VrpnSettings, route: Route, emit: Emit, output: ServerOutput | None = None
     ) -> None:
         self._settings = settings
         self._route = route
         self._name = f"VRPN server {settings.server}:{settings.port}"
-        self._emit = emit
-        self.silent = after_silence
-        """Whether poses have stopped and none has arrived since, in any connection."""
-        self._held: list[Chunk] = []
+        self._output = output or ServerOutput()
+        self._output.begin(emit)
         self._codec = vrpn.VrpnCodec()
         self._cookie: vrpn.Cookie | None = None
         self._foreign = False
@@ -79,7 +77,7 @@ class VrpnSession:
             for name, number in _TYPES.items():
                 link.send(vrpn.TypeDescription(number, name))
             if self._settings.transport == "udp":
-                port = link.open_udp(self._route.host, self._route.local)
+                port = link.open_udp(self._route)
                 link.send(vrpn.UdpChannel(port, self._route.local))
             await self._stream(link)
 
@@ -167,22 +165,18 @@ class VrpnSession:
 
     def _take(self, chunk: Chunk) -> None:
         """Emit one chunk, and note what its arrival shows."""
+        emit = self._output.emit_answer
         for message in self._codec.feed(chunk.data):
             match message:
                 case vrpn.TrackerPose():
-                    self._pose_ns, self.silent = chunk.t_ns, False
+                    self._pose_ns, emit = chunk.t_ns, self._output.emit_frame
                 case vrpn.Pong():
                     self._pong_ns = chunk.t_ns
                 case vrpn.Cookie():
                     self._cookie = message
         self._foreign |= self._cookie is None
 
-        if self.silent:
-            self._held.append(chunk)
-        else:
-            while self._held:
-                self._emit(self._held.pop(0))
-            self._emit(chunk)
+        emit(chunk)
         if self._link is not None and (self._pose_ns == 0 or self._codec.lost):
             self._link.wake()
 
@@ -212,7 +206,7 @@ class VrpnSession:
 
     def _silence(self) -> DeviceLostError:
         """Return the error of a server without poses, with its probable cause."""
-        self.silent = True
+        self._output.silent = True
         if self._pong_ns > self._pose_ns:
             cause = "it answers, but sees no body: bring the bodies into view, or start streaming"
         elif not self._codec.senders:

@@ -30,7 +30,8 @@ Before = Callable[[NatNetServer], None]
 
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_diagnosis, "_FRAMES_S", 0.3)
+    monkeypatch.setattr("jointfit_drivers.motion_capture._reception.FRAMES_S", 0.3)
+    monkeypatch.setattr(_diagnosis, "_MULTICAST_S", 0.3)
     monkeypatch.setattr(_session, "CONNECT_S", 0.5)
 
 

@@ -189,7 +189,8 @@ async def test_a_port_without_a_server_has_no_answer() -> None:
 
 async def test_servers_of_a_network_announce_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_server_search, "DISCOVERY_PORT", 52_226)
-    monkeypatch.setattr(_server_search, "network_cards", list)
+    loopback = ("127.0.0.1", "127.0.0.1")
+    monkeypatch.setattr(_server_search, "broadcast_networks", lambda: [loopback])
     server = made(discovery_port=52_226)
     async with served(server, sends=False):
         (found,) = await QtmMocap.find_servers([], broadcast=True, port=None, wait_s=0.3)
