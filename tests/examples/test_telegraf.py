@@ -27,6 +27,30 @@ PAYLOADS = {
 }  # fmt: skip
 
 
+OPTIONS: dict[str, set[str]] = {
+    "agent": {"flush_interval"},
+    "inputs": {"mqtt_consumer"},
+    "outputs": {"influxdb_v2"},
+    "mqtt_consumer": {
+        "servers", "topics", "topic_tag", "topic_parsing", "qos", "connection_timeout",
+        "max_undelivered_messages", "persistent_session", "client_id", "username", "password",
+        "data_format", "json_v2",
+    },
+    "topic_parsing": {"topic", "measurement", "tags", "fields", "types"},
+    "json_v2": {
+        "measurement_name", "measurement_name_path", "timestamp_path", "timestamp_format",
+        "timestamp_timezone", "field", "tag", "object",
+    },
+    "field": {"path", "type", "rename", "optional"},
+    "object": {
+        "path", "optional", "timestamp_key", "timestamp_format", "timestamp_timezone", "renames",
+        "fields", "tags", "included_keys", "excluded_keys", "disable_prepend_keys",
+    },
+    "influxdb_v2": {"urls", "token", "organization", "bucket"},
+}  # fmt: skip
+"""Options of the tables, from the documentation of Telegraf: it ends at start if one is unknown."""
+
+
 def inputs() -> dict[str, dict[str, Any]]:
     """Return the MQTT inputs by their only topic."""
     table = tomllib.loads(CONFIGURATION.read_text(encoding="utf-8"))
@@ -81,6 +105,32 @@ def point(settings: dict[str, Any], topic: str, payload: dict[str, Any]) -> dict
 def point_of(topic: str) -> dict[str, Any]:
     (settings,) = (each for pattern, each in inputs().items() if matches(pattern, topic))
     return point(settings, topic, PAYLOADS[topic])
+
+
+def unknown_options(name: str, tables: Any) -> list[str]:
+    """Return the options of a table, and of the tables below it, that Telegraf does not have."""
+    found = []
+    for table in tables if isinstance(tables, list) else [tables]:
+        found += [f"{name}.{key}" for key in table.keys() - OPTIONS[name]]
+        for key in table.keys() & OPTIONS.keys():
+            found += unknown_options(key, table[key])
+    return found
+
+
+def test_every_option_is_documented_and_a_misspelled_one_is_noticed() -> None:
+    table = tomllib.loads(CONFIGURATION.read_text(encoding="utf-8"))
+    assert table.keys() <= OPTIONS.keys()
+    assert [name for key in table for name in unknown_options(key, table[key])] == []
+    table["inputs"]["mqtt_consumer"][0]["json_v2"][0]["object"][0]["exclude_keys"] = []
+    assert unknown_options("inputs", table["inputs"]) == ["object.exclude_keys"]
+
+
+def test_a_persistent_session_has_a_client_id_of_its_own() -> None:
+    persistent = [each for each in inputs().values() if each.get("persistent_session")]
+    names = [each["client_id"] for each in persistent]
+    assert names
+    assert len(set(names)) == len(names)
+    assert all(each["qos"] >= 1 for each in persistent)
 
 
 def test_a_joint_is_a_point_with_all_known_numbers_and_two_tags() -> None:

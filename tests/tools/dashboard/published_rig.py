@@ -102,6 +102,8 @@ class PublishedRig:
     """Clock of the gateway minus clock of this machine, s."""
     lengths_known: bool = True
     """Whether the lengths of the segments are known, and so the positions of knee and ankle."""
+    calibrated: bool = True
+    """Whether orientations and angles are known."""
     offline: frozenset[str] = frozenset()
     """Devices without data."""
     version: int = 1
@@ -256,6 +258,11 @@ class PublishedRig:
         pose = self._limb(hip, knee)
         optical = self._limb(hip, knee + optical_error)
         pose |= {"v": 1, "seq": seq, "t_us": t_us, "mode": "imu+mocap", "sync": "locked"}
+        if not self.calibrated:
+            pose["flags"] = ["uncalibrated"]
+            for part in (*pose["segments"].values(), *pose["joints"].values()):
+                part.update(dict.fromkeys(part))
+            return pose, optical | {"v": 1, "t_us": t_us, "frame": seq}
         return pose | {"flags": []}, optical | {"v": 1, "t_us": t_us, "frame": seq}
 
     def orientations(self) -> dict[str, Any]:

@@ -117,6 +117,7 @@ async def test_the_check_of_axes_names_the_axis_and_the_angle_of_a_turned_sensor
     rig = PublishedRig()
     async with shown(broker, rig) as page:
         await page.show("sensors")
+        assert "are not published" not in await page.text("#view-sensors")
         await page.until_text("#view-sensors .turn", "not turned")
         rig.turned["S1"] = (axis, degrees)
         await page.until_text("#view-sensors .card.turned .turn", text)

@@ -124,6 +124,33 @@ async def test_a_request_is_sent_and_a_refusal_is_shown_in_words(broker: Broker)
         assert [request["phase"] for request in rig.requests] == ["static"]
 
 
+@pytest.mark.parametrize(
+    ("phase", "words", "button"),
+    [
+        ("functional", "Calibrating: move every joint", "Show this step"),
+        ("aligned", "Sensors aligned; the static pose is next", "Show the steps"),
+    ],
+)
+async def test_a_first_calibration_is_explained_where_the_limb_will_be(
+    broker: Broker, phase: str, words: str, button: str
+) -> None:
+    rig = PublishedRig(calibrated=False, changes={"phase": phase, "version": None, "quality": {}})
+    server = DashboardServer(BrokerAddress(HOST, broker.port))
+    async with (
+        chromium() as browser,
+        publishing(rig, broker.port),
+        server.listening(ListenAddress(HOST, 0)) as url,
+        opened(browser, url) as page,
+    ):
+        await page.until_text("#empty", words)
+        assert await page.page.is_hidden("#limb-panel")
+        assert await page.page.is_visible("#cards")
+        assert await page.accessibility_faults() == []
+        await page.page.click(f"#empty >> text={button}")
+        await page.page.wait_for_selector("#view-calibrate", state="visible")
+        assert page.errors == []
+
+
 TICKS = "[...document.querySelectorAll('.rail .done .rail-title')].map((each) => each.textContent)"
 
 

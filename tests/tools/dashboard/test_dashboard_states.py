@@ -108,6 +108,7 @@ async def test_a_wrong_password_is_named_and_the_right_one_continues(
         await page.until_text("#login-reason", "refuses the user name viewer or its password")
         await page.until_text("#banner", "refuses the user name viewer or its password")
         assert await page.text("#main-action") == "Log in"
+        assert await page.page.evaluate("document.activeElement.id") == "login-password"
         await show_state(page, "wrong-password")
         await log_in(page, "viewer", "v")
         await page.until_text("#angle-value", "°")

@@ -9,6 +9,7 @@ const STALE_MS = 1500;
 const OPTICAL_GAP_US = 150_000;
 const GAP_PERIODS = 3.5; // a longer pause than these periods interrupts the curve
 const MARK = { dash: [4, 4], font: "600 12px system-ui, sans-serif" };
+const HAS_SD = /^(flexion|elevation|inner)_deg$/;
 const STORED_CHOICE = "jointfit-angle";
 
 /** Show the angle of a store; return the view. */
@@ -94,7 +95,7 @@ export function chosenValue(view) {
 
 // sd_deg is that of the flexion, or of the elevation of a shoulder.
 function sdOf(joint, key) {
-  return /^(flexion|elevation|inner)_deg$/.test(key) ? joint.sd_deg ?? null : null;
+  return HAS_SD.test(key) ? joint.sd_deg ?? null : null;
 }
 
 function updateNumber(view) {
@@ -113,6 +114,7 @@ function reasonOf(view, value, sd) {
   const serious = flags.filter((flag) => !isMinorFlag(flag));
   if (serious.length > 0) return [serious.map(flagSentence).slice(0, 2).join(" "), "warning"];
   if (value === null) return ["The angle is unknown: one of its two segments has no orientation.", "warning"];
+  if (sd === null && HAS_SD.test(view.choice[1])) return ["The standard deviation is unknown.", ""];
   if (sd === null) return ["A standard deviation is published for flexion and elevation only.", ""];
   if (view.store.pose.sync === "settling") return ["The clocks of the devices are settling.", ""];
   return ["", ""];

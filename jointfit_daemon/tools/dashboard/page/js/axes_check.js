@@ -21,18 +21,20 @@ export function createAxesCheck(store, link) {
     createElement("div", { class: "panel-head" }, createElement("h2", {}, "Check of axes"), zero), note, drawings,
   );
   let visible = false;
+  let shownMs = 0;
 
   const update = () => { if (visible && isFresh(store)) updateDrawings(store, drawings, cards); };
   store.on("sensors", update);
   setInterval(() => { if (visible) updateNote(); }, 500);
   const updateNote = () => {
-    setText(note, noteOf(store));
+    setText(note, noteOf(store, shownMs));
     zero.hidden = !isFresh(store);
   };
   return {
     root,
     show(shown) {
       visible = shown;
+      shownMs = performance.now();
       if (shown) link.subscribe("sensors/pose");
       else link.unsubscribe("sensors/pose");
       for (const card of cards.values()) card.start = null;
@@ -46,10 +48,11 @@ function isFresh(store) {
   return store.sensorsReceivedMs !== null && performance.now() - store.sensorsReceivedMs < STALE_MS;
 }
 
-function noteOf(store) {
+function noteOf(store, shownMs) {
   if (isFresh(store)) {
     return "Turn one sensor by hand about one of the axes printed on its housing, for example by 90° about x. The drawing must turn the same way, and the line below it must name the same axis, sign and angle. Up in the drawing is up in the room.";
   }
+  if (performance.now() - shownMs < STALE_MS) return "Waiting for the orientations of the sensors.";
   return "Orientations of single sensors are not published. To see their axes, set sensors_hz = 10 under [mqtt] in rig.toml and reload the daemon.";
 }
 

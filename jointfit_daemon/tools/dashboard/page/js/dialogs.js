@@ -20,7 +20,9 @@ export function createDialogs(link, requests) {
   return {
     askForAccount(reason) {
       setText(byId("login-reason"), reason);
-      if (!byId("login").open) byId("login").showModal();
+      if (byId("login").open) return;
+      byId("login").showModal();
+      if (byId("login-user").value !== "") byId("login-password").focus(); // usually the password was wrong
     },
     /** Return when a key was entered; throws an Error if the dialog was closed without one. */
     askForKey() {

@@ -1,6 +1,6 @@
 // Small functions that create and change elements. Text from MQTT is set as text, never as HTML.
 
-const MOST_COLUMNS = 8; // a table with more does not fit on a phone
+const MOST_COLUMNS = 6; // a table with more does not fit on a phone
 const SVG = "http://www.w3.org/2000/svg";
 
 /** Return an element with attributes and children; strings become text. */

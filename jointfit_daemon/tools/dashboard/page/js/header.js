@@ -88,9 +88,9 @@ function updateBanner(text) {
 /** Explain a live view without poses: no rig, no daemon, or no calibration. */
 export function updateEmptyState(link, store, configuration, rigs, choose) {
   const empty = byId("empty");
-  const content = emptyContent(link, store, configuration, rigs, choose);
-  empty.hidden = content === null;
   const known = (store.pose?.segments && Object.values(store.pose.segments).some((segment) => segment.q)) ?? false;
+  const content = emptyContent(link, store, configuration, rigs, choose, known);
+  empty.hidden = content === null;
   for (const id of ["limb-panel", "angle-panel"]) byId(id).hidden = content !== null && !known;
   if (content === null) { empty.dataset.kind = ""; return; }
   if (empty.dataset.kind === content.kind) return; // unchanged: buttons keep their focus
@@ -98,7 +98,7 @@ export function updateEmptyState(link, store, configuration, rigs, choose) {
   empty.replaceChildren(...content.children);
 }
 
-function emptyContent(link, store, configuration, rigs, choose) {
+function emptyContent(link, store, configuration, rigs, choose, known) {
   if (link.state === "lost" && store.pose === null) {
     return { kind: "lost", children: [
       createElement("h2", {}, "Not connected"),
@@ -136,7 +136,16 @@ function emptyContent(link, store, configuration, rigs, choose) {
       createElement("p", { class: "caption" }, "If it runs: its host and port under [mqtt] must be those of this broker, and your account must have the right to read its topics."),
     ] };
   }
-  if (store.bridge === "online" && store.calibration?.phase === "uncalibrated") {
+  const phase = store.calibration?.phase;
+  if (store.bridge === "online" && !known && (isRunning(phase) || ["aligned", "posed", "aborted"].includes(phase))) {
+    const words = calibrationSentence(store.calibration);
+    return { kind: `calibrating ${words}`, children: [
+      createElement("h2", { dir: "auto" }, words),
+      createElement("p", {}, "The limb and its joint angles appear here after the last step. The view Calibrate shows each step with its progress."),
+      createElement("button", { class: "button primary", type: "button", onclick: () => { location.hash = "calibrate"; } }, isRunning(phase) ? "Show this step" : "Show the steps"),
+    ] };
+  }
+  if (store.bridge === "online" && phase === "uncalibrated") {
     const cameras = Object.values(store.info?.devices ?? {}).some((device) => device.kind === "mocap");
     const steps = cameras
       ? "A calibration takes about two minutes: turn the sensors on a plate, stand still, move every joint."

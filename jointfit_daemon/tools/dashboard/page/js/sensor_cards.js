@@ -40,7 +40,7 @@ export function summaryOf(store, name) {
   const lost = health ? health.lost / Math.max(1, health.received + health.lost) : null;
   return {
     name,
-    place: device.kind === "mocap" ? "cameras" : device.segment ?? "",
+    place: device.kind === "mocap" ? "cameras" : (device.segment ?? "").replaceAll("_", " "),
     driver: device.driver ?? "",
     level, state,
     rate: availability === "online" ? formatNumber(health?.rate_hz, 1, " Hz") : UNKNOWN,

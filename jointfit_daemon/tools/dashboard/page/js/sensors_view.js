@@ -4,7 +4,7 @@ import { byId, createElement, createTable, patchTable } from "./dom.js";
 import { createAxesCheck } from "./axes_check.js";
 import { createPhysicalTest } from "./physical_test.js";
 import { summaryOf } from "./sensor_cards.js";
-import { UNKNOWN, formatBytes, formatNumber } from "./words.js";
+import { UNKNOWN, formatBytes, formatDelay, formatNumber } from "./words.js";
 
 /** Show the health of a store's devices in a view; `openAction(name, device)` starts a request. */
 export function createSensorsView(store, link, openAction, request) {
@@ -52,8 +52,8 @@ function tablesOf(store, openAction) {
       createElement("span", { class: "model" }, [info.model, info.firmware].filter(Boolean).join(" ") || UNKNOWN),
       ...["received", "used", "late", "lost", "corrupt"].map((key) => formatNumber(health[key], 0)),
       summary.rate,
-      formatNumber(health.delay_us?.p50 == null ? null : health.delay_us.p50 / 1000, 1, " ms"),
-      formatNumber(health.delay_us?.p99 == null ? null : health.delay_us.p99 / 1000, 1, " ms"),
+      formatDelay(health.delay_us?.p50),
+      formatDelay(health.delay_us?.p99),
       createElement("span", { class: `status ${summary.clockLevel}` }, summary.clock),
     ];
   });

@@ -24,6 +24,12 @@ export function ageInWords(seconds) {
   return seconds < 90 ? "1 min ago" : `${formatDuration(seconds)} ago`;
 }
 
+/** Return a delay given in microseconds, in milliseconds or from one second on in seconds. */
+export function formatDelay(microseconds) {
+  if (microseconds >= 1e6) return formatNumber(microseconds / 1e6, 2, " s");
+  return formatNumber(microseconds == null ? null : microseconds / 1000, 1, " ms");
+}
+
 /** Return a duration as hours, minutes and seconds: "0:12:04". */
 export function formatStopwatch(seconds) {
   if (!Number.isFinite(seconds)) return UNKNOWN;
@@ -135,6 +141,7 @@ export function clockQuality(device) {
   const [level, words] = CLOCKS[device?.clock] ?? ["unknown", UNKNOWN];
   const sigma = device?.sigma_us;
   if (level !== "ok" || typeof sigma !== "number") return [level, words];
-  if (sigma > 2000) return ["warning", `${words}, ± ${formatNumber(sigma / 1000, 1, " ms")}`];
-  return [level, `${words}, ± ${formatNumber(sigma, 0, " µs")}`];
+  // Spaces that do not break: a narrow card begins a new line before the number, not inside it.
+  if (sigma > 2000) return ["warning", `${words}, ±\u00a0${formatNumber(sigma / 1000, 1, "\u00a0ms")}`];
+  return [level, `${words}, ±\u00a0${formatNumber(sigma, 0, "\u00a0µs")}`];
 }
