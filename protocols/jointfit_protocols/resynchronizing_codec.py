@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
+from jointfit_protocols.compilation import mypyc_attr
 from jointfit_protocols.corrupt import CHECKSUM, CUT_OFF, NO_START, CorruptBytes, CorruptRun
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ class StreamMessage(Protocol):
 M = TypeVar("M", bound=StreamMessage)
 
 
+@mypyc_attr(allow_interpreted_subclasses=True)  # for driver packages of others
 class ResynchronizingCodec(Generic[M]):
     """Decoder of pieces of any size to messages.
 

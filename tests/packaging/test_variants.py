@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import sysconfig
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
+from typing_extensions import override
 
+from jointfit_protocols.corrupt import CUT_OFF, NO_START, CorruptBytes
+from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 from jointfit_variant import running_variant
 from tests.compiled_variant import ROOT, run_compiled
 
@@ -64,3 +69,37 @@ def test_compiled_modules_and_their_sources_give_the_same_frames_bit_for_bit() -
         assert variant == ("pure" if pure else "compiled")
     assert len(outputs[True]) > 500
     assert outputs[False] == outputs[True]
+
+
+class _Letter(NamedTuple):
+    """Message of a made-up protocol: one byte after a start byte."""
+
+    letter: bytes
+    end: int
+
+
+class _LetterCodec(ResynchronizingCodec[_Letter]):
+    """Codec as in a driver package outside of this project, which is not compiled."""
+
+    def __init__(self) -> None:
+        super().__init__(self._letter, re.compile(b"\x02"), longest_run=64)
+        self.silences = 0
+
+    def _letter(self, buffer: bytes, at: int, before: int) -> _Letter | CorruptBytes | None:
+        if buffer[at] != 2:
+            return CorruptBytes(1, NO_START)
+        piece = buffer[at + 1 : at + 2]
+        return _Letter(piece, before + at + 2) if piece else None
+
+    @override
+    def flush(self) -> list[_Letter | CorruptBytes]:
+        self.silences += 1
+        return super().flush()
+
+
+def test_a_codec_of_another_package_extends_the_one_of_this_installation() -> None:
+    codec = _LetterCodec()
+    assert codec.feed(b"\x02a\x02") == [(b"a", 2)]
+    assert codec.feed(b"b??\x02c\x02") == [(b"b", 4), CorruptBytes(2, NO_START), (b"c", 8)]
+    assert codec.flush() == [CorruptBytes(1, CUT_OFF)]
+    assert (codec.messages, codec.discarded, codec.silences) == (3, 3, 1)
