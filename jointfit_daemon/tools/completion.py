@@ -5,10 +5,36 @@ Each list is imported only when a shell asks for it, because most need the packa
 
 from __future__ import annotations
 
+import glob
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+import typer  # noqa: TC002 - typer reads the annotations
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
+
+def complete_rig_or_command(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Return second words of commands that begin with this one, and TOML files beside them.
+
+    Without such a word the result is empty, and the shell completes paths itself.
+    """
+    group = getattr(ctx.parent, "command", None)
+    names = [name.split(" ") for name in getattr(group, "commands", {}) if " " in name]
+    words = _beginning_with(incomplete, [two[1] for two in names if two[0] == ctx.info_name])
+    return [*words, *glob.glob(f"{glob.escape(incomplete)}*.toml")] if words else []  # noqa: PTH207 - as typed
+
+
+def complete_sensor(ctx: typer.Context, incomplete: str) -> list[str]:
+    """Return the sensors of the rig that begin with `incomplete`; none if it cannot be read."""
+    from jointfit_daemon.files.text import parse_toml
+
+    try:
+        table = parse_toml(Path(ctx.params.get("rig") or "rig.toml").read_text(encoding="utf-8"))
+        return _beginning_with(incomplete, [str(imu["id"]) for imu in table["imu"]])
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
+        return []
 
 
 def complete_driver(incomplete: str) -> list[str]:

@@ -78,12 +78,28 @@ def completions(*words: str) -> list[str]:
         (["schema", "bridge/request/mar"], ["bridge/request/mark"]),
         (["demo", "--limb", "ar"], ["arm"]),
         (["check", "--js"], ["--json"]),
+        (["calibrate", "se"], ["sensor"]),
+        (["calibrate", "sensor", "--reco"], ["--recording"]),
+        (["fuse", "ap"], ["apply"]),
     ],
 )
 def test_bash_completes_commands_options_and_their_values(
     words: list[str], offered: list[str]
 ) -> None:
     assert completions(*words) == offered
+
+
+def test_bash_completes_the_sensors_and_files_of_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rig.toml").write_text('[[imu]]\nid = "S1"\n[[imu]]\nid = "T1"\n')
+    (tmp_path / "seat.toml").write_text("")
+    assert completions("calibrate", "sensor", "T") == ["T1"]
+    assert completions("calibrate", "se") == ["sensor", "seat.toml"]
+    assert completions("calibrate", "rig") == []  # bash completes the path
+    steps = ("--steps", "gyroscope,acc")
+    assert completions("calibrate", "sensor", "S1", *steps) == ["gyroscope,accelerometer"]
 
 
 def test_the_packaged_completion_is_what_the_command_line_prints() -> None:

@@ -25,6 +25,7 @@ from jointfit_daemon.tools.calibrate._phase_tracker import (
 from jointfit_daemon.tools.calibrate._report import ProgressLines, movement_lines, report
 from jointfit_daemon.tools.calibrate._versions import list_versions, use_version
 from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.completion import complete_rig_or_command
 from jointfit_daemon.tools.stop_signals import cancel_on_signal
 
 if TYPE_CHECKING:
@@ -86,6 +87,10 @@ class OutputLostError(Exception):
     """Standard error is closed, for example because the terminal was closed."""
 
 
+_Config = Annotated[
+    Path,
+    typer.Argument(help="The rig.toml of the daemon.", autocompletion=complete_rig_or_command),
+]
 _Phases = Annotated[
     list[str] | None,
     typer.Option(
@@ -104,7 +109,7 @@ _Force = Annotated[
 
 
 def calibrate(
-    config: Annotated[Path, typer.Argument(help="The rig.toml of the daemon.")] = Path("rig.toml"),
+    config: _Config = Path("rig.toml"),
     *,
     phase: _Phases = None,
     seconds: _Seconds = None,

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_FAILED
+from jointfit_daemon.tools.completion import complete_sensor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,11 +24,22 @@ if TYPE_CHECKING:
     from jointfit_daemon.sensor_calibration import SensorCalibrationSettings
     from jointfit_daemon.tools.calibrate_sensor._guided_steps import SensorFindings
 
+
+def _complete_steps(incomplete: str) -> list[str]:
+    """Return lists of steps that begin with `incomplete`."""
+    from jointfit_daemon.tools.calibrate_sensor._guided_steps import STEPS
+
+    given = incomplete.split(",")[:-1]
+    lists = [",".join((*given, step)) for step in STEPS if step not in given]
+    return [steps for steps in lists if steps.startswith(incomplete)]
+
+
 _Steps = Annotated[
     str | None,
     typer.Option(
         help="gyroscope, accelerometer, magnetometer, separated by commas. Default: the first two, "
-        "and the magnetometer if rig.toml uses it."
+        "and the magnetometer if rig.toml uses it.",
+        autocompletion=_complete_steps,
     ),
 ]
 _StepTime = Annotated[
@@ -43,7 +55,10 @@ _PrintOnly = Annotated[
 
 
 def calibrate_sensor(
-    name: Annotated[str, typer.Argument(metavar="ID", help="Sensor of rig.toml.")],
+    name: Annotated[
+        str,
+        typer.Argument(metavar="ID", help="Sensor of rig.toml.", autocompletion=complete_sensor),
+    ],
     *,
     rig: Annotated[
         Path, typer.Option("--rig", "--config", help="Configuration of the sensor.")
@@ -66,9 +81,10 @@ def calibrate_sensor(
     from jointfit_daemon.config import load_rig
     from jointfit_daemon.tools.text_output import echo_json, echo_wrapped
 
+    named = _named_steps(steps)
     own = load_rig(rig)
     source = _calibratable(_recorded_rig(recording) or own, name, _sensor(own, name))
-    names = _chosen_steps(steps, source)
+    names = _possible_steps(named, source)
     findings = (
         _run_live(source, names, step_s, json=json)
         if recording is None
@@ -124,23 +140,34 @@ def _calibratable(rig: Rig, name: str, configured: Source) -> Source:
     return _sensor(rig, name)
 
 
-def _chosen_steps(steps: str | None, source: Source) -> list[str]:
+def _named_steps(steps: str | None) -> list[str] | None:
+    """Return the steps of the option; checked first, so that no other fault hides a wrong name."""
     from jointfit_daemon.tools.calibrate_sensor._guided_steps import STEPS
     from jointfit_daemon.tools.text_output import join_choices
 
-    magnetic = bool(source.settings.magnetometer)
     if steps is None:
+        return None
+    named = [step.strip() for step in steps.split(",")]
+    if wrong := [step for step in named if step not in STEPS]:
+        raise ValueError(
+            f"--steps {', '.join(map(repr, wrong))}: expected {join_choices(list(STEPS))}"
+        )
+    return [step for step in STEPS if step in named]
+
+
+def _possible_steps(named: list[str] | None, source: Source) -> list[str]:
+    """Return the steps for a sensor: those of the option, or all that it can use."""
+    from jointfit_daemon.tools.calibrate_sensor._guided_steps import STEPS
+
+    magnetic = bool(source.settings.magnetometer)
+    if named is None:
         return [step for step in STEPS if magnetic or step != "magnetometer"]
-    chosen = [step.strip() for step in steps.split(",")]
-    for step in chosen:
-        if step not in STEPS:
-            raise ValueError(f"--steps {step!r}: expected {join_choices(list(STEPS))}")
-    if "magnetometer" in chosen and not magnetic:
+    if "magnetometer" in named and not magnetic:
         raise ValueError(
             f"--steps magnetometer: {source.id} does not use its magnetometer: set magnetometer = "
             "true in its [[imu]] table first"
         )
-    return [step for step in STEPS if step in chosen]
+    return named
 
 
 def _recorded_rig(recording: Path | None) -> Rig | None:

@@ -145,6 +145,7 @@ def test_parts_of_the_same_sensor_are_kept_and_those_of_another_are_not() -> Non
             ["S1", "--steps", "compass"],
             "expected gyroscope, accelerometer or magnetometer",
         ),
+        (("", ""), ["S7", "--steps", "gyroscope,compas"], "--steps 'compas': expected gyroscope"),
         (
             ("magnetometer = true\n", ""),
             ["S1", "--steps", "magnetometer"],
