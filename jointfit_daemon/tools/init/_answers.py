@@ -10,7 +10,13 @@ from jointfit_daemon.tools.init._limbs import LIMBS
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from jointfit_daemon.tools.init._found import Found, ImuDriver, KeyChoice, MocapDriver
+    from jointfit_daemon.tools.init._found import (
+        CanSensor,
+        Found,
+        ImuDriver,
+        KeyChoice,
+        MocapDriver,
+    )
     from jointfit_daemon.tools.init._limbs import Limb
 
 Key = tuple[str, str]
@@ -57,6 +63,8 @@ def driver_of(answers: Mapping[Key, Any], found: Found, sensor: str) -> ImuDrive
     fitting = drivers_for(answers, found, sensor)
     named = {driver.name: driver for driver in fitting}
     recognized = found.recognized.get(str(answers.get(("device", sensor))))
+    received = [each.driver for each in free_sensors(answers, found, sensor)]
+    recognized = next((name for name in received if name in named), recognized)
     if ("driver", sensor) not in answers and recognized in named:
         return named[str(recognized)]
 
@@ -64,6 +72,31 @@ def driver_of(answers: Mapping[Key, Any], found: Found, sensor: str) -> ImuDrive
     sensors = list(sensors_of(answers))
     known = [answers.get(("driver", name)) for name in sensors[: sensors.index(sensor) + 1]]
     return next((named[name] for name in reversed(known) if name in named), fitting[0])
+
+
+def free_sensors(answers: Mapping[Key, Any], found: Found, sensor: str) -> list[CanSensor]:
+    """Return the sensors received on the bus of `sensor` whose identifiers no other sensor has."""
+    bus = answers.get(("device", sensor))
+    used = {number for each in ids_of_others(answers, sensor) for number in each}
+    return [each for each in found.can_sensors.get(str(bus), ()) if used.isdisjoint(each.ids)]
+
+
+def ids_of_others(answers: Mapping[Key, Any], sensor: str) -> list[tuple[int, ...]]:
+    """Return the identifiers of the other sensors on the bus of `sensor`."""
+    bus = answers.get(("device", sensor))
+    return [
+        ids
+        for (key, other), ids in answers.items()
+        if key == "ids" and other != sensor and ids != LATER
+        and answers.get(("device", other)) == bus
+    ]  # fmt: skip
+
+
+def chosen_settings(answers: Mapping[Key, Any], sensor: str) -> dict[str, str]:
+    """Return the answers to the settings of `sensor`, by key."""
+    settings = {subject: value for (key, subject), value in answers.items() if key == "setting"}
+    names = ((subject.rpartition("."), value) for subject, value in settings.items())
+    return {key: str(value) for (owner, _, key), value in names if owner == sensor}
 
 
 def settings_asked(answers: Mapping[Key, Any], found: Found) -> tuple[str, ...]:

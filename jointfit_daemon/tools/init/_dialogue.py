@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import LATER
 from jointfit_daemon.nearest_name import did_you_mean
-from jointfit_daemon.tools.init._answers import driver_of, split_address
+from jointfit_daemon.tools.init._answers import driver_of, split_address, wiring_of
 from jointfit_daemon.tools.init._engine import accept, complete, next_question
 from jointfit_daemon.tools.init._parsing import AnswerError
 
@@ -172,7 +172,10 @@ class Dialogue:
         total = len(complete(self.answers, self.found))
         self.show(f"\n({len(self.answers) + 1}/{total}) {asked.text}")
         width = max((len(choice.address) for choice in asked.choices), default=0)
-        if asked.question.kind != "ids":
+        if asked.question.kind == "ids":
+            names = " ".join(each.address for each in asked.choices)
+            self.show(f"  {names}, as {' '.join(each.text for each in asked.choices)}")
+        else:
             for number, choice in enumerate(asked.choices, 1):
                 self.show(f"  {number}  {choice.address:{width}}  {choice.text}".rstrip())
 
@@ -225,6 +228,11 @@ class Dialogue:
 
         if asked.question.finder == "traffic":
             port = self.answers["device", asked.subject]
+            if wiring_of(self.answers, port) == "can":
+                self.found = self.search.identifiers(self.found, port)
+                sensors = self.found.can_sensors[port]
+                self.show(f"  {port}: {'; '.join(each.text for each in sensors)}")
+                return
             self.found, text = self.search.recognized_driver(self.found, port)
             self.show(f"  {text}")
             return
@@ -232,7 +240,15 @@ class Dialogue:
         if asked.question.finder == "identifiers":
             bus = self.answers["device", asked.subject]
             self.found = self.search.identifiers(self.found, bus)
-            self.show(f"  {bus}: {len(self.found.ids[bus])} sensors were received")
+            sensors = self.found.can_sensors[bus]
+            self.show(f"  {bus}: {len(sensors)} sensors were received")
+            again = next_question(self.answers, self.found)
+            if again is None or again.default is None:
+                listed = "; ".join(each.text for each in sensors)
+                raise AnswerError(
+                    f"no sensor is left that fits the driver and its settings, received: {listed}. "
+                    f"{BACK!r} returns to them"
+                )
             return
 
         self.found, address = self.search.moved_device(

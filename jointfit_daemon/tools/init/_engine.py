@@ -103,8 +103,17 @@ def _in_order(answers: Mapping[Key, Any], found: Found) -> Iterator[tuple[Questi
         questions = tuple(members)
         for subject in questions[0].subjects(answers, found):
             for question in questions:
-                if question.group != group or subject in question.subjects(answers, found):
-                    yield question, subject
+                subjects: tuple[str, ...] = (subject,)
+                if question.group == group:
+                    every = question.subjects(answers, found)
+                    subjects = tuple(each for each in every if _owner(question, each) == subject)
+                for each in subjects:
+                    yield question, each
+
+
+def _owner(question: Question, subject: str) -> str:
+    """Return the subject of the group to which a subject of a question belongs."""
+    return subject.rpartition(".")[0] if question.is_of_keys else subject
 
 
 def answered(answers: Mapping[Key, Any], found: Found) -> list[tuple[str, Any]]:

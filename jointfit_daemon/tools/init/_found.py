@@ -34,6 +34,28 @@ class KeyChoice:
 
 
 @dataclass(frozen=True, slots=True)
+class CanSensor:
+    """A sensor on a CAN bus, as its frames show it."""
+
+    driver: str
+    ids: tuple[int, ...]
+    """Identifiers in the order of the names in the table of its driver."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Other keys of its ``[[imu]]`` table."""
+
+    @property
+    def text(self) -> str:
+        """Driver, identifiers and settings in words."""
+        settings = "".join(f", {key} {value}" for key, value in self.settings.items())
+        return f"{self.driver} {' '.join(map(hex, self.ids))}{settings}"
+
+    def agrees(self, driver: str, settings: Mapping[str, str]) -> bool:
+        """Return whether driver and settings, as text, are those of this sensor."""
+        pairs = ((str(value), settings.get(key)) for key, value in self.settings.items())
+        return driver == self.driver and all(given in {own, None} for own, given in pairs)
+
+
+@dataclass(frozen=True, slots=True)
 class ImuDriver:
     """An installed driver of IMUs, as far as the dialogue asks for its keys."""
 
@@ -49,6 +71,8 @@ class ImuDriver:
     """Keys without default that have few values."""
     needs_layout: bool = False
     """Whether its table describes the frames of the device."""
+    possible: tuple[CanSensor, ...] = ()
+    """Sensors with identifiers that could exist, if its identifiers have no default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +109,8 @@ class Found:
     ports: tuple[FoundDevice, ...] = ()
     interfaces: tuple[FoundDevice, ...] = ()
     servers: tuple[FoundDevice, ...] = ()
-    ids: Mapping[str, tuple[tuple[int, ...], ...]] = field(default_factory=dict)
-    """Sets of CAN identifiers of sensors that were received, by bus."""
+    can_sensors: Mapping[str, tuple[CanSensor, ...]] = field(default_factory=dict)
+    """Sensors that were received, by bus."""
     bauds: Mapping[str, int] = field(default_factory=dict)
     """Speeds at which devices answered, by serial port, baud."""
     recognized: Mapping[str, str] = field(default_factory=dict)

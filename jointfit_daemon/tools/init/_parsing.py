@@ -136,7 +136,7 @@ def _ids(given: Any, choices: Sequence[str]) -> tuple[int, ...]:
     if len(numbers) != len(choices):
         raise AnswerError(
             f"found {given!r}, expected {len(choices)} identifiers ({', '.join(choices)}),"
-            " such as 0x105 0x106 0x121"
+            f" such as {' '.join(f'{0x105 + at:#x}' for at in range(len(choices)))}"
         )
     return numbers
 

@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Any
 from jointfit_daemon.config import LATER
 from jointfit_daemon.tools.init._answers import (
     Key,
+    chosen_settings,
     driver_of,
+    free_sensors,
+    ids_of_others,
     is_connected,
     limb_of,
     marked_parts,
@@ -89,7 +92,12 @@ def baud(answers: Given, found: Found, sensor: str) -> int:
 
 
 def setting(answers: Given, found: Found, subject: str) -> str | None:
-    """Return the value of the last sensor with the same driver; None without one."""
+    """Return the received value, or that of the last sensor with the same driver, or None."""
+    sensor, _, key = subject.rpartition(".")
+    name, given = driver_of(answers, found, sensor).name, chosen_settings(answers, sensor)
+    for received in free_sensors(answers, found, sensor):
+        if received.agrees(name, given) and key in received.settings:
+            return str(received.settings[key])
     value = previous_answer(answers, found, "setting", subject)
     return None if value is None else str(value)
 
@@ -102,25 +110,22 @@ def layout(answers: Given, found: Found, sensor: str) -> str | None:
     return None if value is None else str(value)
 
 
-def _ids_in_use(answers: Given, bus: str) -> list[tuple[int, ...]]:
-    return [
-        ids
-        for (key, sensor), ids in answers.items()
-        if key == "ids" and ids != LATER and answers.get(("device", sensor)) == bus
-    ]
-
-
 def ids(answers: Given, found: Found, sensor: str) -> tuple[int, ...] | None:
-    """Return the first identifiers received on the bus of `sensor` that no other sensor has."""
-    bus = answers["device", sensor]
-    used = {number for each in _ids_in_use(answers, bus) for number in each}
-    return next((each for each in found.ids.get(bus, ()) if used.isdisjoint(each)), None)
+    """Return the first received identifiers that fit the driver and that no other sensor has."""
+    name, given = driver_of(answers, found, sensor).name, chosen_settings(answers, sensor)
+    free = free_sensors(answers, found, sensor)
+    return next((each.ids for each in free if each.agrees(name, given)), None)
 
 
 def unused_ids(answers: Given, found: Found, sensor: str) -> tuple[int, ...]:
     """Return identifiers that no other sensor on the bus has."""
-    used = {number for each in _ids_in_use(answers, answers["device", sensor]) for number in each}
-    first = tuple(driver_of(answers, found, sensor).ids.values())
+    used = {number for each in ids_of_others(answers, sensor) for number in each}
+    driver, given = driver_of(answers, found, sensor), chosen_settings(answers, sensor)
+    for possible in driver.possible:
+        if possible.agrees(driver.name, given) and used.isdisjoint(possible.ids):
+            return possible.ids
+
+    first = tuple(driver.ids.values())
     for step in count():
         numbers = tuple(number + step * _ID_STEP for number in first)
         block = {number & ~0xFF for number in numbers}

@@ -73,6 +73,8 @@ class Question:
     finder: Finder | None = None
     explain: Propose = _nothing
     """Help for this subject; None for `help`."""
+    is_of_keys: bool = False
+    """Whether it is asked for keys of the subjects of its group, such as ``S1.mode``."""
 
 
 def _if(condition: Callable[[Given], bool]) -> Callable[[Given, Found], tuple[str, ...]]:
@@ -103,6 +105,18 @@ def _list(*entries: tuple[str, str]) -> Callable[..., tuple[FoundDevice, ...]]:
     listed = tuple(FoundDevice(*entry) for entry in entries)
     return lambda _answers, _found, _subject: listed
 
+
+def _identifiers(answers: Given, found: Found, sensor: str) -> tuple[FoundDevice, ...]:
+    """Return the names of the identifiers, each with an example."""
+    names, numbers = driver_of(answers, found, sensor).ids, _proposals.unused_ids
+    pairs = zip(names, numbers(answers, found, sensor), strict=True)
+    return tuple(FoundDevice(name, f"{number:#05x}") for name, number in pairs)
+
+
+_IDS_HELP = (
+    "Identifiers of the messages of this sensor. 'find' receives on a CAN interface and proposes"
+    " the identifiers of its sensors. 'later' leaves the place open until they are known."
+)
 
 QUESTIONS: tuple[Question, ...] = (
     Question(
@@ -196,8 +210,8 @@ QUESTIONS: tuple[Question, ...] = (
         "driver",
         "choice",
         "Driver of the sensor {subject}",
-        "Several installed drivers read this connection. 'find' receives on the serial port,"
-        " without sending, and proposes the driver that decodes the data.",
+        "Several installed drivers read this connection. 'find' receives on the serial port or"
+        " CAN interface, without sending, and proposes the driver that decodes the data.",
         group="sensor",
         subjects=lambda answers, found: tuple(
             name
@@ -224,12 +238,26 @@ QUESTIONS: tuple[Question, ...] = (
         default=_proposals.baud,
     ),
     Question(
+        "setting",
+        "choice",
+        "Setting {subject}",
+        "A property of the device that its data do not show.",
+        group="sensor",
+        is_of_keys=True,
+        subjects=settings_asked,
+        default=_proposals.setting,
+        stand_in=lambda answers, found, subject: str(choice_of(answers, found, subject).values[0]),
+        choices=lambda answers, found, subject: tuple(
+            FoundDevice(str(value), choice_of(answers, found, subject).meaning(value))
+            for value in choice_of(answers, found, subject).values
+        ),
+        explain=lambda answers, found, subject: choice_of(answers, found, subject).help,
+    ),
+    Question(
         "ids",
         "ids",
-        "CAN identifiers of the sensor {subject}, as 0x105 0x106 0x121",
-        "Identifiers of the messages of this sensor. 'find' receives on a"
-        " CAN interface and proposes the identifiers of its sensors. 'later' leaves the place open"
-        " until they are known.",
+        "CAN identifiers of the sensor {subject}",
+        _IDS_HELP,
         group="sensor",
         postponable=True,
         subjects=lambda answers, found: tuple(
@@ -239,24 +267,12 @@ QUESTIONS: tuple[Question, ...] = (
         ),
         default=_proposals.ids,
         stand_in=_proposals.unused_ids,
-        choices=lambda answers, found, sensor: tuple(
-            FoundDevice(name) for name in driver_of(answers, found, sensor).ids
-        ),
+        choices=_identifiers,
         finder="identifiers",
-    ),
-    Question(
-        "setting",
-        "choice",
-        "Setting {subject}",
-        "A property of the device that its data do not show.",
-        subjects=settings_asked,
-        default=_proposals.setting,
-        stand_in=lambda answers, found, subject: str(choice_of(answers, found, subject).values[0]),
-        choices=lambda answers, found, subject: tuple(
-            FoundDevice(str(value), choice_of(answers, found, subject).meaning(value))
-            for value in choice_of(answers, found, subject).values
+        explain=lambda answers, found, sensor: (
+            f"{', '.join(driver_of(answers, found, sensor).ids)}, as "
+            f"{' '.join(each.text for each in _identifiers(answers, found, sensor))}. {_IDS_HELP}"
         ),
-        explain=lambda answers, found, subject: choice_of(answers, found, subject).help,
     ),
     Question(
         "layout",

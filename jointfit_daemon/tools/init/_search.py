@@ -24,6 +24,7 @@ from jointfit_daemon.tools.discovery import (
 )
 from jointfit_daemon.tools.init._answers import wiring_of
 from jointfit_daemon.tools.init._found import (
+    CanSensor,
     Found,
     FoundDevice,
     ImuDriver,
@@ -49,6 +50,8 @@ _LAYOUT_KEYS = (
     "direction", "orientation", "magnetometer",
 )  # fmt: skip
 """Keys of ``[[imu]]`` that a file with a layout may have."""
+_CONNECTION_KEYS = {"driver", "can", "ids"}
+"""Keys of ``[[imu]]`` that say where a sensor on CAN is."""
 _PROPOSED_FIRST = ("xbus", "xcdi", "natnet")
 """Drivers that lead the list of their kind; the others follow by name."""
 LISTEN_S = 1.0
@@ -67,11 +70,14 @@ def drivers_found() -> Found:
         choices = _key_choices(fields)
         if not required <= _DIALOGUE_KEYS | {choice.key for choice in choices}:
             continue
-        if "ids" in required and "fields" not in required:  # identifiers without default
-            continue
         if issubclass(driver.Settings, ImuSettings) and required & {"port", "can"}:
             about = replace(_imu_driver(name, fields), text=_devices_of(driver), choices=choices)
-            imu.append(replace(about, needs_layout="fields" in required))
+            about = replace(about, needs_layout="fields" in required)
+            if "ids" in required and not about.needs_layout:  # identifiers without default
+                about = _with_identifiers(about, driver, fields)
+                if not about.ids:
+                    continue
+            imu.append(about)
         elif issubclass(driver.Settings, MocapSettings) and "server" in fields:
             key = "command_port" if "command_port" in fields else "port"
             port = fields[key].default if key in fields else None
@@ -108,6 +114,36 @@ def _imu_driver(name: str, fields: Mapping[str, FieldInfo]) -> ImuDriver:
         if isinstance(field.default, int):
             ids[key] = field.default
     return ImuDriver(name, "serial" if "port" in fields else "can", baud, ids)
+
+
+def _with_identifiers(
+    about: ImuDriver, driver: type[Driver], fields: Mapping[str, FieldInfo]
+) -> ImuDriver:
+    """Return the driver with sensors that it would recognize on a bus with all identifiers."""
+    names = tuple(getattr(fields["ids"].annotation, "model_fields", ()))
+    propose = getattr(driver, "candidate_tables", None)
+    if not names or propose is None:
+        return about
+    possible = []
+    used: dict[str, set[int]] = {}
+    for table in propose({(number, False): _CAN_BYTES for number in range(_STANDARD_IDS)}):
+        sensor = _can_sensor(about.name, table, names)
+        taken = used.setdefault(str(sensor.settings), set())
+        if taken.isdisjoint(sensor.ids):
+            taken.update(sensor.ids)
+            possible.append(sensor)
+    first = dict(zip(names, possible[0].ids, strict=True)) if possible else {}
+    return replace(about, ids=first, possible=tuple(possible))
+
+
+_CAN_BYTES, _STANDARD_IDS = 8, 0x800
+"""Data bytes of a full frame, and number of 11-bit identifiers."""
+
+
+def _can_sensor(driver: str, table: Mapping[str, Any], names: Sequence[str]) -> CanSensor:
+    """Return the sensor that a table describes; its identifiers are in the order of `names`."""
+    others = {key: value for key, value in table.items() if key != "ids"}
+    return CanSensor(driver, tuple(table["ids"][name] for name in names), others)
 
 
 @dataclass
@@ -174,8 +210,6 @@ class DeviceSearch:
         AnswerError
             The port cannot be opened or is silent, or no driver decodes its data.
         """
-        if "/" not in port:
-            raise AnswerError(f"{port} is a CAN interface: choose from the list")
         self.show(f"  Receiving on {port} …")
         traffic = listen_serial(port, listen_s=LISTEN_S)
         if traffic.fault is not None:
@@ -249,16 +283,16 @@ class DeviceSearch:
         """
         if "/" in bus:
             raise AnswerError(
-                f"{bus} is a serial adapter, which is not searched: type the identifiers, as MT"
-                " Manager shows them"
+                f"{bus} is a serial adapter, which is not searched: type the identifiers, as the"
+                " vendor's program shows them"
             )
-        sensors = tuple(ids for _, ids in self._sensors_on(found, bus))
+        sensors = tuple(self._sensors_on(found, bus))
         if not sensors:
             raise AnswerError(f"{bus}: no sensor was received: check its power and the bit rate")
-        return replace(found, ids={**found.ids, bus: sensors})
+        return replace(found, can_sensors={**found.can_sensors, bus: sensors})
 
-    def _sensors_on(self, found: Found, bus: str) -> list[tuple[ImuDriver, tuple[int, ...]]]:
-        """Return driver and identifiers of every sensor that sends on `bus`."""
+    def _sensors_on(self, found: Found, bus: str) -> list[CanSensor]:
+        """Return every sensor that sends on `bus`."""
         traffic = listen_can(bus)
         if traffic.fault is not None:
             raise AnswerError(traffic.fault)
@@ -266,8 +300,8 @@ class DeviceSearch:
         sensors = []
         for device in traffic.devices:
             driver, ids = drivers.get(device.driver), device.settings.get("ids") or {}
-            if driver is not None and driver.ids.keys() <= ids.keys():
-                sensors.append((driver, tuple(ids[name] for name in driver.ids)))
+            if driver is not None and driver.ids and driver.ids.keys() <= ids.keys():
+                sensors.append(_can_sensor(driver.name, device.settings, tuple(driver.ids)))
         return sensors
 
     def moved_device(
@@ -295,8 +329,10 @@ class DeviceSearch:
             speed = {port: table["baud"]} if "baud" in table else {}
             return replace(found, bauds={**found.bauds, **speed}), port
         bus, ids = str(table["can"]["channel"]), tuple(table["ids"].values())
-        others = (each for each in found.ids.get(bus, ()) if each != ids)
-        return replace(found, ids={**found.ids, bus: (ids, *others)}), bus
+        settings = {key: table[key] for key in table if key not in _CONNECTION_KEYS}
+        moved = CanSensor(table["driver"], ids, settings)
+        others = (each for each in found.can_sensors.get(bus, ()) if each.ids != ids)
+        return replace(found, can_sensors={**found.can_sensors, bus: (moved, *others)}), bus
 
     def _tables(
         self, found: Found, answers: Answers, choices: Sequence[FoundDevice]
@@ -304,6 +340,7 @@ class DeviceSearch:
         """Return keys of ``[[imu]]`` of every free port, and of every free sensor on a bus."""
         used = {value for (key, _), value in answers.items() if key == "ids"}
         serial = [driver.name for driver in found.imu_drivers if driver.wiring == "serial"]
+        names = {driver.name: driver.ids for driver in found.imu_drivers}
         tables: dict[str, dict[str, Any]] = {}
         for address in (choice.address for choice in choices):
             if wiring_of(answers, address) == "serial":
@@ -312,12 +349,13 @@ class DeviceSearch:
                     tables[address] = {"driver": name, "port": address}
             elif "/" not in address:
                 with contextlib.suppress(AnswerError):  # a bus that is down has no sensor
-                    for driver, ids in self._sensors_on(found, address):
-                        if ids not in used:
-                            name = f"{address} {' '.join(map(hex, ids))}"
+                    for sensor in self._sensors_on(found, address):
+                        if sensor.ids not in used:
+                            name = f"{address} {' '.join(map(hex, sensor.ids))}"
                             tables[name] = {
-                                "driver": driver.name,
+                                "driver": sensor.driver,
                                 "can": {"interface": "socketcan", "channel": address},
-                                "ids": dict(zip(driver.ids, ids, strict=True)),
+                                "ids": dict(zip(names[sensor.driver], sensor.ids, strict=True)),
+                                **sensor.settings,
                             }
         return tables

@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 from hypothesis import strategies as st
 
 from jointfit_daemon.tools.init._engine import accept, next_question
-from jointfit_daemon.tools.init._found import Found, FoundDevice, ImuDriver, MocapDriver
+from jointfit_daemon.tools.init._found import (
+    CanSensor,
+    Found,
+    FoundDevice,
+    ImuDriver,
+    MocapDriver,
+)
 from jointfit_daemon.tools.init._limbs import LIMBS
 from jointfit_daemon.tools.init._parsing import AnswerError
 
@@ -36,7 +42,12 @@ STREAM = replace(
     DEVICES,
     markers=tuple(f"{stem}{k}" for stem in ("P", "T", "C", "Foot_") for k in range(1, 5)),
     bodies=("Thigh", "calibration plate"),
-    ids={"can0": ((0x105, 0x106, 0x121), (0x205, 0x206, 0x221))},
+    can_sensors={
+        "can0": (
+            CanSensor("xcdi", (0x105, 0x106, 0x121)),
+            CanSensor("xcdi", (0x205, 0x206, 0x221)),
+        )
+    },
 )
 NAMES = st.text(st.characters(codec="utf-8"), min_size=1, max_size=6)
 

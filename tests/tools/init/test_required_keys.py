@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from jointfit_daemon.config import parse_rig
-from jointfit_daemon.tools.discovery import DecodedDevice, SerialTraffic
+from jointfit_daemon.tools.discovery import DecodedDevice, SerialTraffic, _can_listening
 from jointfit_daemon.tools.init import _search
 from jointfit_daemon.tools.init._dialogue import Dialogue
 from jointfit_daemon.tools.init._engine import complete, next_question
@@ -18,10 +18,13 @@ from jointfit_daemon.tools.init._parsing import AnswerError
 from jointfit_daemon.tools.init._rig_table import rig_table
 from jointfit_daemon.tools.init._rig_text import rig_text
 from jointfit_daemon.tools.init._search import DeviceSearch, drivers_found
+from jointfit_simulators.devices import LpmsCanDevice, LpmsCanDeviceOptions, XcdiDevice
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
+
+    from jointfit_protocols.can import CanFrame
 
 LAYOUT = """
 [frame]
@@ -72,7 +75,7 @@ def question(started: Dialogue) -> Any:
 
 def test_a_key_without_default_is_asked_for_with_the_meaning_of_its_values() -> None:
     started = dialogue(devices=["/dev/ttyUSB0"])
-    answer(started, driver="lpms", baud=115200, device="/dev/ttyUSB1", driver_="", baud_="")
+    answer(started, driver="lpms", baud=115200)
     asked = question(started)
     assert (asked.name, asked.text) == (
         "setting.S1.generation", "Setting generation of the sensor S1",
@@ -83,7 +86,7 @@ def test_a_key_without_default_is_asked_for_with_the_meaning_of_its_values() -> 
     assert asked.default is None
     with pytest.raises(AnswerError, match="an answer is needed"):
         started.accept_answer(asked, None)
-    answer(started, setting="3")
+    answer(started, setting="3", device="/dev/ttyUSB1", driver="", baud="")
     assert question(started).default == "3"  # proposed for the next sensor
     imus = finished(started)["imu"]
     assert [imu["generation"] for imu in imus] == [3, 3]
@@ -180,3 +183,83 @@ def _with_server(found: Any, server: FoundDevice, driver: str) -> Any:
 
 def rig_table_of(started: Dialogue) -> dict[str, Any]:
     return rig_table(complete(started.answers, started.found), started.found)
+
+
+# --- identifiers without default ------------------------------------------------------------------
+
+
+class _Bus:
+    """Wire that collects the frames of simulated sensors."""
+
+    bitrate = None
+    is_open = True
+
+    def __init__(self) -> None:
+        self.frames: list[CanFrame] = []
+
+    def send(self, frames: list[CanFrame]) -> bool:
+        self.frames += frames
+        return True
+
+
+@pytest.fixture
+def can0(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bus with an XCDI sensor and two LPMS sensors: CANopen style, and sequential with floats."""
+    bus: Any = _Bus()
+    sequential = LpmsCanDeviceOptions(
+        mode="sequential", ids=(0x514, 0x515, 0x516, 0x517), precision="float32"
+    )
+    sensors: list[Any] = [LpmsCanDevice(bus), LpmsCanDevice(bus, sequential), XcdiDevice(bus)]
+    received: list[tuple[int, int, bytes]] = []
+    for number in range(40):
+        for sensor in sensors:
+            sensor.push(number * 10_000_000, (0.5, -0.5, 0.1, 0.7))
+        for frame in bus.frames:
+            t_ns = number * 10_000_000 + 100_000 * len(received) % 10_000_000
+            received.append((t_ns, frame.can_id, frame.data))
+        bus.frames.clear()
+    monkeypatch.setattr(_can_listening, "_receive", lambda *_: received)
+    found = (FoundDevice("can0", "CAN interface, up"),)
+    monkeypatch.setattr(DeviceSearch, "refresh", lambda _, old: replace(old, interfaces=found))
+
+
+@pytest.mark.usefixtures("can0")
+def test_sensors_on_can_are_found_with_the_settings_that_their_frames_show() -> None:
+    started = dialogue(devices=["can0"])
+    started.next()  # finds the interface
+    asked = question(started)
+    assert {"xcdi", "lpms-can", "can-table"} == {each.address for each in asked.choices}
+    started.find(asked)
+    answer(started, driver="lpms-can")
+    mode, ids = question(started), (0x181, 0x281, 0x381, 0x481)
+    assert (mode.name, mode.default) == ("setting.S1.mode", "canopen")
+    answer(started, setting="", setting_="")
+    assert question(started).default == ids
+    answer(started, ids="", device="can0", driver="lpms-can", setting="", setting_="")
+    assert question(started).default == (0x514, 0x515, 0x516, 0x517)
+    first, second = finished(started)["imu"]
+    assert (first["mode"], first["precision"]) == ("canopen", "int16")
+    assert tuple(first["ids"].values()) == ids
+    assert (second["mode"], second["precision"]) == ("sequential", "float32")
+    assert list(second["ids"]) == ["frame1", "frame2", "frame3", "frame4"]
+
+
+@pytest.mark.usefixtures("can0")
+def test_a_received_sensor_with_other_settings_is_named() -> None:
+    started = dialogue(devices=["can0"])
+    answer(started, driver="lpms-can", setting="canopen", setting_="float32")
+    with pytest.raises(AnswerError, match=r"lpms-can 0x181 0x281 .*, mode canopen, precision int1"):
+        started.find(question(started))
+
+
+def test_typed_identifiers_are_those_of_their_mode() -> None:
+    started = dialogue(devices=["can0"])
+    answer(started, driver="lpms-can", setting="sequential", setting_="int16")
+    asked = question(started)
+    assert asked.help.startswith("frame1, frame2, frame3, frame4, as 0x000 0x001 0x002 0x003. ")
+    with pytest.raises(AnswerError, match=r"sequential identifiers follow each other"):
+        answer(started, ids="0x181 0x281 0x381 0x481")
+    with pytest.raises(AnswerError, match="expected 4 identifiers"):
+        answer(started, ids="0x181")
+    answer(started, ids="0x101 0x102 0x103 0x104", device="/dev/ttyUSB0")
+    assert finished(started)["imu"][0]["ids"]["frame4"] == 0x104

@@ -14,7 +14,7 @@ from jointfit_daemon.model import Chunk, ImuSample
 from jointfit_daemon.tools import discovery
 from jointfit_daemon.tools.discovery import CanTraffic, DecodedDevice
 from jointfit_daemon.tools.init import _movement, _search
-from jointfit_daemon.tools.init._found import FoundDevice, ImuDriver
+from jointfit_daemon.tools.init._found import CanSensor, FoundDevice, ImuDriver
 from jointfit_daemon.tools.init._movement import find_moved
 from jointfit_daemon.tools.init._parsing import AnswerError
 from jointfit_daemon.tools.init._search import DeviceSearch, drivers_found
@@ -109,7 +109,7 @@ def test_identifiers_on_a_bus_become_proposals(monkeypatch: pytest.MonkeyPatch) 
     device = DecodedDevice("xcdi", {"ids": ids}, 30, 10, 100.0, 0)
     monkeypatch.setattr(_search, "listen_can", lambda bus: CanTraffic(bus, None, (), (device,)))
     found = DeviceSearch(print).identifiers(DEVICES, "can0")
-    assert found.ids == {"can0": ((0x105, 0x106, 0x121),)}
+    assert found.can_sensors == {"can0": (CanSensor("xcdi", (0x105, 0x106, 0x121)),)}
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_a_sensor_that_moves_on_a_bus_is_found_by_its_identifiers(
     )
     assert offered == ["can0 0x205 0x206 0x221", "can0 0x305 0x306 0x321"]
     assert address == "can0"
-    assert found.ids["can0"][0] == (0x305, 0x306, 0x321)
+    assert found.can_sensors["can0"][0].ids == (0x305, 0x306, 0x321)
 
 
 def test_installed_drivers_are_described_by_the_keys_the_dialogue_asks_for() -> None:
