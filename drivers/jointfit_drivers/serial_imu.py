@@ -26,6 +26,10 @@ _SILENCE_FLOOR_NS = 250_000_000
 At high speed the duration of 1.5 messages is so short that a host that reads late would look like a
 silent line.
 """
+_PERIODS_OF_SILENCE = 3
+"""Smallest number of sample periods without data after which a device counts as silent. A slow
+device may be silent for two periods.
+"""
 _RATE_TOLERANCE = 1e-3
 """Largest relative difference between a requested rate and the rate of a device."""
 _RATES_SHOWN = 12
@@ -49,6 +53,11 @@ class SerialImuSettings(ImuSettings):
     def line_baud(self) -> int | None:
         """Speed that delays bytes, baud; None for USB."""
         return self.baud if self.transport == "uart" else None
+
+    @property
+    def lost_after_s(self) -> float:
+        """Time without a byte after which the device counts as lost, s."""
+        return max(self.silence_s, _PERIODS_OF_SILENCE / self.rate_hz)
 
     def require_line_speed(self, speed: str = "the speed of the device") -> None:
         """Raise DeviceMisconfiguredError if the data need more bits per second than `baud`.

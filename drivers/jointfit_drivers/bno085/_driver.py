@@ -19,9 +19,6 @@ from jointfit_drivers.ports.serial_port import SerialPort
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
 
-_PERIODS_OF_SILENCE = 3
-"""Smallest number of sample periods without data after which a device counts as silent."""
-
 
 class Bno085Imu:
     """One BNO085 or BNO086: orientation and an 8-bit number of samples, without device time."""
@@ -58,5 +55,4 @@ class Bno085Imu:
         ensure = ensure_rvc if settings.baud == RVC_BAUD else ensure_shtp
         with SerialPort(settings.port, settings.baud) as port:
             await ensure(port, emit, settings)
-            silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
-            await port.pump(emit, silence_s)
+            await port.pump(emit, settings.lost_after_s)

@@ -8,6 +8,7 @@ Invariant: the output depends only on the readings fed; no clock and no port is 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 from jointfit_daemon.model import DeviceEvent, ImuSample
@@ -20,6 +21,8 @@ from jointfit_drivers.gateway_orientation._filter import (
 from jointfit_drivers.gateway_orientation._sensor_correction import SensorCorrection
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from jointfit_daemon.model import Decoded, Quaternion, Vector
     from jointfit_drivers.gateway_orientation._settings import GatewaySettings
 
@@ -95,6 +98,11 @@ class RawSamples:
             correction=None if calibration is None else SensorCorrection(calibration),
             readings_only=settings.readings_only,
         )
+
+    @classmethod
+    def maker(cls, settings: GatewaySettings) -> Callable[[], Self] | None:
+        """Return what makes new samples; None if the device computes the orientation."""
+        return partial(cls.of, settings) if settings.orientation == "gateway" else None
 
     @property
     def period_ns(self) -> float:

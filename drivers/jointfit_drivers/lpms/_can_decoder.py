@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
+from jointfit_daemon.model import DeviceEvent, ImuSample
+from jointfit_drivers.bus_events import BusEvents
 from jointfit_drivers.lpms._arrival_gaps import ArrivalGaps
 from jointfit_drivers.lpms._orientation import LpmsConvention, LpmsOrientation
 from jointfit_protocols import can
@@ -27,12 +28,10 @@ from jointfit_protocols.lpms.channels import (
 )
 
 if TYPE_CHECKING:
-    from jointfit_daemon.model import Chunk, Decoded, DeviceEventKind
+    from jointfit_daemon.model import Chunk, Decoded
     from jointfit_drivers.lpms._can_settings import LpmsCanSettings
 
 _NS = 1_000_000_000
-_REPEAT_NS = 1_000_000_000
-"""Shortest interval, ns, between reports of the same error."""
 _TORN = 20
 """Frames of incomplete quaternions in a row after which the order of the frames is reported."""
 
@@ -60,25 +59,31 @@ class LpmsCanDecoder:
         self._rate_hz = settings.rate_hz
         self._gaps = ArrivalGaps(settings.rate_hz)
         self._orientation = LpmsOrientation(LpmsConvention.of(settings), _NORM_REMEDY)
-        self._incomplete = self._torn = self._refused = self._reported_ns = 0
+        self._incomplete = self._torn = self._refused = 0
         self._state: int | None = None
-        self._error_text = ""
-        self.discarded_bytes = 0
-        """Bytes of rejected records, and of lost lines of an adapter."""
+        self._bus = BusEvents()
 
     @property
     def messages(self) -> int:
         """Well-formed frames of this sensor so far."""
         return self._codec.messages - self._refused
 
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes of rejected records, and of lost lines of an adapter."""
+        return self._bus.discarded_bytes
+
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the content that `chunk` completed, in wire order; never raises."""
         out: list[Decoded] = []
         for item in can.unpack_frames(chunk.data):
             if not isinstance(item, can.CanFrame):
-                out.append(self._lose(item.discarded, item.reason))
+                out.append(self._bus.discard(item.discarded, item.reason))
             elif item.error:
-                out += self._error_frame_events(item)
+                if item.can_id in {can.HOST_CORRUPT, can.HOST_DROPPED}:
+                    # frames may be missing here: halves before and after are of different samples
+                    out += self.flush()
+                out += self._bus.add_error_frame(item)
             else:
                 self._take(item, out)
         return out
@@ -102,7 +107,7 @@ class LpmsCanDecoder:
         elif isinstance(found, Heartbeat):
             self._heartbeat(found, out)
         elif isinstance(found, CorruptBytes):
-            out.append(self._lose(can.RECORD_BYTES, found.reason))
+            out.append(self._bus.discard(can.RECORD_BYTES, found.reason))
 
     def _sample(self, quaternion: ChannelQuaternion, out: list[Decoded]) -> None:
         """Append the sample of a complete quaternion."""
@@ -122,7 +127,7 @@ class LpmsCanDecoder:
             self._orientation.events = []
         if converted is None:
             self._refused += 1
-            out.append(self._lose(can.RECORD_BYTES, "quaternion norm is not 1"))
+            out.append(self._bus.discard(can.RECORD_BYTES, "quaternion norm is not 1"))
             return
         native, q = converted
         out.append(ImuSample(quaternion.t_ns, q, native, None, None))
@@ -149,33 +154,13 @@ class LpmsCanDecoder:
         if not count:
             return
         self._refused += count
-        out.append(self._lose(count * can.RECORD_BYTES, "frame without the others of its sample"))
+        out.append(
+            self._bus.discard(count * can.RECORD_BYTES, "frame without the others of its sample")
+        )
 
         before, self._torn = self._torn, self._torn + count
         if before < _TORN <= self._torn:
             out.append(DeviceEvent("warning", _OUT_OF_ORDER))
-
-    def _error_frame_events(self, frame: can.CanFrame) -> list[Decoded]:
-        """Return the events of an error frame of the controller, its driver or the host."""
-        if frame.can_id in {can.HOST_CORRUPT, can.HOST_DROPPED}:
-            # frames may be missing here: halves before and after are of different samples
-            out = self.flush()
-            count = can.host_count(frame)
-            if frame.can_id == can.HOST_CORRUPT:
-                return [*out, self._lose(count, "no SLCAN line")]
-            text = f"this host was too slow: the kernel dropped {count} CAN frames"
-            return [*out, DeviceEvent("warning", text, {"dropped_frames": count})]
-
-        text, serious = can.describe_error(frame)
-        if text == self._error_text and 0 <= frame.t_ns - self._reported_ns < _REPEAT_NS:
-            return []
-        self._error_text, self._reported_ns = text, frame.t_ns
-        kind: DeviceEventKind = "error" if serious else "warning"
-        return [DeviceEvent(kind, text)]
-
-    def _lose(self, count: int, reason: str) -> Corrupt:
-        self.discarded_bytes += count
-        return Corrupt(count, reason)
 
 
 _NORM_REMEDY = "change `precision` or `mapping`, and remove `scale`"

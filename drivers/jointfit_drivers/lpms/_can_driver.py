@@ -6,13 +6,11 @@ tool: identifiers, precision, and the quantity of each channel.
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from jointfit_drivers.can_reception import CanReception
 from jointfit_drivers.lpms._can_decoder import LpmsCanDecoder
 from jointfit_drivers.lpms._can_settings import LpmsCanSettings
-from jointfit_drivers.ports.can_bus import shared_bus
-from jointfit_protocols.can import unpack_frames
 from jointfit_protocols.lpms import UNITS, unit_of
 from jointfit_protocols.lpms.channels import (
     FRAME_BYTES,
@@ -27,15 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from jointfit_daemon.driver import Emit, Wire
-    from jointfit_daemon.model import Chunk
 
-log = logging.getLogger(__name__)
-
-_LONGEST_SILENCE_S = 30.0
-"""Longest wait, s, for the first frame of a sensor that is lost; the wait doubles with every
-attempt. The sensor stays subscribed meanwhile, so its first frame is received at once."""
-_RAW_FRAMES = 20
-"""Frames logged at debug level, so that the log contains raw data of a sensor."""
 _MOST = 1.01
 """Largest component of a quaternion."""
 _LEAST = 1e-12
@@ -73,8 +63,7 @@ class LpmsCanImu:
 
     def __init__(self, settings: LpmsCanSettings) -> None:
         self._settings = settings
-        self._worked = False
-        self._first_s = settings.silence_s  # waiting is cheap; opening the bus again is not
+        self._reception = CanReception(settings, "over UART or USB, with LpmsControl")
 
     def decoder(self) -> LpmsCanDecoder:
         """Return the decoder from chunks to samples, for live data and replay."""
@@ -97,33 +86,7 @@ class LpmsCanImu:
         if heartbeat is not None:
             ids[heartbeat, False] = "heartbeat"
         last = frames_of(settings.mapping, settings.precision)[-1]
-
-        left = _RAW_FRAMES if log.isEnabledFor(logging.DEBUG) else 0
-
-        def emit_frames(chunk: Chunk) -> None:
-            nonlocal left
-            if left:
-                for frame in unpack_frames(chunk.data)[:left]:
-                    left -= 1
-                    log.debug("%s: %s", settings.id, frame)
-            self._first_s = settings.silence_s
-            self._worked = True
-            emit(chunk)
-
-        first_s = self._first_s
-        self._first_s = min(2 * first_s, max(settings.silence_s, _LONGEST_SILENCE_S))
-        async with shared_bus(settings.can) as bus:
-            await bus.pump(
-                settings.id,
-                ids,
-                emit_frames,
-                settings.silence_s,
-                needed=(numbers[last], False),
-                first_s=first_s,
-                resembles=self._resembles,
-                worked=self._worked,
-                configured_by="over UART or USB, with LpmsControl",
-            )
+        await self._reception.run(emit, ids, (numbers[last], False), self._resembles)
 
     def _resembles(self, data: bytes) -> bool:
         """Whether the data of a frame could be those of a quaternion, or of its half."""

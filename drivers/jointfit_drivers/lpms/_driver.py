@@ -11,15 +11,10 @@ from typing import TYPE_CHECKING, ClassVar
 from jointfit_drivers.lpms._decoder import LpmsDecoder
 from jointfit_drivers.lpms._handshake import LINE_SPEEDS, LpmsHandshake
 from jointfit_drivers.lpms._settings import LpmsSettings
-from jointfit_drivers.ports.serial_port import SerialPort
+from jointfit_drivers.serial_reception import SerialReception
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
-
-_PERIODS_OF_SILENCE = 3
-"""Smallest number of sample periods without data after which a sensor counts as silent."""
-_HUNT_EVERY = 10
-"""Number of attempts to connect per search at other speeds, which takes longer than an attempt."""
 
 
 class LpmsImu:
@@ -31,7 +26,7 @@ class LpmsImu:
 
     def __init__(self, settings: LpmsSettings) -> None:
         self._settings = settings
-        self._attempts = 0
+        self._reception = SerialReception(settings)
 
     def decoder(self) -> LpmsDecoder:
         """Return the decoder from chunks to samples, for live data and replay."""
@@ -49,12 +44,7 @@ class LpmsImu:
             others, or it does not accept the settings.
         """
         settings = self._settings
-
-        with SerialPort(settings.port, settings.baud) as port:
-            hunt = self._attempts % _HUNT_EVERY == 0
-            self._attempts += 1
-            await LpmsHandshake(port, emit, settings, hunt=hunt).ensure_streaming()
-            self._attempts = 0
-
-            silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
-            await port.pump(emit, silence_s)
+        await self._reception.run(
+            emit,
+            lambda port, hunt: LpmsHandshake(port, emit, settings, hunt=hunt).ensure_streaming(),
+        )

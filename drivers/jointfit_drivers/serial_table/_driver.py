@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_PERIODS_OF_SILENCE = 3
-"""Smallest number of sample periods without data after which a device counts as silent."""
 _UNKNOWN_BYTES = 4096
 """Bytes without a message after which the table does not fit."""
 _UNKNOWN_S = 2.0
@@ -58,16 +56,15 @@ class SerialTableImu:
             The file is no serial port, or the received bytes contain no message of the table.
         """
         settings = self._settings
-        silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
         with SerialPort(settings.port, settings.baud) as port:
             port.flush_input()
-            for chunk in await self._first_message(port, silence_s):
+            for chunk in await self._first_message(port):
                 emit(chunk)
-            await port.pump(emit, silence_s)
+            await port.pump(emit, settings.lost_after_s)
 
-    async def _first_message(self, port: SerialPort, silence_s: float) -> list[Chunk]:
+    async def _first_message(self, port: SerialPort) -> list[Chunk]:
         """Return the chunks up to the first message with measurements."""
-        wire = self._settings.wire_format()
+        wire, silence_s = self._settings.wire_format(), self._settings.lost_after_s
         codec, chunks = open_codec(wire), []
         received = 0
         while codec.messages == codec.skipped:

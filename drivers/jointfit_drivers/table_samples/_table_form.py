@@ -6,7 +6,6 @@ Invariant: every fault is returned with its key and remedy; nothing is opened.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import partial
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import TickClock
@@ -212,7 +211,7 @@ def sample_form(form: TableForm, settings: TableImuSettings, *, is_text: bool) -
         settings.direction == "world_to_sensor",
         None if is_text else form.fields,
         _rate_unit(form),
-        partial(RawSamples.of, settings) if settings.orientation == "gateway" else None,
+        RawSamples.maker(settings),
     )
 
 

@@ -6,22 +6,16 @@ reads until cancelled. The two share only chunks.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 from jointfit_drivers.gateway_orientation import RawSamples
-from jointfit_drivers.ports.serial_port import SerialPort
+from jointfit_drivers.serial_reception import SerialReception
 from jointfit_drivers.vectornav._decoder import VectorNavDecoder
 from jointfit_drivers.vectornav._handshake import LINE_SPEEDS, VectorNavHandshake
 from jointfit_drivers.vectornav._settings import VectorNavSettings
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
-
-_PERIODS_OF_SILENCE = 3
-"""Smallest number of sample periods without data after which a device counts as silent."""
-_HUNT_EVERY = 10
-"""Number of attempts to connect per search at other speeds, which takes longer than an attempt."""
 
 
 class VectorNavImu:
@@ -33,19 +27,16 @@ class VectorNavImu:
 
     def __init__(self, settings: VectorNavSettings) -> None:
         self._settings = settings
-        self._attempts = 0
+        self._reception = SerialReception(settings)
 
     def decoder(self) -> VectorNavDecoder:
         """Return the decoder from chunks to samples, for live data and replay."""
         settings = self._settings
-        make_raw = None
-        if settings.orientation == "gateway":
-            make_raw = partial(RawSamples.of, settings)
         inverse = settings.direction == "world_to_sensor"
         return VectorNavDecoder(
             settings.line_baud,
             world_to_sensor=inverse,
-            make_raw=make_raw,
+            make_raw=RawSamples.maker(settings),
             rate_hz=settings.rate_hz,
             output=settings.output,
         )
@@ -62,12 +53,9 @@ class VectorNavImu:
             cannot send the orientation at this rate.
         """
         settings = self._settings
-
-        with SerialPort(settings.port, settings.baud) as port:
-            hunt = self._attempts % _HUNT_EVERY == 0
-            self._attempts += 1
-            await VectorNavHandshake(port, emit, settings, hunt=hunt).ensure_streaming()
-            self._attempts = 0
-
-            silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
-            await port.pump(emit, silence_s)
+        await self._reception.run(
+            emit,
+            lambda port, hunt: VectorNavHandshake(
+                port, emit, settings, hunt=hunt
+            ).ensure_streaming(),
+        )

@@ -17,9 +17,6 @@ from jointfit_drivers.witmotion._settings import WitMotionSettings
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
 
-_PERIODS_OF_SILENCE = 3
-"""Smallest number of sample periods without data after which a device counts as silent."""
-
 
 class WitMotionImu:
     """One WitMotion device: orientation, stamped on arrival or with the device's calendar time."""
@@ -59,5 +56,4 @@ class WitMotionImu:
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:
             await WitMotionHandshake(port, emit, settings).ensure_streaming()
-            silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
-            await port.pump(emit, silence_s)
+            await port.pump(emit, settings.lost_after_s)

@@ -6,11 +6,10 @@ mode and reads until cancelled. The two share only chunks.
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, ClassVar
 
 from jointfit_drivers.gateway_orientation import RawSamples
-from jointfit_drivers.ports.serial_port import SerialPort
+from jointfit_drivers.serial_reception import SerialReception
 from jointfit_drivers.xbus._decoder import XbusDecoder
 from jointfit_drivers.xbus._handshake import LINE_SPEEDS, XbusHandshake
 from jointfit_drivers.xbus._legacy_measurements import LegacyMeasurements
@@ -20,13 +19,6 @@ from jointfit_drivers.xbus._sync_lines import trigger_wires
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
-
-_PERIODS_OF_SILENCE = 3
-"""Smallest number of sample periods without data after which a device counts as silent. A slow
-device may be silent for two periods.
-"""
-_HUNT_EVERY = 10
-"""Number of attempts to connect per search at other speeds, which takes longer than an attempt."""
 
 
 class XbusImu:
@@ -38,15 +30,14 @@ class XbusImu:
 
     def __init__(self, settings: XbusSettings) -> None:
         self._settings = settings
-        self._attempts = 0
+        self._reception = SerialReception(settings)
 
     def decoder(self) -> XbusDecoder:
         """Return the decoder from chunks to samples, for live data and replay."""
         settings = self._settings
         baud = settings.baud if settings.transport == "uart" else None
-        raw = None
-        if settings.orientation == "gateway":
-            raw = RawOrientation(partial(RawSamples.of, settings))
+        make_raw = RawSamples.maker(settings)
+        raw = None if make_raw is None else RawOrientation(make_raw)
 
         legacy = None
         if settings.format == "mtdata":
@@ -68,12 +59,7 @@ class XbusImu:
             configuration differs while ``persist`` is false.
         """
         settings = self._settings
-
-        with SerialPort(settings.port, settings.baud) as port:
-            hunt = self._attempts % _HUNT_EVERY == 0
-            self._attempts += 1
-            await XbusHandshake(port, emit, settings, hunt=hunt).ensure_measuring()
-            self._attempts = 0
-
-            silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
-            await port.pump(emit, silence_s)
+        await self._reception.run(
+            emit,
+            lambda port, hunt: XbusHandshake(port, emit, settings, hunt=hunt).ensure_measuring(),
+        )

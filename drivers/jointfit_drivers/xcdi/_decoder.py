@@ -11,7 +11,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, TickClock
+from jointfit_daemon.model import DeviceEvent, ImuSample, TickClock
+from jointfit_drivers.bus_events import BusEvents
 from jointfit_drivers.xcdi._continuity import XcdiContinuity
 from jointfit_protocols import can
 from jointfit_protocols.orientation import OrientationGate
@@ -35,8 +36,6 @@ _UNDECIDED = 100
 """Groups after which an undecided unit of SampleTime is reported."""
 _TIMELESS = 20
 """Quaternions after which a missing SampleTime is reported."""
-_REPEAT_NS = 1_000_000_000
-"""Shortest interval, ns, between reports of the same error."""
 
 
 class XcdiDecoder:
@@ -67,26 +66,29 @@ class XcdiDecoder:
             self.tick_clock = TickClock(self._configured, TICKS_MODULUS)
         self._measured_ns: int | None = None  # measured duration of a tick
         self._has_time = self._has_counter = False
-        self._incomplete = self._timed = self._reported_at_ns = 0
+        self._incomplete = self._timed = 0
         self._refused = 0
-        self.discarded_bytes = 0
-        """Bytes of rejected records, and of lost lines of an adapter."""
+        self._bus = BusEvents()
         self._reported_topics: set[str] = set()
-        self._error_text = ""
 
     @property
     def messages(self) -> int:
         """Well-formed frames of this sensor so far."""
         return self._xcdi.messages - self._refused
 
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes of rejected records, and of lost lines of an adapter."""
+        return self._bus.discarded_bytes
+
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the content that `chunk` completed, in wire order; never raises."""
         out: list[Decoded] = []
         for item in can.unpack_frames(chunk.data):
             if not isinstance(item, can.CanFrame):
-                out.append(self._lose(item.discarded, item.reason))
+                out.append(self._bus.discard(item.discarded, item.reason))
             elif item.error:
-                out += self._error_frame_events(item)
+                out += self._bus.add_error_frame(item)
             else:
                 message = self._xcdi.feed(item)
                 if isinstance(message, XcdiGroup):
@@ -94,9 +96,9 @@ class XcdiDecoder:
                 elif isinstance(message, XcdiError):
                     known = message.code == OVERFLOW
                     text = _OVERFLOWED if known else f"device reports error {message.code}"
-                    out += self._limited("error", text, message.t_ns)
+                    out += self._bus.limited("error", text, message.t_ns)
                 elif message is not None:
-                    out.append(self._lose(can.RECORD_BYTES, message.reason))
+                    out.append(self._bus.discard(can.RECORD_BYTES, message.reason))
         return out
 
     def flush(self) -> list[Decoded]:
@@ -209,25 +211,6 @@ class XcdiDecoder:
             text = f"median quaternion norm is {norm:.4g}, expected 1: change `byte_order`"
             out += self._once("warning", "norm", text, {"median_norm": norm})
 
-    def _error_frame_events(self, frame: can.CanFrame) -> list[Decoded]:
-        """Return the events of an error frame of the controller, its driver or the host."""
-        if frame.can_id == can.HOST_CORRUPT:
-            return [self._lose(can.host_count(frame), "no SLCAN line")]
-        if frame.can_id == can.HOST_DROPPED:
-            lost = can.host_count(frame)
-            text = f"this host was too slow: the kernel dropped {lost} CAN frames"
-            return [DeviceEvent("warning", text, {"dropped_frames": lost})]
-
-        text, serious = can.describe_error(frame)
-        return self._limited("error" if serious else "warning", text, frame.t_ns)
-
-    def _limited(self, kind: DeviceEventKind, text: str, t_ns: int) -> list[Decoded]:
-        """Return the event unless the same one was reported within a second."""
-        if text == self._error_text and 0 <= t_ns - self._reported_at_ns < _REPEAT_NS:
-            return []
-        self._error_text, self._reported_at_ns = text, t_ns
-        return [DeviceEvent(kind, text)]
-
     def _once(
         self, kind: DeviceEventKind, topic: str, text: str, data: dict[str, object] | None = None
     ) -> list[Decoded]:
@@ -239,11 +222,7 @@ class XcdiDecoder:
     def _refuse(self, reason: str, out: list[Decoded]) -> None:
         """Discard the quaternion frame that was just decoded."""
         self._refused += 1
-        out.append(self._lose(can.RECORD_BYTES, reason))
-
-    def _lose(self, count: int, reason: str) -> Corrupt:
-        self.discarded_bytes += count
-        return Corrupt(count, reason)
+        out.append(self._bus.discard(can.RECORD_BYTES, reason))
 
 
 def _native(group: XcdiGroup) -> Quaternion:

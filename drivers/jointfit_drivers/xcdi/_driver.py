@@ -7,16 +7,16 @@ remedy.
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 from typing_extensions import override
 
 from jointfit_daemon.driver import CanBusError, CanBusSettings, ImuSettings, Settings, Wire
-from jointfit_drivers.ports.can_bus import bus_faults, shared_bus
+from jointfit_drivers.can_reception import CanReception
+from jointfit_drivers.ports.can_bus import bus_faults
 from jointfit_drivers.xcdi._decoder import XcdiDecoder
-from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX, unpack_frames
+from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX
 from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.orientation import OrientationGate
 from jointfit_protocols.xcdi import QUATERNION_SCALE, DataId, XcdiIds, decode, id_block
@@ -25,18 +25,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from jointfit_daemon.driver import Emit
-    from jointfit_daemon.model import Chunk
 
-log = logging.getLogger(__name__)
-
-_LONGEST_SILENCE_S = 30.0
-"""Longest wait, s, for the first frame of a sensor that is lost; the wait doubles with every
-attempt. The sensor stays subscribed meanwhile, so its first frame is received at once. From then
-on `silence_s` applies."""
 _SAMPLE_BYTES = {DataId.SAMPLE_TIME: 4, DataId.GROUP_COUNTER: 2, DataId.QUATERNION: 8}
 _ID_NAMES = XcdiIds._fields[:5]
-_RAW_FRAMES = 20
-"""Frames logged at debug level, so that the log contains raw data of a device."""
 
 
 class XcdiIdSettings(Settings):
@@ -190,8 +181,7 @@ class XcdiImu:
     def __init__(self, settings: XcdiSettings) -> None:
         self._settings = settings
         self._ids = settings.ids.resolved(extended=settings.extended_ids)
-        self._worked = False
-        self._first_s = settings.silence_s  # waiting is cheap; opening the bus again is not
+        self._reception = CanReception(settings, "over UART, Xsens MT Manager")
 
     def decoder(self) -> XcdiDecoder:
         """Return the decoder from chunks to samples, for live data and replay."""
@@ -211,40 +201,16 @@ class XcdiImu:
             This kind of bus is not available, or another sensor of the rig uses the same
             identifiers.
         """
-        settings, by_id = self._settings, self._ids.by_id()
+        by_id, byte_order = self._ids.by_id(), self._settings.byte_order
         ids = {key: data_id.name.lower() for key, data_id in by_id.items()}
         (needed,) = (key for key, data_id in by_id.items() if data_id is DataId.QUATERNION)
 
-        left = _RAW_FRAMES if log.isEnabledFor(logging.DEBUG) else 0
-
-        def emit_sample(chunk: Chunk) -> None:
-            nonlocal left
-            if left:
-                for frame in unpack_frames(chunk.data)[:left]:
-                    left -= 1
-                    log.debug("%s: %s", settings.id, frame)
-            self._first_s = settings.silence_s
-            self._worked = True
-            emit(chunk)
-
         def resembles(data: bytes) -> bool:
             """Whether `data` could be a quaternion: four integers of norm 1."""
-            counts = decode(DataId.QUATERNION, data, settings.byte_order)
+            counts = decode(DataId.QUATERNION, data, byte_order)
             if isinstance(counts, CorruptBytes):
                 return False
             w, x, y, z = (count * QUATERNION_SCALE for count in counts)
             return OrientationGate().admit((w, x, y, z)) is not None
 
-        first_s = self._first_s
-        self._first_s = min(2 * first_s, max(settings.silence_s, _LONGEST_SILENCE_S))
-        async with shared_bus(settings.can) as bus:
-            await bus.pump(
-                settings.id,
-                ids,
-                emit_sample,
-                settings.silence_s,
-                needed=needed,
-                first_s=first_s,
-                resembles=resembles,
-                worked=self._worked,
-            )
+        await self._reception.run(emit, ids, needed, resembles)

@@ -9,7 +9,6 @@ Invariant: the output depends only on the chunks fed; the decoder reads no clock
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
@@ -61,9 +60,8 @@ class XImu3Decoder:
         self._codec = XImu3Codec()
         self._reports = DeviceReports(settings.world)
         self._stamps = ArrivalStamps(settings.line_baud, MAX_LINE)
-        self._raw = None
-        if settings.orientation == "gateway":
-            self._raw = XImu3RawOrientation(partial(RawSamples.of, settings))
+        make_raw = RawSamples.maker(settings)
+        self._raw = None if make_raw is None else XImu3RawOrientation(make_raw)
         self._continuity = XImu3Continuity()
         self._held: _Measurement | None = None
         self._gate = OrientationGate()

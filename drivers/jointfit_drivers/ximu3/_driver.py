@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from jointfit_drivers.ports.serial_port import SerialPort
+from jointfit_drivers.serial_reception import SerialReception
 from jointfit_drivers.ximu3._decoder import XImu3Decoder
 from jointfit_drivers.ximu3._handshake import LINE_SPEEDS, XImu3Handshake
 from jointfit_drivers.ximu3._passive_check import ensure_expected_messages
@@ -16,11 +16,7 @@ from jointfit_drivers.ximu3._settings import XImu3Settings
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
-
-_PERIODS_OF_SILENCE = 3
-"""Smallest number of sample periods without data after which a device counts as silent."""
-_HUNT_EVERY = 10
-"""Number of attempts to connect per search at other speeds, which takes longer than an attempt."""
+    from jointfit_drivers.ports.serial_port import SerialPort
 
 
 class XImu3Imu:
@@ -32,7 +28,7 @@ class XImu3Imu:
 
     def __init__(self, settings: XImu3Settings) -> None:
         self._settings = settings
-        self._attempts = 0
+        self._reception = SerialReception(settings)
 
     def decoder(self) -> XImu3Decoder:
         """Return the decoder from chunks to samples, for live data and replay."""
@@ -51,14 +47,11 @@ class XImu3Imu:
         """
         settings = self._settings
 
-        with SerialPort(settings.port, settings.baud) as port:
-            silence_s = max(settings.silence_s, _PERIODS_OF_SILENCE / settings.rate_hz)
+        async def start(port: SerialPort, hunt: bool) -> None:
             if settings.passive:
                 port.flush_input()
-                await ensure_expected_messages(port, emit, settings, silence_s)
+                await ensure_expected_messages(port, emit, settings, settings.lost_after_s)
             else:
-                hunt = self._attempts % _HUNT_EVERY == 0
-                self._attempts += 1
                 await XImu3Handshake(port, emit, settings, hunt=hunt).ensure_configured()
-                self._attempts = 0
-            await port.pump(emit, silence_s)
+
+        await self._reception.run(emit, start)

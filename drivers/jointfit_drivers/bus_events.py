@@ -1,0 +1,51 @@
+"""Corrupt data and errors of a CAN bus, for the decoder of one of its devices.
+
+Invariant: the output depends only on the frames added; no clock and no bus is read.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_daemon.model import Corrupt, DeviceEvent
+from jointfit_protocols import can
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Decoded, DeviceEventKind
+
+_REPEAT_NS = 1_000_000_000
+"""Shortest interval, ns, between reports of the same error."""
+
+
+class BusEvents:
+    """Counts discarded bytes, and reports errors."""
+
+    def __init__(self) -> None:
+        self.discarded_bytes = 0
+        """Bytes of rejected records, and of lost lines of an adapter."""
+        self._text = ""
+        self._reported_ns = 0
+
+    def discard(self, count: int, reason: str) -> Corrupt:
+        """Return and count `count` corrupt bytes."""
+        self.discarded_bytes += count
+        return Corrupt(count, reason)
+
+    def add_error_frame(self, frame: can.CanFrame) -> list[Decoded]:
+        """Return the events of an error frame of the controller, its driver or the host."""
+        if frame.can_id == can.HOST_CORRUPT:
+            return [self.discard(can.host_count(frame), "no SLCAN line")]
+        if frame.can_id == can.HOST_DROPPED:
+            lost = can.host_count(frame)
+            text = f"this host was too slow: the kernel dropped {lost} CAN frames"
+            return [DeviceEvent("warning", text, {"dropped_frames": lost})]
+
+        text, serious = can.describe_error(frame)
+        return self.limited("error" if serious else "warning", text, frame.t_ns)
+
+    def limited(self, kind: DeviceEventKind, text: str, t_ns: int) -> list[Decoded]:
+        """Return an event unless the same one was reported within a second before `t_ns`."""
+        if text == self._text and 0 <= t_ns - self._reported_ns < _REPEAT_NS:
+            return []
+        self._text, self._reported_ns = text, t_ns
+        return [DeviceEvent(kind, text)]

@@ -1,0 +1,51 @@
+"""Reception of a device on a serial port, over all attempts of its driver."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from jointfit_drivers.ports.serial_port import SerialPort
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from jointfit_daemon.driver import Emit
+    from jointfit_drivers.serial_imu import SerialImuSettings
+
+    Start = Callable[[SerialPort, bool], Awaitable[None]]
+
+_HUNT_EVERY = 10
+"""Number of attempts to connect per search at other speeds, which takes longer than an attempt."""
+
+
+class SerialReception:
+    """Opens the port of a device, starts the device, and reads.
+
+    Parameters
+    ----------
+    settings : SerialImuSettings
+        Its table of rig.toml.
+    """
+
+    def __init__(self, settings: SerialImuSettings) -> None:
+        self._settings = settings
+        self._attempts = 0
+
+    async def run(self, emit: Emit, start: Start) -> None:
+        """Read until cancelled.
+
+        Parameters
+        ----------
+        emit : callable
+            Receives every chunk after the start.
+        start : callable
+            Makes the device on the open port send. Its second argument is whether it may search for
+            a silent device at other speeds.
+        """
+        settings = self._settings
+        with SerialPort(settings.port, settings.baud) as port:
+            hunt = self._attempts % _HUNT_EVERY == 0
+            self._attempts += 1
+            await start(port, hunt)
+            self._attempts = 0
+            await port.pump(emit, settings.lost_after_s)
