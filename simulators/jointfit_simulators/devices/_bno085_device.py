@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from math import asin, atan2, degrees
 from typing import TYPE_CHECKING
 
+from typing_extensions import override
+
 from jointfit_protocols.bno085 import (
     ROTATION_REPORTS,
     HubReport,
@@ -28,9 +30,9 @@ from jointfit_protocols.bno085 import (
 )
 from jointfit_protocols.bno085 import ShtpBufferStatus as _Status
 from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.devices._inertial_signals import InertialSignals
 from jointfit_simulators.imu_device import clean_wire
-from jointfit_simulators.wires import PtyLine
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,7 +40,6 @@ if TYPE_CHECKING:
 
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
-_BITS = 10
 _G = 9.80665
 _AGE = 12
 """Time between measurement and transmission, 100 us."""
@@ -70,7 +71,7 @@ class Bno085DeviceOptions:
     accuracy: int = 3
 
 
-class Bno085Device:
+class Bno085Device(SerialDevice):
     """`ImuDevice` on a pty.
 
     Parameters
@@ -83,6 +84,8 @@ class Bno085Device:
         Noise applied to each packet to the host.
     """
 
+    garbage_bits = 0x2A
+
     def __init__(
         self,
         link: Path,
@@ -91,16 +94,14 @@ class Bno085Device:
         wire_noise: WireNoise = clean_wire,
     ) -> None:
         self._options = options or Bno085DeviceOptions()
-        self._line, self._noise = PtyLine(link), wire_noise
+        super().__init__(link, wire_noise)
         self._inertial = InertialSignals()
         self._codec = ShtpCodec()
         self.intervals: dict[int, int] = {}
         """Interval of each enabled report, us."""
         self._packets: dict[int, int] = {}
-        self._to_lose = self.sent = 0
         self.counter = 0
         """Number of the next sample; it is sent modulo 256."""
-        self.unplug, self.plug = self._line.unplug, self._line.plug
 
     # --- control by the simulation ------------------------------------------------------------
 
@@ -117,11 +118,10 @@ class Bno085Device:
         return 1e6 / min(self.intervals.values()) if self.intervals else 0.0
 
     @property
-    def line_ns(self) -> int:
-        """Transmission time of a sample at the speed of the host's port, ns."""
-        baud = self._line.host_baud
-        size = len(self._sample((1.0, 0.0, 0.0, 0.0)))
-        return size * _BITS * 1_000_000_000 // baud if baud else 0
+    @override
+    def sample_bytes(self) -> int:
+        """Bytes of a sample on the wire."""
+        return len(self._sample((1.0, 0.0, 0.0, 0.0)))
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now, as described in `ImuDevice.push`."""
@@ -133,13 +133,6 @@ class Bno085Device:
         elif self.streaming and self._write(wire):
             self.sent += 1
 
-    def lose(self, count: int) -> None:
-        """Lose the next `count` samples: they are numbered and not sent."""
-        self._to_lose += count
-
-    def edge(self, device_ns: int) -> None:
-        """Ignore an edge: the device has no sync input."""
-
     def power_cycle(self) -> None:
         """Interrupt the power supply: settings and numbers restart."""
         self.intervals.clear()
@@ -149,19 +142,22 @@ class Bno085Device:
             self._send(ShtpChannel.COMMAND, _ADVERTISEMENT)
             self._send(ShtpChannel.EXECUTABLE, b"\x01")
 
+    @override
     async def run(self) -> None:
         """Serve until cancelled."""
         if self._options.mode == "shtp" and not self.intervals:
             self.power_cycle()
-        await self._line.serve(self._receive)
+        await super().run()
 
     # --- requests of the host -----------------------------------------------------------------
 
     @property
+    @override
     def _same_speed(self) -> bool:
         wanted = _RVC_BAUD if self._options.mode == "rvc" else _SHTP_BAUD
         return not self._options.checks_speed or self._line.host_baud == wanted
 
+    @override
     def _receive(self, data: bytes) -> None:
         if self._options.mode == "rvc" or not self._same_speed:
             return
@@ -226,11 +222,6 @@ class Bno085Device:
 
     def _send(self, channel: int, payload: bytes) -> None:
         self._write(self._packet(channel, payload))
-
-    def _write(self, wire: bytes) -> bool:
-        if not self._same_speed:  # bytes, none of them correct
-            wire = bytes((byte * 7 + 1) & 0x2A for byte in wire)
-        return self._line.write(self._noise(wire))
 
 
 def euler_deg(q: Quaternion, order: Literal["zxy", "zyx"]) -> tuple[float, float, float]:

@@ -24,6 +24,7 @@ from jointfit_protocols.lpms.channels import (
 from jointfit_protocols.lpms.configuration import TABLES, LpmsCommand
 from jointfit_protocols.lpms.measurement import PacketLayout
 from jointfit_protocols.orientation import native_of
+from jointfit_simulators.devices._device_wire import CanDevice
 
 if TYPE_CHECKING:
     from jointfit_protocols.orientation import World
@@ -57,7 +58,7 @@ class LpmsCanDeviceOptions:
     first_tick: int = 0
 
 
-class LpmsCanDevice:
+class LpmsCanDevice(CanDevice):
     """`ImuDevice` on a CAN wire.
 
     Parameters
@@ -69,14 +70,13 @@ class LpmsCanDevice:
     """
 
     def __init__(self, wire: CanWire, options: LpmsCanDeviceOptions | None = None) -> None:
-        self.wire = wire
+        super().__init__(wire)
         self._options = options = options or LpmsCanDeviceOptions()
         self.rate_hz = options.rate_hz
         """Configured samples per second."""
         self._ids = options.ids or tpdo_ids(options.node)
         self._used = {(channel - 1) // PER_FRAME[options.precision] for channel in options.mapping}
         self._layout = PacketLayout(TABLES[1], TABLES[1].quaternion)
-        self._last_ns = 0
         self._beat_ns: int | None = None
         self._to_lose = 0
         self._to_lose_frames: dict[int, int] = {}
@@ -84,16 +84,6 @@ class LpmsCanDevice:
         """Whether the frames of a period leave in descending order."""
         self.counter = 0
         """Number of samples since power-up; it is not sent."""
-        self.sent = 0
-        """Number of quaternions written to the wire."""
-
-    @property
-    def streaming(self) -> bool:
-        """Whether the bus is open."""
-        return self.wire.is_open
-
-    def edge(self, device_ns: int) -> None:
-        """Ignore an edge on the sync input; no message reports it."""
 
     @property
     def line_ns(self) -> int:
@@ -131,18 +121,6 @@ class LpmsCanDevice:
         self.counter = 0
         if self._options.mode == "canopen":
             self.wire.send([encode_heartbeat(HEARTBEAT + self._options.node, BOOTED)])
-
-    def unplug(self) -> None:
-        """Disconnect the wire."""
-        self.wire.unplug()
-
-    def plug(self) -> None:
-        """Connect the wire; the sensor remained powered."""
-        self.wire.plug()
-
-    async def run(self) -> None:
-        """Serve until cancelled."""
-        await self.wire.run()
 
     def _send_heartbeat(self, device_ns: int) -> None:
         """Send a heartbeat if one is due."""

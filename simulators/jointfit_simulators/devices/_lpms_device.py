@@ -11,6 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from typing_extensions import override
+
 from jointfit_protocols.lpms import LpBusCodec, LpBusMessage, encode
 from jointfit_protocols.lpms.configuration import (
     TABLES,
@@ -23,8 +25,8 @@ from jointfit_protocols.lpms.configuration import (
 )
 from jointfit_protocols.lpms.measurement import TICK_MODULUS, PacketLayout, tick_of
 from jointfit_protocols.orientation import native_of
+from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.imu_device import clean_wire
-from jointfit_simulators.wires import PtyLine
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,8 +34,6 @@ if TYPE_CHECKING:
     from jointfit_protocols.orientation import World
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
-_BITS = 10
-"""Bits of one byte on the line (8N1)."""
 _NS = 1_000_000_000
 _STATUS, _SLEEP, _GYRO_CALIBRATION = 0x05, 0x08, 0x16
 """Commands of generation 1 that a host takes for others of generation 3."""
@@ -79,7 +79,7 @@ class LpmsDeviceOptions:
     """Rates that its firmware has not, Hz."""
 
 
-class LpmsDevice:
+class LpmsDevice(SerialDevice):
     """`ImuDevice` on a pty.
 
     Parameters
@@ -101,8 +101,7 @@ class LpmsDevice:
     ) -> None:
         self._options = options = options or LpmsDeviceOptions()
         self._table = TABLES[options.generation]
-        self._line = PtyLine(link)
-        self._noise = wire_noise
+        super().__init__(link, wire_noise, options.baud)
         self._decoder = LpBusCodec()
         self.flash = options.configuration or _FACTORY[options.generation]
         """Settings that survive a loss of power."""
@@ -111,11 +110,8 @@ class LpmsDevice:
         self.streaming = options.streams_at_once
         """Whether the sensor is in stream mode."""
         self.asleep = False
-        self._epoch_ns = self._last_ns = self._to_lose = 0
         self.counter = 0
         """Number of samples since power-up; it is not sent."""
-        self.sent = 0
-        """Number of complete samples written to the wire."""
         self.flash_writes = 0
         self.factory_resets = 0
         self.gyro_calibrations = 0
@@ -130,11 +126,10 @@ class LpmsDevice:
         return float(self.configuration.rate_hz or 0)
 
     @property
-    def line_ns(self) -> int:
-        """Transmission time of a sample at the speed of the host's port, ns."""
-        baud = self._line.host_baud
-        size = len(encode(LpmsCommand.DATA, self._packet(0, (1.0, 0.0, 0.0, 0.0))))
-        return size * _BITS * _NS // baud if baud else 0
+    @override
+    def sample_bytes(self) -> int:
+        """Bytes of a sample on the wire."""
+        return len(encode(LpmsCommand.DATA, self._packet(0, (1.0, 0.0, 0.0, 0.0))))
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now in stream mode, as described in `ImuDevice.push`."""
@@ -152,36 +147,16 @@ class LpmsDevice:
         data = self._packet(device_ns, q_world_sensor)
         self.sent += self._send(LpmsCommand.DATA, data)
 
-    def edge(self, device_ns: int) -> None:
-        """Ignore an edge on the sync input; no message reports it."""
-
-    def lose(self, count: int) -> None:
-        """Lose the next `count` samples: time continues, but they are not sent."""
-        self._to_lose += count
-
     def power_cycle(self) -> None:
         """Interrupt the power supply: time restarts, and the settings are those in flash."""
         self._epoch_ns, self.counter = self._last_ns, 0
         self.configuration, self.asleep = self.flash, False
         self.streaming = self._options.streams_at_once
 
-    def unplug(self) -> None:
-        """Disconnect the wire."""
-        self._line.unplug()
-
-    def plug(self) -> None:
-        """Connect the wire; the sensor remained powered."""
-        self._line.plug()
-
-    async def run(self) -> None:
-        """Serve until cancelled."""
-        await self._line.serve(self._receive)
-
     # --- commands of the host -----------------------------------------------------------------
 
+    @override
     def _receive(self, data: bytes) -> None:
-        if not self._same_speed:
-            data = bytes(byte ^ 0x55 for byte in data)
         for event in self._decoder.feed(data):
             is_mine = isinstance(event, LpBusMessage) and event.sensor_id == self._options.sensor_id
             if isinstance(event, LpBusMessage) and is_mine and not self.asleep:
@@ -247,10 +222,6 @@ class LpmsDevice:
 
     # --- messages to the host -----------------------------------------------------------------
 
-    @property
-    def _same_speed(self) -> bool:
-        return self._options.baud in {None, self._line.host_baud}
-
     def _acknowledge(self, *, accepted: bool = True) -> None:
         if self._options.acknowledges:
             self._send(LpmsCommand.ACK if accepted else LpmsCommand.NACK)
@@ -262,11 +233,6 @@ class LpmsDevice:
             lrc = (options.sensor_id + command + len(data) + sum(data)) & 0xFFFF
             wire = wire[:-4] + lrc.to_bytes(2, "little") + wire[-2:]
         return self._write(wire)
-
-    def _write(self, wire: bytes) -> bool:
-        if not self._same_speed:  # the same number of bytes, none of them correct
-            wire = bytes((byte * 7 + 1) & 0x7F for byte in wire)
-        return self._line.write(self._noise(wire))
 
     def _tick(self, device_ns: int) -> int:
         hz = self._options.tick_hz or self._table.tick_hz

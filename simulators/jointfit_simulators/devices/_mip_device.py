@@ -11,6 +11,8 @@ import asyncio
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from typing_extensions import override
+
 from jointfit_protocols.mip import MipCodec, MipPacket, commands, encode
 from jointfit_protocols.mip.commands import (
     Base,
@@ -31,20 +33,17 @@ from jointfit_protocols.mip.data import (
     field_bytes,
 )
 from jointfit_protocols.orientation import native_of
+from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.devices._inertial_signals import InertialSignals
 from jointfit_simulators.imu_device import clean_wire
-from jointfit_simulators.wires import PtyLine
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from pathlib import Path
 
     from jointfit_protocols.mip import MipField
     from jointfit_protocols.mip.commands import Family
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
-_BITS = 10
-"""Bits of one byte on the line (8N1)."""
 _FRAME_BYTES = 6
 """Framing of a packet, bytes."""
 _SPEED_BYTES = 4
@@ -115,7 +114,7 @@ class _StreamState:
     """Samples that are not sent yet: time and orientation."""
 
 
-class MipDevice:
+class MipDevice(SerialDevice):
     """`ImuDevice` on a pty.
 
     Parameters
@@ -128,6 +127,8 @@ class MipDevice:
         Noise applied to each packet to the host.
     """
 
+    garbage_bits = 0x3F
+
     def __init__(
         self,
         link: Path,
@@ -136,8 +137,7 @@ class MipDevice:
         wire_noise: WireNoise = clean_wire,
     ) -> None:
         self._options = options = options or MipDeviceOptions()
-        self._line = PtyLine(link)
-        self._noise = wire_noise
+        super().__init__(link, wire_noise, options.baud)
         self._codec = MipCodec()
         self._inertial = InertialSignals()
         self._base_rates = dict(options.base_rates_hz)
@@ -148,13 +148,7 @@ class MipDevice:
             )
             for data_set in self._base_rates
         }
-        self.baud = options.baud
-        """Speed of the device, bit/s; None: any."""
-        self._timer: asyncio.TimerHandle | None = None
-        self._epoch_ns = self._last_ns = self._to_lose = 0
         self._changing_speed = False
-        self.sent = 0
-        """Number of complete samples written to the wire."""
         self.writes = 0
         """Number of settings written."""
         self.saves = 0
@@ -188,15 +182,14 @@ class MipDevice:
         return 0.0
 
     @property
-    def line_ns(self) -> int:
-        """Transmission time of a sample at the speed of the host's port, ns."""
-        baud = self._line.host_baud
-        size = sum(
+    @override
+    def sample_bytes(self) -> int:
+        """Bytes of a sample on the wire."""
+        return sum(
             _FRAME_BYTES + sum(field_bytes(data_set, one.field) for one in state.outputs)
             for data_set, state in self._streams.items()
             if state.is_on
         )
-        return size * _BITS * 1_000_000_000 // baud if baud else 0
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now while streaming, as described in `ImuDevice.push`."""
@@ -224,41 +217,17 @@ class MipDevice:
             complete &= not fields or self._write(encode(data_set, fields))
         self.sent += complete
 
-    def edge(self, device_ns: int) -> None:
-        """Ignore an edge: no sync input is wired."""
-
-    def lose(self, count: int) -> None:
-        """Lose the next `count` samples."""
-        self._to_lose += count
-
     def power_cycle(self) -> None:
         """Interrupt the power supply: the clock restarts, and saved settings apply."""
         self._epoch_ns = self._last_ns
         self._power_up()
 
-    def unplug(self) -> None:
-        """Disconnect the wire."""
-        self._line.unplug()
-
-    def plug(self) -> None:
-        """Connect the wire; the device remained powered."""
-        self._line.plug()
-
-    async def run(self) -> None:
-        """Serve until cancelled."""
-        try:
-            await self._line.serve(self._receive)
-        finally:
-            if self._timer is not None:
-                self._timer.cancel()
-
     # --- commands of the host -----------------------------------------------------------------
 
+    @override
     def _receive(self, data: bytes) -> None:
         if self._changing_speed:
             return
-        if not self._same_speed:
-            data = bytes(byte ^ 0x55 for byte in data)
         for event in self._codec.feed(data):
             if isinstance(event, MipPacket):
                 for command, content in event.fields:
@@ -408,20 +377,6 @@ class MipDevice:
         return commands.OK, ()
 
     # --- packets to the host ------------------------------------------------------------------
-
-    @property
-    def _same_speed(self) -> bool:
-        return self.baud in {None, self._line.host_baud}
-
-    def _after(self, delay_s: float, act: Callable[[], None]) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer = asyncio.get_running_loop().call_later(delay_s, act)
-
-    def _write(self, wire: bytes) -> bool:
-        if not self._same_speed:  # the same number of bytes, none of them correct
-            wire = bytes((byte * 7 + 1) & 0x3F for byte in wire)
-        return self._line.write(self._noise(wire))
 
     def _fields(
         self, data_set: int, state: _StreamState, device_ns: int, q: Quaternion

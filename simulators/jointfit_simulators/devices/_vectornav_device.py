@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from math import asin, atan2, degrees
 from typing import TYPE_CHECKING, Any
 
+from typing_extensions import override
+
 from jointfit_protocols.orientation import native_of
 from jointfit_protocols.vectornav import (
     BinaryLayout,
@@ -26,17 +28,15 @@ from jointfit_protocols.vectornav.registers import (
     decode_output,
     encode_output,
 )
+from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.devices._inertial_signals import InertialSignals
 from jointfit_simulators.imu_device import clean_wire
-from jointfit_simulators.wires import PtyLine
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
-_BITS = 10
-"""Bits of one byte on the line (8N1)."""
 _OUTPUTS = range(Register.BINARY_OUTPUT, Register.BINARY_OUTPUT + 3)
 _INVALID_PARAMETER, _INVALID_REGISTER, _INVALID_COMMAND = 7, 8, 4
 _IDENTITY = "1,0,0,0,1,0,0,0,1"
@@ -65,7 +65,7 @@ class VectorNavDeviceOptions:
     """Clock at power-up, ns."""
 
 
-class VectorNavDevice:
+class VectorNavDevice(SerialDevice):
     """`ImuDevice` on a pty.
 
     Parameters
@@ -78,6 +78,8 @@ class VectorNavDevice:
         Noise applied to each message to the host.
     """
 
+    garbage_bits = 0x1F
+
     def __init__(
         self,
         link: Path,
@@ -86,18 +88,14 @@ class VectorNavDevice:
         wire_noise: WireNoise = clean_wire,
     ) -> None:
         self._options = options = options or VectorNavDeviceOptions()
-        self._line = PtyLine(link)
-        self._noise = wire_noise
+        super().__init__(link, wire_noise, options.baud)
         self._codec = VectorNavCodec()
         self._inertial = InertialSignals()
         self._stored_outputs = dict(
             zip(_OUTPUTS, (BinaryOutput(*one) for one in options.outputs), strict=False)
         )
         self._stored_text = options.text_output
-        self._epoch_ns = self._last_ns = self._to_lose = 0
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
-        self.sent = 0
-        """Number of complete samples written to the wire."""
         self.writes = 0
         """Number of registers written."""
         self.stores = 0
@@ -131,15 +129,14 @@ class VectorNavDevice:
         return 0.0
 
     @property
-    def line_ns(self) -> int:
-        """Transmission time of a sample at the speed of the host's port, ns."""
-        baud = self._line.host_baud
-        size = sum(
+    @override
+    def sample_bytes(self) -> int:
+        """Bytes of a sample on the wire."""
+        return sum(
             len(self._output(one, 0, self._q))
             for one in self.outputs.values()
             if one.ports and one.fields
         )
-        return size * _BITS * 1_000_000_000 // baud if baud else 0
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now while streaming, as described in `ImuDevice.push`."""
@@ -165,35 +162,15 @@ class VectorNavDevice:
                 complete &= self._write(self._output(one, device_ns, q_world_sensor))
         self.sent += complete
 
-    def edge(self, device_ns: int) -> None:
-        """Ignore an edge: no sync input is wired."""
-
-    def lose(self, count: int) -> None:
-        """Lose the next `count` samples."""
-        self._to_lose += count
-
     def power_cycle(self) -> None:
         """Interrupt the power supply: the clock restarts, and stored registers apply."""
         self._epoch_ns = self._last_ns
         self._power_up()
 
-    def unplug(self) -> None:
-        """Disconnect the wire."""
-        self._line.unplug()
-
-    def plug(self) -> None:
-        """Connect the wire; the device remained powered."""
-        self._line.plug()
-
-    async def run(self) -> None:
-        """Serve until cancelled."""
-        await self._line.serve(self._receive)
-
     # --- requests of the host -----------------------------------------------------------------
 
+    @override
     def _receive(self, data: bytes) -> None:
-        if not self._same_speed:
-            data = bytes(byte ^ 0x55 for byte in data)
         for event in self._codec.feed(data):
             if isinstance(event, TextMessage):
                 self._write(encode_text(self._reply(event)))
@@ -251,15 +228,6 @@ class VectorNavDevice:
         return True
 
     # --- messages to the host -----------------------------------------------------------------
-
-    @property
-    def _same_speed(self) -> bool:
-        return self._options.baud in {None, self._line.host_baud}
-
-    def _write(self, wire: bytes) -> bool:
-        if not self._same_speed:  # the same number of bytes, none of them correct
-            wire = bytes((byte * 7 + 1) & 0x1F for byte in wire)
-        return self._line.write(self._noise(wire))
 
     def _output(self, output: BinaryOutput, device_ns: int, q: Quaternion) -> bytes:
         t_ns = self._options.first_ns + device_ns - self._epoch_ns

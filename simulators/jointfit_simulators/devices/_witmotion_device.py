@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from math import atan2, degrees, radians
 from typing import TYPE_CHECKING
 
+from typing_extensions import override
+
 from jointfit_protocols.orientation import native_of
 from jointfit_protocols.witmotion import (
     BAUD_CODES,
@@ -29,9 +31,9 @@ from jointfit_protocols.witmotion import (
     encode_time,
 )
 from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.devices._inertial_signals import InertialSignals
 from jointfit_simulators.imu_device import clean_wire
-from jointfit_simulators.wires import PtyLine
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,7 +62,6 @@ _EPOCH_MS = 475_372_800_000
 _FIELD_COUNTS = 500
 """Counts of the magnitude of the magnetic field."""
 _GLITCH_MS = 3_600_000
-_BITS = 10
 _OTHER_FRAME = struct.Struct("<BB9h")
 
 
@@ -85,7 +86,7 @@ class WitMotionDeviceOptions:
     """Samples between two glitches of the calendar time; 0: none."""
 
 
-class WitMotionDevice:
+class WitMotionDevice(SerialDevice):
     """`ImuDevice` on a pty.
 
     Parameters
@@ -101,6 +102,7 @@ class WitMotionDevice:
     """
 
     streaming = True  # from power-on, independent of the host
+    garbage_bits = 0x4A
 
     def __init__(
         self,
@@ -111,7 +113,8 @@ class WitMotionDevice:
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._options = options = options or WitMotionDeviceOptions()
-        self._line, self._noise, self._now_s = PtyLine(link), wire_noise, now_s
+        super().__init__(link, wire_noise)
+        self._now_s = now_s
         self._inertial = InertialSignals()
         self.flash = {
             int(WitMotionRegister.CONTENT): options.content,
@@ -123,12 +126,10 @@ class WitMotionDevice:
         """Registers in force; `flash` contains those that survive power-off."""
         self._unlocked_until_s = 0.0
         self._rest = b""
-        self._to_lose = self.sent = 0
         self.counter = 0
         """Number of the next sample; the device does not send it."""
         self.saved = 0
         """Number of commands that stored the registers in flash."""
-        self.unplug, self.plug = self._line.unplug, self._line.plug
 
     # --- control by the simulation ------------------------------------------------------------
 
@@ -139,11 +140,10 @@ class WitMotionDevice:
         return float(codes.get(self.registers[WitMotionRegister.RATE], 10))
 
     @property
-    def line_ns(self) -> int:
-        """Transmission time of a sample at the speed of the host's port, ns."""
-        baud = self._line.host_baud
-        size = len(self._frames(0, (1.0, 0.0, 0.0, 0.0)))
-        return size * _BITS * 1_000_000_000 // baud if baud else 0
+    @override
+    def sample_bytes(self) -> int:
+        """Bytes of a sample on the wire."""
+        return len(self._frames(0, (1.0, 0.0, 0.0, 0.0)))
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now, as described in `ImuDevice.push`."""
@@ -156,25 +156,15 @@ class WitMotionDevice:
         elif self._write(self._frames(device_ns, q_world_sensor)):
             self.sent += 1
 
-    def lose(self, count: int) -> None:
-        """Lose the next `count` samples: they are not sent."""
-        self._to_lose += count
-
-    def edge(self, device_ns: int) -> None:
-        """Ignore an edge: the device has no sync input."""
-
     def power_cycle(self) -> None:
         """Interrupt the power supply: settings that were not saved are lost."""
         self.counter = 0
         self.registers = dict(self.flash)
         self._unlocked_until_s = 0.0
 
-    async def run(self) -> None:
-        """Serve until cancelled."""
-        await self._line.serve(self._receive)
-
     # --- commands of the host -----------------------------------------------------------------
 
+    @override
     def _receive(self, data: bytes) -> None:
         if self._options.ignores_commands or not self._same_speed:
             return
@@ -206,15 +196,11 @@ class WitMotionDevice:
     # --- frames to the host -------------------------------------------------------------------
 
     @property
+    @override
     def _same_speed(self) -> bool:
         code = self.registers.get(WitMotionRegister.BAUD)
         host = self._line.host_baud
         return code is None or (host is not None and BAUD_CODES.get(host) == code)
-
-    def _write(self, wire: bytes) -> bool:
-        if not self._same_speed:  # the same number of bytes, none of them correct
-            wire = bytes((byte * 7 + 1) & 0x4A for byte in wire)
-        return self._line.write(self._noise(wire))
 
     def _frames(self, device_ns: int, q: Quaternion) -> bytes:
         """Return the frames of one sample, in the order of their kinds."""

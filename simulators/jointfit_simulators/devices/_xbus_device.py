@@ -7,25 +7,26 @@ WakeUp after power-up. Source: MT0101P rev. 2020.A.
 
 from __future__ import annotations
 
-import asyncio
 import random
 from dataclasses import dataclass
 from math import ceil
 from typing import TYPE_CHECKING
+
+from typing_extensions import override
 
 from jointfit_protocols.orientation import native_of
 from jointfit_protocols.xbus import MASTER, XbusCodec, XbusMessage, XbusMessageId, encode, mtdata2
 from jointfit_protocols.xbus import configuration as setup
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_protocols.xbus.sync_lines import IN1
+from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.devices._inertial_signals import InertialSignals
 from jointfit_simulators.devices._xbus_legacy import legacy_content, legacy_reply
 from jointfit_simulators.devices._xbus_sync_inputs import SyncInputs
 from jointfit_simulators.imu_device import clean_wire
-from jointfit_simulators.wires import PtyLine
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
     from pathlib import Path
 
     from jointfit_protocols.orientation import World
@@ -43,8 +44,6 @@ _COUNTS = 1 << 16
 """Modulus of the packet counter."""
 _FOREIGN_EVERY = 12
 """Number of messages between those of a GNSS receiver: 4 Hz with orientations at 50 Hz."""
-_BITS = 10
-"""Bits of one byte on the line (8N1)."""
 _PARAMETER = b"\x21"
 """Error code for a parameter out of range."""
 _INVALID = b"\x04"
@@ -96,7 +95,7 @@ class XbusDeviceOptions:
     first_counter: int = 0
 
 
-class XbusDevice:
+class XbusDevice(SerialDevice):
     """`ImuDevice` on a pty.
 
     Parameters
@@ -117,8 +116,7 @@ class XbusDevice:
         wire_noise: WireNoise = clean_wire,
     ) -> None:
         self._options = options = options or XbusDeviceOptions()
-        self._line = PtyLine(link)
-        self._noise = wire_noise
+        super().__init__(link, wire_noise, options.baud)
         self._sync = SyncInputs(options.sync)
         self._inertial = InertialSignals()
         self._decoder = XbusCodec()
@@ -132,11 +130,8 @@ class XbusDevice:
         self._stuck, self._waking = options.stuck, False
         self.counter = options.first_counter
         """Number of the next message."""
-        self._epoch_ns = self._last_ns = self._messages = self._to_lose = 0
+        self._messages = 0
         self._random = random.Random(3)  # noqa: S311 - the same GNSS times in every run
-        self._timer: asyncio.TimerHandle | None = None
-        self.sent = 0
-        """Number of complete samples written to the wire."""
         self.flash_writes = 0
         """Number of settings stored in flash."""
 
@@ -153,11 +148,10 @@ class XbusDevice:
         return 0.0
 
     @property
-    def line_ns(self) -> int:
-        """Transmission time of a sample at the speed of the host's port, ns."""
-        baud = self._line.host_baud
-        size = len(encode(XbusMessageId.MT_DATA2, self._content(0, 0, (1.0, 0.0, 0.0, 0.0), {})))
-        return size * _BITS * 1_000_000_000 // baud if baud else 0
+    @override
+    def sample_bytes(self) -> int:
+        """Bytes of a sample on the wire."""
+        return len(encode(XbusMessageId.MT_DATA2, self._content(0, 0, (1.0, 0.0, 0.0, 0.0), {})))
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now in measurement mode, as described in `ImuDevice.push`."""
@@ -170,6 +164,7 @@ class XbusDevice:
         if self._measure(self._ticks(device_ns), q_world_sensor):
             self.sent += 1
 
+    @override
     def edge(self, device_ns: int) -> None:
         """Add a rising edge on the first sync input."""
         self._sync.edge(IN1, self._ticks(device_ns) % self._modulus)
@@ -178,10 +173,6 @@ class XbusDevice:
     def sync(self) -> tuple[setup.SyncSetting, ...]:
         """Synchronisation settings in force."""
         return self._sync.entries
-
-    def lose(self, count: int) -> None:
-        """Lose the next `count` messages: the counter increments, but they are not sent."""
-        self._to_lose += count
 
     def power_cycle(self) -> None:
         """Interrupt the power supply: clock and counter restart, and WakeUp is sent."""
@@ -196,29 +187,17 @@ class XbusDevice:
 
         self._after(WAKE_UP_S, measure)
 
-    def unplug(self) -> None:
-        """Disconnect the wire."""
-        self._line.unplug()
-
-    def plug(self) -> None:
-        """Connect the wire; the device remained powered."""
-        self._line.plug()
-
+    @override
     async def run(self) -> None:
         """Serve until cancelled."""
         if self._options.wakes_up:
             self.power_cycle()
-        try:
-            await self._line.serve(self._receive)
-        finally:
-            if self._timer is not None:
-                self._timer.cancel()
+        await super().run()
 
     # --- requests of the host -----------------------------------------------------------------
 
+    @override
     def _receive(self, data: bytes) -> None:
-        if not self._same_speed:
-            data = bytes(byte ^ 0x55 for byte in data)
         for event in self._decoder.feed(data):
             if isinstance(event, XbusMessage):
                 self._answer(event)
@@ -320,20 +299,8 @@ class XbusDevice:
 
     # --- messages to the host -----------------------------------------------------------------
 
-    @property
-    def _same_speed(self) -> bool:
-        return self._options.baud in {None, self._line.host_baud}
-
-    def _after(self, delay_s: float, act: Callable[[], None]) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer = asyncio.get_running_loop().call_later(delay_s, act)
-
     def _send(self, mid: int, data: bytes = b"", bid: int = MASTER) -> bool:
-        wire = encode(mid, data, bid)
-        if not self._same_speed:  # the same number of bytes, none of them correct
-            wire = bytes((byte * 7 + 1) & 0x7F for byte in wire)
-        return self._line.write(self._noise(wire))
+        return self._write(encode(mid, data, bid))
 
     def _ticks(self, device_ns: int) -> int:
         return self._options.first_tick + (device_ns - self._epoch_ns) // setup.TICK_NS

@@ -21,6 +21,7 @@ from jointfit_protocols.xcdi import (
     layout,
     quaternion_counts,
 )
+from jointfit_simulators.devices._device_wire import CanDevice
 
 if TYPE_CHECKING:
     from jointfit_protocols.xcdi import ByteOrder
@@ -46,7 +47,7 @@ class XcdiDeviceOptions:
     first_counter: int = 0
 
 
-class XcdiDevice:
+class XcdiDevice(CanDevice):
     """`ImuDevice` on a CAN wire.
 
     Parameters
@@ -58,24 +59,13 @@ class XcdiDevice:
     """
 
     def __init__(self, wire: CanWire, options: XcdiDeviceOptions | None = None) -> None:
-        self.wire = wire
+        super().__init__(wire)
         self._options = options or XcdiDeviceOptions()
         self.rate_hz = self._options.rate_hz
         """Configured groups per second."""
         self.counter = self._options.first_counter
         """Number of the next group."""
-        self._epoch_ns = self._last_ns = 0
         self._to_lose: dict[DataId | None, int] = {}  # None: whole groups
-        self.sent = 0
-        """Number of quaternions written to the wire."""
-
-    @property
-    def streaming(self) -> bool:
-        """Whether the bus is open."""
-        return self.wire.is_open
-
-    def edge(self, device_ns: int) -> None:
-        """Ignore an edge on the sync input; XCDI has no message for it."""
 
     @property
     def line_ns(self) -> int:
@@ -141,18 +131,6 @@ class XcdiDevice:
     def power_cycle(self) -> None:
         """Interrupt the power supply: clock and counter restart."""
         self._epoch_ns, self.counter = self._last_ns, self._options.first_counter
-
-    def unplug(self) -> None:
-        """Disconnect the wire."""
-        self.wire.unplug()
-
-    def plug(self) -> None:
-        """Connect the wire; the device remained powered."""
-        self.wire.plug()
-
-    async def run(self) -> None:
-        """Serve until cancelled."""
-        await self.wire.run()
 
     def _lost(self, data_id: DataId | None) -> bool:
         left = self._to_lose.get(data_id, 0)

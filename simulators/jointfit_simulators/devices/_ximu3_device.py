@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from math import asin, atan2, degrees
 from typing import TYPE_CHECKING, Literal
 
+from typing_extensions import override
+
 from jointfit_protocols.orientation import World, native_of
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_protocols.ximu3 import (
@@ -24,9 +26,9 @@ from jointfit_protocols.ximu3 import (
     encode_data,
     encode_text,
 )
+from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.devices._inertial_signals import InertialSignals
 from jointfit_simulators.imu_device import clean_wire
-from jointfit_simulators.wires import PtyLine
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -70,8 +72,6 @@ _ACCESSORY = 2
 _MAGNETIC_NS = 50_000_000
 """Interval of the magnetometer, ns, at divisor 1."""
 _BATTERY_NS = 1_000_000_000
-_BITS = 10
-"""Bits of one byte on the line (8N1)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class XImu3DeviceOptions:
     """Errors of its sensors; None: it measures exactly."""
 
 
-class XImu3Device:
+class XImu3Device(SerialDevice):
     """`ImuDevice` on a pty.
 
     Parameters
@@ -117,18 +117,15 @@ class XImu3Device:
         wire_noise: WireNoise = clean_wire,
     ) -> None:
         self._options = options = options or XImu3DeviceOptions()
-        self._line = PtyLine(link)
-        self._noise = wire_noise
+        super().__init__(link, wire_noise, options.baud)
         self._inertial = InertialSignals(options.errors)
         self._codec = XImu3Codec()
         self.settings = _FACTORY | dict(options.settings)
         """Settings in force."""
         self._pending = dict(self.settings)
-        self._epoch_ns = self._last_ns = self._pushes = self._to_lose = 0
+        self._pushes = 0
         self._next_ns = {DataKind.MAGNETIC: 0, DataKind.BATTERY: 0}
         self._error = options.error
-        self.sent = 0
-        """Number of complete samples written to the wire."""
         self.saves = 0
         """Number of times that the settings were saved."""
 
@@ -155,11 +152,10 @@ class XImu3Device:
         return self._pushes
 
     @property
-    def line_ns(self) -> int:
-        """Transmission time of a sample at the speed of the host's port, ns."""
-        baud = self._line.host_baud
-        size = len(self._ahrs_message(0, (1.0, 0.0, 0.0, 0.0)))
-        return size * _BITS * 1_000_000_000 // baud if baud else 0
+    @override
+    def sample_bytes(self) -> int:
+        """Bytes of a sample on the wire."""
+        return len(self._ahrs_message(0, (1.0, 0.0, 0.0, 0.0)))
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send the messages of one sample now, as described in `ImuDevice.push`."""
@@ -174,7 +170,7 @@ class XImu3Device:
 
         ticks = self._ticks(device_ns)
         if self._error:
-            self._send(
+            self._write(
                 encode_text(DataKind.ERROR, ticks, self._error.encode(), binary=self._binary)
             )
             self._error = ""
@@ -185,35 +181,20 @@ class XImu3Device:
         )
         sent = True
         if inertial and number % max(round(inertial / (ahrs or inertial)), 1) == 0:
-            sent = self._send(self._data(DataKind.INERTIAL, ticks, self._inertial_values()))
+            sent = self._write(self._data(DataKind.INERTIAL, ticks, self._inertial_values()))
         if ahrs:
-            sent = self._send(self._ahrs_message(ticks, q_world_sensor))
+            sent = self._write(self._ahrs_message(ticks, q_world_sensor))
         self.sent += sent
 
+    @override
     def edge(self, device_ns: int, *, rising: bool = True) -> None:
         """Send the message of an edge at the accessory's sync input, if one is in use."""
         if self.streaming and self.settings["serial_mode"] == _ACCESSORY:
-            self._send(self._data(DataKind.SYNC, self._ticks(device_ns), (float(rising),)))
-
-    def lose(self, count: int) -> None:
-        """Lose the next `count` samples."""
-        self._to_lose += count
+            self._write(self._data(DataKind.SYNC, self._ticks(device_ns), (float(rising),)))
 
     def power_cycle(self) -> None:
         """Interrupt the power supply: the clock restarts."""
         self._epoch_ns, self._next_ns = self._last_ns, dict.fromkeys(self._next_ns, 0)
-
-    def unplug(self) -> None:
-        """Disconnect the wire."""
-        self._line.unplug()
-
-    def plug(self) -> None:
-        """Connect the wire; the device remained powered."""
-        self._line.plug()
-
-    async def run(self) -> None:
-        """Serve until cancelled."""
-        await self._line.serve(self._receive)
 
     # --- commands of the host -----------------------------------------------------------------
 
@@ -221,12 +202,11 @@ class XImu3Device:
     def _alive(self) -> bool:
         return self._options.interface == "USB" or self.settings["serial_mode"] == 1
 
+    @override
     def _receive(self, data: bytes) -> None:
-        if not self._same_speed:
-            data = bytes(byte ^ 0x55 for byte in data)
         for command in self._codec.feed(data):
             if isinstance(command, XImu3Reply) and self._alive and self._options.answers:
-                self._send(encode_command(command.key, self._reply(command.key, command.value)))
+                self._write(encode_command(command.key, self._reply(command.key, command.value)))
 
     def _reply(self, key: str, value: object) -> object:
         """Return the value of the answer to a command."""
@@ -251,21 +231,12 @@ class XImu3Device:
     # --- messages to the host -----------------------------------------------------------------
 
     @property
-    def _same_speed(self) -> bool:
-        return self._options.baud in {None, self._line.host_baud}
-
-    @property
     def _binary(self) -> bool:
         return bool(self.settings["binary_mode_enabled"])
 
     def _number(self, key: str) -> int:
         value = self.settings[key]
         return value if isinstance(value, int) else 0
-
-    def _send(self, wire: bytes) -> bool:
-        if not self._same_speed:  # the same number of bytes, none of them correct
-            wire = bytes((byte * 7 + 1) & 0x7F for byte in wire)
-        return self._line.write(self._noise(wire))
 
     def _ticks(self, device_ns: int) -> int:
         return self._options.first_tick + (device_ns - self._epoch_ns) // TICK_NS
@@ -284,7 +255,7 @@ class XImu3Device:
         for kind, (interval_ns, values) in due.items():
             if interval_ns and device_ns - self._epoch_ns >= self._next_ns[kind]:
                 self._next_ns[kind] = device_ns - self._epoch_ns + interval_ns
-                self._send(self._data(kind, ticks, values))
+                self._write(self._data(kind, ticks, values))
 
     def _inertial_values(self) -> tuple[float, ...]:
         """Return angular rate, deg/s, and specific force, g."""
