@@ -32,6 +32,10 @@ _LATEST_TICKS = 1 << 52
 """Device time, us, that is not plausible: 142 years."""
 _RATE_TOLERANCE = 0.1
 """Largest relative difference of the measured rate from ``rate_hz`` without a warning."""
+_UNUSABLE = {
+    DataKind.MATRIX: "rotation matrix is not orthonormal",
+    DataKind.EULER: "Euler angles are not finite",
+}
 _OLD_PULSE_US = 10_000_000
 """Largest difference, us, between an edge and the last measurement."""
 
@@ -127,7 +131,7 @@ class XImu3Decoder:
         elif is_orientation(message):
             native = orientation_of(message)
             if native is None:
-                return [self._refuse(message, "rotation matrix is not orthonormal")]
+                return [self._refuse(message, _UNUSABLE[kind])]
             return self._measure(message, native)
 
         if kind == DataKind.SYNC:

@@ -7,7 +7,7 @@ with yaw, pitch and roll in the order of the message: roll, pitch, yaw.
 
 from __future__ import annotations
 
-from math import cos, radians, sin, sqrt
+from math import cos, isfinite, radians, sin, sqrt
 from typing import TYPE_CHECKING, cast
 
 from jointfit_protocols.ximu3 import DataKind
@@ -35,13 +35,13 @@ def is_orientation(message: XImu3Data) -> bool:
 def orientation_of(message: XImu3Data) -> Quaternion | None:
     """Return the quaternion of a message with an orientation, in the world of the device.
 
-    None if a rotation matrix is not orthonormal.
+    None if a rotation matrix is not orthonormal, or an Euler angle is not finite.
     """
     values = message.values
     if message.kind == DataKind.MATRIX:
         return _quaternion_of_matrix(values)
     if message.kind == DataKind.EULER:
-        return _quaternion_of_angles(*values)
+        return _quaternion_of_angles(*values) if all(map(isfinite, values)) else None
     return cast("Quaternion", values[:4])
 
 

@@ -176,9 +176,13 @@ def parse_rest(rest: bytes, end: int) -> XImu3Data | XImu3Reply | None:
     """Return the message that the end of a corrupt line contains; None if there is none.
 
     Accidental matches are the reason for narrower rules than those of `parse_line`: no text, no
-    multiplexer, and a plausible time.
+    multiplexer, a plausible time, and no blank in an object before its key, which would also make
+    the search of a line of braces slow.
     """
-    if rest[0] & 0x7F not in _KINDS and rest[0] != OBJECT:
+    if rest[0] == OBJECT:
+        if not rest.startswith(b'{"'):
+            return None
+    elif rest[0] & 0x7F not in _KINDS:
         return None
     if (rest[0] & 0x7F) in _TEXTS:
         return None

@@ -149,6 +149,12 @@ def test_a_matrix_that_is_no_rotation_is_refused() -> None:
     ]
 
 
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
+def test_euler_angles_that_are_not_finite_are_refused(value: float) -> None:
+    wire = encode_data("A", 1, (0.0, value, 0.0))
+    assert fed(decoder(), wire) == [Corrupt(len(wire), "Euler angles are not finite")]
+
+
 def test_older_firmware_sends_the_quaternion_with_accelerations() -> None:
     wire = encode_data("E", 1, (*swing(3), 0.0, 0.0, 0.0))
     assert len(samples(fed(decoder(), wire))) == 1
