@@ -154,7 +154,7 @@ class SharedBus:
         first_s: float | None = None,
         resembles: Callable[[bytes], bool] = lambda _: False,
         worked: bool = False,
-        configured_by: str = "over UART, Xsens MT Manager",
+        configured_by: str = "with the configuration program of the device",
     ) -> None:
         """Emit every frame with one of `ids`, in chunks of packed frames, until cancelled.
 
