@@ -47,6 +47,7 @@ NOT_RUN = {
     r"^make ": "minutes of processor time: CI runs the targets",
     r"python -m bench": "minutes of processor time: the options are checked against its --help",
     r"pytest": "the test suite itself",
+    r"examples/jointfit-example-driver": "changes the environment: tests/drivers installs it",
     r"examples/subscribers|http.server": "runs until it is stopped: tests/examples",
     r"^telegraf ": "is not in Debian: tests/examples evaluates its configuration",
     r"^colcon |^ros2 ": "needs ROS 2: tests/examples runs the bridge with a stand-in",

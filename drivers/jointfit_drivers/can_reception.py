@@ -25,7 +25,7 @@ _RAW_FRAMES = 20
 """Frames logged at debug level, so that the log contains raw data of a device."""
 
 
-class CanImuSettings(Protocol):
+class CanDeviceSettings(Protocol):
     """Keys of an ``[[imu]]`` table on a CAN bus."""
 
     @property
@@ -46,13 +46,13 @@ class CanReception:
 
     Parameters
     ----------
-    settings : CanImuSettings
+    settings : CanDeviceSettings
         Its table of rig.toml.
     configured_by : str
         How its identifiers and outputs are changed, for error messages.
     """
 
-    def __init__(self, settings: CanImuSettings, configured_by: str) -> None:
+    def __init__(self, settings: CanDeviceSettings, configured_by: str) -> None:
         self._settings = settings
         self._configured_by = configured_by
         self._worked = False

@@ -21,6 +21,10 @@ _RESUME_S = 0.5
 """Longest wait for the device to continue, s."""
 
 
+_LISTEN_FIRST_S = 0.4
+"""Time at each speed, s, for a device that sends without being asked."""
+
+
 class SpeedConversation(Protocol):
     """Conversation with a device whose speed is unknown."""
 
@@ -125,6 +129,47 @@ async def explain_silence(
     if not received:
         raise DeviceLostError(
             f"{port.path}: silent: check its power, and that TX and RX are not swapped"
+        )
+    raise DeviceMisconfiguredError(
+        f"{port.path}: the device on this port does not use {family}: it sends bytes, none of them "
+        f"{family} at any common speed: correct `port` or `driver`"
+    )
+
+
+async def explain_missing_messages(
+    port: SerialPort,
+    conversation: SerialConversation[Any],
+    *,
+    baud: int,
+    speeds: Sequence[int],
+    family: str,
+) -> NoReturn:
+    """Raise the error for a device that sends without being asked, and of which no message arrived.
+
+    Nothing is sent. Parameters as for `explain_silence`.
+
+    Raises
+    ------
+    DeviceLostError
+        The line is silent.
+    DeviceMisconfiguredError
+        The device sends at another speed, or is of another kind.
+    """
+    if not conversation.received:
+        raise DeviceLostError(
+            f"{port.path}: silent: check its power and cable, and that the device sends without "
+            "being asked"
+        )
+
+    async def sends() -> bool:
+        # no message is a reply: nothing that was received at another speed is emitted
+        return await conversation.receive(lambda _: False, _LISTEN_FIRST_S) is not None
+
+    speed = await find_other_speed(port, conversation, speeds, baud, sends)
+    if speed is not None:
+        raise DeviceMisconfiguredError(
+            f"{port.path}: {baud} baud, but no message can be decoded; "
+            f"the device sends at {speed}: set baud = {speed}"
         )
     raise DeviceMisconfiguredError(
         f"{port.path}: the device on this port does not use {family}: it sends bytes, none of them "

@@ -1,5 +1,6 @@
 """Samples of devices that a table of rig.toml describes: keys, places, units and plausibility."""
 
+from jointfit_drivers.table_samples._continuity import RecordContinuity
 from jointfit_drivers.table_samples._field_settings import (
     AsParts,
     ChecksumSettings,
@@ -7,7 +8,11 @@ from jointfit_drivers.table_samples._field_settings import (
     TableImuSettings,
 )
 from jointfit_drivers.table_samples._record_samples import RecordSamples
-from jointfit_drivers.table_samples._records import SampleForm, TableRecord
+from jointfit_drivers.table_samples._records import (
+    SampleForm,
+    TableRecord,
+    duration_ns,
+)
 from jointfit_drivers.table_samples._table_form import (
     Faults,
     FieldFaultError,
@@ -27,12 +32,14 @@ __all__ = [
     "Faults",
     "FieldFaultError",
     "FieldSettings",
+    "RecordContinuity",
     "RecordSamples",
     "SampleForm",
     "TableForm",
     "TableImuSettings",
     "TableRecord",
     "binary_place",
+    "duration_ns",
     "orientation_faults",
     "overlap_faults",
     "place_fields",

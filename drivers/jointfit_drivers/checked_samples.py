@@ -1,0 +1,124 @@
+"""Checks that every IMU sample passes: norm and sign of its quaternion, its time and its counter.
+
+Decoders of one device share them. Lost messages, restarts and a wrong scale become device events.
+
+Invariant: the output depends only on the samples added; no clock and no port is read.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.model import Corrupt, DeviceEvent
+from jointfit_drivers.table_samples import RecordContinuity, duration_ns
+from jointfit_protocols.orientation import OrientationGate
+
+if TYPE_CHECKING:
+    from jointfit_daemon.model import Decoded, ImuSample, TickClock
+
+
+class _HeldSample(NamedTuple):
+    sample: ImuSample
+    size: int
+
+
+class CheckedSamples:
+    """Checks the samples of one device.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Configured sample rate, Hz.
+    tick_clock : TickClock, optional
+        Unit and modulus of the device time; None if the device sends none.
+    counts : int, optional
+        Number of values of the message counter, 256 for one byte; None if it never wraps.
+    tolerance : float
+        Largest deviation of the quaternion norm from 1; 0.05 suits integers in thousandths.
+    """
+
+    def __init__(
+        self,
+        rate_hz: float,
+        tick_clock: TickClock | None,
+        counts: int | None,
+        tolerance: float = 0.01,
+    ) -> None:
+        self.tick_clock = tick_clock
+        modulus = None if tick_clock is None else tick_clock.modulus
+        self._continuity = RecordContinuity(rate_hz, duration_ns(tick_clock), modulus, counts)
+        self._gate = OrientationGate(tolerance)
+        self._held: _HeldSample | None = None
+        self._norm_checked = False
+        self.refused = self.refused_bytes = 0
+        """Messages that became no sample, and their bytes."""
+
+    def add(self, sample: ImuSample, size: int) -> list[Decoded]:
+        """Return the events and samples that the next sample completes.
+
+        Parameters
+        ----------
+        sample
+            `q_world_sensor` has the canonical direction and axes; norm and sign are arbitrary.
+        size
+            Bytes of its message on the wire.
+        """
+        if sample.ticks is None and sample.counter is None:
+            return self._admit(sample, size)
+
+        step = self._continuity.take(sample.ticks, sample.counter, sample.arrival_ns)
+        held = self._held
+        if held is not None and step.confirmed:
+            self._held = None
+            out: list[Decoded] = []
+            if step.restarted:
+                self._gate.forget()
+                out.append(DeviceEvent("restart", _restart_text(held.sample)))
+            out += self._admit(*held)
+            lost = step.lost_since
+        else:
+            out = self.flush()  # the next sample contradicts the held one
+            lost = step.lost
+
+        # one sample never proves a restart: a checksum passes some corrupt messages
+        if step.held:
+            self._held = _HeldSample(sample, size)
+            return out
+        if lost:
+            out.append(DeviceEvent("gap", f"{lost} samples lost", {"lost": lost}))
+        return out + self._admit(sample, size)
+
+    def flush(self) -> list[Decoded]:
+        """Refuse a sample that no later one confirmed."""
+        held, self._held = self._held, None
+        if held is None:
+            return []
+        return [self.refuse(held.size, "time and counter disagree with the other samples")]
+
+    def refuse(self, size: int, reason: str) -> Corrupt:
+        """Count a message of `size` bytes that becomes no sample."""
+        self.refused += 1
+        self.refused_bytes += size
+        return Corrupt(size, reason)
+
+    def _admit(self, sample: ImuSample, size: int) -> list[Decoded]:
+        """Return the sample with a unit quaternion, or the reason why it has none."""
+        q = self._gate.admit(sample.q_world_sensor)
+        if q is not None:
+            return [sample._replace(q_world_sensor=q)]
+        return [self.refuse(size, "quaternion norm is not 1"), *self._norm_warning()]
+
+    def _norm_warning(self) -> list[Decoded]:
+        """Return a warning, once, if hardly any of the first quaternions has norm 1."""
+        norm = None if self._norm_checked else self._gate.misconfigured_norm
+        if norm is None:
+            return []
+        self._norm_checked = True
+        text = f"median quaternion norm is {norm:.4g}, expected 1: byte order or scale is wrong"
+        return [DeviceEvent("warning", text, {"median_norm": norm} if isfinite(norm) else {})]
+
+
+def _restart_text(first: ImuSample) -> str:
+    clock = "its counter" if first.ticks is None else f"device time {first.ticks}"
+    return f"device restarted at {clock}"
