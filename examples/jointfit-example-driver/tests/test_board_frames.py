@@ -6,11 +6,11 @@ import random
 
 import pytest
 
-from jointfit_board.frames import SCALE, SIZE, BoardCodec, BoardFrame, encode
+from jointfit_board.frames import SCALE, SIZE, BoardFrame, board_codec, encode
 
 
 def decode(chunks: list[bytes]) -> tuple[list[BoardFrame], int]:
-    codec = BoardCodec()
+    codec = board_codec()
     found = [event for chunk in chunks for event in codec.feed(chunk)] + codec.flush()
     return [event for event in found if isinstance(event, BoardFrame)], codec.discarded
 

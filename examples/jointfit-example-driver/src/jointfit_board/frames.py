@@ -6,16 +6,19 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from typing import NamedTuple
 
-from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.corrupt import CHECKSUM, NO_START, CorruptBytes
+from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 
 SIZE = 16
 """Length of a frame, bytes."""
 SCALE = 32767
 """Counts of 1 in the quaternion."""
 _HEAD = b"\xa5\x5a"
+_START = re.compile(rb"\xa5(?:\x5a|\Z)")  # a lone A5 at the end of the input may be a beginning
 _BODY = struct.Struct("<BI4h")
 
 
@@ -27,6 +30,8 @@ class BoardFrame(NamedTuple):
     counts: tuple[int, int, int, int]
     end: int = 0
     """Number of bytes fed to the codec up to the end of the frame, for back-dating."""
+    size: int = SIZE
+    """Number of bytes on the wire."""
 
 
 def encode(frame: BoardFrame) -> bytes:
@@ -35,43 +40,18 @@ def encode(frame: BoardFrame) -> bytes:
     return _HEAD + body + bytes((sum(body) & 0xFF,))
 
 
-class BoardCodec:
-    """Converts bytes, in pieces of any size, to frames."""
+def board_codec() -> ResynchronizingCodec[BoardFrame]:
+    """Return a new codec, which converts bytes in pieces of any size to frames."""
+    return ResynchronizingCodec(_read, _START, longest_run=256, shortest=SIZE)
 
-    def __init__(self) -> None:
-        self._pending = b""  # always shorter than a frame between calls
-        self.fed = self.frames = self.discarded = 0
 
-    def feed(self, data: bytes) -> list[BoardFrame | CorruptBytes]:
-        """Return the frames completed by `data`, in wire order; never raises."""
-        buffer, start = self._pending + data, self.fed - len(self._pending)
-        self.fed += len(data)
-
-        found: list[BoardFrame | CorruptBytes] = []
-        at = skipped = 0
-        while len(buffer) - at >= SIZE:
-            if (
-                buffer[at : at + 2] != _HEAD
-                or sum(buffer[at + 2 : at + 15]) & 0xFF != buffer[at + 15]
-            ):
-                at += 1  # a valid frame may begin inside an invalid one: skip one byte, not all
-                skipped += 1
-                continue
-            found += self._corrupt(skipped)
-            skipped = 0
-            counter, time_us, w, x, y, z = _BODY.unpack_from(buffer, at + 2)
-            at += SIZE
-            found.append(BoardFrame(counter, time_us, (w, x, y, z), start + at))
-            self.frames += 1
-
-        self._pending = buffer[at:]
-        return found + self._corrupt(skipped)
-
-    def flush(self) -> list[CorruptBytes]:
-        """Discard pending bytes; they are shorter than a frame and contain none."""
-        pending, self._pending = len(self._pending), b""
-        return self._corrupt(pending)
-
-    def _corrupt(self, count: int) -> list[CorruptBytes]:
-        self.discarded += count
-        return [CorruptBytes(count, "no frame starts here")] if count else []
+def _read(buffer: bytes, at: int, base: int) -> BoardFrame | CorruptBytes | None:
+    """Return the frame that begins at `at`, the bytes to skip, or None for an incomplete frame."""
+    if not _HEAD.startswith(buffer[at : at + 2]):
+        return CorruptBytes(1, NO_START)
+    if len(buffer) < at + SIZE:
+        return None
+    if sum(buffer[at + 2 : at + 15]) & 0xFF != buffer[at + 15]:
+        return CorruptBytes(1, CHECKSUM)
+    counter, time_us, w, x, y, z = _BODY.unpack_from(buffer, at + 2)
+    return BoardFrame(counter, time_us, (w, x, y, z), base + at + SIZE)
