@@ -39,6 +39,9 @@ PAUSE_S = 60.0
 """Pause of a misconfigured source, s: a device may be reconfigured without being unplugged."""
 PLUGGED_S = 0.05
 """Interval between checks whether an absent port is back before the next retry, s."""
+SERVER_PAUSE_S = 5.0
+"""Pause of a misconfigured source without a port, s: no file shows that its server was changed, and
+a connection costs the server a few datagrams."""
 CHECK_S = 0.5
 """Interval between checks of the port of a paused source, s; each is one stat(2)."""
 
@@ -131,6 +134,8 @@ async def run_source(
             reporter.closed("lost", str(lost), absent=absent)  # the core logs the fault
         except DeviceMisconfiguredError as wrong:
             again = f"retrying with another device on the port, or every {PAUSE_S:g} s"
+            if path is None:
+                again = f"retrying every {SERVER_PAUSE_S:g} s"
             reporter.closed("misconfigured", f"{wrong} ({again})")
             state.paused = True
             await _wait_for_change(path, device)
@@ -156,9 +161,9 @@ async def _wait_for_retry(path: str | None, delay_s: float) -> None:
 
 
 async def _wait_for_change(path: str | None, device: object) -> None:
-    """Wait until another device is at `path` than `device`; at most `PAUSE_S`."""
+    """Wait until another device is at `path` than `device`; at most the pause of the source."""
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(PAUSE_S):
+        async with asyncio.timeout(SERVER_PAUSE_S if path is None else PAUSE_S):
             while _device_identity(path) == device:  # noqa: ASYNC110 - a file system has no event
                 await asyncio.sleep(CHECK_S)
 

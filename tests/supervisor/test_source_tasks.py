@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.config import parse_rig
@@ -12,6 +13,8 @@ from jointfit_daemon.supervisor import _source_tasks as sources_module
 from jointfit_daemon.supervisor._source_tasks import SourceTasks
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pytest
 
     from jointfit_daemon.pipeline.events import Event
@@ -36,7 +39,7 @@ class Refused:
 async def test_paused_source_is_retried_and_reported_once(
     table: dict[str, Any], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(sources_module, "PAUSE_S", 0.05)
+    monkeypatch.setattr(sources_module, "SERVER_PAUSE_S", 0.05)
     driver: Any = type("Port", (Refused,), {})
     source = parse_rig(table).sources[0].__class__("S1", "imu", "x", 100.0, "thigh", None, driver)
     events: list[Event] = []
@@ -52,6 +55,34 @@ async def test_paused_source_is_retried_and_reported_once(
         assert isinstance(closed, SourceClosed)
         assert "add the user to group dialout (retrying" in closed.text
         assert caplog.text == ""  # the core reports it, on the log too
+        await sources.stop()
+
+
+async def test_misconfigured_server_is_retried_sooner_than_a_port(
+    table: dict[str, Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sources_module, "PAUSE_S", 60.0)
+    monkeypatch.setattr(sources_module, "SERVER_PAUSE_S", 0.05)
+    events: list[Event] = []
+    drivers: list[Any] = [type("Server", (Refused,), {}), type("Serial", (Refused,), {})]
+    ports = (None, SimpleNamespace(port=str(tmp_path)))
+    of_rig = type(parse_rig(table).sources[0])
+    async with asyncio.TaskGroup() as tasks:
+        sources = SourceTasks(tasks, events.append)
+        await sources.apply(
+            [
+                of_rig(name, "imu", "x", 100.0, "thigh", port, driver)
+                for name, port, driver in zip(("server", "port"), ports, drivers, strict=True)
+            ]
+        )
+        await asyncio.sleep(0.1)
+        for driver in drivers:
+            driver.mended = True
+        await asyncio.sleep(0.3)
+        assert [driver.opened for driver in drivers] == [1, 0]
+        texts = {event.source: event.text for event in events if isinstance(event, SourceClosed)}
+        assert "(retrying every" in texts["server"]
+        assert "with another device on the port" in texts["port"]
         await sources.stop()
 
 
