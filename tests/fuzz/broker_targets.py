@@ -30,6 +30,8 @@ from jointfit_daemon.outputs.recording import (
     encode_event,
     read_events,
 )
+from jointfit_daemon.outputs.spool import SpoolFiles
+from jointfit_daemon.outputs.spool._spool_files import SpooledMessage
 from jointfit_daemon.outputs.unix_clock import UnixClock
 from jointfit_daemon.pipeline import Core
 from jointfit_daemon.pipeline.events import (
@@ -264,6 +266,34 @@ def seeds_recorded_event() -> list[bytes]:
     return [b"configured " + encode_event(configured), b"closed " + encode_event(closed)]
 
 
+def run_spool(data: bytes) -> None:
+    """Read a file of the spool, deliver it, and append behind it."""
+    place = folder() / "spool"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir()
+    (place / "00000007.spool").write_bytes(data)
+    files = SpoolFiles(place, 100_000)
+    files.load()
+    files.append([SpooledMessage("late/pose", b"{}")])
+    topics, found = [], files.oldest()
+    while found is not None:
+        number, messages = found
+        topics += [message.topic for message in messages]
+        files.remove(number)
+        found = files.oldest()
+    assert topics[-1] == "late/pose"
+    assert not any({"#", "+", "\0"} & set(topic) for topic in topics)
+    assert files.waiting == files.size_bytes == 0
+
+
+def seeds_spool() -> list[bytes]:
+    """Return a file of three messages, and one with a topic for a subscription."""
+    kept, wild = folder() / "spool-seed", folder() / "spool-wild"
+    for place, topics in ((kept, ("late/pose", "bridge/event", "late/pose")), (wild, ("late/#",))):
+        SpoolFiles(place, 100_000).append([SpooledMessage(t, b'{"seq":1}') for t in topics])
+    return [next(place.iterdir()).read_bytes() for place in (kept, wild)]
+
+
 TARGETS = (
     Target("mqtt-request", run_request, seeds_request, share=3),
     Target("rig-toml", run_rig, seeds_rig, (ConfigError,), share=0.1),
@@ -276,6 +306,7 @@ TARGETS = (
         0.4,
         32,
     ),
+    Target("spool", run_spool, seeds_spool, share=0.4),
     Target("recording", run_recording, seeds_recording, (RecordingError, ConfigError), share=0.4),
     Target(
         "recorded-event", run_recorded_event, seeds_recorded_event, (ValueError, ConfigError), 0.4

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 _BLOCK_ROWS = 1 << 15
 """Rows that are converted to text at a time, which bounds the memory."""
+MOST_VALUES = 1 << 27
+"""Values that are read from a file: 1 GiB."""
 _NEEDS_QUOTES = frozenset(',"\n\r')
 
 
@@ -144,24 +146,54 @@ def read_parquet_session(path: Path) -> SessionData:
 
     def read(file: Path, columns: Sequence[str]) -> Table:
         try:
-            found = parquet.read_table(file, partitioning=None)
+            # Texts remain dictionaries: a long one that is repeated takes its memory once.
+            texts = [name for name in columns if name in TEXT_COLUMNS]
+            with parquet.ParquetFile(file, read_dictionary=texts) as opened:
+                _check_parquet(file, opened.schema_arrow.names, opened.metadata, columns)
+                found = opened.read().unify_dictionaries().combine_chunks()
         except (arrow.ArrowException, OSError) as fault:
             raise MalformedFileError(
                 f"{file}: not a Parquet file, or cut off: export it again"
             ) from fault
-        if found.column_names != list(columns):
-            raise MalformedFileError(
-                f"{file}: found the columns {', '.join(found.column_names)}, expected"
-                f" {', '.join(columns)}: export the session again"
-            )
         return {
-            name: np.array(found[name].to_pylist(), dtype=object)
+            name: _texts_in(file, name, found[name])
             if name in TEXT_COLUMNS
             else found[name].to_numpy().astype(np.float64)
             for name in columns
         }
 
     return _read_session(path, ".parquet", read)
+
+
+def _check_parquet(file: Path, names: list[str], metadata: Any, columns: Sequence[str]) -> None:
+    """Refuse other columns than expected, and more values than `MOST_VALUES`, before they are read.
+
+    Repetitions take no space in a file: a few bytes can stand for any number of rows.
+    """
+    if names != list(columns):
+        raise MalformedFileError(
+            f"{file}: found the columns {', '.join(names)[:200]}, expected"
+            f" {', '.join(columns)}: export the session again"
+        )
+    if metadata.num_rows * len(columns) > MOST_VALUES:
+        raise MalformedFileError(
+            f"{file}: declares {metadata.num_rows} rows of {len(columns)} columns, at most"
+            f" {MOST_VALUES} values are read: split the session"
+        )
+
+
+def _texts_in(file: Path, name: str, column: Any) -> NDArray[Any]:
+    """Return the texts of a column of dictionaries; equal ones are one object."""
+    found = [
+        np.array([*chunk.dictionary.to_pylist(), None], dtype=object)[
+            chunk.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+        ]
+        for chunk in column.chunks
+        if hasattr(chunk, "dictionary")
+    ]
+    if len(found) != len(column.chunks):
+        raise MalformedFileError(f"{file}: column {name} has no texts: export the session again")
+    return np.concatenate(found) if found else np.array([], dtype=object)
 
 
 def _read_session(

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 FILES = 16
 """Number of files of a full spool: so much of it is deleted at once."""
+_TOPIC = re.compile(r"[!-~]{1,200}")
+"""A topic: printable ASCII. A client rejects those with wildcards, spaces or control characters."""
+_WILDCARDS = frozenset("+#")
 _NUMBERED = re.compile(r"(\d{8})\.spool")
 
 
@@ -177,6 +180,9 @@ def _message(line: bytes) -> SpooledMessage | None:
     """Return the message of a line; None if it is damaged."""
     digits, _, rest = line.removesuffix(b"\n").partition(b" ")
     topic, _, payload = rest.partition(b" ")
-    if not line.endswith(b"\n") or digits != b"%08x" % crc32(rest) or not topic.isascii():
+    if not line.endswith(b"\n") or digits != b"%08x" % crc32(rest):
         return None
-    return SpooledMessage(topic.decode(), payload)
+    name = topic.decode("ascii", "replace")
+    if not _TOPIC.fullmatch(name) or _WILDCARDS & set(name):
+        return None
+    return SpooledMessage(name, payload)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import sys
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as arrow
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pyarrow import parquet
 
 from jointfit_daemon.files.mocap import MissingPackageError
 from jointfit_daemon.files.sessions import NothingToWriteError, read_session, write_session
+from jointfit_daemon.files.sessions._tidy_tables import TEXT_COLUMNS
 from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.session_data import SessionData
 from tests.files.sessions.session_samples import walking_session
@@ -87,6 +91,38 @@ def test_a_length_of_gigabytes_takes_no_memory(written: dict[str, Path], tmp_pat
     path = tmp_path / "vast.xdf"
     path.write_bytes(b"XDF:\x08" + (1 << 40).to_bytes(8, "little") + b"\x03\x00\x01\x00\x00\x00")
     assert "declares 1099511627776 bytes" in refusal(path)
+
+
+def test_rows_that_take_no_space_are_refused_before_they_are_read(
+    written: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sensors = written["parquet"].with_name("walk_sensors.parquet")
+    table = parquet.read_table(sensors)
+    path = tmp_path / sensors.name
+    parquet.write_table(arrow.concat_tables([table.slice(0, 1)] * 5000).combine_chunks(), path)
+    monkeypatch.setattr("jointfit_daemon.files.sessions._table_files.MOST_VALUES", 10_000)
+    assert path.stat().st_size < 100_000
+    assert "declares 5000 rows" in refusal(path)
+
+
+def test_a_long_text_in_every_row_takes_its_memory_once(
+    written: dict[str, Path], tmp_path: Path
+) -> None:
+    sensors = written["parquet"].with_name("walk_sensors.parquet")
+    table = parquet.read_table(sensors)
+    at = next(k for k, name in enumerate(table.column_names) if name in TEXT_COLUMNS)
+    long = arrow.array(["x" * 50_000] * len(table), arrow.string())
+    path = tmp_path / sensors.name
+    parquet.write_table(
+        table.set_column(at, table.column_names[at], long), path, store_schema=False
+    )
+    assert len(table) > 300
+    tracemalloc.start()
+    try:
+        refusal(path)
+        assert tracemalloc.get_traced_memory()[1] < 8_000_000
+    finally:
+        tracemalloc.stop()
 
 
 def test_entities_of_an_xdf_header_are_never_expanded(tmp_path: Path) -> None:

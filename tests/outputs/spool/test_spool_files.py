@@ -70,6 +70,11 @@ def test_a_line_that_a_power_cut_tore_is_counted_and_skipped(tmp_path: Path, cut
     assert files.damaged == 1
 
 
+@pytest.mark.parametrize("topic", ["late/#", "late/+", "", "late\npose", "late/\0", "x" * 300])
+def test_a_topic_that_no_client_can_publish_is_no_message(topic: str) -> None:
+    assert _message(_line(SpooledMessage(topic, b"1"))) is None
+
+
 @given(st.binary(max_size=200))
 def test_random_bytes_are_no_message(data: bytes) -> None:
     found = _message(data)
