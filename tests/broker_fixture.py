@@ -13,6 +13,7 @@ import socket
 import subprocess
 import sys
 import time
+import zlib
 from abc import ABC, abstractmethod
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar
@@ -56,8 +57,8 @@ class Broker(ABC):
     PATH: ClassVar[str] = f"{os.environ.get('PATH', '')}:/usr/sbin:/usr/local/sbin"
     host: ClassVar[str] = HOST
 
-    def __init__(self) -> None:
-        self.port = free_port()
+    def __init__(self, port: int | None = None) -> None:
+        self.port = port or free_port()
         self._process: subprocess.Popen[bytes] | None = None
 
     @classmethod
@@ -111,11 +112,14 @@ class Broker(ABC):
 
 
 class MosquittoBroker(Broker):
-    """Mosquitto with one listener; `more` are further lines of its configuration."""
+    """Mosquitto with one listener; `more` are further lines of its configuration.
 
-    def __init__(self, folder: Path, *, more: str = "") -> None:
-        super().__init__()
-        self._config = folder / f"mosquitto-{self.port}.conf"
+    By default it has a free port.
+    """
+
+    def __init__(self, folder: Path, *, port: int | None = None, more: str = "") -> None:
+        super().__init__(port)
+        self._config = folder / f"mosquitto-{self.port}-{zlib.crc32(more.encode()):08x}.conf"
         self._config.write_text(
             f"listener {self.port} {HOST}\nallow_anonymous true\npersistence false\n"
             f"set_tcp_nodelay true\nuser {os.environ.get('USER') or 'root'}\n{more}",

@@ -30,18 +30,20 @@ def main() -> int:
         parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(known)}")
 
     outcomes: dict[str, list[Outcome]] = {}
+    failures: list[str] = []
     with tempfile.TemporaryDirectory() as name:
         broker = chosen_broker()(Path(name))
         broker.start()
         try:
             names = options.names or list(known)
-            asyncio.run(run_all(Path(name), broker, names, options.repeat, outcomes))
+            run = run_all(Path(name), broker, names, options.repeat, outcomes)
+            failures = asyncio.run(run)
         finally:
             broker.stop()
             if options.repeat > 1:
                 store({key: summary(found) for key, found in outcomes.items()})
 
-    faults = [
+    faults = failures + [
         text for key, found in outcomes.items() for one in found for text in known[key].faults(one)
     ]
     for key, found in outcomes.items():

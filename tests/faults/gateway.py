@@ -1,4 +1,9 @@
-"""A gateway for fault scenarios: two simulated sensors, broker, daemon and listener."""
+"""A gateway for fault scenarios: simulated devices, broker, daemon and listener.
+
+There are three: two serial sensors alone; with a sensor on CAN and cameras; and in a mount
+namespace with a small disk for recordings, a clock that can be stepped and writes that can be
+delayed.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +11,15 @@ import asyncio
 import contextlib
 import itertools
 import math
+import os
 import random
+import shutil
 import signal
+import struct
+import subprocess
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from jointfit_daemon.calibration.record import CalibrationStore
@@ -17,14 +27,15 @@ from jointfit_daemon.config import load_rig
 from jointfit_daemon.tools.child_processes import ChildProcess, daemon
 from jointfit_simulators.devices import XbusDevice
 from tests.broker_fixture import free_port
+from tests.faults.hardware import Cameras, CanSensor
 from tests.limb_model.plain_calibration import plain_calibration
 from tests.system.station import Listener, broker, sensors_in
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable
-    from pathlib import Path
 
     from tests.broker_fixture import Broker
+    from tests.faults.scenario import Kind
 
 BASE = "jointfit/faults"
 PERIOD_S = 0.01
@@ -57,6 +68,35 @@ listen = "127.0.0.1:{metrics}"
 [recording]
 directory = "{folder}/recordings"
 """
+MORE = """
+[can.can0]
+interface = "slcan"
+channel = "{folder}/can"
+[[imu]]
+id = "S3"
+segment = "thigh"
+driver = "xcdi"
+can = "can0"
+[mocap]
+driver = "natnet"
+server = "127.0.0.1"
+command_port = {mocap}
+silence_s = 0.5
+markers.thigh = ["T1", "T2", "T3"]
+"""
+INJECTED = Path(__file__).parent / "injected"
+"""Folder of the module that steps the clock of a daemon and delays its writes."""
+DISK_MB = 4
+"""Size of the file system for recordings, MB."""
+
+
+def no_namespace() -> str | None:
+    """Return why this user cannot mount a file system of their own; None if they can."""
+    command = ["unshare", "-rm", "mount", "-t", "tmpfs", "none", "/mnt"]
+    if shutil.which("unshare") is None:
+        return "unshare is not installed (Debian: apt install util-linux)"
+    run = subprocess.run(command, capture_output=True, check=False)
+    return None if run.returncode == 0 else "this kernel refuses mount namespaces to this user"
 
 
 class Sensor:
@@ -66,6 +106,8 @@ class Sensor:
         self.link, self.number = link, 0
         self.stuck_at: int | None = None
         """Number of the sample whose orientation is repeated; None while the sensor works."""
+        self.resting = False
+        """Whether the sensor rests, apart from noise."""
         self.batch = 1
         """Samples that are sent together, as an adapter with a latency timer does."""
         self.corrupted_share = 0.0
@@ -99,7 +141,7 @@ class Sensor:
 
     def _push(self) -> None:
         number = self.number if self.stuck_at is None else self.stuck_at
-        angle = math.sin(2.0 * number * PERIOD_S)
+        angle = 1e-4 * math.sin(number) if self.resting else math.sin(2.0 * number * PERIOD_S)
         q = (math.cos(angle / 2), math.sin(angle / 2), 0.0, 0.0)
         self.device.push(round(self.number * PERIOD_S * 1e9), q)
 
@@ -112,8 +154,23 @@ class Gateway:
     broker: Broker
     listener: Listener
     metrics_port: int
+    kind: Kind
     sensors: dict[str, Sensor] = field(default_factory=dict)
     child: ChildProcess | None = None
+    _cameras: Cameras | None = None
+    _can: CanSensor | None = None
+
+    @property
+    def cameras(self) -> Cameras:
+        """The cameras of the gateway "all"."""
+        assert self._cameras is not None
+        return self._cameras
+
+    @property
+    def can(self) -> CanSensor:
+        """The sensor on CAN of the gateway "all"."""
+        assert self._can is not None
+        return self._can
 
     @property
     def rig(self) -> Path:
@@ -133,9 +190,73 @@ class Gateway:
         return self.child.process.pid
 
     async def start(self) -> float:
-        """Start the daemon; return the time until both sensors contribute to poses, s."""
-        self.child = await daemon(self.folder, self.rig).__aenter__()
-        return await self.used("S1", "S2")
+        """Start the daemon; return the time until all sensors contribute to poses, s."""
+        await self.launch()
+        return await self.used(*self.names)
+
+    async def launch(self) -> None:
+        """Start the process of the daemon."""
+        child = daemon(self.folder, self.rig)
+        if self.kind == "host":
+            self.inject()
+            disk = self.folder / "recordings"
+            disk.mkdir(exist_ok=True)
+            mount = f'mount -t tmpfs -o size={DISK_MB}m none "{disk}" && exec "$@"'
+            child.arguments = ["unshare", "-rm", "sh", "-c", mount, "sh", *child.arguments]
+            child.environment |= {
+                "PYTHONPATH": str(INJECTED), "INJECTED_FAULTS": str(self.folder / "injected"),
+            }  # fmt: skip
+        self.child = await child.__aenter__()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Sensors of the gateway."""
+        return ("S1", "S2", "S3") if self.kind == "all" else ("S1", "S2")
+
+    def inject(self, step_s: float = 0.0, write_s: float = 0.0) -> None:
+        """Step UNIX time in the daemon by `step_s`, and delay its durable writes by `write_s`."""
+        path = self.folder / "injected"
+        path.touch()
+        with path.open("r+b") as file:
+            file.write(struct.pack("<qd", round(step_s * 1e9), write_s))
+
+    def in_namespace(self, path: Path) -> Path:
+        """Return a path of the daemon's mount namespace."""
+        return Path(f"/proc/{self.pid}/root{path}")
+
+    def rest(self, *, resting: bool) -> None:
+        """Let the serial sensors rest or move."""
+        for sensor in self.sensors.values():
+            sensor.resting = resting
+
+    def reload(self) -> None:
+        """Let the daemon load rig.toml again."""
+        os.kill(self.pid, signal.SIGHUP)
+
+    async def request(self, name: str, **arguments: object) -> dict[str, Any]:
+        """Send a request; return the answer."""
+        assert self.listener.client is not None
+        answer: dict[str, Any] = await self.listener.client.request(name, arguments)
+        return answer
+
+    async def logged(self, text: str, since: int = 0) -> float:
+        """Wait for a text in the log behind its first `since` characters; return the time, s."""
+        return await self.seconds(lambda: text in self.log[since:])
+
+    async def device(self, name: str) -> dict[str, Any]:
+        """Return the present counters of a device."""
+        found: dict[str, Any] = (await self.health())["devices"][name]
+        return found
+
+    async def streaming(self, name: str) -> float:
+        """Wait until a device is online and sends; return the time, s."""
+        began_s = time.monotonic()
+        await self.listener.connected({name})
+        before = self.listener.latest["bridge/health"]["devices"][name]["received"]
+        await self.listener.until(
+            lambda: self.listener.latest["bridge/health"]["devices"][name]["received"] > before
+        )
+        return time.monotonic() - began_s
 
     def unfinished_recordings(self) -> set[str]:
         """Return the names of recordings that are being written or need a repair."""
@@ -175,6 +296,37 @@ class Gateway:
                 await asyncio.sleep(0.02)
         return time.monotonic() - began_s
 
+    async def link_dropped(self) -> float:
+        """Wait until the daemon drops a message to the broker; return the time, s."""
+        began_s, name = time.monotonic(), b"\njointfit_mqtt_dropped_messages_total "
+
+        async def dropped() -> int:
+            return int(float((await self._metrics()).split(name)[1].split()[0]))
+
+        before = await dropped()
+        async with asyncio.timeout(60.0):
+            while await dropped() == before:
+                await asyncio.sleep(0.05)
+        return time.monotonic() - began_s
+
+    async def fresh_pose(self) -> float:
+        """Wait for a pose of the last half second with all sensors; return the time, s."""
+        return await self.seconds(
+            lambda: any(
+                time.time() - pose["t_us"] * 1e-6 < 0.5 and sensors_in(pose).issuperset(self.names)
+                for pose in self.listener.poses[-3:]
+            )
+        )
+
+    async def remove_old_recordings(self) -> None:
+        """Begin a new recording and delete the others: the disk is small."""
+        await self.request("record", action="stop")
+        folder = self.in_namespace(self.folder / "recordings")
+        for path in folder.iterdir():
+            path.unlink()
+        answer = await self.request("record", action="start")
+        assert answer["status"] == "ok", answer
+
     async def _metrics(self) -> bytes:
         reader, writer = await asyncio.open_connection("127.0.0.1", self.metrics_port)
         try:
@@ -204,18 +356,25 @@ class Gateway:
 
 
 @contextlib.asynccontextmanager
-async def running_gateway(folder: Path, chosen: Broker) -> AsyncIterator[Gateway]:
-    """Yield a gateway whose two sensors contribute to poses."""
-    metrics = free_port()
+async def running_gateway(
+    folder: Path, chosen: Broker, kind: Kind = "serial"
+) -> AsyncIterator[Gateway]:
+    """Yield a gateway whose sensors contribute to poses."""
+    metrics, cameras = free_port(), Cameras() if kind == "all" else None
     text = RIG.format(folder=folder, port=chosen.port, base=BASE, metrics=metrics)
+    if cameras is not None:
+        text += MORE.format(folder=folder, mocap=cameras.server.command_port)
     (folder / "rig.toml").write_text(text, encoding="utf-8")
     rig = load_rig(folder / "rig.toml")
     store = CalibrationStore(folder / "state" / "calibrations", rig.calibration_store)
     store.save(plain_calibration(rig.chain))
     listener = Listener(broker(chosen.port, BASE), TOPICS)
-    gateway = Gateway(folder, chosen, listener, metrics)
+    gateway = Gateway(folder, chosen, listener, metrics, kind)
     gateway.sensors = {name: Sensor(folder / name) for name in ("S1", "S2")}
     tasks = [asyncio.create_task(sensor.run()) for sensor in gateway.sensors.values()]
+    if cameras is not None:
+        gateway._cameras, gateway._can = cameras, CanSensor(folder / "can")
+        tasks += [asyncio.create_task(part.run()) for part in (cameras, gateway.can)]
     tasks.append(asyncio.create_task(listener.run(), name="listener"))
     try:
         await gateway.start()

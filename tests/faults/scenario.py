@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from tests.faults.gateway import Gateway
+
+Kind = Literal["serial", "all", "host"]
+"""Gateways: two serial sensors; these, a CAN sensor and cameras; with a disk and clock of its own.
+"""
+
+
+def nothing_missing() -> str | None:
+    """Return None: the scenario runs everywhere."""
+    return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +52,10 @@ class Scenario:
     """Limit of the median of all runs, s."""
     gap_limit_s: float | None = None
     """Limit of the time between two poses, s; None if poses stop."""
+    kind: Kind = "serial"
+    """Gateway that it needs."""
+    missing: Callable[[], str | None] = nothing_missing
+    """Returns why it cannot run on this machine; None if it can."""
 
     def faults(self, outcome: Outcome, factor: float = 1.0) -> list[str]:
         """Return the limits that `outcome` exceeds; `factor` is that of a loaded machine."""

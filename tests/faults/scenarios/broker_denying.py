@@ -1,0 +1,41 @@
+"""The access list of the broker refuses messages on the daemon its topics."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tests.broker_fixture import MosquittoBroker
+from tests.faults.scenario import Outcome, Scenario
+
+if TYPE_CHECKING:
+    from tests.faults.gateway import Gateway
+
+
+async def run(gateway: Gateway) -> Outcome:
+    """Replace the broker by a mosquitto with an access list without right to write."""
+    rights = gateway.folder / "denying.acl"
+    rights.write_text("topic read #\n", "utf-8")
+    rights.chmod(0o600)
+    denying = MosquittoBroker(gateway.folder, port=gateway.broker.port, more=f"acl_file {rights}\n")
+    since = len(gateway.log)
+    gateway.broker.stop()
+    denying.start()
+    try:
+        noticed_s = await gateway.logged("the broker refuses messages on", since)
+    finally:
+        denying.stop()
+        gateway.broker.start()
+    recovered_s = await gateway.used("S1", "S2")
+    return Outcome(noticed_s, recovered_s, 0.0, 0)
+
+
+SCENARIO = Scenario(
+    title="broker whose access list denies the topics",
+    reported="log; `denied` of the link",
+    continues="acquisition, fusion and recording",
+    counted="poses: `confirmed` of the link is false",
+    run=run,
+    noticed_limit_s=5.0,
+    recovered_limit_s=1.0,
+    missing=MosquittoBroker.missing,
+)

@@ -1,0 +1,28 @@
+"""UNIX time is set back by an hour."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from tests.faults.scenario import Outcome, Scenario
+from tests.faults.scenarios.clock_forward import step
+
+if TYPE_CHECKING:
+    from tests.faults.gateway import Gateway
+
+
+async def run(gateway: Gateway) -> Outcome:
+    """Step the clock by an hour."""
+    return await step(gateway, -3600.0)
+
+
+SCENARIO = Scenario(
+    title="UNIX time set back by an hour",
+    reported="noticed: times of poses follow",
+    continues="everything",
+    counted="the figure counts `lost`, `late`, `dropped` and `restarts` of one sensor",
+    run=run,
+    noticed_limit_s=1.5,
+    recovered_limit_s=1.5,
+    kind="host",
+)
