@@ -137,7 +137,10 @@ class RawSamples:
         self._t_ns = reading.t_ns
         if self.readings_only:
             found = self._warnings(stamp, reading, clipped=clipped, restarted=False, missing=0)
-            return [*found, _uncorrected_sample(stamp, reading)]
+            arrival_ns, ticks, counter, status = stamp
+            vectors = (reading.rate, reading.force, reading.magnetic)
+            sample = ImuSample(arrival_ns, _IDENTITY, _IDENTITY, ticks, counter, status, *vectors)
+            return [*found, sample]
         if self._correction is not None:
             reading = self._correction.correct(reading, field=not field_corrected)
         step = self._filter.take(reading)
@@ -209,12 +212,6 @@ class RawSamples:
             data["sensor_calibration"] = self._correction.date
         out.append(DeviceEvent("info", "orientation filter", {"orientation_filter": data}))
         return out
-
-
-def _uncorrected_sample(stamp: RawStamp, reading: RawReading) -> ImuSample:
-    arrival_ns, ticks, counter, status = stamp
-    vectors = (reading.rate, reading.force, reading.magnetic)
-    return ImuSample(arrival_ns, _IDENTITY, _IDENTITY, ticks, counter, status, *vectors)
 
 
 def _sample(

@@ -215,7 +215,11 @@ class StartEstimator:
             observed[3:, _FIELD] = np.eye(3)[:, 1:]
             mean = np.einsum("nij,nj->i", matrices[known], field[known]) / np.sum(known)
             innovation[3:] = mean - world - observed[3:, _PHI] @ error[_PHI]
-            variances[3:] = self._field_variance(innovation[3:]) * LASTING_S / duration_s
+
+            # A disturbed field has a larger variance.
+            off = float(np.linalg.norm(innovation[3:])) / (FIELD_LIMIT * self._strength)
+            field_sd = FIELD_SD * self._strength * max(1.0, off)
+            variances[3:] = field_sd**2 * LASTING_S / duration_s
 
         crossed = observed @ covariance
         gain = np.linalg.solve(crossed @ observed.T + np.diag(variances), crossed).T
@@ -223,11 +227,6 @@ class StartEstimator:
         covariance -= gain @ crossed
         self.covariance = 0.5 * (covariance + covariance.T)
         self._correct(error, duration_s)
-
-    def _field_variance(self, innovation: NDArray[np.float64]) -> float:
-        """Return the variance of the field, larger if the field is disturbed."""
-        off = float(np.linalg.norm(innovation)) / (FIELD_LIMIT * self._strength)
-        return (FIELD_SD * self._strength * max(1.0, off)) ** 2
 
     def _correct(self, error: NDArray[np.float64], duration_s: float) -> None:
         """Move an estimated error into the estimates."""

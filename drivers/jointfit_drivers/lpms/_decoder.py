@@ -79,7 +79,7 @@ class LpmsDecoder:
         self._check = self._new_check()
         self._last_tick = self._unwrapped = 0
         self._refused = self._refused_bytes = 0
-        self._reported: set[str] = set()
+        self._id_reported = False
         self._sizes: set[int] = set()
         self._noise = b""
 
@@ -134,7 +134,11 @@ class LpmsDecoder:
         out: list[Decoded] = []
         if not self._check.done:
             out += self._time_warning(measurement.tick, arrival_ns)
-        out += self._id_warning(message.sensor_id)
+        if message.sensor_id != self._sensor_id and not self._id_reported:
+            self._id_reported = True
+            found, wanted = message.sensor_id, self._sensor_id
+            text = f"sends as sensor id {found}, expected {wanted}: set `sensor_id`"
+            out.append(DeviceEvent("warning", text, {"sensor_id": found}))
 
         ticks = self._device_ticks(measurement.tick)
         if ticks is None:
@@ -255,13 +259,6 @@ class LpmsDecoder:
             "the driver connect again, or enable the quaternion alone"
         )
         return [DeviceEvent("warning", text, {"data_bytes": size})]
-
-    def _id_warning(self, sensor_id: int) -> list[Decoded]:
-        if sensor_id == self._sensor_id or "id" in self._reported:
-            return []
-        self._reported.add("id")
-        text = f"sends as sensor id {sensor_id}, expected {self._sensor_id}: set `sensor_id`"
-        return [DeviceEvent("warning", text, {"sensor_id": sensor_id})]
 
     def _text_warning(self, data: bytes) -> list[Decoded]:
         """Return a warning if the device sends text in place of messages, once."""

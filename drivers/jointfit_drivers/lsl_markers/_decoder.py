@@ -19,8 +19,8 @@ from jointfit_drivers.motion_capture import (
     NO_POSITION,
     UnitCheck,
     bind_columns,
-    binding_events,
     is_near,
+    renew_columns,
     rows_array,
     unit_quaternion,
     wanted_names,
@@ -145,8 +145,9 @@ class LslMarkersDecoder:
         bound = bind_columns(
             layout.markers, layout.bodies, self._wanted_markers, self._wanted_bodies
         )
-        out += binding_events(self._binding, bound, self._codec.undescribed)
-        self._layout, self._binding = layout, bound
+        self._binding, events = renew_columns(self._binding, bound, self._codec.undescribed)
+        out += events
+        self._layout = layout
         self._unit_check = UnitCheck(layout.unit)
         self._trip, self._on_lsl_clock = None, None
 

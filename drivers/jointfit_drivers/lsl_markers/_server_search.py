@@ -71,11 +71,16 @@ def _described(lsl: Any, info: Any, wait_s: float) -> FoundServer:
         layout = stream_layout(description, LslMarkersSettings(driver="lsl-markers"))
         markers = tuple(entry.name for entry in layout.markers)
         bodies = tuple(entry.name for entry in layout.bodies)
+
+    try:
+        interface = local_address(min(addresses_of(info.hostname())), None)
+    except (OSError, ValueError):
+        interface = "an unknown network card"
     return FoundServer(
         driver="lsl-markers",
         server=info.hostname(),
         port=_PORT,
-        interface=_interface(info.hostname()),
+        interface=interface,
         application=f"LSL stream {info.name()}",
         version=f"{info.version() / 100:.2f}",
         protocol="LSL",
@@ -83,14 +88,6 @@ def _described(lsl: Any, info: Any, wait_s: float) -> FoundServer:
         bodies=bodies,
         markers=markers,
     )
-
-
-def _interface(hostname: str) -> str:
-    """Return the address of this host's network card towards a sender."""
-    try:
-        return local_address(min(addresses_of(hostname)), None)
-    except (OSError, ValueError):
-        return "an unknown network card"
 
 
 async def diagnose(settings: LslMarkersSettings, wait_s: float) -> list[Finding]:

@@ -6,7 +6,7 @@ from jointfit_drivers.motion_capture._binding import (
     ColumnKey,
     ModelEntry,
     bind_columns,
-    binding_events,
+    renew_columns,
     wanted_names,
 )
 from jointfit_drivers.motion_capture._continuity import FrameContinuity, FrameStep
@@ -61,13 +61,13 @@ __all__ = [
     "UnitCheck",
     "UpAxis",
     "bind_columns",
-    "binding_events",
     "content_findings",
     "find_route",
     "gather_servers",
     "host_address",
     "is_near",
     "matrix_quaternion",
+    "renew_columns",
     "rows_array",
     "run_until",
     "summary",

@@ -12,7 +12,7 @@ the number of columns is bounded, because a model of one datagram can contain 65
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -111,10 +111,12 @@ def bind_columns(
     )
 
 
-def binding_events(
-    before: ColumnBinding | None, binding: ColumnBinding, unpublished: int
-) -> list[DeviceEvent]:
-    """Return the events of a new binding: its columns if they changed, and new warnings.
+def renew_columns(
+    before: ColumnBinding | None, binding: ColumnBinding, unpublished: int = 0
+) -> tuple[ColumnBinding, list[DeviceEvent]]:
+    """Return a new binding, and its events: its columns if they changed, and new warnings.
+
+    Equal columns keep the layout object of the binding before.
 
     Parameters
     ----------
@@ -128,7 +130,9 @@ def binding_events(
     layout = binding.layout
     listed = list(layout.markers[:_MOST_LISTED])
     events = []
-    if before is None or before.layout != layout:
+    if before is not None and before.layout == layout:
+        binding = replace(binding, layout=before.layout)
+    else:
         text = f"{len(layout.markers)} markers, {len(layout.bodies)} bodies"
         bodies = list(layout.bodies[:_MOST_LISTED])
         data = {"markers": listed, "bodies": bodies, "unpublished": unpublished}
@@ -137,7 +141,7 @@ def binding_events(
     if before is None or before.warnings != binding.warnings:
         unknown = {"unknown": list(binding.unknown), "known": listed}
         events += [DeviceEvent("warning", text, unknown) for text in binding.warnings]
-    return events
+    return binding, events
 
 
 # --- names of the columns ---------------------------------------------------------------------

@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, MocapFrame, TickClock
-from jointfit_drivers.motion_capture import FrameContinuity, binding_events, wanted_names
+from jointfit_drivers.motion_capture import FrameContinuity, renew_columns, wanted_names
 from jointfit_drivers.natnet._binding import bind_model
 from jointfit_drivers.natnet._bitstream import FRAME_START, BitstreamTracker
 from jointfit_drivers.natnet._frame_time import FrameTime
@@ -179,14 +179,10 @@ class NatNetDecoder:
     def _model(self, model: natnet.ModelDefinition, out: list[Decoded]) -> None:
         """Bind the columns to a model; append its changes and the warnings about it."""
         binding = bind_model(model, self._wanted_markers, self._wanted_bodies)
-        before = self._binding
-        out += binding_events(
-            None if before is None else before.columns, binding.columns, self.unpublished
-        )
-        if before is not None and before.columns.layout == binding.columns.layout:
-            columns = replace(binding.columns, layout=before.columns.layout)
-            binding = replace(binding, columns=columns)
-        self._binding = binding
+        before = None if self._binding is None else self._binding.columns
+        columns, events = renew_columns(before, binding.columns, self.unpublished)
+        out += events
+        self._binding = binding = replace(binding, columns=columns)
         self._named_unknown.clear()
 
         if not model.complete:

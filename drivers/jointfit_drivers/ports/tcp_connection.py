@@ -1,8 +1,7 @@
 """TCP connections whose data carry their arrival time.
 
-The kernel stamps segments on arrival (SO_TIMESTAMPNS) in CLOCK_REALTIME; `WallClock` converts the
-stamps to CLOCK_MONOTONIC. asyncio's streams do not return ancillary data, so this module reads its
-sockets itself.
+The kernel stamps segments on arrival; `SocketStamps` converts the stamps. asyncio's streams do not
+return ancillary data, so this module reads its sockets itself.
 """
 
 from __future__ import annotations
@@ -11,11 +10,10 @@ import asyncio
 import contextlib
 import errno
 import socket
-import struct
 import time
 from typing import NamedTuple
 
-from jointfit_drivers.ports._wall_clock import WallClock
+from jointfit_drivers.ports._socket_stamps import ANCILLARY_BYTES, SocketStamps
 
 READ_BYTES = 1 << 16
 """Most bytes of one read."""
@@ -24,11 +22,6 @@ RECEIVE_BUFFER = 1 << 20
 IDLE_S, PROBE_S, PROBES = 5, 2, 3
 """A peer without power or cable is detected after 5 s of silence and three unanswered probes, 2 s
 apart."""
-
-_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
-"""Socket option of the kernel stamps; the same number on x86-64 and ARM."""
-_STAMP = struct.Struct("@ll")
-_ANCILLARY = socket.CMSG_SPACE(_STAMP.size)
 
 
 class Segment(NamedTuple):
@@ -51,13 +44,12 @@ class TcpConnection:
     def __init__(self, connected: socket.socket) -> None:
         self._socket = connected
         connected.setblocking(False)
-        connected.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
         connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, IDLE_S)
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, PROBE_S)
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, PROBES)
-        self._wall = WallClock()
+        self._stamps = SocketStamps(connected)
 
     @classmethod
     async def open(cls, host: str, port: int, *, local: str, within_s: float) -> TcpConnection:
@@ -117,20 +109,15 @@ class TcpConnection:
         OSError
             The connection is lost; ConnectionResetError also if the server closed it.
         """
-        self._wall.pair()
+        self._stamps.pair()
         try:
-            data, ancillary, _, _ = self._socket.recvmsg(READ_BYTES, _ANCILLARY)
+            data, ancillary, _, _ = self._socket.recvmsg(READ_BYTES, ANCILLARY_BYTES)
         except BlockingIOError:
             return None
         if not data:
             raise ConnectionResetError(errno.ECONNRESET, "closed by the server")
 
-        now_ns = time.monotonic_ns()
-        for level, kind, value in ancillary:
-            if level == socket.SOL_SOCKET and kind == _TIMESTAMPNS and len(value) == _STAMP.size:
-                seconds, ns = _STAMP.unpack(value)
-                return Segment(self._wall.monotonic(seconds * 10**9 + ns, now_ns), data)
-        return Segment(now_ns, data)
+        return Segment(self._stamps.arrival(ancillary, time.monotonic_ns()), data)
 
 
 class TcpListener:

@@ -1,8 +1,7 @@
 """UDP sockets that stamp every datagram with its arrival.
 
-The kernel stamps datagrams on arrival (SO_TIMESTAMPNS) in CLOCK_REALTIME; `WallClock` converts the
-stamps to CLOCK_MONOTONIC. asyncio's datagram endpoint does not return ancillary data, so this
-module reads its sockets itself.
+The kernel stamps datagrams on arrival; `SocketStamps` converts the stamps. asyncio's datagram
+endpoint does not return ancillary data, so this module reads its sockets itself.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import struct
 import time
 from typing import NamedTuple
 
-from jointfit_drivers.ports._wall_clock import WallClock
+from jointfit_drivers.ports._socket_stamps import ANCILLARY_BYTES, SocketStamps
 
 MAX_DATAGRAM = 65_507
 """Largest payload of a UDP datagram over IPv4, bytes."""
@@ -24,8 +23,6 @@ DRAIN = 64
 RECEIVE_BUFFER = 1 << 20
 """Requested receive buffer, bytes: half a second of large frames while the host is busy."""
 
-_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
-"""Socket option of the kernel stamps; the same number on x86-64 and ARM."""
 _IP_RECVERR = 11
 """Socket option: an ICMP refusal becomes an error of this socket, connected or not."""
 _IP_MULTICAST_ALL = 49
@@ -38,8 +35,6 @@ _LOAD_WORD, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x15, 0x06  # classic BPF
 _SOURCE_ADDRESS = 0xFFF00000 + 12
 """Offset of the source address for packet filters: SKF_NET_OFF and its place in the header."""
 _WHOLE_PACKET = 0xFFFFFFFF
-_STAMP = struct.Struct("@ll")
-_ANCILLARY = socket.CMSG_SPACE(_STAMP.size)
 
 
 class Datagram(NamedTuple):
@@ -72,7 +67,7 @@ class UdpSocket:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.setblocking(False)
-            self._socket.setsockopt(socket.SOL_SOCKET, _TIMESTAMPNS, 1)
+            self._stamps = SocketStamps(self._socket)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
             self._socket.setsockopt(socket.IPPROTO_IP, _IP_RECVERR, 1)
             if shared:
@@ -96,7 +91,6 @@ class UdpSocket:
         except OSError:
             self._socket.close()
             raise
-        self._wall = WallClock()
 
     @classmethod
     def in_group(cls, group: str, port: int, local: str, *, sender: str) -> UdpSocket:
@@ -141,11 +135,11 @@ class UdpSocket:
             In particular ConnectionRefusedError: no program listens at the destination of a
             datagram that was sent.
         """
-        self._wall.pair()
+        self._stamps.pair()
         found: list[Datagram] = []
         for _ in range(DRAIN):
             try:
-                data, ancillary, _, address = self._socket.recvmsg(MAX_DATAGRAM, _ANCILLARY)
+                data, ancillary, _, address = self._socket.recvmsg(MAX_DATAGRAM, ANCILLARY_BYTES)
             except BlockingIOError:
                 break
             except OSError:
@@ -155,7 +149,7 @@ class UdpSocket:
                 raise
 
             now_ns = time.monotonic_ns()
-            found.append(Datagram(self._arrival(ancillary, now_ns), data, *address))
+            found.append(Datagram(self._stamps.arrival(ancillary, now_ns), data, *address))
 
         if not found:
             self._drop_errors()  # woken by a refusal that `send` has already reported
@@ -166,14 +160,6 @@ class UdpSocket:
         with contextlib.suppress(OSError):
             while True:
                 self._socket.recvmsg(1, 0, socket.MSG_ERRQUEUE)
-
-    def _arrival(self, ancillary: list[tuple[int, int, bytes]], now_ns: int) -> int:
-        for level, kind, value in ancillary:
-            if level == socket.SOL_SOCKET and kind == _TIMESTAMPNS and len(value) == _STAMP.size:
-                seconds, ns = _STAMP.unpack(value)
-                return self._wall.monotonic(seconds * 10**9 + ns, now_ns)
-        self._wall.replaced += 1
-        return now_ns
 
 
 def local_address(server: str, interface: str | None) -> str:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, MocapFrame, TickClock
-from jointfit_drivers.motion_capture import binding_events, wanted_names
+from jointfit_drivers.motion_capture import renew_columns, wanted_names
 from jointfit_drivers.qtm._binding import bind_settings
 from jointfit_drivers.qtm._continuity import TimestampContinuity
 from jointfit_drivers.qtm._frame_parts import FrameParts
@@ -144,14 +144,10 @@ class QtmDecoder:
             self._poses = QtmPoseConverter(axis)
 
         binding = bind_settings(settings, self._wanted_markers, self._wanted_bodies)
-        before = self._binding
-        out += binding_events(
-            None if before is None else before.columns, binding.columns, self.unpublished
-        )
-        if before is not None and before.columns.layout == binding.columns.layout:
-            columns = replace(binding.columns, layout=before.columns.layout)
-            binding = replace(binding, columns=columns)
-        self._binding = binding
+        before = None if self._binding is None else self._binding.columns
+        columns, events = renew_columns(before, binding.columns, self.unpublished)
+        out += events
+        self._binding = binding = replace(binding, columns=columns)
 
         self._camera_time = bool(settings.timestamp_enabled) and "camera" in (
             settings.timestamp_type or ""

@@ -113,21 +113,18 @@ class QtmSession:
 
     def _read(self, segment: Segment) -> None:
         for packet in self._stream.feed(segment.data):
-            if isinstance(packet, CorruptBytes):
-                raise self._unreadable(segment.data)
-            self._take(Chunk(segment.t_ns, packet))
-
-    def _unreadable(self, data: bytes) -> Exception:
-        """Return the error for a stream that contains no packets."""
-        if self._greeted:
-            return DeviceLostError(f"{self._name}: invalid packet size: connecting again")
-        port = self._settings.command_port
-        if GREETING.encode() in data:
-            return DeviceMisconfiguredError(
-                f"{self._name}: this port sends big-endian: set command_port = {port - 1}, the "
-                "little-endian one (base port of QTM plus 1)"
-            )
-        return _not_qtm(self._name)
+            if not isinstance(packet, CorruptBytes):
+                self._take(Chunk(segment.t_ns, packet))
+            elif self._greeted:
+                raise DeviceLostError(f"{self._name}: invalid packet size: connecting again")
+            elif GREETING.encode() in segment.data:
+                port = self._settings.command_port
+                raise DeviceMisconfiguredError(
+                    f"{self._name}: this port sends big-endian: set command_port = {port - 1}, the "
+                    "little-endian one (base port of QTM plus 1)"
+                )
+            else:
+                raise _not_qtm(self._name)
 
     def _read_udp(self, udp: UdpSocket) -> None:
         try:

@@ -5,6 +5,7 @@ Invariant: a pure function of bytes; every input yields a text.
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -85,7 +86,7 @@ def _cells(line: bytes, wire: LineFormat) -> list[bytes]:
 
 def _explain_frames(data: bytes, wire: FrameFormat) -> str:
     sync = wire.sync.hex(" ").upper()
-    starts = list(_starts(data, wire.sync))
+    starts = [found.start() for found in re.finditer(b"(?=" + re.escape(wire.sync) + b")", data)]
     if len(starts) < _FEW:
         shown = _shown(data)
         return f"sync bytes {sync} hardly occur in {shown}: check `baud` and `frame.sync`"
@@ -186,13 +187,6 @@ def _described(checksum: Checksum) -> str:
         shown = str(value).lower() if isinstance(value, bool) else shown
         keys.append(f"{name} = {value if name == 'first' else shown}")
     return ", ".join(keys)
-
-
-def _starts(data: bytes, sync: bytes) -> Iterator[int]:
-    at = data.find(sync)
-    while at >= 0:
-        yield at
-        at = data.find(sync, at + 1)
 
 
 def _shown(data: bytes) -> str:

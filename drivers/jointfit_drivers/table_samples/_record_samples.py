@@ -117,7 +117,11 @@ class RecordSamples:
         ticks = self._ticks(held.values)
         out: list[Decoded] = []
         if restarted:
-            self._forget()
+            self._gate.forget()
+            self._raw = self._new_filter()
+            self._raw_ns, self._raw_at = 0, -1
+            if self._checks is not None:
+                self._checks.forget()
             clock = "its counter" if ticks is None else f"device time {ticks}"
             out.append(DeviceEvent("restart", f"device restarted at {clock}"))
         return out + self._sample(held, ticks, self._count(held.values))
@@ -225,14 +229,6 @@ class RecordSamples:
         except (ValueError, OverflowError):
             return False
         return bits != 0 if self._form.equals is None else bits == self._form.equals
-
-    def _forget(self) -> None:
-        """Start again: the device restarted."""
-        self._gate.forget()
-        self._raw = self._new_filter()
-        self._raw_ns, self._raw_at = 0, -1
-        if self._checks is not None:
-            self._checks.forget()
 
     def _refuse(self, record: TableRecord, reason: str) -> Corrupt:
         self.refused += 1

@@ -197,6 +197,8 @@ def sample_form(form: TableForm, settings: TableImuSettings, *, is_text: bool) -
         counts = configured or (None if is_text else form.fields[counter].modulus)
     if valid in form.fields:
         mask, equals = form.parts[valid].mask or -1, form.parts[valid].equals
+    rate = form.parts.get(SLOTS["rate"].start)
+    rate_unit = 1.0 if rate is None else UNITS["rate"].get(rate.unit or "", 1.0)
     return SampleForm(
         slots,
         tuple(each.scale for each in measured),
@@ -210,15 +212,9 @@ def sample_form(form: TableForm, settings: TableImuSettings, *, is_text: bool) -
         settings.world,
         settings.direction == "world_to_sensor",
         None if is_text else form.fields,
-        _rate_unit(form),
+        rate_unit,
         RawSamples.maker(settings),
     )
-
-
-def _rate_unit(form: TableForm) -> float:
-    """Return the SI value of the configured unit of angular rates."""
-    part = form.parts.get(SLOTS["rate"].start)
-    return 1.0 if part is None else UNITS["rate"].get(part.unit or "", 1.0)
 
 
 def orientation_faults(form: TableForm, settings: TableImuSettings, *, timed: bool) -> Faults:

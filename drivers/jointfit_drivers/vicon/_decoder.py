@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, MocapFrame, TickClock
-from jointfit_drivers.motion_capture import FrameContinuity, binding_events, wanted_names
+from jointfit_drivers.motion_capture import FrameContinuity, renew_columns, wanted_names
 from jointfit_drivers.vicon._binding import bind_subjects
 from jointfit_drivers.vicon._latency import AnnouncedLatency
 from jointfit_drivers.vicon._poses import ViconPoseConverter
@@ -142,14 +142,10 @@ class ViconDecoder:
     def _bind(self, subjects: tuple[vicon.SubjectInfo, ...], out: list[Decoded]) -> ViconBinding:
         """Bind the columns to the subjects; append their changes and the warnings about them."""
         binding = bind_subjects(subjects, self._wanted_markers, self._wanted_bodies)
-        before = self._binding
-        out += binding_events(
-            None if before is None else before.columns, binding.columns, unpublished=0
-        )
-        if before is not None and before.columns.layout == binding.columns.layout:
-            columns = replace(binding.columns, layout=before.columns.layout)
-            binding = replace(binding, columns=columns)
-        self._binding = binding
+        before = None if self._binding is None else self._binding.columns
+        columns, events = renew_columns(before, binding.columns)
+        out += events
+        self._binding = binding = replace(binding, columns=columns)
         self._poor.clear()
         return binding
 

@@ -8,6 +8,7 @@ Invariant: the output depends only on the chunks fed; the decoder reads no clock
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, MocapFrame, TickClock
@@ -19,7 +20,7 @@ from jointfit_drivers.motion_capture import (
     ModelEntry,
     UnitCheck,
     bind_columns,
-    binding_events,
+    renew_columns,
     rows_array,
     unit_quaternion,
     wanted_names,
@@ -245,12 +246,9 @@ class VrpnDecoder:
         others = [entry for entry in entries if entry.name not in self._wanted_markers]
         binding = bind_columns(markers, others, self._wanted_markers, self._wanted_bodies)
         if not self._settled:
-            binding = ColumnBinding(binding.layout, binding.markers, binding.bodies, (), ())
-        elif before is not None and before.layout == binding.layout:
-            binding = ColumnBinding(
-                before.layout, binding.markers, binding.bodies, binding.warnings, binding.unknown
-            )
-        out += binding_events(before, binding, 0)
+            binding = replace(binding, warnings=(), unknown=())
+        binding, events = renew_columns(before, binding)
+        out += events
         self._binding, self._stale_binding = binding, False
         return binding
 

@@ -82,7 +82,7 @@ class FrameAssembler:
         if not self._follows(key, time_us):
             return []
         out = []
-        spread_us = self._spread_us
+        spread_us = _FIRST_SPREAD_US if self._period_us is None else _SAME_FRAME * self._period_us
         distance_us = abs(time_us - self._time_us)
         if self._reports and (key in self._reports or distance_us > spread_us):
             out.append(self._close())
@@ -109,10 +109,6 @@ class FrameAssembler:
     def flush(self) -> list[ReportedFrame]:
         """Return the frame in progress."""
         return [self._close()] if self._reports else []
-
-    @property
-    def _spread_us(self) -> float:
-        return _FIRST_SPREAD_US if self._period_us is None else _SAME_FRAME * self._period_us
 
     def _follows(self, key: ColumnKey, time_us: int) -> bool:
         """Return whether a report is newer than the last one of its body; count it otherwise."""

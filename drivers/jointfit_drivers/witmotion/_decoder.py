@@ -131,8 +131,10 @@ class WitMotionDecoder:
             if kind == _QUATERNION:
                 if self._raw is None:
                     out += self._orientation(event)
-            elif kind == _TIME:
-                self._begin_sample(event)
+            elif kind == _TIME:  # the first frame of a sample
+                self._first_ns = self._arrival_of(event)
+                self._ticks = self._calendar.accept(time_of(event.data), self._first_ns)
+                self._force = self._rate = None
             elif self._raw is not None:
                 out += self._measurement(event, self._raw)
             if not self._kinds_checked:
@@ -143,12 +145,6 @@ class WitMotionDecoder:
     def _arrival_of(self, frame: WitMotionFrame) -> int:
         """Return the arrival of the first byte of `frame`, monotonic ns."""
         return self._stamps.stamp(self._codec.fed - frame.end + FRAME_BYTES)
-
-    def _begin_sample(self, frame: WitMotionFrame) -> None:
-        """Take a time frame, the first one of a sample."""
-        self._first_ns = self._arrival_of(frame)
-        self._ticks = self._calendar.accept(time_of(frame.data), self._first_ns)
-        self._force = self._rate = None
 
     def _orientation(self, frame: WitMotionFrame) -> list[Decoded]:
         """Return the sample of a quaternion frame."""

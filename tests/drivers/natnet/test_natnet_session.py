@@ -311,7 +311,7 @@ def test_the_kernel_stamps_datagrams_on_loopback() -> None:
         (arrival,) = opened.receive()
     finally:
         opened.close()
-    assert (arrival.data, arrival.host, opened._wall.replaced) == (b"x", "127.0.0.1", 0)
+    assert (arrival.data, arrival.host, opened._stamps.replaced) == (b"x", "127.0.0.1", 0)
     assert before - 200_000 <= arrival.t_ns <= after + 5_000_000
 
 

@@ -19,7 +19,7 @@ from jointfit_protocols.ximu3 import (
     encode_multiplexed,
     encode_text,
 )
-from jointfit_simulators.devices._ximu3_device import _angles, _matrix
+from jointfit_simulators.devices._rotations import roll_pitch_yaw_deg, rotation_rows
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -136,7 +136,8 @@ def test_matrices_and_angles_give_the_orientation_of_the_quaternion(one: int, ot
     a, b = one * math.pi / 200, other * math.pi / 200
     q = (math.cos(a) * math.cos(b), math.cos(a) * math.sin(b), math.sin(a) * math.cos(b),
          math.sin(a) * math.sin(b))  # fmt: skip
-    wires = (encode_data("R", 1, _matrix(q)), encode_data("A", 1, _angles(q)))
+    matrix = tuple(value for row in rotation_rows(q) for value in row)
+    wires = (encode_data("R", 1, matrix), encode_data("A", 1, roll_pitch_yaw_deg(q)))
     for wire in wires:
         (sample,) = samples(fed(decoder(world="ENU"), wire))
         assert angle_between(sample.q_world_sensor, q) < 2e-3
