@@ -32,6 +32,7 @@ from jointfit_protocols.bno085 import ShtpBufferStatus as _Status
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.devices._inertial_signals import InertialSignals
+from jointfit_simulators.devices._rotations import roll_pitch_yaw_deg
 from jointfit_simulators.imu_device import clean_wire
 
 if TYPE_CHECKING:
@@ -226,13 +227,11 @@ class Bno085Device(SerialDevice):
 
 def euler_deg(q: Quaternion, order: Literal["zxy", "zyx"]) -> tuple[float, float, float]:
     """Return yaw, pitch and roll of an orientation, degrees."""
+    if order == "zyx":
+        roll, pitch, yaw = roll_pitch_yaw_deg(q)
+        return yaw, pitch, roll
     w, x, y, z = q
-    if order == "zxy":
-        sine = max(-1.0, min(1.0, 2 * (y * z + w * x)))
-        yaw = atan2(-2 * (x * y - w * z), 1 - 2 * (x * x + z * z))
-        roll = atan2(-2 * (x * z - w * y), 1 - 2 * (x * x + y * y))
-    else:
-        sine = max(-1.0, min(1.0, 2 * (w * y - x * z)))
-        yaw = atan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z))
-        roll = atan2(2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
+    sine = max(-1.0, min(1.0, 2 * (y * z + w * x)))
+    yaw = atan2(-2 * (x * y - w * z), 1 - 2 * (x * x + z * z))
+    roll = atan2(-2 * (x * z - w * y), 1 - 2 * (x * x + y * y))
     return degrees(yaw), degrees(asin(sine)), degrees(roll)

@@ -11,11 +11,12 @@ with `SensorErrors` measures these signals with bias, scale errors and noise.
 
 from __future__ import annotations
 
-from math import atan2, cos, radians, sin, sqrt
+from math import cos, radians, sin, sqrt
 from random import Random
 from typing import TYPE_CHECKING
 
 from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_simulators.devices._rotations import TINY, rotation_vector
 from jointfit_simulators.devices._sensor_errors import SensorErrors, Vector, VectorErrors
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ GRAVITY = 9.81
 """Specific force at rest, m/s^2."""
 DIP_RAD = radians(65.0)
 """Inclination of the magnetic field below the horizon; its magnitude is 1, its heading north."""
-_TINY = 1e-12
-"""Rotation below which the small-angle limit is used, rad."""
 
 
 class InertialSignals:
@@ -51,7 +50,7 @@ class InertialSignals:
         """Add the orientation at the next instant."""
         if self._last is not None:
             at_ns, before = self._last
-            self._turn = _rotation_vector(before, q_world_sensor)
+            self._turn = _rotation_between(before, q_world_sensor)
             self._step_s = (device_ns - at_ns) * 1e-9
         self._last, self._q = (device_ns, q_world_sensor), q_world_sensor
 
@@ -87,7 +86,7 @@ class InertialSignals:
             case Item.DELTA_Q:
                 x, y, z = self._turn if self._exact else _scaled(self.rate, step_s)
                 angle = sqrt(x * x + y * y + z * z)
-                scale = sin(angle / 2.0) / angle if angle > _TINY else 0.5
+                scale = sin(angle / 2.0) / angle if angle > TINY else 0.5
                 return (cos(angle / 2.0), scale * x, scale * y, scale * z)
             case Item.ACCELERATION:
                 return self.force
@@ -103,8 +102,8 @@ def _scaled(vector: Vector, scale: float) -> Vector:
     return (vector[0] * scale, vector[1] * scale, vector[2] * scale)
 
 
-def _rotation_vector(before: Quaternion, after: Quaternion) -> Vector:
-    """Return log(before* after), rad."""
+def _rotation_between(before: Quaternion, after: Quaternion) -> Vector:
+    """Return the rotation vector of before* after, rad."""
     a, b, c, d = before
     w, x, y, z = after
     v = (
@@ -112,14 +111,7 @@ def _rotation_vector(before: Quaternion, after: Quaternion) -> Vector:
         a * y + b * z - c * w - d * x,
         a * z - b * y + c * x - d * w,
     )
-    real = a * w + b * x + c * y + d * z
-
-    # q and -q are the same rotation: use the one with a positive real part
-    if real < 0.0:
-        real, v = -real, (-v[0], -v[1], -v[2])
-    length = sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    scale = 2.0 * atan2(length, real) / length if length > _TINY else 2.0
-    return (scale * v[0], scale * v[1], scale * v[2])
+    return rotation_vector((a * w + b * x + c * y + d * z, *v))
 
 
 def _to_sensor(q: Quaternion, v: Vector) -> Vector:

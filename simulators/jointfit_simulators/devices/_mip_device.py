@@ -235,18 +235,19 @@ class MipDevice(SerialDevice):
 
     def _answer(self, command_set: int, command: int, data: bytes) -> None:
         if (command_set, command) == (CommandSet.BASE, Base.IDLE) and not self.idle:
-            delay_s = self._options.idle_delay_s
-            if delay_s:
-                self._after(delay_s, lambda: self._set_idle(command))
+            if delay_s := self._options.idle_delay_s:
+                accepted = (commands.REPLY, bytes((command, commands.OK)))
+
+                def acknowledge() -> None:
+                    self.idle = True
+                    self._write(encode(CommandSet.BASE, (accepted,)))
+
+                self._after(delay_s, acknowledge)
                 return
             self.idle = True
 
         code, fields = self._reply(command_set, command, data)
         self._write(encode(command_set, ((commands.REPLY, bytes((command, code))), *fields)))
-
-    def _set_idle(self, command: int) -> None:
-        self.idle = True
-        self._write(encode(CommandSet.BASE, ((commands.REPLY, bytes((command, commands.OK))),)))
 
     def _reply(
         self, command_set: int, command: int, data: bytes

@@ -20,6 +20,7 @@ from jointfit_protocols.qtm import (
     TimecodeComponent,
     TimecodeType,
 )
+from jointfit_simulators.devices._rotations import rotation_rows
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -223,13 +224,3 @@ def _body(kind: ComponentType, pose: tuple[Vector, Quaternion] | None) -> tuple[
         return (*position, *map(math.degrees, angles), *last)
     column_major = tuple(row[column] for column in range(3) for row in rows)
     return (*position, *column_major, *last)
-
-
-def rotation_rows(q: Quaternion) -> tuple[Vector, Vector, Vector]:
-    """Return the rotation matrix of a unit quaternion (w, x, y, z) by rows."""
-    w, x, y, z = q
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )

@@ -7,7 +7,6 @@ reply, ASCII messages stand between binary outputs, and asynchronous output can 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import asin, atan2, degrees
 from typing import TYPE_CHECKING, Any
 
 from typing_extensions import override
@@ -30,6 +29,7 @@ from jointfit_protocols.vectornav.registers import (
 )
 from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.devices._inertial_signals import InertialSignals
+from jointfit_simulators.devices._rotations import roll_pitch_yaw_deg
 from jointfit_simulators.imu_device import clean_wire
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ class VectorNavDevice(SerialDevice):
         if self.paused:
             return
         if self.text_output:
-            yaw, pitch, roll = _angles(native_of(q_world_sensor, "NED"))
+            roll, pitch, yaw = roll_pitch_yaw_deg(native_of(q_world_sensor, "NED"))
             self._write(
                 encode_text(f"{self.text_output},{yaw:+08.3f},{pitch:+08.3f},{roll:+08.3f}")
             )
@@ -255,12 +255,3 @@ class VectorNavDevice(SerialDevice):
 
 def _error(code: int) -> str:
     return f"VNERR,{code:02X}"
-
-
-def _angles(q: Quaternion) -> tuple[float, float, float]:
-    """Return yaw, pitch and roll, degrees."""
-    w, x, y, z = q
-    yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    pitch = asin(max(-1.0, min(1.0, 2 * (w * y - x * z))))
-    roll = atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    return degrees(yaw), degrees(pitch), degrees(roll)

@@ -9,7 +9,6 @@ Invariant: static objects are sent once after each change and are listed as unch
 from __future__ import annotations
 
 import asyncio
-import math
 import random
 import struct
 from dataclasses import dataclass, field
@@ -20,7 +19,7 @@ from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.vicon import ObjectId
 from jointfit_simulators.devices._natnet_frames import axes_from_z_up
 from jointfit_simulators.devices._natnet_options import same_clock
-from jointfit_simulators.devices._qtm_frames import rotation_rows
+from jointfit_simulators.devices._rotations import rotation_rows, rotation_vector
 from jointfit_simulators.devices._tcp_port import TcpPort
 from jointfit_simulators.imu_device import WireNoise, clean_wire
 
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
         Bodies,
         Markers,
         Pose,
-        Quaternion,
         RigidBodyAsset,
     )
     from jointfit_simulators.devices._tcp_port import TcpClient
@@ -245,7 +243,7 @@ class ViconServer:
         q = self._turn(*pose[1])
         rotation = tuple(value for row in rotation_rows(q) for value in row)
         segment = (vicon.SegmentPose(1, (x, y, z), rotation),)
-        light = vicon.LightSegment(1, x, y, z, *_rotation_vector(q))
+        light = vicon.LightSegment(1, x, y, z, *rotation_vector(q))
         return [
             (ObjectId.LOCAL_SEGMENTS,
              vicon.Segments(ObjectId.LOCAL_SEGMENTS, subject, segment)),
@@ -283,11 +281,3 @@ class ViconServer:
                 client.wire.send(vicon.encode(item))
             case _:
                 return
-
-
-def _rotation_vector(q: Quaternion) -> tuple[float, float, float]:
-    """Return the rotation vector of a unit quaternion, rad."""
-    w, x, y, z = q if q[0] >= 0 else (-q[0], -q[1], -q[2], -q[3])
-    sine = math.sqrt(x * x + y * y + z * z)
-    scale = 2 * math.atan2(sine, w) / sine if sine > 0 else 2.0
-    return scale * x, scale * y, scale * z

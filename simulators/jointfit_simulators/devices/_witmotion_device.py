@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import time
 from dataclasses import dataclass
-from math import atan2, degrees, radians
+from math import radians
 from typing import TYPE_CHECKING
 
 from typing_extensions import override
@@ -33,6 +33,7 @@ from jointfit_protocols.witmotion import (
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.devices._inertial_signals import InertialSignals
+from jointfit_simulators.devices._rotations import roll_pitch_yaw_deg
 from jointfit_simulators.imu_device import clean_wire
 
 if TYPE_CHECKING:
@@ -213,7 +214,10 @@ class WitMotionDevice(SerialDevice):
             every = self._options.time_glitch_every
             glitch = every and self.counter % every == every - 1
             return encode_time(_EPOCH_MS + device_ns // TICK_NS + _GLITCH_MS * bool(glitch))
-        return _encode_reals(self._values(kind, q))
+        # missing values are 0
+        values = [*self._values(kind, q), 0.0, 0.0, 0.0, 0.0][:4]
+        w, x, y, z = (round(value * FULL_SCALE) for value in values)
+        return encode_counts((w, x, y, z))
 
     def _values(self, kind: int, q: Quaternion) -> list[float]:
         """Return the values of a frame in units of full scale; none for other kinds."""
@@ -225,7 +229,7 @@ class WitMotionDevice(SerialDevice):
             case WitMotionFrameKind.MAGNETIC_FIELD:
                 return self._signal(Item.MAGNETIC_FIELD, FULL_SCALE / _FIELD_COUNTS)
             case WitMotionFrameKind.ANGLE:
-                return [angle / 180.0 for angle in _euler_deg(q)]
+                return [angle / 180.0 for angle in roll_pitch_yaw_deg(q)]
             case WitMotionFrameKind.QUATERNION:
                 w, x, y, z = native_of(q, self._options.world)
                 sign = -1.0 if self._options.world_to_sensor else 1.0
@@ -238,22 +242,6 @@ class WitMotionDevice(SerialDevice):
 
     def _other_frame(self, q: Quaternion) -> bytes:
         """Return a frame of the variant 55 61: acceleration, rate and angle, no checksum."""
-        angles = [round(angle / 180.0 * FULL_SCALE) for angle in _euler_deg(q)]
+        angles = [round(angle / 180.0 * FULL_SCALE) for angle in roll_pitch_yaw_deg(q)]
         limited = [max(-FULL_SCALE, min(FULL_SCALE - 1, angle)) for angle in angles]
         return _OTHER_FRAME.pack(0x55, 0x61, 0, 0, 2048, 0, 0, 0, *limited)
-
-
-def _encode_reals(values: list[float]) -> bytes:
-    """Return the data of a frame with values in units of full scale; missing ones are 0."""
-    w, x, y, z = (round(value * FULL_SCALE) for value in [*values, 0.0, 0.0, 0.0, 0.0][:4])
-    return encode_counts((w, x, y, z))
-
-
-def _euler_deg(q: Quaternion) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw, degrees."""
-    w, x, y, z = q
-    roll = atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    sine = max(-1.0, min(1.0, 2 * (w * y - z * x)))
-    pitch = atan2(sine, (1.0 - sine * sine) ** 0.5)
-    yaw = atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    return degrees(roll), degrees(pitch), degrees(yaw)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import struct
-from math import asin, atan2, degrees
+from itertools import chain
 from typing import TYPE_CHECKING
 
 from jointfit_protocols.orientation import native_of
 from jointfit_protocols.xbus import XbusMessageId
 from jointfit_protocols.xbus.mtdata import NED, PERIOD_HZ, MTDataLayout
 from jointfit_protocols.xbus.mtdata2 import FILTER_VALID, Item
+from jointfit_simulators.devices._rotations import roll_pitch_yaw_deg, rotation_rows
 
 if TYPE_CHECKING:
     from jointfit_protocols.orientation import World
@@ -37,12 +38,13 @@ def legacy_content(
         Rates, accelerations and magnetic field.
     """
     native = native_of(q, "NED" if layout.settings & NED else world)
+    columns = zip(*rotation_rows(native), strict=True)
     values: dict[int, Value] = {
         Item.PACKET_COUNTER: counter,
         Item.STATUS_BYTE: FILTER_VALID,
         Item.QUATERNION: native,
-        Item.EULER_ANGLES: _euler(native),
-        Item.ROTATION_MATRIX: _matrix(native),
+        Item.EULER_ANGLES: roll_pitch_yaw_deg(native),
+        Item.ROTATION_MATRIX: tuple(chain(*columns)),
     }
     for item in (Item.ACCELERATION, Item.RATE_OF_TURN, Item.MAGNETIC_FIELD):
         value = inertial.value(item)
@@ -63,20 +65,3 @@ def legacy_reply(
     }
     data = replies.get(mid)
     return None if data is None else (mid + 1, data)
-
-
-def _matrix(q: Quaternion) -> tuple[float, ...]:
-    """Return R(q) by columns."""
-    w, x, y, z = q
-    return (
-        1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y),
-        2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x),
-        2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-
-
-def _euler(q: Quaternion) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw, degrees."""
-    r = _matrix(q)
-    pitch = asin(max(-1.0, min(1.0, -r[2])))
-    return degrees(atan2(r[5], r[8])), degrees(pitch), degrees(atan2(r[1], r[0]))

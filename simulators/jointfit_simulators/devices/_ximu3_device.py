@@ -9,7 +9,8 @@ log of a device.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import asin, atan2, degrees
+from itertools import chain
+from math import degrees
 from typing import TYPE_CHECKING, Literal
 
 from typing_extensions import override
@@ -28,6 +29,7 @@ from jointfit_protocols.ximu3 import (
 )
 from jointfit_simulators.devices._device_wire import SerialDevice
 from jointfit_simulators.devices._inertial_signals import InertialSignals
+from jointfit_simulators.devices._rotations import roll_pitch_yaw_deg, rotation_rows
 from jointfit_simulators.imu_device import clean_wire
 
 if TYPE_CHECKING:
@@ -269,8 +271,8 @@ class XImu3Device(SerialDevice):
         q = native_of(q_world_sensor, world)
         encode: tuple[Callable[[], bytes], ...] = (
             lambda: self._data(DataKind.QUATERNION, ticks, tuple(NORM * part for part in q)),
-            lambda: self._data(DataKind.MATRIX, ticks, _matrix(q)),
-            lambda: self._data(DataKind.EULER, ticks, _angles(q)),
+            lambda: self._data(DataKind.MATRIX, ticks, tuple(chain(*rotation_rows(q)))),
+            lambda: self._data(DataKind.EULER, ticks, roll_pitch_yaw_deg(q)),
             lambda: self._data(DataKind.LINEAR_ACCELERATION, ticks, (0.0, 0.0, 0.0)),
             lambda: self._data(DataKind.EARTH_ACCELERATION, ticks, (0.0, 0.0, 0.0)),
         )
@@ -286,23 +288,3 @@ def _fault(key: str, value: object, before: object) -> str:
     if isinstance(value, int) and not 0 <= value <= _MOST.get(key, 1):
         return "Out of range"
     return ""
-
-
-def _matrix(q: Quaternion) -> tuple[float, ...]:
-    """Return the rotation matrix of a unit quaternion, row by row."""
-    w, x, y, z = q
-    return (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-
-
-def _angles(q: Quaternion) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw of a unit quaternion, deg."""
-    xx, _, _, yx, _, _, zx, zy, zz = _matrix(q)
-    return (
-        degrees(atan2(zy, zz)),
-        degrees(-asin(min(max(zx, -1.0), 1.0))),
-        degrees(atan2(yx, xx)),
-    )
