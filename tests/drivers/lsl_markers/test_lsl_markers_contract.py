@@ -8,18 +8,16 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from typing_extensions import override
 
-from jointfit_daemon.model import MocapFrame
 from jointfit_drivers.lsl_markers import LslMarkersMocap, LslMarkersSettings
 from jointfit_simulators._contract_fixtures import orientation
 from jointfit_simulators.devices import LslServer, LslServerOptions
-from jointfit_simulators.driver_contract import DriverContract
+from tests.drivers.motion_capture.mocap_contract import MocapContract
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
     from jointfit_daemon.driver import Driver
-    from jointfit_simulators.imu_device import WireNoise
+    from jointfit_daemon.model import MocapFrame
 
 pytestmark = [pytest.mark.real_time, pytest.mark.usefixtures("lsl_network")]
 
@@ -27,28 +25,15 @@ SOURCE = f"contract-{os.getpid()}"
 """Other processes of this host have streams, too."""
 
 
-class TestLslMarkers(DriverContract):
+class TestLslMarkers(MocapContract):
     registered_as = "lsl-markers"
-    measurement = MocapFrame
-    has_noise = False  # TCP has a checksum
-    test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
     # The outlet is in this process, and closes its side later: see test_lsl_session.
     test_cancelling_closes_all_descriptors_and_tasks = None  # type: ignore[assignment]
     options = LslServerOptions(markers=("T1",), bodies=("Thigh",), unit="mm", source_id=SOURCE)
-    _devices: list[Any]
-
-    @pytest.fixture(autouse=True)
-    def _close(self) -> Iterator[None]:
-        self._devices = []
-        yield
-        for device in self._devices:
-            device.unplug()
 
     @override
-    def make_device(self, folder: Path, wire_noise: WireNoise) -> LslServer:
-        device = LslServer(self.options)
-        self._devices.append(device)
-        return device
+    def make_server(self) -> LslServer:
+        return LslServer(self.options)
 
     @override
     def make_driver(self, folder: Path) -> Driver:
@@ -59,9 +44,7 @@ class TestLslMarkers(DriverContract):
     @override
     def make_wrong_device(self, folder: Path) -> LslServer:
         text = LslServerOptions(markers=("T1",), source_id=SOURCE, channel_format="string")
-        device = LslServer(text)
-        self._devices.append(device)
-        return device
+        return self.opened(LslServer(text))
 
     @override
     def send(self, device: LslServer, number: int) -> None:

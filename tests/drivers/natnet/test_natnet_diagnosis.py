@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import time
 from collections.abc import Callable
 from ipaddress import IPv4Network
@@ -15,9 +13,10 @@ from jointfit_drivers.natnet import NatNetMocap, NatNetSettings, _diagnosis, _se
 from jointfit_drivers.natnet._network_findings import card_findings, multicast_arrivals
 from jointfit_drivers.ports.network_cards import NetworkCard, network_cards
 from jointfit_simulators.devices import NatNetServer, NatNetServerOptions, RigidBodyAsset
+from tests.drivers.motion_capture.mocap_run import answering
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from contextlib import AbstractAsyncContextManager
 
     from jointfit_daemon.device_search import Finding
 
@@ -35,26 +34,16 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_session, "CONNECT_S", 0.5)
 
 
-@contextlib.asynccontextmanager
-async def served(
+def served(
     server: NatNetServer, scene: Any, before: Before = lambda _: None
-) -> AsyncIterator[None]:
+) -> AbstractAsyncContextManager[None]:
     """Answer, and send a frame every 10 ms; `scene` None sends none."""
 
-    async def push() -> None:
-        while scene is not None:
-            before(server)
-            server.push(time.monotonic_ns(), *scene)
-            await asyncio.sleep(0.01)
+    def push() -> None:
+        before(server)
+        server.push(time.monotonic_ns(), *scene)
 
-    tasks = [asyncio.create_task(server.run()), asyncio.create_task(push())]
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
-        server.unplug()
+    return answering(server, None if scene is None else push)
 
 
 async def findings(server: NatNetServer, **settings: Any) -> list[Finding]:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
 from jointfit_simulators.devices import QtmServer, QtmServerOptions, RigidBodyAsset
+from tests.drivers.motion_capture.mocap_run import answering
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import Callable
+    from contextlib import AbstractAsyncContextManager
 
 THIGH = RigidBodyAsset("Thigh", ("T1", "T2", "T3"), 1)
 SHANK = RigidBodyAsset("Shank", ("S1",), 2)
@@ -22,24 +22,13 @@ def made(**options: Any) -> QtmServer:
     return QtmServer(QtmServerOptions(**({"bodies": (THIGH, SHANK)} | options)))
 
 
-@contextlib.asynccontextmanager
-async def served(
+def served(
     server: QtmServer, *, sends: bool = True, before: Callable[[], None] = lambda: None
-) -> AsyncIterator[None]:
+) -> AbstractAsyncContextManager[None]:
     """Answer, and send a frame every 10 ms."""
 
-    async def push() -> None:
-        while sends:
-            before()
-            server.push(time.monotonic_ns(), SEEN, {"Thigh": POSE, "Shank": None})
-            await asyncio.sleep(0.01)
+    def push() -> None:
+        before()
+        server.push(time.monotonic_ns(), SEEN, {"Thigh": POSE, "Shank": None})
 
-    tasks = [asyncio.create_task(server.run()), asyncio.create_task(push())]
-    await server.ready.wait()
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
-        server.unplug()
+    return answering(server, push if sends else None)

@@ -2,83 +2,29 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import pytest
 from typing_extensions import override
 
-from jointfit_daemon.model import MocapFrame
-from jointfit_drivers.qtm import QtmMocap, QtmSettings
-from jointfit_simulators._contract_fixtures import orientation
-from jointfit_simulators.devices import QtmServer, QtmServerOptions, RigidBodyAsset, TextServer
-from jointfit_simulators.driver_contract import DriverContract
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
-
-    from jointfit_daemon.driver import Driver
-    from jointfit_simulators.imu_device import WireNoise
+from jointfit_simulators.devices import QtmServer, QtmServerOptions
+from tests.drivers.motion_capture.mocap_contract import THIGH, MocapContract
 
 pytestmark = pytest.mark.real_time
 
-THIGH = RigidBodyAsset("Thigh", ("T1", "T2", "T3"), 1)
 
-
-class TestQtmOverUdp(DriverContract):
+class TestQtmOverUdp(MocapContract):
     registered_as = "qtm"
-    measurement = MocapFrame
-    has_noise = False  # checksums of UDP and TCP detect damage before the driver sees it
-    test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
     options = QtmServerOptions(bodies=(THIGH,))
-    settings: ClassVar[dict[str, Any]] = {}
-    _devices: list[Any]
-
-    @pytest.fixture(autouse=True)
-    def _close(self) -> Iterator[None]:
-        self._devices = []
-        yield
-        for device in self._devices:
-            device.unplug()
 
     @override
-    def make_device(self, folder: Path, wire_noise: WireNoise) -> QtmServer:
-        device = QtmServer(self.options)
-        self._devices.append(device)
-        return device
-
-    @override
-    def make_driver(self, folder: Path) -> Driver:
-        port = self._devices[-1].command_port if self._devices else 22223
-        table = {
-            "driver": "qtm", "server": "127.0.0.1", "command_port": port, "silence_s": 0.5,
-            "markers": {"thigh": THIGH.markers},
-        }  # fmt: skip
-        return QtmMocap(QtmSettings.model_validate(table | self.settings))
-
-    @override
-    def make_wrong_device(self, folder: Path) -> TextServer:
-        device = TextServer(b"HTTP/1.1 400 Bad Request\r\n\r\n")
-        self._devices.append(device)
-        return device
-
-    @override
-    def send(self, device: QtmServer, number: int) -> None:
-        pose = ((0.1, 0.2, 0.001 * number), orientation(number))
-        device.push(
-            self.device_ns(device, number), {"T1": (1.0, 2.0, 0.001 * number)}, {"Thigh": pose}
-        )
-
-    @override
-    def matches(self, number: int, measurement: MocapFrame) -> bool:
-        q = measurement.body_orientations[0]
-        same = abs(sum(a * b for a, b in zip(q, orientation(number), strict=True))) > 1 - 1e-6
-        return bool(same and abs(measurement.markers[0, 2] - 0.001 * number) < 1e-6)
+    def make_server(self) -> QtmServer:
+        return QtmServer(self.options)
 
 
 class TestQtmOverTcp(TestQtmOverUdp):
     options = QtmServerOptions(bodies=(THIGH,), newest=(1, 21), camera_time=False, pieces=3)
-    settings: ClassVar[dict[str, Any]] = {"transport": "tcp"}
+    keys: ClassVar[dict[str, Any]] = MocapContract.keys | {"transport": "tcp"}
 
 
 class TestQtmInParts(TestQtmOverUdp):

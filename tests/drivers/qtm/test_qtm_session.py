@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import struct
 from typing import TYPE_CHECKING, Any
 
@@ -11,17 +10,14 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
-from jointfit_daemon.model import DeviceEvent, MocapFrame
 from jointfit_drivers.qtm import QtmMocap, QtmSettings, _diagnosis, _server_search, _session
 from jointfit_protocols.qtm import QtmEvent
 from jointfit_simulators.devices import QtmServer, RigidBodyAsset, TextServer
+from tests.drivers.motion_capture.mocap_run import MocapRun
 from tests.drivers.qtm.serving import POSE, SHANK, THIGH, made, served
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
-
     from jointfit_daemon.device_search import Finding
-    from jointfit_daemon.model import Chunk, Decoded
 
 pytestmark = pytest.mark.real_time
 
@@ -31,38 +27,8 @@ def settings_of(port: int, **table: Any) -> QtmSettings:
     return QtmSettings.model_validate(keys | table)
 
 
-class Reading:
-    """A driver at work and the output of its decoder."""
-
-    def __init__(self, server: QtmServer, **table: Any) -> None:
-        self.driver = QtmMocap(settings_of(server.command_port, **table))
-        self.decoder = self.driver.decoder()
-        self.items: list[Decoded] = []
-
-    def emit(self, chunk: Chunk) -> None:
-        self.items += self.decoder.feed(chunk)
-
-    @property
-    def frames(self) -> list[MocapFrame]:
-        return [item for item in self.items if isinstance(item, MocapFrame)]
-
-    def texts(self) -> list[str]:
-        return [item.text for item in self.items if isinstance(item, DeviceEvent)]
-
-    async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(10):
-            while not condition():
-                assert not self.task.done(), self.task.exception()
-                await asyncio.sleep(0.01)
-
-    @contextlib.asynccontextmanager
-    async def running(self) -> AsyncIterator[None]:
-        self.task = asyncio.create_task(self.driver.run(self.emit))
-        try:
-            yield
-        finally:
-            self.task.cancel()
-            await asyncio.wait([self.task])
+def run_of(server: QtmServer, **table: Any) -> MocapRun:
+    return MocapRun(QtmMocap(settings_of(server.command_port, **table)))
 
 
 async def refusal(port: int, **table: Any) -> Exception:
@@ -76,7 +42,7 @@ async def refusal(port: int, **table: Any) -> Exception:
 @pytest.mark.parametrize("newest", [(1, 19), (1, 22), (1, 28)])
 async def test_the_newest_version_of_both_sides_is_used(newest: tuple[int, int]) -> None:
     server = made(newest=newest)
-    reading = Reading(server)
+    reading = run_of(server)
     async with served(server), reading.running():
         await reading.until(lambda: bool(reading.frames))
     chosen = min(newest, (1, 25))
@@ -118,7 +84,7 @@ async def test_the_big_endian_port_is_recognized() -> None:
 async def test_the_driver_waits_for_a_measurement_and_resumes() -> None:
     server = made(camera_time=False)
     server.measuring = False
-    reading = Reading(server)
+    reading = run_of(server)
     async with served(server), reading.running():
         await reading.until(lambda: any("waiting" in text for text in reading.texts()))
         await asyncio.sleep(0.8)  # longer than silence_s
@@ -134,7 +100,7 @@ async def test_the_driver_waits_for_a_measurement_and_resumes() -> None:
 
 async def test_bodies_that_the_operator_reorders_remain_bound_by_name() -> None:
     server = made()
-    reading = Reading(server, rigid_body={"thigh": "Thigh"})
+    reading = run_of(server, rigid_body={"thigh": "Thigh"})
     async with served(server), reading.running():
         await reading.until(lambda: len(reading.frames) > 3)
         server.set_bodies((SHANK, RigidBodyAsset("New", ("N1",), 3), THIGH))
@@ -146,7 +112,7 @@ async def test_bodies_that_the_operator_reorders_remain_bound_by_name() -> None:
 
 async def test_lost_repeated_and_reordered_datagrams_are_counted() -> None:
     server = made(loss=0.1, duplication=0.1, reordering=0.1)
-    reading = Reading(server)
+    reading = run_of(server)
     async with served(server), reading.running():
         await reading.until(lambda: len(reading.frames) > 60)
     numbers = [frame.number for frame in reading.frames]
@@ -158,7 +124,7 @@ async def test_lost_repeated_and_reordered_datagrams_are_counted() -> None:
 
 async def test_damaged_frames_are_rejected_as_a_whole() -> None:
     server = made(hostile=0.3)
-    reading = Reading(server)
+    reading = run_of(server)
     async with served(server), reading.running():
         await reading.until(lambda: len(reading.frames) > 30)
     assert reading.decoder.discarded_bytes > 0

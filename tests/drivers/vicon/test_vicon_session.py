@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -11,17 +10,17 @@ import numpy as np
 import pytest
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
-from jointfit_daemon.model import DeviceEvent, MocapFrame
+from jointfit_daemon.model import DeviceEvent
 from jointfit_drivers.vicon import ViconMocap, ViconSettings, _session
 from jointfit_protocols.vicon import ObjectId
 from jointfit_simulators.devices import RigidBodyAsset, TextServer, ViconServer, ViconServerOptions
+from tests.drivers.motion_capture.mocap_run import MocapRun, answering
 from tests.drivers.motion_capture.oracle_client import needs_client, oracle_frames
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from contextlib import AbstractAsyncContextManager
 
     from jointfit_daemon.device_search import Finding
-    from jointfit_daemon.model import Chunk, Decoded
 
 pytestmark = pytest.mark.real_time
 
@@ -35,24 +34,13 @@ def made(**options: Any) -> ViconServer:
     return ViconServer(ViconServerOptions(**(usual | options)))
 
 
-@contextlib.asynccontextmanager
-async def served(server: ViconServer, *, sends: bool = True) -> AsyncIterator[None]:
+def served(server: ViconServer, *, sends: bool = True) -> AbstractAsyncContextManager[None]:
     """Answer, and send a frame every 10 ms."""
 
-    async def push() -> None:
-        while sends:
-            server.push(time.monotonic_ns(), {"T1": (0.1, 0.2, 0.3)}, {"Thigh": POSE})
-            await asyncio.sleep(0.01)
+    def push() -> None:
+        server.push(time.monotonic_ns(), {"T1": (0.1, 0.2, 0.3)}, {"Thigh": POSE})
 
-    tasks = [asyncio.create_task(server.run()), asyncio.create_task(push())]
-    await server.ready.wait()
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
-        server.unplug()
+    return answering(server, push if sends else None)
 
 
 def settings_of(port: int, **table: Any) -> ViconSettings:
@@ -60,40 +48,13 @@ def settings_of(port: int, **table: Any) -> ViconSettings:
     return ViconSettings.model_validate(keys | table)
 
 
-class Reading:
-    """A driver at work and the output of its decoder."""
-
-    def __init__(self, server: ViconServer, **table: Any) -> None:
-        self.driver = ViconMocap(settings_of(server.command_port, **table))
-        self.decoder = self.driver.decoder()
-        self.items: list[Decoded] = []
-
-    def emit(self, chunk: Chunk) -> None:
-        self.items += self.decoder.feed(chunk)
-
-    @property
-    def frames(self) -> list[MocapFrame]:
-        return [item for item in self.items if isinstance(item, MocapFrame)]
-
-    async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(10):
-            while not condition():
-                assert not self.task.done(), self.task.exception()
-                await asyncio.sleep(0.01)
-
-    @contextlib.asynccontextmanager
-    async def running(self) -> AsyncIterator[None]:
-        self.task = asyncio.create_task(self.driver.run(self.emit))
-        try:
-            yield
-        finally:
-            self.task.cancel()
-            await asyncio.wait([self.task])
+def run_of(server: ViconServer, **table: Any) -> MocapRun:
+    return MocapRun(ViconMocap(settings_of(server.command_port, **table)))
 
 
 async def test_subjects_that_change_remain_bound_by_name() -> None:
     server = made()
-    reading = Reading(server, rigid_body={"thigh": "Thigh"})
+    reading = run_of(server, rigid_body={"thigh": "Thigh"})
     async with served(server), reading.running():
         await reading.until(lambda: len(reading.frames) > 3)
         server.set_bodies((SHANK, RigidBodyAsset("New", ("N1",), 3), THIGH))
@@ -105,7 +66,7 @@ async def test_subjects_that_change_remain_bound_by_name() -> None:
 
 async def test_the_announced_delay_and_pings_reach_the_frames() -> None:
     server = made(stages=(("Processing", 0.2),))
-    reading = Reading(server)
+    reading = run_of(server)
     async with served(server), reading.running():
         await reading.until(lambda: len(reading.frames) > 110)
     (info,) = [i for i in reading.items if isinstance(i, DeviceEvent) and "delay_ms" in i.data]
@@ -115,7 +76,7 @@ async def test_the_announced_delay_and_pings_reach_the_frames() -> None:
 
 async def test_damaged_packets_are_rejected_as_a_whole() -> None:
     server = made(hostile=0.3, seed=2)
-    reading = Reading(server)
+    reading = run_of(server)
     async with served(server), reading.running():
         await reading.until(lambda: len(reading.frames) > 30)
     assert reading.decoder.discarded_bytes > 0

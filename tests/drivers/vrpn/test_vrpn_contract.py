@@ -7,57 +7,32 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import pytest
 from typing_extensions import override
 
-from jointfit_daemon.model import MocapFrame
-from jointfit_drivers.vrpn import VrpnMocap, VrpnSettings
-from jointfit_protocols.vrpn import DEFAULT_PORT
 from jointfit_simulators._contract_fixtures import orientation
-from jointfit_simulators.devices import TextServer, VrpnServer, VrpnServerOptions
-from jointfit_simulators.driver_contract import DriverContract
+from jointfit_simulators.devices import VrpnServer, VrpnServerOptions
+from tests.drivers.motion_capture.mocap_contract import MocapContract
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
-    from jointfit_daemon.driver import Driver
-    from jointfit_simulators.imu_device import WireNoise
+    from jointfit_daemon.model import MocapFrame
+
 
 pytestmark = pytest.mark.real_time
 
 
-class TestVrpn(DriverContract):
+BODY = {"rigid_body": {"thigh": "Thigh"}}
+
+
+class TestVrpn(MocapContract):
     registered_as = "vrpn"
-    measurement = MocapFrame
-    has_noise, baud = False, None  # TCP and UDP have checksums
-    test_line_noise_affects_only_damaged_samples = None  # type: ignore[assignment]
+    baud = None
     options = VrpnServerOptions(bodies=("Thigh",))
-    keys: ClassVar[dict[str, str]] = {}
-    _devices: list[Any]
-
-    @pytest.fixture(autouse=True)
-    def _close(self) -> Iterator[None]:
-        self._devices = []
-        yield
-        for device in self._devices:
-            device.unplug()
+    port_key = "port"
+    keys: ClassVar[dict[str, Any]] = BODY
 
     @override
-    def make_device(self, folder: Path, wire_noise: WireNoise) -> VrpnServer:
-        device = VrpnServer(self.options)
-        self._devices.append(device)
-        return device
-
-    @override
-    def make_driver(self, folder: Path) -> Driver:
-        port = self._devices[-1].command_port if self._devices else DEFAULT_PORT
-        table = {"driver": "vrpn", "server": "127.0.0.1", "port": port, "silence_s": 0.5}
-        body = {"rigid_body": {"thigh": "Thigh"}}
-        return VrpnMocap(VrpnSettings.model_validate(table | body | self.keys))
-
-    @override
-    def make_wrong_device(self, folder: Path) -> TextServer | None:
-        device = TextServer(b"HTTP/1.1 400 Bad Request\r\n\r\n")
-        self._devices.append(device)
-        return device
+    def make_server(self) -> VrpnServer:
+        return VrpnServer(self.options)
 
     @override
     def send(self, device: VrpnServer, number: int) -> None:
@@ -72,11 +47,11 @@ class TestVrpn(DriverContract):
 
 
 class TestVrpnUdp(TestVrpn):
-    keys: ClassVar[dict[str, str]] = {"transport": "udp"}
+    keys: ClassVar[dict[str, Any]] = BODY | {"transport": "udp"}
 
 
 class TestVrpnClassic(TestVrpn):
-    keys: ClassVar[dict[str, str]] = {"connection": "classic"}
+    keys: ClassVar[dict[str, Any]] = BODY | {"connection": "classic"}
     options = VrpnServerOptions(bodies=("Thigh",), connections=frozenset({"classic"}))
 
     @override
@@ -85,5 +60,9 @@ class TestVrpnClassic(TestVrpn):
 
 
 class TestVrpnClassicUdp(TestVrpnClassic):
-    keys: ClassVar[dict[str, str]] = {"connection": "classic", "transport": "udp", "unit": "mm"}
+    keys: ClassVar[dict[str, Any]] = BODY | {
+        "connection": "classic",
+        "transport": "udp",
+        "unit": "mm",
+    }
     options = VrpnServerOptions(bodies=("Thigh",), unit="mm", segment_bytes=7)

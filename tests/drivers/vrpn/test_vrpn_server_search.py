@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -12,9 +11,10 @@ import pytest
 from jointfit_daemon.driver import DeviceLostError
 from jointfit_drivers.vrpn import VrpnMocap, VrpnSettings
 from jointfit_simulators.devices import TextServer, VrpnServer, VrpnServerOptions
+from tests.drivers.motion_capture.mocap_run import answering
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from contextlib import AbstractAsyncContextManager
 
 pytestmark = pytest.mark.real_time
 
@@ -27,23 +27,13 @@ def settings(port: int, **more: Any) -> VrpnSettings:
     return VrpnSettings.model_validate(table | {"rigid_body": {"thigh": "Thigh"}} | more)
 
 
-@contextlib.asynccontextmanager
-async def serving(server: Any, *visible: str) -> AsyncIterator[None]:
+def serving(server: Any, *visible: str) -> AbstractAsyncContextManager[None]:
     """Run a server that sends the poses of the visible bodies at 100 Hz."""
 
-    async def send() -> None:
-        while visible:
-            server.push(time.monotonic_ns(), {}, dict.fromkeys(visible, POSE))
-            await asyncio.sleep(0.01)
+    def push() -> None:
+        server.push(time.monotonic_ns(), {}, dict.fromkeys(visible, POSE))
 
-    tasks = [asyncio.create_task(server.run()), asyncio.create_task(send())]
-    try:
-        yield
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.wait(tasks)
-        server.unplug()
+    return answering(server, push if visible else None)
 
 
 async def test_a_server_is_found_with_its_version_and_bodies() -> None:
