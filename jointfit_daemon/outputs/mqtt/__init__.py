@@ -5,6 +5,8 @@ from jointfit_daemon.outputs.mqtt._connection import (
     BrokerLostError,
     DisconnectErrorFilter,
     Incoming,
+    MqttConnection,
+    Outgoing,
 )
 from jointfit_daemon.outputs.mqtt._outbox import Outbox
 from jointfit_daemon.outputs.mqtt._publisher import LinkHealth, MqttPublisher
@@ -31,9 +33,11 @@ __all__ = [
     "Incoming",
     "LinkHealth",
     "MqttClient",
+    "MqttConnection",
     "MqttPublisher",
     "NoAnswerError",
     "Outbox",
+    "Outgoing",
     "RequestKeyError",
     "SignatureRejectedError",
     "check_age",

@@ -9,12 +9,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
-import logging
 import socket
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
 import aiomqtt
+from paho.mqtt.client import MQTTMessageInfo
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.subscribeoptions import SubscribeOptions
@@ -27,6 +27,8 @@ from jointfit_daemon.outputs.mqtt._error_messages import (
     session_fault,
 )
 from jointfit_daemon.outputs.mqtt._packet_limit import PacketLimitSocket
+from jointfit_daemon.outputs.mqtt._paho_log import PahoLog
+from jointfit_daemon.outputs.mqtt._publish_packet import PUBLISH, PublishEncoder
 from jointfit_daemon.outputs.mqtt._secret_files import password_of
 from jointfit_daemon.outputs.mqtt._tls import TlsFilesError, tls_context, tls_remedy
 from jointfit_daemon.outputs.topics import PAYLOAD_VERSION
@@ -67,11 +69,8 @@ LONGEST_PACKET_BYTES = 32 * 1024
 _SOCKET_OPTIONS = (
     (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),  # Nagle's algorithm delays by 40 ms
     (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * KEEPALIVE_S),
-    (
-        socket.SOL_SOCKET,
-        socket.SO_SNDBUF,
-        16 * 1024,
-    ),  # messages in the kernel's buffer are lost without being counted
+    # messages in the kernel's buffer are lost without being counted
+    (socket.SOL_SOCKET, socket.SO_SNDBUF, 16 * 1024),
 )
 
 
@@ -91,6 +90,8 @@ class Outgoing:
     """Time after which the broker drops the undelivered message, s."""
     response_topic: str | None = None
     correlation: bytes | None = None
+    written: Callable[[], None] | None = field(default=None, compare=False)
+    """Called once the kernel has accepted the message; not at QoS 1, which waits for the broker."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,11 +157,10 @@ class MqttConnection:
     ) -> None:
         self._settings, self._identifier = settings, identifier
         self._will, self._farewell = will, farewell
-        self._longest_bytes, self._admit = longest_bytes, admit
-        self._most_unread = most_unread
+        self._longest_bytes, self._admit, self._most_unread = longest_bytes, admit, most_unread
         self._modern = settings.version == "5"
         self._cached: dict[int | None, Any] = {}
-        self._paho_log = _PahoLog()
+        self._paho_log = PahoLog()
 
     async def __aenter__(self) -> Self:
         self._client = await self._new_client()
@@ -307,6 +307,7 @@ class MqttConnection:
             except TlsFilesError as fault:
                 raise BrokerLostError(f"{self._address()}: [mqtt.tls]: {fault}") from fault
 
+        last = will and aiomqtt.Will(will.topic, will.payload, will.qos, will.retain)
         limit: Any = None
         if self._modern:
             limit = _Properties(PacketTypes.CONNECT)
@@ -319,9 +320,7 @@ class MqttConnection:
             password=password_of(settings),
             identifier=self._identifier,
             protocol=version,
-            will=None
-            if will is None
-            else aiomqtt.Will(will.topic, will.payload, will.qos, will.retain),
+            will=last,
             clean_session=None if self._modern else True,
             timeout=ANSWER_S,
             keepalive=KEEPALIVE_S,
@@ -365,26 +364,6 @@ class MqttConnection:
         return made
 
 
-class _PahoLog(logging.Logger):
-    """Logger of paho that stores the last exception of a socket instead of logging it.
-
-    With TLS 1.3 a broker rejects the client's certificate after the handshake. paho logs that
-    alert, and aiomqtt reports a timeout only.
-    """
-
-    def __init__(self) -> None:
-        super().__init__("mqtt", logging.ERROR)
-        self.last: OSError | None = None
-
-    def handle(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
-        """Store the exception of `record`, if there is one."""
-        for value in record.args if isinstance(record.args, tuple) else ():
-            if isinstance(value, OSError):
-                self.last = value
-        if record.exc_info:  # a callback of the daemon failed: a bug
-            logging.getLogger(__name__).handle(record)
-
-
 class _Client(aiomqtt.Client):
     """aiomqtt's client with a limit on incoming packets and immediate detection of failures.
 
@@ -403,6 +382,7 @@ class _Client(aiomqtt.Client):
         **options: Any,
     ) -> None:
         super().__init__(*arguments, **options)
+        self._encoder = PublishEncoder()
         self._unacknowledged: dict[int, tuple[float, Callable[[str | None], None]]] = {}
         """Time limit, s, and callback of each message sent, by message id, the oldest first."""
         self._acknowledged = asyncio.Event()
@@ -509,12 +489,45 @@ class _Client(aiomqtt.Client):
             self._acknowledged.clear()
             await self._acknowledged.wait()
 
+        if not message.qos and self._write_at_once(message, properties, accepted):
+            return
         sent = self._client.publish(
             message.topic, message.payload, message.qos, message.retain, properties
         )
         if sent.rc:
             raise aiomqtt.MqttCodeError(sent.rc)
-        self._unacknowledged[sent.mid] = (self._loop.time() + ANSWER_S, accepted)
+        self._await_acceptance(sent.mid, accepted)
+
+    def _write_at_once(
+        self, message: Outgoing, properties: Any, accepted: Callable[[str | None], None]
+    ) -> bool:
+        """Write a message at QoS 0 to the socket; return False if the library has to queue it.
+
+        The library would wake the event loop by a byte to itself, wait until the socket is
+        writable, and build the acknowledgement that QoS 0 does not have.
+        """
+        client: Any = self._client
+        opened = client.socket()
+        if opened is None or client.want_write():
+            return False  # closed, or other messages come first
+        packet = self._encoder.encode(message.topic, message.payload, properties, message.retain)
+        try:
+            written = opened.send(packet)
+        except OSError:  # full, or broken: then the library meets the same error and reports it
+            return False
+        if written == len(packet):
+            accepted(None)
+            return True
+
+        # The library writes the rest before anything else.
+        sent = MQTTMessageInfo(client._mid_generate())  # noqa: SLF001 - it has no public equivalent
+        self._await_acceptance(sent.mid, accepted)
+        client._packet_queue(PUBLISH, packet[written:], sent.mid, 0, sent)  # noqa: SLF001 - also
+        return True
+
+    def _await_acceptance(self, mid: int, accepted: Callable[[str | None], None]) -> None:
+        """Wait for the acceptance of a message for at most `ANSWER_S`."""
+        self._unacknowledged[mid] = (self._loop.time() + ANSWER_S, accepted)
         if self._limit_timer is None:
             self._limit_timer = self._loop.call_later(ANSWER_S, self._check_limit)
 

@@ -1,0 +1,25 @@
+"""The log of paho, from which a connection takes the error that a broker answered with."""
+
+from __future__ import annotations
+
+import logging
+
+
+class PahoLog(logging.Logger):
+    """Logger of paho that stores the last exception of a socket instead of logging it.
+
+    With TLS 1.3 a broker rejects the client's certificate after the handshake. paho logs that
+    alert, and aiomqtt reports a timeout only.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("mqtt", logging.ERROR)
+        self.last: OSError | None = None
+
+    def handle(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
+        """Store the exception of `record`, if there is one."""
+        for value in record.args if isinstance(record.args, tuple) else ():
+            if isinstance(value, OSError):
+                self.last = value
+        if record.exc_info:  # a callback of the daemon failed: a bug
+            logging.getLogger(__name__).handle(record)

@@ -1,0 +1,47 @@
+"""PUBLISH packets at QoS 0 (MQTT 5.0 and 3.1.1, section 3.3), encoded without the library.
+
+Invariant: the packets are those of paho, byte for byte.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+PUBLISH = 0x30
+"""First byte of a PUBLISH packet at QoS 0."""
+_RETAIN = 0x01
+_MORE = 0x80
+"""Bit of a length byte: another length byte follows."""
+
+
+class PublishEncoder:
+    """Encodes messages at QoS 0; topic and properties of a stream only once."""
+
+    def __init__(self) -> None:
+        self._headers: dict[str, tuple[Any, bytes]] = {}
+        """Properties and variable header of the last message, by topic."""
+
+    def encode(self, topic: str, payload: bytes, properties: Any, retain: bool) -> bytes:
+        """Return the packet of one message.
+
+        Parameters
+        ----------
+        topic, payload, retain
+            The message.
+        properties
+            Properties of paho, which are not changed later; None with MQTT 3.1.1, which has none.
+        """
+        known, header = self._headers.get(topic, (None, b""))
+        if not header or known is not properties:
+            packed = b"" if properties is None else properties.pack()
+            name = topic.encode()
+            header = len(name).to_bytes(2) + name + packed
+            self._headers[topic] = properties, header
+
+        length = len(header) + len(payload)
+        fixed = bytearray((PUBLISH | _RETAIN if retain else PUBLISH,))
+        while length >= _MORE:  # seven bits a byte, the lowest first (MQTT 5.0, 1.5.5)
+            fixed.append(length % _MORE | _MORE)
+            length >>= 7
+        fixed.append(length)
+        return b"".join((fixed, header, payload))
