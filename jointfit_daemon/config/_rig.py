@@ -60,3 +60,8 @@ class Rig:
     table: Mapping[str, Any]
     """The parsed rig.toml, for recordings, with the content of the chain model; it contains no
     secrets (passwords are in files)."""
+
+    @property
+    def cameras(self) -> tuple[Source, ...]:
+        """The motion-capture sources."""
+        return tuple(source for source in self.sources if source.kind == "mocap")

@@ -12,6 +12,7 @@ from jointfit_daemon.config import drifting_imus, heading_warning
 from jointfit_daemon.fusion import LimbFuser, SensorMonitor, sensor_states
 from jointfit_daemon.model import Corrupt, DeviceEvent, FusionMode, ImuSample, SyncState
 from jointfit_daemon.pipeline._frame_grid import FrameGrid
+from jointfit_daemon.pipeline._marks import mark_outputs
 from jointfit_daemon.pipeline._mocap_router import MocapRouter
 from jointfit_daemon.pipeline._moving_centers import MovingCenters
 from jointfit_daemon.pipeline._notice_limiter import NoticeLimiter, unix_step_notices
@@ -56,13 +57,14 @@ from jointfit_daemon.timing.alignment import RateDivider
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from jointfit_daemon.config import Rig, Source
+    from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import LimbState, MocapFrame
     from jointfit_daemon.pipeline._label_monitor import LabelMonitor
     from jointfit_daemon.pipeline.chain_tracking import ChainTracker
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.pipeline.planar_chain import PlanarTracker
+    from jointfit_daemon.pipeline.stage_observer import StageObserver
     from jointfit_daemon.timing.alignment import AlignedFrame, FrameAligner
     from jointfit_daemon.timing.clock import Stamp
 
@@ -88,6 +90,8 @@ class Core:
 
     def __init__(self, observe: Callable[[str, StampedMeasurement], None] | None = None) -> None:
         self._observe = observe
+        self.stages: StageObserver | None = None
+        """Observer of the stages of every frame."""
         self._rig: Rig | None = None
         self._sources: dict[str, SourceState] = {}
         self._lines = SyncLines()
@@ -180,7 +184,7 @@ class Core:
         session = CalibrationSession(
             rig.chain,
             rig.calibration,
-            mocap=any(source.kind == "mocap" for source in rig.sources),
+            mocap=bool(rig.cameras),
             calibration=event.calibration,
             version=event.calibration_version,
         )
@@ -197,7 +201,7 @@ class Core:
         else:
             self._grid.reload(rig)
         self._aligner = self._grid.aligner
-        if before is None or _cameras(before) != _cameras(rig):
+        if before is None or before.cameras != rig.cameras:
             self._moving_centers = self._chain_tracker = self._planar_tracker = None
         self._planar_tracker = planar_tracker(rig, self._planar_tracker)
         if before is None or before.chain != rig.chain:
@@ -230,7 +234,7 @@ class Core:
             for s in rig.sources
         }
         self._feed_unix_offset()
-        if all(source.kind != "mocap" for source in rig.sources):
+        if not rig.cameras:
             self._mocap.reset_counts()
 
     def _use_calibration(self) -> None:
@@ -300,7 +304,10 @@ class Core:
         state = self._sources.get(event.source)
         if state is None:
             return []
-        outputs = self._process(event.source, state, state.feed(event.chunk))
+        items = state.feed(event.chunk)
+        if self.stages is not None:
+            self.stages.mark_decoded(event.chunk.t_ns)
+        outputs = self._process(event.source, state, items)
 
         # After a stall of the process, samples of other sources are still in the kernel. Deadlines
         # therefore apply at a Tick only, which comes after everything readable was read.
@@ -391,9 +398,13 @@ class Core:
             return []
         now_ns = self._now_ns
         frames = self._aligner.advance(now_ns, complete_only=complete_only)
+        if frames and self.stages is not None:
+            self.stages.mark_aligned()
         outputs: list[Output] = []
         for frame in frames:
             state = self._fuse(frame)
+            if self.stages is not None:
+                self.stages.mark_fused(None if complete_only else frame.completed_ns)
             outputs += (state, *self._comparison.add_state(state))
             if self._sensors_rate is not None and self._sensors_rate.is_due(frame.t_ns):
                 chain, usable = self._rig.chain, self._usable
@@ -439,22 +450,11 @@ class Core:
         if request.command in ("calibrate", "static"):
             return self._update_session(request)
         if request.command == "mark":
-            return self._mark(request)
+            self._marks += 1
+            name = "" if self._rig is None else self._rig.name
+            return mark_outputs(request, self._marks, self._unix_offset_ns, name)
         known = f"unknown request {request.command!r}; known: calibrate, static, mark"
         return [request.refusal("command", known)]
-
-    def _mark(self, request: Request) -> list[Output]:
-        """Publish a label at the instant of the request."""
-        self._marks += 1
-        t_ns, text = request.t_ns, str(request.arguments.get("text", ""))
-        offset_ns = self._unix_offset_ns
-        t_us = None if offset_ns is None else (t_ns + offset_ns) // 1000
-        name = "" if self._rig is None else self._rig.name
-        data = {"number": self._marks}
-        return [
-            request.reply("ok", {**data, "t_us": t_us, "text": text}),
-            Notice(t_ns, NoticeKind.MARK, name, text, data=data),
-        ]
 
     def _update_session(
         self,
@@ -481,10 +481,6 @@ class Core:
             if isinstance(event, CalibrationSelected):
                 self._fuser.set_calibration_time(event.t_ns - round(event.age_s * 1e9))
         return outputs
-
-
-def _cameras(rig: Rig) -> list[Source]:
-    return [source for source in rig.sources if source.kind == "mocap"]
 
 
 def _calibration_inputs(rig: Rig) -> tuple[object, ...]:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.unix_clock import UnixClock
     from jointfit_daemon.pipeline.events import Event, Output
     from jointfit_daemon.pipeline.health import CoreHealth
+    from jointfit_daemon.pipeline.stage_observer import StageObserver
 
 LONGEST_TICK_INTERVAL_NS = 100_000_000
 """Longest time without an event for the core, ns."""
@@ -28,6 +29,9 @@ _NS_PER_S = 1e9
 
 class CoreInterface(Protocol):
     """The methods of the core that the shell uses."""
+
+    stages: StageObserver | None
+    """Observer of the stages of every frame."""
 
     @property
     def next_deadline_ns(self) -> int | None:

@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.config import ConfigError, Fault, load_rig
 from jointfit_daemon.outputs import topics
+from jointfit_daemon.outputs.frame_latency import FrameLatency
 from jointfit_daemon.outputs.log import MqttLogHandler, journal_fields
 from jointfit_daemon.outputs.mqtt import DisconnectErrorFilter, MqttPublisher, Outbox
 from jointfit_daemon.outputs.payloads import (
@@ -129,6 +130,7 @@ class Daemon:
     def __init__(self, config: Path, rig: Rig, core: CoreInterface) -> None:
         self._config, self._rig = config, rig
         self._clock = UnixClock()
+        self._latency = core.stages = FrameLatency()
         self._core = CoreRunner(core, self._clock)
         self._core.subscribe(self)
         self._notices = NoticeLog(rig)
@@ -159,7 +161,7 @@ class Daemon:
     def _use_broker(self, rig: Rig) -> None:
         self._outbox = Outbox(topics.BRIDGE_STATE.name(rig.mqtt.base))
         self._link = MqttPublisher(rig.mqtt, self._outbox, self._receive_request)
-        self._topics = TopicWriter(rig, self._outbox, self._clock, self._spool)
+        self._topics = TopicWriter(rig, self._outbox, self._clock, self._spool, self._latency)
         self._core.subscribe(self._topics)
         self._read_request_key(rig)
 
@@ -271,14 +273,12 @@ class Daemon:
             self._topics.output(replace(self._calibration, t_ns=now_ns, text=text))
 
     def _publish_log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
-        self._topics.publish_log_line(
-            level, name, text, suppressed
-        )  # topics change with the broker
+        # topics change with the broker
+        self._topics.publish_log_line(level, name, text, suppressed)
 
     def _report(self, kind: NoticeKind, text: str, level: NoticeLevel = NoticeLevel.INFO) -> None:
         """Report a state of the shell on the log and on ``bridge/event``."""
-        fields = journal_fields(kind, self._rig.name)
-        log.log(LEVELS[level], "%s: %s", kind, text, extra=fields)
+        log.log(LEVELS[level], "%s: %s", kind, text, extra=journal_fields(kind, self._rig.name))
         notice = Notice(time.monotonic_ns(), kind, self._rig.name, text, level)
         self._topics.publish_notice(notice)
         if self._recorder is not None:
@@ -392,19 +392,21 @@ class Daemon:
                     self._state_check = self._tasks.create_task(check, name="state check")
 
     def health(self) -> BridgeHealth:
-        """Return counters and clocks of this instant; those of the process are the last ones."""
+        """Return the health of this instant; process and latency as in the last health message."""
         core = self._core.core.health(time.monotonic_ns())
         link = self._link.health(self._loop_errors.dropped)
         state = StateHealth(self._state_fault, self._calibrations.fault)
         recording = None if self._recorder is None else self._recorder.health()
         spool = None if self._spool is None else self._spool.health()
-        return BridgeHealth(core, self._process_health, link, state, recording, spool)
+        process, latency = self._process_health, self._latency.health
+        return BridgeHealth(core, process, link, state, recording, spool, latency)
 
     def _publish_health_soon(self) -> None:
         self._health_due_s = min(self._health_due_s, time.monotonic() + HEALTH_SOON_S)
 
     def _publish_health(self) -> None:
         self._process_health = self._process.health()
+        self._latency.end_interval()
         found = self.health()
         self._topics.publish_health(found)
         if self._recorder is not None:
@@ -416,8 +418,7 @@ class Daemon:
         states = health.frames.sent - health.frames.empty
         rate_hz = self._frame_rate.rate_hz(states, time.monotonic())
         rig, online, connected = self._rig.sources, self._notices.online, link.connected
-        line = status_line(rig, online, health.phase, rate_hz, connected=connected)
-        self._systemd.status(line)
+        self._systemd.status(status_line(rig, online, health.phase, rate_hz, connected=connected))
 
     # --- configuration -----------------------------------------------------------------------
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_daemon.pipeline.events import Event, Output
+    from jointfit_daemon.pipeline.stage_observer import StageObserver
 
 S, MS = 1_000_000_000, 1_000_000
 BEGIN_UNIX_NS = 1_795_250_000 * S
@@ -119,6 +120,7 @@ class Listening:
     def __init__(self) -> None:
         self.heard: list[Event] = []
         self.next_deadline_ns = None
+        self.stages: StageObserver | None = None
 
     def feed(self, event: Event) -> list[Output]:
         self.heard.append(event)

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.pipeline.events import Event, Output
+    from jointfit_daemon.pipeline.stage_observer import StageObserver
 
 
 @pytest.fixture
@@ -110,6 +111,7 @@ class ReadyCore:
     """Hands out a calibration when asked, and keeps what it is configured with."""
 
     next_deadline_ns = None
+    stages: StageObserver | None = None
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration = calibration

@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.pipeline.events import Event, Output
+    from jointfit_daemon.pipeline.stage_observer import StageObserver
     from tests.broker_fixture import Broker
     from tests.fake_drivers import FakeImu
 
@@ -68,6 +69,7 @@ class RecordingCore:
         self.next_deadline_ns: int | None = None
         self.answers: dict[type[Any], list[Output]] = {}
         self.failure: Exception | None = None
+        self.stages: StageObserver | None = None
 
     def feed(self, event: Event) -> list[Output]:
         self.events.append(event)
@@ -391,13 +393,16 @@ async def test_a_run_of_the_real_core_gives_poses_and_health(
             async for topic, payload in client.messages():
                 if topic == "pose":
                     seqs.append(payload["seq"])
-                elif topic == "bridge/health" and payload["devices"]["S1"]["received"]:
+                elif topic == "bridge/health" and payload["latency"]["total_us"]:
                     health = payload
                 if len(seqs) > 50 and health:
                     break
     assert seqs == list(range(seqs[0], seqs[0] + len(seqs)))
     assert health["process"]["rss_bytes"] > 1e6
     assert health["link"]["connected"] is True
+    stages = {name: stage for name, stage in health["latency"].items() if name != "frames"}
+    assert all(stage["p50"] <= stage["p99"] <= stage["max"] for stage in stages.values())
+    assert stages["written_us"]["max"] <= stages["total_us"]["max"]
 
 
 @pytest.mark.system

@@ -125,9 +125,9 @@ class Outbox:
         message = Outgoing(topic, payload, 1, False, RESPONSE_EXPIRY_S, None, correlation)
         self._push(self._responses, _EVENT_CAPACITY, message)
 
-    def stream(self, topic: str, payload: bytes) -> None:
-        """Queue a message that is sent at most once, at QoS 0."""
-        message = Outgoing(topic, payload, 0, False, STREAM_EXPIRY_S)
+    def stream(self, topic: str, payload: bytes, written: Callable[[], None] | None = None) -> None:
+        """Queue a message that is sent at most once, at QoS 0; `written` as in `Outgoing`."""
+        message = Outgoing(topic, payload, 0, False, STREAM_EXPIRY_S, written=written)
         self._push(self._streams, _STREAM_CAPACITY, message)
 
     def late(self, topic: str, payload: bytes) -> None:

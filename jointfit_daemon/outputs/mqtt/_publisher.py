@@ -319,6 +319,8 @@ class MqttPublisher:
         """Note that the broker, or at QoS 0 the kernel, has accepted or refused `message`."""
         sent()
         self.sent += 1
+        if message.written is not None and not message.qos:
+            message.written()
         if message.qos and self._modern:
             # Log a change of whether the broker accepts messages on this topic.
             topic = message.topic

@@ -60,7 +60,7 @@ class Info(Payload):
 
 
 class Delays(Table):
-    """Delays from sampling to arrival, µs."""
+    """Quantiles of a delay, µs."""
 
     p50: Number
     p99: Number
@@ -146,6 +146,18 @@ class Process(Table):
     loop_delay_p99_ms: Number
 
 
+class Latency(Table):
+    """Latency of the frames since the last health message, by stage."""
+
+    frames: int
+    decoded_us: Delays | None
+    aligned_us: Delays | None
+    fused_us: Delays | None
+    encoded_us: Delays | None
+    written_us: Delays | None
+    total_us: Delays | None = Field(description="from the arrival of the last chunk to written")
+
+
 class StateFaults(Table):
     """Reasons why data cannot be stored."""
 
@@ -181,6 +193,7 @@ class Health(Payload):
     state: StateFaults
     recording: Recording | None = None
     spool: SpoolHealth | None = None
+    latency: Latency | None = None
 
 
 class Event(Payload):

@@ -7,6 +7,7 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jointfit_daemon.outputs.frame_latency import LatencyHealth, StageLatency
     from jointfit_daemon.outputs.mqtt import LinkHealth
     from jointfit_daemon.outputs.recording import RecordingHealth
     from jointfit_daemon.outputs.spool import SpoolHealth
@@ -53,6 +54,7 @@ class BridgeHealth:
     state: StateHealth
     recording: RecordingHealth | None = None
     spool: SpoolHealth | None = None
+    latency: LatencyHealth | None = None
 
 
 def health_payload(health: BridgeHealth) -> dict[str, Any]:
@@ -66,6 +68,8 @@ def health_payload(health: BridgeHealth) -> dict[str, Any]:
         parts["recording"] = asdict(health.recording)
     if health.spool is not None:
         parts["spool"] = asdict(health.spool)
+    if health.latency is not None:
+        parts["latency"] = _latency(health.latency)
     return core_payload(health.core) | parts
 
 
@@ -79,6 +83,17 @@ def core_payload(core: CoreHealth) -> dict[str, Any]:
         "frames": asdict(core.frames),
         "learning": learning_payload(core.learning),
     }
+
+
+def _latency(latency: LatencyHealth) -> dict[str, Any]:
+    stages = {f"{name}_us": _stage(stage) for name, stage in latency.stages.items()}
+    return {"frames": latency.frames, **stages}
+
+
+def _stage(stage: StageLatency | None) -> dict[str, float | None] | None:
+    if stage is None:
+        return None
+    return {"p50": _us(stage.p50_ns), "p99": _us(stage.p99_ns), "max": _us(stage.max_ns)}
 
 
 def _device(device: DeviceHealth) -> dict[str, Any]:

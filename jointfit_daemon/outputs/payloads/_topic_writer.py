@@ -58,6 +58,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.config import Rig
     from jointfit_daemon.model import Chain
+    from jointfit_daemon.outputs.frame_latency import FrameLatency
     from jointfit_daemon.outputs.mqtt import Outbox
     from jointfit_daemon.outputs.payloads._health_encoding import BridgeHealth
     from jointfit_daemon.outputs.spool import Spool
@@ -88,13 +89,20 @@ class TopicWriter:
         Converts stamps to UNIX time.
     spool
         Receives events and decimated poses, in case of an outage; None without a spool.
+    latency
+        Measures encoding and writing of every frame.
     """
 
     def __init__(
-        self, rig: Rig, outbox: Outbox, clock: UnixClock, spool: Spool | None = None
+        self,
+        rig: Rig,
+        outbox: Outbox,
+        clock: UnixClock,
+        spool: Spool | None = None,
+        latency: FrameLatency | None = None,
     ) -> None:
         self._base, self._outbox, self._clock = rig.mqtt.base, outbox, clock
-        self._spool = spool
+        self._spool, self._latency = spool, latency
         self._pose_topic = topics.POSE.name(self._base)
         self._pose_ui_topic = topics.POSE_UI.name(self._base)
         self._devices: tuple[str, ...] = ()
@@ -189,7 +197,9 @@ class TopicWriter:
     def _publish_limb_state(self, state: LimbState) -> None:
         offset_ns, now_ns = self._clock.offset_ns(), self._clock.now_ns()
         pose = encode_pose(state, offset_ns, now_ns)
-        self._outbox.stream(self._pose_topic, pose)
+        latency = self._latency
+        written = None if latency is None else latency.mark_encoded()
+        self._outbox.stream(self._pose_topic, pose, written)
 
         if self._pose_ui_rate.is_due(state.t_ns):
             self._outbox.stream(self._pose_ui_topic, pose)

@@ -18,7 +18,7 @@ from jointfit_daemon.tools.monitor._words import (
 )
 
 if TYPE_CHECKING:
-    from jointfit_daemon.outputs.payload_models import DeviceCounts, Health
+    from jointfit_daemon.outputs.payload_models import DeviceCounts, Health, Latency
     from jointfit_daemon.tools.monitor._rig_view import Moment, RigView
     from jointfit_daemon.tools.monitor._text_lines import Style
     from jointfit_daemon.tools.monitor._words import Level
@@ -196,6 +196,26 @@ def _ms(microseconds: float | None) -> float | None:
     return None if microseconds is None else microseconds / 1000.0
 
 
+def _latency_text(latency: Latency) -> str:
+    """Return the latency of the frames in words: in all, and the 99th percentile by stage."""
+    total = latency.total_us
+    if total is None:
+        return "frames: none written since the last health message"
+    stages = {
+        "decoded": latency.decoded_us, "aligned": latency.aligned_us, "fused": latency.fused_us,
+        "encoded": latency.encoded_us, "written": latency.written_us,
+    }  # fmt: skip
+    parts = ", ".join(
+        f"{name} {format_number(None if stage is None else _ms(stage.p99), 2)}"
+        for name, stage in stages.items()
+    )
+    return (
+        f"frames: {format_number(_ms(total.p50), 1, ' ms')} from arrival to broker (median), "
+        f"{format_number(_ms(total.p99), 1, ' ms')} (p99), "
+        f"{format_number(_ms(total.max), 1, ' ms')} at most; p99 by stage, ms: {parts}"
+    )
+
+
 def _daemon(rig: RigView, health: Health, width: int, broker: str, now: Moment) -> list[Line]:
     """Return the state of the process, its link, learning and recording."""
     process, link, frames = health.process, health.link, health.frames
@@ -213,6 +233,8 @@ def _daemon(rig: RigView, health: Health, width: int, broker: str, now: Moment) 
          f"{link.ignored_requests} requests ignored", ""),
         (f"online learning: {learning}", ""),
     ]  # fmt: skip
+    if health.latency is not None:
+        texts.append((_latency_text(health.latency), ""))
     if link.denied:
         denied = ", ".join(link.denied)
         texts.append((f"▲ the broker refuses {denied}: correct its access list", "warning"))

@@ -28,6 +28,8 @@ WRITTEN_BYTES_S = 66_600
 THIGH_M, SHANK_M = 0.43, 0.39
 STEP_S = 1.2
 """Period of the simulated walk, s."""
+STAGES = ("decoded", "aligned", "fused", "encoded", "written", "total")
+LATENCY = {f"{stage}_us": {"p50": 655.4, "p99": 1638.4, "max": 2904.5} for stage in STAGES}
 HOUR_US = 3_600_000_000
 
 
@@ -178,6 +180,7 @@ class PublishedRig:
             "devices": {name: counters(name) for name in self.devices},
             "frames": {"sent": 8100, "empty": 0, "skipped": 0},
             "process": {"cpu_pct": 9.1, "rss_bytes": 91000000},
+            "latency": {"frames": 1000, **LATENCY},
             "learning": {"state": "waiting", "reason": "no live camera frames"},
             "link": {"connected": True, "sent": 9123, "dropped": 0, "denied": []},
             "recording": {"backlog_bytes": 0, **self._recorded()},

@@ -245,11 +245,15 @@ def test_health_lists_counters_and_faults_of_the_daemon() -> None:
     health = sample.health()
     health["link"]["denied"] = ["pose"]
     health["state"]["fault"] = "state directory is full: free some space"
+    stages = ("decoded", "aligned", "fused", "encoded", "written", "total")
+    delays = {"p50": 655.4, "p99": 1638.4, "max": 2904.5}
+    health["latency"] = {"frames": 1000} | {f"{stage}_us": delays for stage in stages}
     take(state, "bridge/health", health)
     state.press("4")
     found = words(state)
     for part in ("81230 received, 81218 used", "0.3 ms median", "▲ the broker refuses pose",
-                 "✖ state directory is full", "9.1 % of a core"):  # fmt: skip
+                 "✖ state directory is full", "9.1 % of a core", "written 1.64",
+                 "0.7 ms from arrival to broker (median), 1.6 ms (p99)"):  # fmt: skip
         assert part in found
 
 

@@ -57,7 +57,22 @@ function tablesOf(store, openAction) {
       createElement("span", { class: `status ${summary.clockLevel}` }, summary.clock),
     ];
   });
-  return [createTable("Devices", columns, rows), createTable("Daemon", [{ name: "item" }, { name: "value", text: true }], daemonRows(store))];
+  const tables = [createTable("Devices", columns, rows), createTable("Daemon", [{ name: "item" }, { name: "value", text: true }], daemonRows(store))];
+  if (store.health?.latency) tables.push(latencyTable(store.health.latency));
+  return tables;
+}
+
+/** Return the latency of the frames since the last health message, by stage. */
+function latencyTable(latency) {
+  const stages = {
+    decoded: "arrival to decoded", aligned: "to aligned", fused: "to joint angles",
+    encoded: "to JSON", written: "to the broker's socket", total: "in all",
+  };
+  const rows = Object.entries(stages).map(([stage, words]) => {
+    const found = latency[`${stage}_us`] ?? {};
+    return [words, ...["p50", "p99", "max"].map((key) => formatNumber(found[key] == null ? null : found[key] / 1000, 2, " ms"))];
+  });
+  return createTable("Latency of a pose", ["stage", "median", "99 %", "longest"].map((name) => ({ name })), rows);
 }
 
 function recordingWords({ recording }) {

@@ -1,0 +1,155 @@
+"""Latency of frames by stage: from the arrival of the last chunk to the socket of the broker.
+
+Invariant: a sample costs one reading of the clock. A frame costs four more, one addition to a
+histogram per stage, and two small objects.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+_UNIT_BITS = 10
+"""Times are counted in units of 1024 ns: a shift is faster than a division."""
+_OCTAVE_BITS = 2
+"""Each octave has four buckets, so an upper limit exceeds a time by at most a quarter."""
+_BUCKETS = 100
+"""Number of buckets; the last one contains all times from 60 s on."""
+
+
+class LatencyHistogram:
+    """Counts of times in logarithmic buckets, four an octave."""
+
+    def __init__(self) -> None:
+        self.counts = [0] * _BUCKETS
+        self.total = 0
+        self.longest_ns = 0
+
+    def add(self, ns: int) -> None:
+        """Count one time, ns; a negative one as zero."""
+        units = max(0, ns) >> _UNIT_BITS
+        shift = max(0, units.bit_length() - _OCTAVE_BITS - 1)
+        bucket = (shift << _OCTAVE_BITS) + (units >> shift)
+        self.counts[min(bucket, _BUCKETS - 1)] += 1
+        self.total += 1
+        self.longest_ns = max(self.longest_ns, ns)
+
+    def quantile_ns(self, share: float) -> int | None:
+        """Return a time that at least `share` of the times do not exceed; None without times.
+
+        It is the upper limit of a bucket, and never more than the longest time.
+        """
+        left = share * self.total
+        for bucket, count in enumerate(self.counts):
+            left -= count
+            if count and left <= 0:
+                return min(_upper_ns(bucket), self.longest_ns)
+        return None
+
+
+def _upper_ns(bucket: int) -> int:
+    """Return the upper limit of a bucket, ns."""
+    shift = max(0, (bucket >> _OCTAVE_BITS) - 1)
+    units = bucket - (shift << _OCTAVE_BITS) + 1
+    return units << (shift + _UNIT_BITS)
+
+
+@dataclass(frozen=True, slots=True)
+class StageLatency:
+    """Quantiles of the latency of one stage, ns."""
+
+    p50_ns: int
+    p99_ns: int
+    max_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class LatencyHealth:
+    """Latency of the frames of one interval between health messages."""
+
+    frames: int
+    """Number of frames fused."""
+    stages: Mapping[str, StageLatency | None]
+    """By stage, in the order of processing; None for a stage that no frame has passed."""
+
+
+STAGES = ("decoded", "aligned", "fused", "encoded", "written", "total")
+"""Stages of a frame. Each latency is the time since the stage before; the first one's is the time
+since the arrival, as is that of ``total``, which ends with ``written``."""
+
+
+class FrameLatency:
+    """Measures the stages of every frame; a `StageObserver` of the core.
+
+    Parameters
+    ----------
+    clock
+        Returns the present instant, CLOCK_MONOTONIC ns.
+    """
+
+    def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
+        self._clock = clock
+        self._histograms = {stage: LatencyHistogram() for stage in STAGES}
+        self._arrival_ns = self._decoded_ns = self._aligned_ns = 0
+        self._fused: deque[tuple[int, int]] = deque()
+        """Beginning and fusion of the frames that are not encoded yet, ns."""
+        self.end_interval()
+
+    def end_interval(self) -> None:
+        """Set `health` to the latency since the last call, and begin anew."""
+        found = self._histograms
+        self._histograms = {stage: LatencyHistogram() for stage in STAGES}
+        stages = {stage: _quantiles(histogram) for stage, histogram in found.items()}
+        self.health = LatencyHealth(found["fused"].total, stages)
+
+    def mark_decoded(self, arrival_ns: int) -> None:
+        """Note that a chunk was decoded."""
+        self._arrival_ns, self._decoded_ns = arrival_ns, self._clock()
+
+    def mark_aligned(self) -> None:
+        """Note that one or more frames were released."""
+        self._aligned_ns = self._clock()
+        self._fused.clear()  # states of the event before, if nobody encoded them
+
+    def mark_fused(self, deadline_ns: int | None) -> None:
+        """Count the stages of a frame up to its limb state."""
+        found, fused_ns = self._histograms, self._clock()
+        if deadline_ns is None:
+            began_ns, decoded_ns = self._arrival_ns, self._decoded_ns
+            found["decoded"].add(decoded_ns - began_ns)
+        else:
+            began_ns = decoded_ns = deadline_ns
+
+        found["aligned"].add(self._aligned_ns - decoded_ns)
+        found["fused"].add(fused_ns - self._aligned_ns)
+        self._fused.append((began_ns, fused_ns))
+
+    def mark_encoded(self) -> Callable[[], None] | None:
+        """Count the encoding of a frame; return the function to call once it was written.
+
+        Frames are encoded in the order of their fusion. None for a state that was not marked.
+        """
+        if not self._fused:
+            return None
+        encoded_ns = self._clock()
+        began_ns, fused_ns = self._fused.popleft()
+        self._histograms["encoded"].add(encoded_ns - fused_ns)
+        return partial(self._mark_written, began_ns, encoded_ns)
+
+    def _mark_written(self, began_ns: int, encoded_ns: int) -> None:
+        now_ns = self._clock()
+        self._histograms["written"].add(now_ns - encoded_ns)
+        self._histograms["total"].add(now_ns - began_ns)
+
+
+def _quantiles(histogram: LatencyHistogram) -> StageLatency | None:
+    p50_ns, p99_ns = histogram.quantile_ns(0.5), histogram.quantile_ns(0.99)
+    if p50_ns is None or p99_ns is None:
+        return None
+    return StageLatency(p50_ns, p99_ns, histogram.longest_ns)
