@@ -161,7 +161,7 @@ def _add_play_options(play: argparse.ArgumentParser) -> None:
 def _add_hardware_options(play: argparse.ArgumentParser) -> None:
     play.add_argument("--imu", action="append", default=[], metavar="ID=DRIVER",
                       help="driver of the IMU that a sensor simulates, such as S2=xbus; by default "
-                      "xbus and xcdi in turn")  # fmt: skip
+                      "xbus and xcdi in turn; xbus-mtdata is an older device of xbus")  # fmt: skip
     play.add_argument("--mocap", default="natnet", metavar="DRIVER",
                       help="driver of the motion-capture server (default natnet)")  # fmt: skip
     play.add_argument("--no-mocap", action="store_true", help="no optical system")

@@ -61,7 +61,7 @@ def create_hardware(
     directory
         Directory of the symbolic links to the ptys.
     wires
-        Driver of each sensor; one of `IMU_FAMILIES`.
+        Family of each sensor; one of `IMU_FAMILIES`.
     can
         ``slcan``, or INTERFACE:CHANNEL of python-can, such as ``socketcan:vcan0``.
     now_ns
@@ -91,7 +91,8 @@ def create_hardware(
             now_ns=now_ns,
             port=None if on_can else OpenedPort(directory / f"tty{name}"),
         )
-        head = [f'id = "{name}"', f'segment = "{segment}"', f'driver = "{wires[name]}"']
+        driver = family.driver or wires[name]
+        head = [f'id = "{name}"', f'segment = "{segment}"', f'driver = "{driver}"']
         rate = f"rate_hz = {knobs.rate_hz:g}"
         # the rate is first: the keys of a family may end with a table of their own
         hardware.tables.append("\n".join(["[[imu]]", *head, rate, *imu.keys, ""]))

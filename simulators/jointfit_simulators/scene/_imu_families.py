@@ -1,4 +1,4 @@
-"""Families of IMUs that a scene can create, by the name of their driver.
+"""Families of IMUs that a scene can create.
 
 A new family is one function and one entry of `IMU_FAMILIES`.
 """
@@ -15,6 +15,7 @@ from jointfit_protocols.vectornav import Field
 from jointfit_protocols.vectornav.registers import BOTH_PORTS
 from jointfit_protocols.witmotion import RATE_CODES
 from jointfit_protocols.xbus.configuration import SyncSetting
+from jointfit_protocols.xbus.mtdata import SAMPLE_COUNTER, MTDataLayout, OutputMode
 from jointfit_protocols.xbus.mtdata2 import Item
 from jointfit_protocols.xbus.sync_lines import IN1, Polarity, SyncFunction
 from jointfit_protocols.xcdi import XcdiIds
@@ -112,6 +113,8 @@ class UartFamily:
 
     create: Callable[[SensorPlace, Path], ConnectedImu]
     """Return the device whose pty is linked at the path."""
+    driver: str = ""
+    """Driver in rig.toml, if it is not the name of the family."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +123,8 @@ class CanFamily:
 
     create: Callable[[SensorPlace, CanWire], ConnectedImu]
     """Return a device on the bus."""
+    driver: str = ""
+    """Driver in rig.toml, if it is not the name of the family."""
 
 
 def _can_table(place: SensorPlace, bus: CanWire) -> ConnectedImu:
@@ -224,6 +229,23 @@ def _xbus(place: SensorPlace, port: Path) -> ConnectedImu:
     return ConnectedImu(device, keys, str(port))
 
 
+def _xbus_mtdata(place: SensorPlace, port: Path) -> ConnectedImu:
+    """Return an MTi or MTx of the first generations, which sends MTData."""
+    mode = OutputMode.CALIBRATED | OutputMode.ORIENTATION | OutputMode.STATUS
+    device = XbusDevice(
+        port,
+        options=XbusDeviceOptions(
+            device_id=bytes([0x00, 0x30, 0x0A, *place.name.encode()[-1:]]),
+            legacy=MTDataLayout(mode, SAMPLE_COUNTER),
+            legacy_hz=place.knobs.rate_hz,
+        ),
+        wire_noise=line_noise(place.knobs, place.name),
+    )
+    return ConnectedImu(
+        device, [f'port = "{port}"', "baud = 921600", 'format = "mtdata"'], str(port)
+    )
+
+
 def _xcdi(place: SensorPlace, bus: CanWire) -> ConnectedImu:
     first = place.first_can_id
     ids = XcdiIds(first + 0x05, first + 0x06, first + 0x21, status_word=None, error=None)
@@ -265,7 +287,8 @@ IMU_FAMILIES: dict[str, UartFamily | CanFamily] = {
     "vectornav": UartFamily(_vectornav),
     "witmotion": UartFamily(_witmotion),
     "xbus": UartFamily(_xbus),
+    "xbus-mtdata": UartFamily(_xbus_mtdata, driver="xbus"),
     "xcdi": CanFamily(_xcdi),
     "ximu3": UartFamily(_ximu3),
 }
-"""Families by driver."""
+"""Families by name, which is that of their driver unless they are a variant of it."""

@@ -1,4 +1,4 @@
-"""Simulated LPMS sensors of a scene are read by the driver with the keys that the scene writes."""
+"""Simulated sensors of a scene are read by the driver with the keys that the scene writes."""
 
 from __future__ import annotations
 
@@ -22,8 +22,11 @@ pytestmark = pytest.mark.real_time
 
 @pytest.mark.parametrize(
     ("name", "number", "rate_hz"),
-    [("lpms", 1, 100.0), ("lpms", 2, 200.0), ("lpms-can", 1, 100.0), ("lpms-can", 2, 100.0)],
-)
+    [
+        ("lpms", 1, 100.0), ("lpms", 2, 200.0), ("lpms-can", 1, 100.0), ("lpms-can", 2, 100.0),
+        ("xbus-mtdata", 1, 100.0),
+    ],
+)  # fmt: skip
 async def test_a_sensor_of_a_scene_is_read_as_its_table_says(
     tmp_path: Path, name: str, number: int, rate_hz: float
 ) -> None:
@@ -38,6 +41,7 @@ async def test_a_sensor_of_a_scene_is_read_as_its_table_says(
     table: dict[str, Any] = tomllib.loads("\n".join(connected.keys))
     if "can" in table:
         table["can"] = {"interface": "slcan", "channel": str(tmp_path / "adapter")}
+    name = family.driver or name
     table |= {"id": "S1", "segment": "thigh", "driver": name, "rate_hz": rate_hz}
     driver = find_driver(name)
     async with serving(connected.device, feeding=True):
