@@ -79,22 +79,31 @@ class LslCodec:
         at = 0
         while at < len(data):
             found = _content(data, at)
-            message = found if isinstance(found, str) else self._message(*found[:2])
-            if isinstance(found, str) or isinstance(message, str):
-                self.discarded += len(data) - at
-                reason = found if isinstance(found, str) else str(message)
-                out.append(CorruptBytes(len(data) - at, reason))
-                return out
-            self.messages += len(message.stamps_s) if isinstance(message, Samples) else 1
+            if isinstance(found, str):
+                return self._discard(data, at, found, out)
+            message = self._message(data, *found)
+            if isinstance(message, str):
+                return self._discard(data, at, message, out)
             if message is not None:
                 out.append(message)
+            self.messages += len(message.stamps_s) if isinstance(message, Samples) else 1
             at = found[2]
         return out
 
-    def _message(self, tag: int, content: memoryview) -> LslMessage | str | None:
+    def _discard(
+        self, data: bytes, at: int, reason: str, out: list[LslMessage | CorruptBytes]
+    ) -> list[LslMessage | CorruptBytes]:
+        """Return `out` with the corrupt rest of a datagram."""
+        self.discarded += len(data) - at
+        out.append(CorruptBytes(len(data) - at, reason))
+        return out
+
+    def _message(self, data: bytes, tag: int, begin: int, end: int) -> LslMessage | str | None:
         """Return the message of a chunk, the reason why it is corrupt, or None to skip it."""
+        if tag == _SAMPLES:
+            return self._samples(data, begin, end)
         if tag == _HEADER:
-            description = parse_description(bytes(content))
+            description = parse_description(data[begin:end])
             if not isinstance(description, str):
                 self.description = description
                 code = FORMATS.get(description.channel_format)
@@ -102,24 +111,28 @@ class LslCodec:
                 self._row = None if code is None else struct.Struct(f"<Bd{count}{code}")
             return description
         if tag == _ROUND_TRIP:
-            if len(content) != _TRIP.size:
-                return f"round trip of {len(content)} bytes"
-            return RoundTrip(*_TRIP.unpack(content))
-        return self._samples(content) if tag == _SAMPLES else None
+            if end - begin != _TRIP.size:
+                return f"round trip of {end - begin} bytes"
+            return RoundTrip(*_TRIP.unpack_from(data, begin))
+        return None
 
-    def _samples(self, content: memoryview) -> Samples | str | None:
+    def _samples(self, data: bytes, begin: int, end: int) -> Samples | str | None:
         if self._row is None:
             self.undescribed += 1
             return None
-        size = content[0] if content else 0
-        start = 1 + size
-        if size not in _LENGTHS or start > len(content):
+        size = data[begin] if begin < end else 0
+        start = begin + 1 + size
+        if size not in _LENGTHS or start > end:
             return "samples without their number"
         # Compared before anything is allocated.
-        count = _LENGTHS[size].unpack_from(content, 1)[0]
-        if count * self._row.size != len(content) - start:
-            return f"{count} samples in {len(content) - start} bytes"
-        rows = tuple(self._row.iter_unpack(content[start:]))
+        count = _LENGTHS[size].unpack_from(data, begin + 1)[0]
+        if count * self._row.size != end - start:
+            return f"{count} samples in {end - start} bytes"
+        if count == 1:  # the usual chunk
+            row = self._row.unpack_from(data, start)
+            stamped = row[0] == _STAMPED
+            return Samples((row[1],), (row[2:],)) if stamped else "sample without a time stamp"
+        rows = tuple(self._row.iter_unpack(memoryview(data)[start:end]))
         if any(row[0] != _STAMPED for row in rows):
             return "sample without a time stamp"
         return Samples(tuple(row[1] for row in rows), tuple(row[2:] for row in rows))
@@ -154,8 +167,8 @@ def encode_round_trip(trip: RoundTrip) -> bytes:
     return _chunk(_ROUND_TRIP, _TRIP.pack(*trip))
 
 
-def _content(data: bytes, at: int) -> tuple[int, memoryview, int] | str:
-    """Return tag, content and end of the chunk at `at`; or why there is none."""
+def _content(data: bytes, at: int) -> tuple[int, int, int] | str:
+    """Return tag of the chunk at `at`, begin and end of its content; or why there is none."""
     size = data[at]
     start = at + 1 + size
     if size not in _LENGTHS or start + _START.size > len(data):
@@ -166,7 +179,7 @@ def _content(data: bytes, at: int) -> tuple[int, memoryview, int] | str:
     tag, stream = _START.unpack_from(data, start)
     if stream != _STREAM:
         return f"chunk of stream {stream}"
-    return tag, memoryview(data)[start + _START.size : start + length], start + length
+    return tag, start + _START.size, start + length
 
 
 def _chunk(tag: int, content: bytes) -> bytes:
