@@ -42,6 +42,11 @@ class SensorCalibrationSettings(Settings):
     gyroscope_bias_deg_s: Row | None = Field(
         None, description="angular rate at rest, sensor axes, deg/s"
     )
+    gyroscope_matrix: Rows | None = Field(
+        None,
+        description="inverse scale factors of the gyroscope, and its axes relative to those of the "
+        "accelerometer, by rows",
+    )
     accelerometer_bias: Row | None = Field(
         None, description="bias of the acceleration, sensor axes, m/s²"
     )
@@ -56,7 +61,7 @@ class SensorCalibrationSettings(Settings):
         None, description="inverse soft iron and scale factors of the magnetometer, by rows"
     )
 
-    @field_validator("accelerometer_matrix", "magnetometer_matrix")
+    @field_validator("gyroscope_matrix", "accelerometer_matrix", "magnetometer_matrix")
     @classmethod
     def _near_the_identity(cls, matrix: Rows | None) -> Rows | None:
         """Refuse a matrix that no calibration yields."""
@@ -81,8 +86,9 @@ class SensorCalibrationSettings(Settings):
     @property
     def parts(self) -> tuple[str, ...]:
         """Names of the calibrated parts."""
-        known = (self.gyroscope_bias_deg_s, self.accelerometer_bias, self.magnetometer_bias)
-        names = ("gyroscope", "accelerometer", "magnetometer")
+        gyroscope = (self.gyroscope_bias_deg_s, self.gyroscope_matrix)
+        known = (*gyroscope, self.accelerometer_bias, self.magnetometer_bias)
+        names = ("gyroscope", "gyroscope scale", "accelerometer", "magnetometer")
         return tuple(name for name, value in zip(names, known, strict=True) if value is not None)
 
 

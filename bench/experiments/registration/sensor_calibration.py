@@ -30,6 +30,7 @@ from jointfit_drivers.gateway_orientation import (
     RawStamp,
     SensorCorrection,
 )
+from tests.calibration.inertial_sensor.faulty_sensor import posed_rotation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -53,9 +54,10 @@ POSES = DIRECTIONS[[0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 14, 15]]
 
 @dataclass(frozen=True)
 class SimulatedSensor:
-    """Biases, and symmetric matrices of accelerometer and magnetometer."""
+    """Biases and matrices; those of accelerometer and magnetometer are symmetric."""
 
     biases: Array
+    rate_matrix: Array
     force_matrix: Array
     field_matrix: Array
 
@@ -63,13 +65,20 @@ class SimulatedSensor:
     def draw(cls, rng: np.random.Generator) -> SimulatedSensor:
         """Return a sensor with errors of low-cost parts."""
         biases = rng.normal(0.0, 1.0, (3, 3)) * np.array((0.01, 0.3, 25.0))[:, None]
-        return cls(biases, _near_identity(rng, 0.02, 0.004), _near_identity(rng, 0.08, 0.03))
+        rate_matrix = _near_identity(rng, 0.02, 0.0) + rng.normal(0.0, 0.004, (3, 3))
+        return cls(
+            biases, rate_matrix, _near_identity(rng, 0.02, 0.004), _near_identity(rng, 0.08, 0.03)
+        )
 
     def measure(
         self, up: Array, north: Array, rates: Array, rng: np.random.Generator
     ) -> list[SensorReading]:
         """Return readings; up and field direction are unit vectors in sensor axes."""
-        true = (rates, GRAVITY * up @ self.force_matrix, FIELD * north @ self.field_matrix)
+        true = (
+            rates @ self.rate_matrix.T,
+            GRAVITY * up @ self.force_matrix,
+            FIELD * north @ self.field_matrix,
+        )
         rows = np.concatenate(
             [
                 values + bias + rng.normal(0.0, sd, values.shape)
@@ -96,10 +105,12 @@ def calibrate(sensor: SimulatedSensor, rng: np.random.Generator) -> SensorCalibr
         free.add(reading)
 
     accelerometer, magnetometer = static.finish(), free.finish()
+    scale = static.finish_gyroscope_scale(accelerometer)
     return SensorCalibrationSettings.model_validate(
         {
             "date": "2026-11-23",
             "gyroscope_bias_deg_s": tuple(np.rad2deg(rest.finish().bias)),
+            "gyroscope_matrix": tuple(map(tuple, scale.matrix)),
             "accelerometer_bias": tuple(accelerometer.bias),
             "accelerometer_matrix": tuple(map(tuple, accelerometer.matrix)),
             "magnetometer_bias": tuple(magnetometer.bias),
@@ -109,14 +120,10 @@ def calibrate(sensor: SimulatedSensor, rng: np.random.Generator) -> SensorCalibr
 
 
 def _posed(sensor: SimulatedSensor, rng: np.random.Generator) -> list[SensorReading]:
-    """Return readings of static poses of 2 s, each after a shaken movement."""
-    ups, rates = [], []
-    for direction in POSES:
-        ups += [_unit(direction + rng.normal(0.0, 0.3, (30, 3)))]
-        ups += [np.tile(_unit(direction + rng.normal(0.0, 0.05, 3)), (2 * RATE_HZ, 1))]
-        rates += [rng.normal(0.0, 1.0, (30, 3)), np.zeros((2 * RATE_HZ, 3))]
-    up = np.concatenate(ups)
-    return sensor.measure(up, up, np.concatenate(rates), rng)
+    """Return readings of static poses of 2 s and of the turns between them."""
+    q, rates = posed_rotation(POSES, rng, 2.0, RATE_HZ)
+    up = rotation.rotate(rotation.conjugate(q), np.tile((0.0, 0.0, 1.0), (len(q), 1)))
+    return sensor.measure(up, up, rates, rng)
 
 
 def _turned(sensor: SimulatedSensor, rng: np.random.Generator) -> list[SensorReading]:
@@ -165,20 +172,23 @@ def orientation_error(
 
 
 def before_and_after(_: Path) -> list[Result]:
-    """Return median and largest RMS errors of the sensors."""
-    errors = []
+    """Return median and largest RMS errors of the sensors, and errors of the gyroscope's scale."""
+    errors, scales = [], []
     for seed in range(SENSORS):
         rng = np.random.default_rng(seed)
         sensor = SimulatedSensor.draw(rng)
         calibration = calibrate(sensor, rng)
         q, readings = turned_sensor(sensor, rng)
         errors.append([orientation_error(q, readings, each) for each in (None, calibration)])
+        corrected = np.array(calibration.gyroscope_matrix) @ sensor.rate_matrix
+        factors = (np.diag(sensor.rate_matrix), np.diag(corrected))
+        scales.append([100.0 * np.abs(each - 1.0).max() for each in factors])
     table = np.array(errors)  # sensor, before or after, whole or tilt
     limits: Mapping[tuple[str, str], float] = {
         ("after", "orientation"): 0.4,
         ("after", "inclination"): 0.2,
     }
-    return [
+    by_quantity = [
         Result(
             f"{quantity} {when} calibration, {name}",
             float(statistic(table[:, row, column])),
@@ -186,8 +196,22 @@ def before_and_after(_: Path) -> list[Result]:
         )
         for column, quantity in enumerate(("orientation", "inclination"))
         for row, when in enumerate(("before", "after"))
-        for name, statistic in (("median", np.median), ("largest", np.max))
+        for name, statistic in _STATISTICS
     ]
+    by_sensor = np.array(scales)
+    return by_quantity + [
+        Result(
+            f"scale of the gyroscope {when} calibration, {name}",
+            float(statistic(by_sensor[:, row])),
+            0.3 if when == "after" else float("inf"),
+            unit="%",
+        )
+        for row, when in enumerate(("before", "after"))
+        for name, statistic in _STATISTICS
+    ]
+
+
+_STATISTICS = (("median", np.median), ("largest", np.max))
 
 
 def _near_identity(rng: np.random.Generator, scale_sd: float, skew_sd: float) -> Array:

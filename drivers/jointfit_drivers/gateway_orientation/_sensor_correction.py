@@ -28,7 +28,8 @@ class SensorCorrection:
 
     def __init__(self, calibration: SensorCalibrationSettings) -> None:
         x, y, z = calibration.gyroscope_bias_deg_s or _ZERO
-        self._rate_bias = (radians(x), radians(y), radians(z))
+        rate_bias = (radians(x), radians(y), radians(z))
+        self._rate = (rate_bias, calibration.gyroscope_matrix or _IDENTITY)
         self._force = (
             calibration.accelerometer_bias or _ZERO,
             calibration.accelerometer_matrix or _IDENTITY,
@@ -42,13 +43,12 @@ class SensorCorrection:
 
     def correct(self, reading: RawReading, *, field: bool) -> RawReading:
         """Return a corrected reading; without `field`, its magnetic field is already correct."""
-        x, y, z = reading.rate
-        a, b, c = self._rate_bias
         magnetic = reading.magnetic
         if field and magnetic is not None:
             magnetic = _mapped(magnetic, *self._field)
         force = _mapped(reading.force, *self._force)
-        return reading._replace(rate=(x - a, y - b, z - c), force=force, magnetic=magnetic)
+        rate = _mapped(reading.rate, *self._rate)
+        return reading._replace(rate=rate, force=force, magnetic=magnetic)
 
     def correct_field(self, field: Vector) -> Vector:
         """Return a corrected magnetic field."""

@@ -2,6 +2,7 @@
 
 Each step takes the readings of one movement and returns an estimate with its covariance:
 `GyroscopeStep` at rest, `AccelerometerStep` in static poses, `MagnetometerStep` in free rotation.
+The turns between the poses also yield the scale factors of the gyroscope.
 """
 
 from jointfit_daemon.calibration.inertial_sensor._accelerometer import (
@@ -15,6 +16,10 @@ from jointfit_daemon.calibration.inertial_sensor._directions import (
     nearest_direction,
 )
 from jointfit_daemon.calibration.inertial_sensor._gyroscope import GyroscopeEstimate, GyroscopeStep
+from jointfit_daemon.calibration.inertial_sensor._gyroscope_scale import (
+    GyroscopeScaleEstimate,
+    fit_gyroscope_scale,
+)
 from jointfit_daemon.calibration.inertial_sensor._magnetometer import (
     MagnetometerEstimate,
     MagnetometerStep,
@@ -23,20 +28,25 @@ from jointfit_daemon.calibration.inertial_sensor._magnetometer import (
 from jointfit_daemon.calibration.inertial_sensor._refusal import SensorCalibrationError
 from jointfit_daemon.calibration.inertial_sensor._rest_blocks import SensorReading
 from jointfit_daemon.calibration.inertial_sensor._step_progress import StepProgress
+from jointfit_daemon.calibration.inertial_sensor._turns import Turn, TurnCollector
 
 __all__ = [
     "DIRECTIONS",
     "AccelerometerEstimate",
     "AccelerometerStep",
     "GyroscopeEstimate",
+    "GyroscopeScaleEstimate",
     "GyroscopeStep",
     "MagnetometerEstimate",
     "MagnetometerStep",
     "SensorCalibrationError",
     "SensorReading",
     "StepProgress",
+    "Turn",
+    "TurnCollector",
     "direction_names",
     "fit_accelerometer",
+    "fit_gyroscope_scale",
     "fit_magnetometer",
     "nearest_direction",
 ]

@@ -31,12 +31,17 @@ from jointfit_daemon.calibration.inertial_sensor._ellipsoid_fit import (
     fit_unit_ellipsoid,
     matrix_sd,
 )
+from jointfit_daemon.calibration.inertial_sensor._gyroscope_scale import fit_gyroscope_scale
 from jointfit_daemon.calibration.inertial_sensor._refusal import SensorCalibrationError
 from jointfit_daemon.calibration.inertial_sensor._rest_blocks import RestBlocks
 from jointfit_daemon.calibration.inertial_sensor._step_progress import StepProgress
+from jointfit_daemon.calibration.inertial_sensor._turns import TurnCollector
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.inertial_sensor._gyroscope_scale import (
+        GyroscopeScaleEstimate,
+    )
     from jointfit_daemon.calibration.inertial_sensor._rest_blocks import SensorReading
 
 STANDARD_GRAVITY = 9.80665
@@ -87,6 +92,10 @@ class AccelerometerEstimate:
     """RMS of the magnitudes minus g, uncorrected, m/s^2."""
     residual: float
     """RMS of the magnitudes minus g, corrected, m/s^2."""
+
+    def correct(self, force: Array) -> Array:
+        """Return a corrected specific force, m/s^2, shape (3,)."""
+        return np.asarray(self.matrix @ (force - self.bias))
 
 
 def fit_accelerometer(forces: Array) -> AccelerometerEstimate:
@@ -158,6 +167,7 @@ class AccelerometerStep:
 
     def __init__(self) -> None:
         self._blocks = RestBlocks()
+        self._turns = TurnCollector()
         self._forces: list[Array] = []
         self._constant: list[Array] = []
 
@@ -180,7 +190,9 @@ class AccelerometerStep:
     def add(self, reading: SensorReading) -> None:
         """Add a reading; a pose is collected if it differs from those before."""
         blocks = self._blocks
-        if not blocks.add(reading) or len(blocks.rest) <= _POSE_BLOCKS:
+        is_block = blocks.add(reading)
+        self._turns.add(reading, blocks.rest if is_block else None)
+        if not is_block or len(blocks.rest) <= _POSE_BLOCKS:
             return
 
         # the first block may contain the end of a movement
@@ -210,6 +222,16 @@ class AccelerometerStep:
         forces = np.array(self._forces)
         self._check_saturation(forces)
         return fit_accelerometer(forces)
+
+    def finish_gyroscope_scale(self, estimate: AccelerometerEstimate) -> GyroscopeScaleEstimate:
+        """Return the scale factors of the gyroscope, from the turns between the poses.
+
+        Raises
+        ------
+        SensorCalibrationError
+            The turns do not determine them.
+        """
+        return fit_gyroscope_scale(self._turns.turns, estimate.correct)
 
     def _missing_faces(self) -> list[int]:
         taken = set(nearest_direction(np.array(self._forces)).tolist()) if self._forces else set()

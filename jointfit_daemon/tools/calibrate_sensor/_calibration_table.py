@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jointfit_daemon.calibration.inertial_sensor import GyroscopeEstimate
+from jointfit_daemon.calibration.inertial_sensor import (
+    GyroscopeEstimate,
+    GyroscopeScaleEstimate,
+)
 from jointfit_daemon.sensor_calibration import SensorCalibrationSettings
 
 if TYPE_CHECKING:
@@ -45,6 +48,9 @@ def make_calibration(
     for part, estimate in estimates.items():
         if isinstance(estimate, GyroscopeEstimate):
             values["gyroscope_bias_deg_s"] = _rounded(np.rad2deg(estimate.bias))
+            continue
+        if isinstance(estimate, GyroscopeScaleEstimate):
+            values["gyroscope_matrix"] = tuple(_rounded(row) for row in estimate.matrix)
             continue
         values[f"{part}_bias"] = _rounded(estimate.bias)
         values[f"{part}_matrix"] = tuple(_rounded(row) for row in estimate.matrix)

@@ -13,6 +13,7 @@ from jointfit_daemon.calibration.inertial_sensor import (
     AccelerometerEstimate,
     AccelerometerStep,
     GyroscopeEstimate,
+    GyroscopeScaleEstimate,
     GyroscopeStep,
     MagnetometerEstimate,
     MagnetometerStep,
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk
 
 Step = GyroscopeStep | AccelerometerStep | MagnetometerStep
-Estimate = GyroscopeEstimate | AccelerometerEstimate | MagnetometerEstimate
+Estimate = GyroscopeEstimate | GyroscopeScaleEstimate | AccelerometerEstimate | MagnetometerEstimate
 
 STEPS: dict[str, type[Step]] = {
     "gyroscope": GyroscopeStep,
@@ -45,6 +46,8 @@ INSTRUCTIONS = {
     "magnetometer": "Take {id} in the hand, away from steel, and turn it slowly in place until "
     "every side has pointed in every direction.",
 }
+GYROSCOPE_SCALE = "gyroscope_scale"
+"""Name of the estimate that the turns between the poses of the accelerometer yield."""
 _SHOW_S = 0.25
 """Interval between two displays of the progress, s."""
 
@@ -56,6 +59,8 @@ class SensorFindings:
     estimates: dict[str, Estimate] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
     """Reason why a step has no result."""
+    not_estimated: dict[str, str] = field(default_factory=dict)
+    """Reason why a quantity that a step yields beside its result is not estimated."""
     serial: str | None = None
     """Serial number, if the sensor reported one."""
     warnings: list[str] = field(default_factory=list)
@@ -64,9 +69,17 @@ class SensorFindings:
     def finish(self, name: str, step: Step) -> None:
         """Add the result of a step, or the reason for its absence."""
         try:
-            self.estimates[name] = step.finish()
+            estimate = step.finish()
         except SensorCalibrationError as error:
             self.refused[name] = str(error)
+            return
+
+        self.estimates[name] = estimate
+        if isinstance(step, AccelerometerStep) and isinstance(estimate, AccelerometerEstimate):
+            try:
+                self.estimates[GYROSCOPE_SCALE] = step.finish_gyroscope_scale(estimate)
+            except SensorCalibrationError as error:
+                self.not_estimated[GYROSCOPE_SCALE] = str(error)
 
 
 class Display(Protocol):

@@ -10,6 +10,7 @@ import numpy as np
 from jointfit_daemon.calibration.inertial_sensor import (
     AccelerometerEstimate,
     GyroscopeEstimate,
+    GyroscopeScaleEstimate,
     MagnetometerEstimate,
 )
 
@@ -24,6 +25,10 @@ def report_lines(name: str, findings: SensorFindings) -> list[str]:
     lines = [f"{name}{serial}"]
     for estimate in findings.estimates.values():
         lines += _lines(estimate)
+    lines += [
+        f"  {name.replace('_', ' ')}: not estimated: {text}"
+        for name, text in findings.not_estimated.items()
+    ]
     lines += [f"  {step}: refused: {text}" for step, text in findings.refused.items()]
     lines += [f"  device: {text}" for text in findings.warnings]
     return lines
@@ -39,6 +44,16 @@ def _lines(estimate: Estimate) -> list[str]:
     scales = 100.0 * (1.0 / np.diag(estimate.matrix) - 1.0)
     scale_sd = 100.0 * np.diag(estimate.matrix_sd).max()
     common = f"scale errors {_numbers(scales, 2)} %, standard deviation {scale_sd:.2f}"
+    if isinstance(estimate, GyroscopeScaleEstimate):
+        off = np.abs(estimate.matrix - np.diag(np.diag(estimate.matrix))).max()
+        axes = f"; axes {np.rad2deg(off):.2f} deg off those of the accelerometer"
+        return [
+            f"  gyroscope scale: errors {_numbers(scales, 2)} %, standard deviation "
+            f"{scale_sd:.2f}{'' if np.isnan(estimate.matrix_sd[0, 1]) else axes}",
+            f"    {estimate.turns} turns, {np.rad2deg(estimate.angle):.0f} deg in all, end "
+            f"{np.rad2deg(estimate.spread_before):.2f} deg (RMS) from gravity before, "
+            f"{np.rad2deg(estimate.residual):.2f} after",
+        ]
     if isinstance(estimate, AccelerometerEstimate):
         axes = "" if np.isnan(estimate.matrix_sd[0, 1]) else f"; axes {_axes(estimate.matrix)}"
         return [
@@ -69,6 +84,7 @@ def report_data(name: str, findings: SensorFindings) -> dict[str, Any]:
         "id": name,
         "serial": findings.serial,
         **parts,
+        "not_estimated": findings.not_estimated,
         "refused": findings.refused,
         "warnings": findings.warnings,
     }

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from jointfit_daemon.calibration.inertial_sensor import DIRECTIONS, SensorReading
+from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -17,19 +18,22 @@ if TYPE_CHECKING:
 RATE_HZ = 50
 STEP_NS = 1_000_000_000 // RATE_HZ
 GRAVITY = 9.80665
+MOVE_S = 0.5
+"""Time of a turn between two poses, s."""
 FIELD = 48.0
 """Magnitude of the magnetic field, uT."""
 
 
 @dataclass(frozen=True)
 class FaultySensor:
-    """Measured = matrix true + bias + noise; the matrices are symmetric."""
+    """Measured = matrix true + bias + noise; the matrices but the gyroscope's are symmetric."""
 
     gyroscope_bias: Array
     accelerometer_bias: Array
     accelerometer_matrix: Array
     magnetometer_bias: Array
     magnetometer_matrix: Array
+    gyroscope_matrix: Array
     noise: tuple[float, float, float] = (0.003, 0.02, 0.3)
     """Standard deviations of rate, rad/s, force, m/s^2, and field, uT."""
 
@@ -43,6 +47,7 @@ class FaultySensor:
             symmetric(rng, 0.02, 0.004),
             rng.normal(0.0, 25.0, 3),
             symmetric(rng, 0.08, 0.03),
+            symmetric(rng, 0.02, 0.0) + rng.normal(0.0, 0.005, (3, 3)),
         )
 
     def readings(
@@ -51,7 +56,7 @@ class FaultySensor:
         """Return readings; up and north are unit vectors of gravity and field in sensor axes."""
         rng = np.random.default_rng(seed)
         gyr, acc, mag = (rng.normal(0.0, sd, rates.shape) for sd in self.noise)
-        rate = rates + self.gyroscope_bias + gyr
+        rate = rates @ self.gyroscope_matrix.T + self.gyroscope_bias + gyr
         force = GRAVITY * up @ self.accelerometer_matrix + self.accelerometer_bias + acc
         field = FIELD * north @ self.magnetometer_matrix + self.magnetometer_bias + mag
         rows = np.concatenate((rate, force, field), axis=1).tolist()
@@ -69,14 +74,9 @@ class FaultySensor:
     def posed(self, directions: Array, seed: int = 0, rest_s: float = 2.0) -> list[SensorReading]:
         """Return readings of static poses with directions up, and of the movements between them."""
         rng = np.random.default_rng(seed)
-        still = round(rest_s * RATE_HZ)
-        up, rates = [], []
-        for direction in directions:
-            up += [unit(direction + rng.normal(0.0, 0.3, (15, 3)))]
-            up += [np.tile(unit(direction + rng.normal(0.0, 0.05, 3)), (still, 1))]
-            rates += [rng.normal(0.0, 1.0, (15, 3)), np.zeros((still, 3))]
-        every = np.concatenate(up)
-        return self.readings(every, every, np.concatenate(rates), rng)
+        q, rates = posed_rotation(directions, rng, rest_s)
+        up = rotation.rotate(rotation.conjugate(q), np.tile((0.0, 0.0, 1.0), (len(q), 1)))
+        return self.readings(up, up, rates, rng)
 
     def turned(self, directions: Array, seed: int = 0, count: int = 400) -> list[SensorReading]:
         """Return readings of a rotation that brings the field to each of some directions."""
@@ -84,6 +84,29 @@ class FaultySensor:
         chosen = directions[rng.integers(0, len(directions), count)]
         north = unit(chosen + rng.normal(0.0, 0.25, (count, 3)))
         return self.readings(north, north, rng.normal(0.0, 1.0, (count, 3)), rng)
+
+
+def posed_rotation(
+    directions: Array, rng: np.random.Generator, rest_s: float, rate_hz: int = RATE_HZ
+) -> tuple[Array, Array]:
+    """Return orientations, shape (n, 4), and rates of static poses and the turns between them."""
+    moving, still = round(MOVE_S * rate_hz), round(rest_s * rate_hz)
+    # speed 1 - cos: the turn begins and ends at rest
+    phase = 2.0 * np.pi * np.arange(moving) / moving
+    share, speed = (phase - np.sin(phase)) / (2.0 * np.pi), (1.0 - np.cos(phase)) / MOVE_S
+    q, rates, pose = [], [], rotation.exp(rng.normal(size=3))
+    for direction in directions:
+        up = unit(direction + rng.normal(0.0, 0.05, 3))
+        axis = np.cross(up, (0.0, 0.0, 1.0))
+        sine = float(np.linalg.norm(axis))
+        tilt = axis * np.arctan2(sine, up[2]) / max(sine, 1e-9)
+        target = rotation.multiply(rotation.heading(rng.uniform(-np.pi, np.pi)), rotation.exp(tilt))
+        turn = rotation.log(rotation.multiply(rotation.conjugate(pose), target))
+        q += [rotation.multiply(pose, rotation.exp(np.outer(share, turn)))]
+        q += [np.tile(target, (still, 1))]
+        rates += [np.outer(speed, turn), np.zeros((still, 3))]
+        pose = target
+    return np.concatenate(q), np.concatenate(rates)
 
 
 def unit(vectors: Array) -> Array:

@@ -17,11 +17,15 @@ from jointfit_daemon.calibration.inertial_sensor import (
     MagnetometerStep,
     SensorCalibrationError,
     SensorReading,
+    Turn,
     direction_names,
     fit_accelerometer,
+    fit_gyroscope_scale,
     fit_magnetometer,
     nearest_direction,
 )
+from jointfit_daemon.calibration.inertial_sensor._turns import Rest
+from jointfit_daemon.kinematics import rotation
 from tests.calibration.inertial_sensor.faulty_sensor import (
     FIELD,
     GRAVITY,
@@ -36,6 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.inertial_sensor import GyroscopeScaleEstimate
 
 AnyStep = TypeVar("AnyStep", GyroscopeStep, AccelerometerStep, MagnetometerStep)
 SENSOR = FaultySensor.draw(1)
@@ -192,6 +197,70 @@ def test_residual_that_is_too_large_is_refused() -> None:
 def test_acceleration_in_another_unit_is_refused() -> None:
     with pytest.raises(SensorCalibrationError, match=r"scale error 920 %.*Check the unit"):
         fit_accelerometer(DIRECTIONS * 0.9614)
+
+
+# --- scale of the gyroscope -----------------------------------------------------------------------
+
+
+def scale_of(readings: Iterable[SensorReading]) -> GyroscopeScaleEstimate:
+    step = AccelerometerStep()
+    for reading in readings:
+        step.add(reading)
+    return step.finish_gyroscope_scale(step.finish())
+
+
+def test_turns_between_poses_yield_scale_and_axes_of_the_gyroscope_with_their_uncertainty() -> None:
+    errors, inside = [], []
+    for seed, sensor in draws(20):
+        jitter_ns = np.random.default_rng(seed).normal(0.0, 1e6, 6000).astype(int).tolist()
+        readings = sensor.posed(poses(), seed)
+        late = [r._replace(t_ns=r.t_ns + jitter_ns[k]) for k, r in enumerate(readings)]
+        found = scale_of(late)
+        assert found.turns == 11
+        assert found.residual < 0.1 * found.spread_before
+        error = (found.matrix - np.linalg.inv(sensor.gyroscope_matrix)).ravel()
+        errors.append(np.abs(error).max())
+        limit = f_distribution.ppf(0.95, 9, found.degrees_of_freedom)
+        inside.append(distance(error, found.covariance) < limit)
+    assert np.median(errors) < 0.001
+    assert max(errors) < 0.004
+    assert np.mean(inside) >= 0.8
+
+
+def test_a_scale_about_an_axis_that_never_turns_while_level_is_not_determined() -> None:
+    turns = []
+    for angle in (0.5, 1.5, -1.0, 1.2, -1.2, 1.0, -1.5):  # about x alone
+        q = rotation.exp(np.outer(np.linspace(0.0, 1.0, 50), (angle, 0.0, 0.0)))
+        up = rotation.rotate(rotation.conjugate(q), np.tile((0.0, 0.0, 1.0), (50, 1)))
+        rates = np.tile((1.03 * angle / 0.98, 0.0, 0.0), (50, 1))
+        ends = [Rest(GRAVITY * each, np.zeros(3)) for each in (up[0], up[-1])]
+        turns.append(Turn(np.linspace(0.0, 0.98, 50), rates, *ends))
+    with pytest.raises(
+        SensorCalibrationError, match=r"about [yz] .*once around about [yz] while this axis is"
+    ):
+        fit_gyroscope_scale(turns, lambda force: force)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda rate: np.clip(rate, -2.0, 2.0), r"11 saturated, expected at least 6"),
+        (lambda rate: 2.0 * rate, r"check (the )?unit"),
+    ],
+)
+def test_turns_that_contradict_gravity_yield_no_scale(change: Any, text: str) -> None:
+    readings = SENSOR.posed(poses())
+    wrong = [r._replace(rate=tuple(change(np.array(r.rate)).tolist())) for r in readings]
+    with pytest.raises(SensorCalibrationError, match=text):
+        scale_of(wrong)
+
+
+def test_a_turn_with_a_pause_of_the_readings_is_left_out() -> None:
+    readings = SENSOR.posed(poses())
+    pause_ns = 10**9
+    middle = next(k for k, r in enumerate(readings) if k > 200 and abs(r.rate[0]) > 1.0)
+    late = [r._replace(t_ns=r.t_ns + pause_ns * (k > middle)) for k, r in enumerate(readings)]
+    assert scale_of(late).turns == 10
 
 
 # --- magnetometer ---------------------------------------------------------------------------------

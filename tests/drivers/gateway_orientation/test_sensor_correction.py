@@ -62,9 +62,11 @@ def calibrated(sensor: FaultySensor) -> SensorCalibrationSettings:
     for reading in sensor.turned(DIRECTIONS, count=600):
         free.add(reading)
     gyroscope, accelerometer, magnetometer = rest.finish(), static.finish(), free.finish()
+    scale = static.finish_gyroscope_scale(accelerometer)
     return SensorCalibrationSettings(
         date="2026-11-23",
         gyroscope_bias_deg_s=tuple(np.rad2deg(gyroscope.bias)),
+        gyroscope_matrix=rows(scale.matrix),
         accelerometer_bias=tuple(accelerometer.bias),
         accelerometer_matrix=rows(accelerometer.matrix),
         magnetometer_bias=tuple(magnetometer.bias),

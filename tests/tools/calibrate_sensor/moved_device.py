@@ -31,11 +31,16 @@ RATE_HZ = 100
 PERIOD_NS = 1_000_000_000 // RATE_HZ
 SERIAL = "0123ABCD"
 GYROSCOPE_BIAS_DEG_S = (1.5, -0.8, 0.4)
+GYROSCOPE_SCALE = (1.015, 0.99, 1.005)
 ACCELEROMETER_BIAS = (0.4, -0.2, 0.3)
 ACCELEROMETER_SCALE = (1.02, 0.98, 1.01)
 MAGNETOMETER_BIAS = (0.5, -0.9, 0.3)
 ERRORS = SensorErrors(
-    VectorErrors((radians(GYROSCOPE_BIAS_DEG_S[0]), radians(-0.8), radians(0.4)), noise_sd=0.002),
+    VectorErrors(
+        (radians(GYROSCOPE_BIAS_DEG_S[0]), radians(-0.8), radians(0.4)),
+        ((GYROSCOPE_SCALE[0], 0, 0), (0, GYROSCOPE_SCALE[1], 0), (0, 0, GYROSCOPE_SCALE[2])),
+        noise_sd=0.002,
+    ),
     VectorErrors(
         ACCELEROMETER_BIAS,
         ((ACCELEROMETER_SCALE[0], 0, 0), (0, ACCELEROMETER_SCALE[1], 0), (0, 0, 1.01)),
@@ -44,7 +49,8 @@ ERRORS = SensorErrors(
     VectorErrors(MAGNETOMETER_BIAS, ((1.1, 0.05, 0), (0.05, 0.9, 0), (0, 0, 1)), noise_sd=0.004),
 )
 POSES = DIRECTIONS[[0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 14, 15]]
-REST_S, MOVE_S = 1.9, 0.3
+LEVEL = DIRECTIONS[4]
+REST_S, MOVE_S = 1.8, 0.4
 RIG = """[rig]
 name = "bench"
 
@@ -79,9 +85,12 @@ def facing(up: np.ndarray) -> Rotation:
 def poses_at(seconds: float) -> Rotation:
     """Return the orientation during the movements of the accelerometer step."""
     number, within = divmod(seconds, REST_S + MOVE_S)
-    now = facing(POSES[int(number) % len(POSES)])
-    left = max(1.0 - within / MOVE_S, 0.0)  # shaken before it rests
-    return now * Rotation.from_rotvec(left * np.sin(40.0 * within) * np.array((0.5, 0.3, -0.4)))
+    before, now = (
+        facing(POSES[(int(number) + step) % len(POSES)]) if number + step >= 0 else facing(LEVEL)
+        for step in (-1, 0)
+    )
+    left = 0.5 + 0.5 * np.cos(np.pi * min(within / MOVE_S, 1.0))
+    return now * Rotation.from_rotvec(left * (now.inv() * before).as_rotvec())
 
 
 def turned_at(seconds: float) -> Rotation:
@@ -93,7 +102,7 @@ def movement(step: str, seconds: float) -> Rotation:
     """Return the orientation of a step, some time after its instruction."""
     if step == "accelerometer":
         return poses_at(seconds)
-    return turned_at(seconds) if step == "magnetometer" else facing(DIRECTIONS[4])
+    return turned_at(seconds) if step == "magnetometer" else facing(LEVEL)
 
 
 def recorded_chunks(steps: dict[str, float]) -> Iterator[Chunk]:

@@ -32,6 +32,7 @@ from tests.tools.calibrate_sensor.moved_device import (
     ACCELEROMETER_BIAS,
     ACCELEROMETER_SCALE,
     GYROSCOPE_BIAS_DEG_S,
+    GYROSCOPE_SCALE,
     MAGNETOMETER_BIAS,
     MOVE_S,
     POSES,
@@ -73,9 +74,13 @@ def test_recorded_movements_yield_the_errors_of_the_sensor(tmp_path: Path) -> No
     assert found.refused == {}
     made = make_calibration(found.estimates, "2026-11-23", SERIAL, None)
     assert_near_truth(made.model_dump())
+    scales = 1.0 / np.diag(np.array(made.gyroscope_matrix))
+    np.testing.assert_allclose(scales, GYROSCOPE_SCALE, atol=0.004)
+    assert "gyroscope scale" in made.parts
 
     text = "\n".join(report_lines("S1", found))
     assert "gyroscope: bias 1.50" in text
+    assert "gyroscope scale: errors 1.5" in text
     assert "|a| differs from gravity by 0.3" in text
     assert "in 12 poses" in text
     data = json.loads(json.dumps(report_data("S1", found), default=lambda each: each.tolist()))

@@ -1,0 +1,97 @@
+"""Turns of a sensor between rests: the readings of each, and gravity before and after it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jointfit_daemon.calibration.inertial_sensor._rest_blocks import LONGEST_PAUSE_NS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.arrays import Array
+    from jointfit_daemon.calibration.inertial_sensor._rest_blocks import RestBlock, SensorReading
+
+REST_BLOCKS = 3
+"""Blocks of a rest before and after a turn, 0.75 s."""
+MOST_READINGS = 20_000
+"""Most readings of a turn; a longer one is discarded, because the noise of its integral grows."""
+
+
+LARGEST_JITTER = 0.4
+"""Largest deviation of arrivals from equal intervals, in intervals; a lost reading deviates by a
+half or more."""
+
+
+class Rest(NamedTuple):
+    """Means of a rest."""
+
+    force: Array
+    """Specific force, m/s^2, shape (3,)."""
+    rate: Array
+    """Angular rate, which is the bias, rad/s, shape (3,)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """A movement that begins and ends at rest."""
+
+    t_s: Array
+    """Instants of the readings, s, shape (n,)."""
+    rates: Array
+    """Angular rates as measured, rad/s, shape (n, 3)."""
+    before: Rest
+    after: Rest
+
+
+class TurnCollector:
+    """Collects the turns in a series of readings."""
+
+    def __init__(self) -> None:
+        self.turns: list[Turn] = []
+        """Turns so far."""
+        self._before: Rest | None = None
+        self._since: list[SensorReading] = []  # readings since the end of `_before`
+
+    def add(self, reading: SensorReading, rest: Sequence[RestBlock] | None) -> None:
+        """Add a reading.
+
+        Parameters
+        ----------
+        reading
+            The next reading.
+        rest
+            Blocks of the present rest if the reading completed a block, else None.
+        """
+        since = self._since
+        pause_ns = reading.t_ns - since[-1].t_ns if since else 0
+        if not 0 <= pause_ns <= LONGEST_PAUSE_NS or len(since) >= MOST_READINGS:
+            since.clear()
+            self._before = None
+        since.append(reading)
+        if rest is None or len(rest) <= REST_BLOCKS:
+            return
+
+        # the first block may contain the end of the turn
+        after = Rest(
+            np.mean([block.force for block in rest[1:]], axis=0),
+            np.mean([block.rate for block in rest[1:]], axis=0),
+        )
+        if self._before is not None and len(rest) == REST_BLOCKS + 1:  # this rest is new
+            t_s = np.array([each.t_ns - since[0].t_ns for each in since]) * 1e-9
+            rates = np.array([each.rate for each in since])
+            self.turns.append(Turn(_without_jitter(t_s), rates, self._before, after))
+        self._before = after
+        self._since = [reading]
+
+
+def _without_jitter(t_s: Array) -> Array:
+    """Return equal intervals if the arrivals deviate from them by jitter alone."""
+    number = np.arange(len(t_s)) - 0.5 * (len(t_s) - 1)
+    period_s = float(number @ t_s / (number @ number))
+    regular = t_s.mean() + period_s * number
+    is_jitter = float(np.abs(t_s - regular).max()) < LARGEST_JITTER * period_s
+    return np.asarray(regular) if is_jitter else t_s
