@@ -132,7 +132,8 @@ async def explain_silence(
         )
     raise DeviceMisconfiguredError(
         f"{port.path}: the device on this port does not use {family}: it sends bytes, none of them "
-        f"{family} at any common speed: correct `port` or `driver`"
+        f"{family} at any common speed: correct `port` or `driver`, which "
+        "`jointfit probe` recognizes"
     )
 
 
@@ -173,5 +174,6 @@ async def explain_missing_messages(
         )
     raise DeviceMisconfiguredError(
         f"{port.path}: the device on this port does not use {family}: it sends bytes, none of them "
-        f"{family} at any common speed: correct `port` or `driver`"
+        f"{family} at any common speed: correct `port` or `driver`, which "
+        "`jointfit probe` recognizes"
     )

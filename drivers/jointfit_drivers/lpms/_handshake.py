@@ -220,7 +220,8 @@ class LpmsHandshake:
             )
         raise DeviceMisconfiguredError(
             f"{self._who}: the device on this port is not LPMS: it sends bytes, none of them "
-            "LP-BUS at any common speed: correct `port` or `driver`"
+            "LP-BUS at any common speed: correct `port` or `driver`, which "
+            "`jointfit probe` recognizes"
         )
 
     async def _other_speed(self) -> int | None:

@@ -242,7 +242,8 @@ class WitMotionHandshake:
                 raise DeviceMisconfiguredError(f"{self._who}: {OTHER_VARIANT}")
         raise DeviceMisconfiguredError(
             f"{self._who}: {received} bytes, none of them a WitMotion frame at any usual speed: "
-            "correct `port` or `driver`"
+            "correct `port` or `driver`, which "
+            "`jointfit probe` recognizes"
         )
 
     async def _move_from(self, baud: int) -> _Reception:

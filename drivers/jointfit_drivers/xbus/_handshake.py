@@ -265,7 +265,8 @@ class XbusHandshake:
             )
         raise DeviceMisconfiguredError(
             f"{self._who}: the device on this port is not Xbus: it sends bytes, none of them "
-            "Xbus at any common speed: correct `port` or `driver`"
+            "Xbus at any common speed: correct `port` or `driver`, which "
+            "`jointfit probe` recognizes"
         )
 
     async def _other_speed(self) -> int | None:

@@ -174,7 +174,8 @@ class XImu3Handshake:
             )
         raise DeviceMisconfiguredError(
             f"{self._who}: the device on this port is not an x-IMU3: it sends bytes, none of them "
-            "its messages at any common speed: correct `port` or `driver`"
+            "its messages at any common speed: correct `port` or `driver`, which "
+            "`jointfit probe` recognizes"
         )
 
     async def _other_speed(self) -> int | None:
