@@ -6,6 +6,7 @@ import tempfile
 from pathlib import Path
 
 from tests.pictures import drift_event
+from tests.pictures.dashboard_pages import draw_pages
 from tests.pictures.report_page import draw_report
 from tests.pictures.tutorial_run import run_tutorial
 
@@ -14,6 +15,7 @@ PICTURES = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 
 def main() -> None:
     """Write all pictures."""
+    draw_pages(PICTURES)
     with tempfile.TemporaryDirectory(prefix="jointfit-pictures-") as folder:
         run_tutorial(Path(folder), PICTURES)
         draw_report(Path(folder), PICTURES / "report.webp")

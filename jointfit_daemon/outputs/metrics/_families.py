@@ -149,7 +149,7 @@ def _device_details(devices: Mapping[str, DeviceHealth]) -> Iterator[Metric]:
     delay = GaugeMetricFamily(
         "jointfit_device_delay_seconds",
         "Quantiles of the delay from sampling to arrival in the last minute; 1 is the largest.",
-        labels=["device", "quantile"],
+        labels=["device", "share"],
     )
     clock = StateSetMetricFamily(
         "jointfit_device_clock_state", "State of the device clock.", labels=["device"]
@@ -162,10 +162,10 @@ def _device_details(devices: Mapping[str, DeviceHealth]) -> Iterator[Metric]:
             if outcome != "pending":
                 samples.add_metric([name, outcome], count)
         if (delays := device.clock.delays) is not None:
-            for quantile, value_ns in (
+            for share, value_ns in (
                 ("0.5", delays.p50_ns), ("0.99", delays.p99_ns), ("1", delays.max_ns),
             ):  # fmt: skip
-                delay.add_metric([name, quantile], value_ns * _NS)
+                delay.add_metric([name, share], value_ns * _NS)
         clock.add_metric([name], {one: one == device.clock.state for one in _CLOCK_STATES})
         if device.sensor is not None:
             states = {one: one == device.sensor for one in get_args(SensorState)}

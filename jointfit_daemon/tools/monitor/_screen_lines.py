@@ -111,10 +111,12 @@ def page_state(state: MonitorState, now: Moment) -> tuple[Level, str, str]:
         return "muted", "Choose a rig" if state.rigs else "Looking for rigs on the broker", ""
     if rig.bridge == "offline":
         return "error", "jointfitd is not running", _STOPPED
-    if rig.bridge != "online":
-        return "muted", "Waiting for jointfitd", ""
 
     fault = next(iter(rig.faults.values()), "")
+    if rig.bridge != "online":
+        words = "The messages of jointfitd cannot be read" if fault else "Waiting for jointfitd"
+        return "error" if fault else "muted", words, fault
+
     calibration = rig.calibration
     age_s = pose_age_s(rig, now)
     if age_s is not None and age_s > 2 * STALE_S and not fault:
@@ -174,7 +176,7 @@ def _body(state: MonitorState, width: int, height: int, now: Moment) -> list[Lin
 
     rig = state.rig
     if rig.bridge == "unknown" and rig.pose is None:
-        return _waiting_lines(state, width)
+        return [] if rig.faults else _waiting_lines(state, width)
     views: dict[str, Callable[[], list[Line]]] = {
         "live": lambda: live_lines(state, width, height, now),
         "calibrate": lambda: calibration_lines(rig, width),

@@ -122,6 +122,8 @@ class PublishedRig:
     """Axis and angle, deg, by which a sensor was turned about its own axis."""
     changes: dict[str, Any] = field(default_factory=dict)
     """Keys of `calibration` with other values."""
+    progress: dict[str, Any] | None = None
+    """Content of `calibration/progress`, of a rig that calibrates."""
     answer: dict[str, Any] = field(
         default_factory=lambda: {"status": "accepted", "data": {}, "error": None}
     )
@@ -364,6 +366,9 @@ async def _publish_poses(rig: PublishedRig, client: aiomqtt.Client) -> None:
             await client.publish(f"{rig.base}/optical/pose", orjson.dumps(optical))
             orientations = orjson.dumps(rig.orientations())
             await client.publish(f"{rig.base}/sensors/pose", orientations)
+        if rig.progress is not None:
+            progress = orjson.dumps({"v": rig.version, "t_us": rig.now_us()} | rig.progress)
+            await client.publish(f"{rig.base}/calibration/progress", progress)
         if seq % HEALTH_POSES == HEALTH_POSES - 1:
             health = orjson.dumps(rig.health() | {"v": rig.version})
             await client.publish(f"{rig.base}/bridge/health", health, 1, retain=True)

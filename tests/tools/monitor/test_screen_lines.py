@@ -170,6 +170,17 @@ def test_without_a_daemon_the_command_to_start_it_is_shown() -> None:
     assert "jointfitd --config rig.toml" in found
 
 
+def test_a_daemon_of_another_version_is_not_taken_for_a_missing_one() -> None:
+    state = connected_state()
+    for topic, payload in SampleRig().retained().items():
+        state.rig.take(topic, payload | {"v": 2}, moment(0.0))
+    found = words(state)
+    assert "✖ The messages of jointfitd cannot be read" in found
+    assert "payload version 2, this program reads 1" in found
+    assert "install the version" in found
+    assert "no rig publishes" not in found
+
+
 def test_missing_layout_and_missing_poses_name_the_right_to_read() -> None:
     state = connected_state()
     take(state, "pose/ui", SampleRig(joints=()).pose(0.0))
