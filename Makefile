@@ -8,7 +8,7 @@ STAMP  := $(VENV)/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root faults fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
+.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root faults endurance fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -60,6 +60,9 @@ test-vm: $(STAMP)  ## virtual machines: SocketCAN on a real vcan; power cuts; th
 
 faults: $(STAMP)  ## every fault of docs/reliability.md on the real daemon (ARGS="--repeat 20" writes the page)
 	@$(BIN)/python -m tests.faults $(ARGS)
+
+endurance: $(STAMP)  ## the daemon for 50 million samples, faster than real time: nothing grows (ARGS="--samples 1000000")
+	@$(BIN)/python -m tests.endurance $(ARGS)
 
 $(VENV)/.fuzz: $(STAMP)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --group fuzz

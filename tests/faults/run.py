@@ -10,6 +10,8 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from tests.endurance.slopes import RESULTS as ENDURANCE
+from tests.endurance.slopes import table_of
 from tests.faults.gateway import running_gateway
 
 if TYPE_CHECKING:
@@ -125,7 +127,12 @@ def render(results: dict[str, Any]) -> str:
         )
     machine = f"Machine: {results['machine']}."
     template = TEMPLATE.read_text("utf-8")
-    return template.replace("{table}", "\n".join(rows)).replace("{machine}", machine)
+    page = template.replace("{table}", "\n".join(rows)).replace("{machine}", machine)
+    endurance = json.loads(ENDURANCE.read_text("utf-8"))
+    samples = f"{endurance['samples']:,}".replace(",", " ")
+    factor = f"{endurance['factor']} times real time"
+    page = page.replace("{samples}", samples).replace("{factor}", factor)
+    return page.replace("{slopes}", table_of(endurance))
 
 
 def stored() -> dict[str, Any]:

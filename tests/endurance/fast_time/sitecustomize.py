@@ -1,0 +1,55 @@
+"""Time of a daemon process runs faster than real time: Python imports this module at its start.
+
+ENDURANCE is the path of a file, the factor, and the instant at which both times agree, ns of
+CLOCK_MONOTONIC. The file receives the numbers of asyncio tasks and of Python objects.
+"""
+
+import asyncio
+import gc
+import mmap
+import os
+import selectors
+import struct
+import time
+from pathlib import Path
+
+_COUNTS = struct.Struct("<qq")
+_COUNT_S = 2.0
+"""Real time between two counts, s: one takes milliseconds."""
+
+
+def _install(path: str, factor: int, begin_ns: int) -> None:
+    real_ns, real_sleep, real_select = (
+        time.monotonic_ns,
+        time.sleep,
+        selectors.EpollSelector.select,
+    )
+    unix_ns = time.time_ns() - real_ns()  # one offset: a correction must not be multiplied
+
+    def monotonic_ns() -> int:
+        return begin_ns + (real_ns() - begin_ns) * factor
+
+    time.monotonic_ns = monotonic_ns
+    time.monotonic = lambda: monotonic_ns() * 1e-9
+    time.time_ns = lambda: monotonic_ns() + unix_ns
+    time.time = lambda: time.time_ns() * 1e-9
+    time.sleep = lambda seconds: real_sleep(float(seconds) / factor)
+
+    with Path(path).open("r+b") as file:
+        shared = mmap.mmap(file.fileno(), _COUNTS.size)
+    counted_ns = 0
+
+    def select(self, timeout=None):  # type: ignore[no-untyped-def]
+        nonlocal counted_ns
+        if real_ns() - counted_ns > _COUNT_S * 1e9:
+            counted_ns = real_ns()
+            _COUNTS.pack_into(shared, 0, len(asyncio.all_tasks()), len(gc.get_objects()))
+        wait_s = timeout / factor if timeout is not None and timeout > 0 else timeout
+        return real_select(self, wait_s)
+
+    selectors.EpollSelector.select = select  # type: ignore[method-assign]
+
+
+if "ENDURANCE" in os.environ:
+    _path, _factor, _begin_ns = os.environ["ENDURANCE"].rsplit(":", 2)
+    _install(_path, int(_factor), int(_begin_ns))
