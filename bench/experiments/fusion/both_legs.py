@@ -205,7 +205,6 @@ EXPERIMENTS = (
         headline=True,
         known_misses={
             "right, walking1: flexion": WALKING_FLEXION,
-            "left, walking1: flexion": WALKING_FLEXION,
             "left, DJ1: flexion": JUMP_FLEXION,
         },
     ),

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.baselines import fusion_methods
+from bench.experiments.fusion.recorded_legs_coverage import segment_scores
 from bench.experiments.fusion.recorded_movements import DEFAULT, NAMES, NOTHING, flexion_scores
 from bench.experiments.fusion.simulated_leg import take_pose, wear_live
 from bench.framework.experiment import Experiment, Result
@@ -23,7 +24,6 @@ from bench.subjects.simulated_wearer import bench_rig, phases
 from jointfit_daemon.calibration.anatomy import track_clusters
 from jointfit_daemon.calibration.phases import fit_calibration, fit_plate_alignment
 from jointfit_daemon.calibration.registration import sensor_at
-from jointfit_daemon.fusion import HEADING_SD
 from jointfit_daemon.kinematics import rotation
 
 if TYPE_CHECKING:
@@ -111,17 +111,8 @@ def _coverage(people: list[tuple[KneeTrial, KneeTrial]]) -> list[Result]:
 
 def _segment_scores(taught: KneeTrial, later: KneeTrial) -> Array:
     """Return errors about each axis of both segments over the predicted ones, with heading."""
-    scores = []
-    for model, part in zip(
-        fusion_methods.models([taught]), fusion_methods.segments(later), strict=True
-    ):
-        said = model.predict(part.sensors, part.other)
-        off = rotation.log(rotation.multiply(rotation.conjugate(said), part.bone))
-        w, x, y, z = said.T
-        up = np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], axis=1)
-        sd = np.hypot(fusion_methods.axis_deviations(model, part), HEADING_SD * up)
-        scores.append((off / sd).ravel())
-    return np.concatenate(scores)
+    parts = zip(fusion_methods.models([taught]), fusion_methods.segments(later), strict=True)
+    return np.concatenate([segment_scores(model, part) for model, part in parts])
 
 
 def _shares(label: str, scores: Array, *, held: bool) -> list[Result]:
