@@ -64,7 +64,7 @@ class LpmsHandshake:
         self._table = settings.table
         self._hunt = hunt
         self._conversation = LpBusConversation(port, emit, settings.sensor_id)
-        self._who = settings.port
+        self._path = settings.port
 
     async def ensure_streaming(self) -> None:
         """Return when the sensor streams according to the settings.
@@ -100,7 +100,7 @@ class LpmsHandshake:
             )
         elif found != self._table.generation:
             raise DeviceMisconfiguredError(
-                f"{self._who}: a sensor of generation {found} ({TABLES[found].models}), expected "
+                f"{self._path}: a sensor of generation {found} ({TABLES[found].models}), expected "
                 f"generation {self._table.generation}: set generation = {found}. Nothing was "
                 "written: the commands of one generation erase settings of the other"
             )
@@ -119,15 +119,15 @@ class LpmsHandshake:
         for command, data in set_command(self._table, part):
             if await self._conversation.write(command, data) is False:
                 raise DeviceMisconfiguredError(
-                    f"{self._who}: refuses {self._describe(part)} (command 0x{command:02X}): "
+                    f"{self._path}: refuses {self._describe(part)} (command 0x{command:02X}): "
                     "change `rate_hz` or `precision`, or update its firmware"
                 )
 
         left = _differing(await self._read_configuration(), wanted)
         if left.outputs is not None or left.rate_hz is not None:
             raise DeviceMisconfiguredError(
-                f"{self._who}: does not accept {self._describe(left)}: change `rate_hz`, or update "
-                "its firmware"
+                f"{self._path}: does not accept {self._describe(left)}: change `rate_hz`, or "
+                "update its firmware"
             )
         if settings.persist:
             log.warning("%s: storing its settings in flash", settings.id)
@@ -143,7 +143,7 @@ class LpmsHandshake:
                 found = found.updated(part)
         if found.outputs is None or found.rate_hz is None:
             raise DeviceLostError(
-                f"{self._who}: does not answer the reads of generation {self._table.generation}: "
+                f"{self._path}: does not answer the reads of generation {self._table.generation}: "
                 "check `generation` and the wire from host to sensor"
             )
         return found
@@ -166,16 +166,16 @@ class LpmsHandshake:
             raise self._settings.stopped_answering()
         if not started:
             raise DeviceMisconfiguredError(
-                f"{self._who}: refuses to stream: change `rate_hz` or `baud`"
+                f"{self._path}: refuses to stream: change `rate_hz` or `baud`"
             )
         self._conversation.last_bytes = b""
         wait_s = max(_FIRST_S, _FIRST_PERIODS / self._settings.rate_hz)
         if await self._conversation.wait_for_data(wait_s):
             return
         if is_text(self._conversation.last_bytes):
-            raise DeviceMisconfiguredError(f"{self._who}: sends text: {TEXT_REMEDY}")
+            raise DeviceMisconfiguredError(f"{self._path}: sends text: {TEXT_REMEDY}")
         raise DeviceLostError(
-            f"{self._who}: accepts the settings but sends no data: check it with LpmsControl"
+            f"{self._path}: accepts the settings but sends no data: check it with LpmsControl"
         )
 
     async def _explain_silence(self) -> NoReturn:
@@ -184,29 +184,29 @@ class LpmsHandshake:
         others = sorted(conversation.ids - {settings.sensor_id})
         if others:
             raise DeviceMisconfiguredError(
-                f"{self._who}: sends as sensor id {others[0]}, expected {settings.sensor_id}: set "
+                f"{self._path}: sends as sensor id {others[0]}, expected {settings.sensor_id}: set "
                 f"sensor_id = {others[0]}"
             )
         if conversation.ids:
             raise DeviceLostError(
-                f"{self._who}: streams but does not answer: check the wire from host to sensor"
+                f"{self._path}: streams but does not answer: check the wire from host to sensor"
             )
         received, sends_text = conversation.received, is_text(conversation.last_bytes)
 
         speed = await self._other_speed() if self._hunt or received else None
         if speed is not None:
             raise DeviceMisconfiguredError(
-                f"{self._who}: {settings.baud} baud, but no message can be decoded; the sensor "
+                f"{self._path}: {settings.baud} baud, but no message can be decoded; the sensor "
                 f"answers at {speed}: set baud = {speed}"
             )
         if not received:
             raise DeviceLostError(
-                f"{self._who}: silent: check its power, and that TX and RX are not swapped. A "
+                f"{self._path}: silent: check its power, and that TX and RX are not swapped. A "
                 "sensor of generation 1 that was put to sleep needs a power cycle"
             )
         if sends_text:
             raise DeviceMisconfiguredError(
-                f"{self._who}: sends text: correct `port` or `driver`, or, if it is an LPMS "
+                f"{self._path}: sends text: correct `port` or `driver`, or, if it is an LPMS "
                 f"sensor, {TEXT_REMEDY}"
             )
 
@@ -215,11 +215,11 @@ class LpmsHandshake:
         await conversation.wait_for_data(_LISTEN_S)
         if not conversation.received:
             raise DeviceLostError(
-                f"{self._who}: some bytes of noise, then silence: check its power and cable, and "
+                f"{self._path}: some bytes of noise, then silence: check its power and cable, and "
                 "`port`"
             )
         raise DeviceMisconfiguredError(
-            f"{self._who}: the device on this port is not LPMS: it sends bytes, none of them "
+            f"{self._path}: the device on this port is not LPMS: it sends bytes, none of them "
             "LP-BUS at any common speed: correct `port` or `driver`, which "
             "`jointfit probe` recognizes"
         )

@@ -227,18 +227,18 @@ class LslSession:
     def _pull(self, inlet: Any, kind: str) -> None:
         """Emit samples until the connection ends."""
         silence_s = self._settings.silence_s
-        heard_ns = time.monotonic_ns()
+        sample_ns = time.monotonic_ns()
         while not self._stop.is_set():
             row, stamp_s = inlet.pull_sample(timeout=min(_STEP_S, silence_s / 4))
             now_ns = time.monotonic_ns()
             if stamp_s is None:
-                if now_ns - heard_ns > silence_s * 1e9:
+                if now_ns - sample_ns > silence_s * 1e9:
                     raise DeviceLostError(
                         f"{self._name}: no sample for {silence_s:g} s: start streaming in the "
                         "camera software"
                     )
                 continue
-            heard_ns = now_ns
+            sample_ns = now_ns
             rows, stamps_s = inlet.pull_chunk(timeout=0.0, max_samples=_MOST_SAMPLES)
             data = encode_samples(kind, [stamp_s, *stamps_s], [row, *rows])
             self._call(self._take, now_ns, data)

@@ -42,6 +42,7 @@ def reply_events(packet: MipPacket) -> list[Decoded]:
 
 
 def _events_of(command_set: int, descriptor: int, data: bytes) -> Iterator[Decoded]:
+    """Yield the events of one field."""
     known: dict[str, object] = {}
     if command_set == CommandSet.BASE and descriptor == Base.DEVICE_INFO_REPLY:
         info = commands.decode_info(data)
@@ -56,11 +57,21 @@ def _events_of(command_set: int, descriptor: int, data: bytes) -> Iterator[Decod
         )
 
     turn = _transform(command_set, descriptor, data)
-    if turn is not None:
-        yield from _transform_events(turn)
+    if turn is None:
+        return
+    stored = [round(value, 6) for value in turn]
+    yield DeviceEvent("info", f"sensor_to_vehicle {stored}", {"sensor_to_vehicle": stored})
+    if not max(map(abs, turn[1:])) <= _SMALL:  # NaN compares false
+        text = (
+            f"a sensor-to-vehicle transform is stored (w x y z = {stored}): sensor axes are those "
+            "of the vehicle, not the printed ones. Remove it with the tool SensorConnect before "
+            "calibration, or leave it as it is"
+        )
+        yield DeviceEvent("warning", text, {"sensor_to_vehicle": stored})
 
 
 def _format(data_set: int | None, data: bytes) -> dict[str, object]:
+    """Return the fields of a message format and their decimations; empty if it is malformed."""
     prefix = data[:1] if data_set is None else b""
     outputs = commands.decode_outputs(prefix, data)
     if outputs is None:
@@ -84,15 +95,3 @@ def _transform(command_set: int, descriptor: int, data: bytes) -> Quaternion | N
             about_x = (cos(roll), sin(roll), 0.0, 0.0)
             return multiply_one(multiply_one(about_z, about_y), about_x)
     return None
-
-
-def _transform_events(turn: Quaternion) -> Iterator[Decoded]:
-    data = {"sensor_to_vehicle": [round(value, 6) for value in turn]}
-    yield DeviceEvent("info", f"sensor_to_vehicle {data['sensor_to_vehicle']}", data)
-    if not max(map(abs, turn[1:])) <= _SMALL:  # NaN compares false
-        text = (
-            f"a sensor-to-vehicle transform is stored (w x y z = {data['sensor_to_vehicle']}): "
-            "sensor axes are those of the vehicle, not the printed ones. Remove it with the "
-            "tool SensorConnect before calibration, or leave it as it is"
-        )
-        yield DeviceEvent("warning", text, data)

@@ -56,7 +56,7 @@ class MipHandshake:
         self._settings = settings
         self._hunt = hunt
         self._conversation = MipConversation(port, emit)
-        self._who = settings.port
+        self._path = settings.port
         self._model = "the device"
         self._required = settings.required
 
@@ -153,7 +153,7 @@ class MipHandshake:
             return
         names = ", ".join(f"0x{data_set:02X},0x{field:02X}" for field in missing)
         raise DeviceMisconfiguredError(
-            f"{self._who}: {self._model} does not measure {names}: set {self._alternatives()}"
+            f"{self._path}: {self._model} does not measure {names}: set {self._alternatives()}"
         )
 
     def _alternatives(self) -> str:
@@ -171,7 +171,7 @@ class MipHandshake:
         base_hz = commands.decode_rate(stream.prefix, reply.data(stream.base_rate_reply))
         if not base_hz:
             raise DeviceMisconfiguredError(
-                f"{self._who}: {self._model} has no outputs in data set "
+                f"{self._path}: {self._model} has no outputs in data set "
                 f"0x{self._required.data_set:02X}: set {self._alternatives()}"
             )
 
@@ -205,7 +205,7 @@ class MipHandshake:
         left = await self._format(stream)
         if not set(wanted) <= set(left):
             raise DeviceMisconfiguredError(
-                f"{self._who}: {self._model} sends {_describe(left)}, expected "
+                f"{self._path}: {self._model} sends {_describe(left)}, expected "
                 f"{_describe(wanted)}: correct `rate_hz`, or update the firmware of the device"
             )
         return True
@@ -240,7 +240,7 @@ class MipHandshake:
     def _refuse(self, reply: MipReply, what: str, change: str = "`family`") -> None:
         if not reply.is_ok:
             raise DeviceMisconfiguredError(
-                f"{self._who}: {self._model} {what} ({commands.code_text(reply.code)}): "
+                f"{self._path}: {self._model} {what} ({commands.code_text(reply.code)}): "
                 f"set or change {change}"
             )
 

@@ -28,9 +28,7 @@ from jointfit_drivers.motion_capture._unit_check import UnitCheck
 from jointfit_drivers.motion_capture._world import (
     ABSENT,
     FARTHEST_M,
-    NO_ORIENTATION,
     NO_POSITION,
-    NORM_TOLERANCE,
     UpAxis,
     is_near,
     matrix_quaternion,
@@ -44,8 +42,6 @@ __all__ = [
     "CHECK",
     "FARTHEST_M",
     "MOST_NAMED",
-    "NORM_TOLERANCE",
-    "NO_ORIENTATION",
     "NO_POSITION",
     "ColumnBinding",
     "ColumnKey",

@@ -253,7 +253,7 @@ class NatNetSession:
             due = [echo_at] * bool(info.clock_hz) + [now + self._settings.silence_s / 4]
             await self._link.pause(min(due + [alive_at] * unicast) - now)
 
-    def _check_alive(self, info: natnet.ServerInfo, unicast: bool, heard_ns: int) -> None:
+    def _check_alive(self, info: natnet.ServerInfo, unicast: bool, last_ns: int) -> None:
         """Raise DeviceLostError without decodable frames, or if another server answers."""
         if self._info is not None and not same_instance(self._info, info):
             raise DeviceLostError(
@@ -261,7 +261,7 @@ class NatNetSession:
                 f"({self._info.application} answers): connecting again"
             )
 
-        if (time.monotonic_ns() - heard_ns) / 1e9 < self._settings.silence_s:
+        if (time.monotonic_ns() - last_ns) / 1e9 < self._settings.silence_s:
             return
 
         # The texts contain no measured duration: it would differ at every attempt, and every

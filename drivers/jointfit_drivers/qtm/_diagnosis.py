@@ -5,7 +5,7 @@
 | QTM is not running, wrong port | the connection is refused, or the answer is not that of QTM |
 | no measurement | QTM answers "no more data", or has no parameters |
 | firewall | frames arrive by TCP, and none by UDP |
-| 6DOF or labels not calculated | frames lack the component; the settings tell so |
+| 6DOF or labels not calculated | frames lack the component, and the settings show it |
 | names | the settings lack names of rig.toml |
 """
 

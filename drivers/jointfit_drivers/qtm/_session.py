@@ -88,7 +88,7 @@ class QtmSession:
     async def run(self) -> None:
         """Connect and read until cancelled; raises the errors of `QtmMocap.run`."""
         with self._link as link:
-            # The data port is bound before QTM is told to send there.
+            # The data port is bound before QTM is asked to send there.
             udp_port = self._open_udp() if self._settings.transport == "udp" else None
             await link.open(self._route, self._settings.command_port)
             await self._greet()
@@ -283,9 +283,9 @@ class QtmSession:
                 f"{self._name} refuses to stream: {refusals[0]!r}: check its version and options"
             )
 
-    def _check_alive(self, heard_ns: int, udp_port: int | None) -> None:
+    def _check_alive(self, last_ns: int, udp_port: int | None) -> None:
         """Raise DeviceLostError without frames, except while QTM waits for a measurement."""
-        if self._waiting or (time.monotonic_ns() - heard_ns) / 1e9 < self._settings.silence_s:
+        if self._waiting or (time.monotonic_ns() - last_ns) / 1e9 < self._settings.silence_s:
             return
         self._output.silent = True
         hint = "" if udp_port is None else ", and allow UDP in firewalls or set transport = 'tcp'"

@@ -65,7 +65,7 @@ class VectorNavHandshake:
         self._settings = settings
         self._hunt = hunt
         self._conversation = SerialConversation[VectorNavMessage](port, emit, VectorNavCodec)
-        self._who = settings.port
+        self._path = settings.port
         self._model = "the device"
 
     async def ensure_streaming(self) -> None:
@@ -139,7 +139,7 @@ class VectorNavHandshake:
         left = await self._read_output(register)
         if not _is_sufficient(left, wanted):
             raise DeviceMisconfiguredError(
-                f"{self._who}: {self._model} does not keep register {register} = "
+                f"{self._path}: {self._model} does not keep register {register} = "
                 f"{encode_output(wanted)}: correct `rate_hz`, or update the firmware of the device"
             )
         return True
@@ -192,7 +192,7 @@ class VectorNavHandshake:
     def _refuse(self, reply: TextMessage, what: str, change: str = "`rate_hz` or `baud`") -> None:
         if reply.error is not None:
             raise DeviceMisconfiguredError(
-                f"{self._who}: {self._model} {what} ({error_text(reply.error)}): "
+                f"{self._path}: {self._model} {what} ({error_text(reply.error)}): "
                 f"set or change {change}"
             )
 

@@ -86,7 +86,7 @@ class WitMotionHandshake:
 
     def __init__(self, port: SerialPort, emit: Emit, settings: WitMotionSettings) -> None:
         self._port, self._emit, self._settings = port, emit, settings
-        self._who = settings.port
+        self._path = settings.port
         self._kinds = {int(kind) for kind in settings.kinds}
         self._held: list[Chunk] = []  # all bytes since the input was flushed
 
@@ -105,15 +105,15 @@ class WitMotionHandshake:
         settings.require_line_speed()
 
         self._flush()  # system and bridge buffer a few kilobytes of an earlier run
-        heard = await self._listen(_LISTEN_S, self._is_complete)
-        if heard.other_frames and not heard.counts:
-            raise DeviceMisconfiguredError(f"{self._who}: {OTHER_VARIANT}")
+        found = await self._listen(_LISTEN_S, self._is_complete)
+        if found.other_frames and not found.counts:
+            raise DeviceMisconfiguredError(f"{self._path}: {OTHER_VARIANT}")
         registers = await self._read_settings()
-        if not heard.counts and registers is None:
-            heard = await self._find_at_other_speed()
+        if not found.counts and registers is None:
+            found = await self._find_at_other_speed()
             registers = await self._read_settings()
 
-        faults = await self._differences(heard, registers)
+        faults = await self._differences(found, registers)
         if faults:
             await self._configure(faults)
 
@@ -161,21 +161,21 @@ class WitMotionHandshake:
         return answer.registers
 
     async def _differences(
-        self, heard: _Reception, registers: tuple[int, int, int, int] | None
+        self, found: _Reception, registers: tuple[int, int, int, int] | None
     ) -> list[str]:
         """Return the differences between the device and the settings; empty if none."""
         faults = []
-        missing = self._kinds - set(heard.counts)
+        missing = self._kinds - set(found.counts)
         if missing:
-            faults.append(f"it sends {kind_names(set(heard.counts))}, no {kind_names(missing)}")
+            faults.append(f"it sends {kind_names(set(found.counts))}, no {kind_names(missing)}")
 
         rate_hz = self._settings.rate_hz
         if registers is not None:
             rates = {code: rate for rate, code in RATE_CODES.items()}
             rate = rates.get(registers[1])
             if rate != rate_hz:
-                found = f"rate code 0x{registers[1]:02X}" if rate is None else f"{rate} Hz"
-                faults.append(f"it is set to {found}, not {rate_hz:g} Hz")
+                present = f"rate code 0x{registers[1]:02X}" if rate is None else f"{rate} Hz"
+                faults.append(f"it is set to {present}, not {rate_hz:g} Hz")
         elif not missing:
             # Without an answer the stream shows only a rate that is too low: bytes that waited in
             # a buffer arrive too fast.
@@ -198,11 +198,11 @@ class WitMotionHandshake:
         await self._send(commands)
 
         self._flush()  # frames of the settings before
-        heard = await self._listen(_LISTEN_S, self._is_complete)
-        missing = self._kinds - set(heard.counts)
-        if not heard.received:
+        found = await self._listen(_LISTEN_S, self._is_complete)
+        missing = self._kinds - set(found.counts)
+        if not found.received:
             raise DeviceLostError(
-                f"{self._who}: stopped sending during configuration: check its power and cable"
+                f"{self._path}: stopped sending during configuration: check its power and cable"
             )
         if missing:
             remedy = (
@@ -211,7 +211,7 @@ class WitMotionHandshake:
                 else ""
             )
             raise DeviceMisconfiguredError(
-                f"{self._who}: {'; '.join(faults)}, even on request: {remedy}enable "
+                f"{self._path}: {'; '.join(faults)}, even on request: {remedy}enable "
                 f"{kind_names(missing)} with the WitMotion software"
             )
 
@@ -225,7 +225,7 @@ class WitMotionHandshake:
         received = sum(len(chunk.data) for chunk in self._held)
         if not received:
             raise DeviceLostError(
-                f"{self._who}: no data: check its power, and that its TX is connected to RX"
+                f"{self._path}: no data: check its power, and that its TX is connected to RX"
             )
         for baud in LINE_SPEEDS:
             if baud == self._settings.baud:
@@ -239,9 +239,9 @@ class WitMotionHandshake:
             if found.counts:
                 return await self._move_from(baud)
             if found.other_frames:
-                raise DeviceMisconfiguredError(f"{self._who}: {OTHER_VARIANT}")
+                raise DeviceMisconfiguredError(f"{self._path}: {OTHER_VARIANT}")
         raise DeviceMisconfiguredError(
-            f"{self._who}: {received} bytes, none of them a WitMotion frame at any usual speed: "
+            f"{self._path}: {received} bytes, none of them a WitMotion frame at any usual speed: "
             "correct `port` or `driver`, which "
             "`jointfit probe` recognizes"
         )
@@ -257,8 +257,9 @@ class WitMotionHandshake:
             fitting = max(fits, default=min(RATE_CODES))
             slower = f" and rate_hz = {fitting}" if fitting < settings.rate_hz else ""
             raise DeviceMisconfiguredError(
-                f"{self._who}: {settings.baud} baud, but no frame can be decoded; the device sends "
-                f"at {baud}: set baud = {baud}{slower}, or persist = true once to change its speed"
+                f"{self._path}: {settings.baud} baud, but no frame can be decoded; the device "
+                f"sends at {baud}: set baud = {baud}{slower}, or persist = true once to change its "
+                "speed"
             )
         log.warning("%s: changing its speed from %d to %d", settings.id, baud, settings.baud)
         await self._send([UNLOCK, write_register(WitMotionRegister.BAUD, code)])
@@ -266,10 +267,10 @@ class WitMotionHandshake:
         await self._send([UNLOCK, SAVE])
 
         self._flush()
-        heard = await self._listen(_LISTEN_S, self._is_complete)
-        if not heard.counts:
+        found = await self._listen(_LISTEN_S, self._is_complete)
+        if not found.counts:
             raise DeviceMisconfiguredError(
-                f"{self._who}: the device sends at {baud} baud and did not change to "
+                f"{self._path}: the device sends at {baud} baud and did not change to "
                 f"{settings.baud}: set baud = {baud}, or change it with the WitMotion software"
             )
-        return heard
+        return found

@@ -66,7 +66,7 @@ class XbusHandshake:
         self._settings = settings
         self._hunt = hunt
         self._conversation = XbusConversation(port, emit)
-        self._who = settings.port
+        self._path = settings.port
         self._product_code = ""
         self._triggers = tuple(map(Item, _sync_lines.trigger_wires(settings.sync or ())))
         self._needs = required_outputs(settings.orientation, magnetometer=settings.magnetometer)
@@ -136,7 +136,7 @@ class XbusHandshake:
         faults = legacy_differences(self._settings, mode, stored, found_hz, skipped=skipped)
         if faults:
             raise DeviceMisconfiguredError(
-                f"{self._who}: {'; '.join(faults)}: change the settings here, or configure the "
+                f"{self._path}: {'; '.join(faults)}: change the settings here, or configure the "
                 "device with MT Manager"
             )
 
@@ -153,7 +153,7 @@ class XbusHandshake:
         reply = await self._answer(XbusMessageId.OUTPUT_CONFIGURATION)
         if reply.mid == XbusMessageId.ERROR and reply.data[:1] == _UNKNOWN_MESSAGE:
             raise DeviceMisconfiguredError(
-                f"{self._who}: does not know output configurations, as older devices: set format ="
+                f"{self._path}: does not know output configurations, as older devices: set format ="
                 ' "mtdata"'
             )
         found = _outputs_of(reply)
@@ -182,7 +182,7 @@ class XbusHandshake:
         if left:
             hint = _rate_hint(_outputs_of(reply), self._needs)
             raise DeviceMisconfiguredError(
-                f"{self._who}: does not accept the requested outputs: {'; '.join(left)}{hint}: "
+                f"{self._path}: does not accept the requested outputs: {'; '.join(left)}{hint}: "
                 "correct `rate_hz`, or update the firmware of the device"
             )
 
@@ -190,7 +190,7 @@ class XbusHandshake:
         """Raise with the necessary changes unless ``persist`` allows them."""
         if not self._settings.persist:
             raise DeviceMisconfiguredError(
-                f"{self._who}: {'; '.join(faults)}{hint}: set persist = true once to write it "
+                f"{self._path}: {'; '.join(faults)}{hint}: set persist = true once to write it "
                 "into the device's flash, or configure the device with MT Manager"
             )
 
@@ -213,7 +213,7 @@ class XbusHandshake:
         left = _sync_lines.sync_differences(await self._sync_stored(), asked)
         if left:
             raise DeviceMisconfiguredError(
-                f"{self._who}: does not accept `sync`: {'; '.join(left)}: change `sync`"
+                f"{self._path}: does not accept `sync`: {'; '.join(left)}: change `sync`"
             )
 
     async def _sync_stored(self) -> tuple[setup.SyncSetting, ...]:
@@ -228,7 +228,7 @@ class XbusHandshake:
         if reply.mid == XbusMessageId.ERROR:
             code = reply.data[0] if reply.data else 0
             raise DeviceMisconfiguredError(
-                f"{self._who}: {what} ({setup.error_text(code)}): change {change}"
+                f"{self._path}: {what} ({setup.error_text(code)}): change {change}"
             )
 
     async def _explain_silence(self) -> NoReturn:
@@ -236,7 +236,7 @@ class XbusHandshake:
         received, conversation = self._conversation.received, self._conversation
         if conversation.understood:
             raise DeviceLostError(
-                f"{self._who}: streams but does not answer GoToConfig: check the wire from host "
+                f"{self._path}: streams but does not answer GoToConfig: check the wire from host "
                 "to device, or set reset_if_stuck = true"
             )
 
@@ -244,27 +244,27 @@ class XbusHandshake:
         if speed is not None:
             if await self._listen_at(self._settings.baud):  # USB ignores the speed
                 raise DeviceLostError(
-                    f"{self._who}: the device answers too late; retrying. If this repeats, check "
+                    f"{self._path}: the device answers too late; retrying. If this repeats, check "
                     "its cable, and the load of the gateway"
                 )
             raise DeviceMisconfiguredError(
-                f"{self._who}: {self._settings.baud} baud, but no message can be decoded; "
+                f"{self._path}: {self._settings.baud} baud, but no message can be decoded; "
                 f"the device answers at {speed}: set baud = {speed}"
             )
 
         if not received:
             raise DeviceLostError(
-                f"{self._who}: silent: check its power, and that TX and RX are not swapped"
+                f"{self._path}: silent: check its power, and that TX and RX are not swapped"
             )
 
         await self._listen_at(self._settings.baud)
         if not conversation.received:
             raise DeviceLostError(
-                f"{self._who}: some bytes of noise, then silence: check its power and cable, and "
+                f"{self._path}: some bytes of noise, then silence: check its power and cable, and "
                 "`port`"
             )
         raise DeviceMisconfiguredError(
-            f"{self._who}: the device on this port is not Xbus: it sends bytes, none of them "
+            f"{self._path}: the device on this port is not Xbus: it sends bytes, none of them "
             "Xbus at any common speed: correct `port` or `driver`, which "
             "`jointfit probe` recognizes"
         )

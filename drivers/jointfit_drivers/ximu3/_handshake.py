@@ -57,7 +57,7 @@ class XImu3Handshake:
         self._settings = settings
         self._hunt = hunt
         self._conversation = XImu3Conversation(port, emit)
-        self._who = settings.port
+        self._path = settings.port
         self._required = required_settings(settings)
 
     async def ensure_configured(self) -> None:
@@ -85,14 +85,14 @@ class XImu3Handshake:
         transport = _INTERFACES.get(str(interface))
         if transport not in {None, settings.transport}:
             raise DeviceMisconfiguredError(
-                f"{self._who}: the device answers on its interface {interface}, expected transport "
-                f'"{settings.transport}": set transport = "{transport}"'
+                f"{self._path}: the device answers on its interface {interface}, expected "
+                f'transport "{settings.transport}": set transport = "{transport}"'
             )
 
         found = await self._read([*REPORTED, *(key for key, _ in self._required)])
         if found.get(WORLD) not in _WORLDS:
             raise DeviceMisconfiguredError(
-                f"{self._who}: {WORLD} is {found.get(WORLD)}, expected 0 (NWU), 1 (ENU) or 2 "
+                f"{self._path}: {WORLD} is {found.get(WORLD)}, expected 0 (NWU), 1 (ENU) or 2 "
                 "(NED): correct it with the x-IMU3 GUI, or update this program"
             )
         await self._ensure_settings(found)
@@ -113,7 +113,7 @@ class XImu3Handshake:
         if needed:
             firmware = found.get("firmware_version", "unknown")
             raise DeviceMisconfiguredError(
-                f"{self._who}: firmware {firmware} does not have {', '.join(needed)}: "
+                f"{self._path}: firmware {firmware} does not have {', '.join(needed)}: "
                 "install another one with the x-IMU3 GUI, or set passive = true"
             )
         return found
@@ -126,7 +126,7 @@ class XImu3Handshake:
         text = "; ".join(faults.values())
         if not self._settings.persist:
             raise DeviceMisconfiguredError(
-                f"{self._who}: {text}{rate_hint(found, self._required)}: set persist = true once "
+                f"{self._path}: {text}{rate_hint(found, self._required)}: set persist = true once "
                 "to write it into the device, or change it with the x-IMU3 GUI"
             )
         log.warning("%s: writing its settings: %s", self._settings.id, text)
@@ -136,7 +136,7 @@ class XImu3Handshake:
                 reply = await self._conversation.request(key, values[0])
                 if reply is not None and reply.error is not None:
                     raise DeviceMisconfiguredError(
-                        f"{self._who}: refuses {key} = {values[0]} ({reply.error}): correct "
+                        f"{self._path}: refuses {key} = {values[0]} ({reply.error}): correct "
                         "rig.toml, or update the firmware of the device"
                     )
         await self._conversation.request("apply")
@@ -147,7 +147,7 @@ class XImu3Handshake:
         )
         if left:
             raise DeviceMisconfiguredError(
-                f"{self._who}: does not accept its settings: {'; '.join(left.values())}: correct "
+                f"{self._path}: does not accept its settings: {'; '.join(left.values())}: correct "
                 "rig.toml, or update the firmware of the device"
             )
         await self._conversation.request("save")
@@ -157,23 +157,23 @@ class XImu3Handshake:
         conversation, received = self._conversation, self._conversation.received
         if conversation.understood:
             raise DeviceLostError(
-                f"{self._who}: sends measurements but does not answer commands: check the wire "
+                f"{self._path}: sends measurements but does not answer commands: check the wire "
                 "from host to device, or set passive = true for a device that only sends"
             )
 
         speed = await self._other_speed() if self._hunt or received else None
         if speed is not None:
             raise DeviceMisconfiguredError(
-                f"{self._who}: {self._settings.baud} baud, but no message can be decoded; the "
+                f"{self._path}: {self._settings.baud} baud, but no message can be decoded; the "
                 f"device answers at {speed}: set baud = {speed}"
             )
         if not received:
             raise DeviceLostError(
-                f"{self._who}: silent: check its power, and that TX and RX are not swapped. The "
+                f"{self._path}: silent: check its power, and that TX and RX are not swapped. The "
                 "serial interface of a new x-IMU3 is disabled: set serial_mode = 1 over USB once"
             )
         raise DeviceMisconfiguredError(
-            f"{self._who}: the device on this port is not an x-IMU3: it sends bytes, none of them "
+            f"{self._path}: the device on this port is not an x-IMU3: it sends bytes, none of them "
             "its messages at any common speed: correct `port` or `driver`, which "
             "`jointfit probe` recognizes"
         )

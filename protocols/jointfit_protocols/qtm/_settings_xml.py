@@ -116,10 +116,6 @@ def _skeleton(skeleton: ET.Element) -> QtmSkeleton:
     return QtmSkeleton(_cut(skeleton.get("Name", "")), tuple(segments))
 
 
-def _is_id(text: str) -> bool:
-    return text.isascii() and text.isdigit() and len(text) < _MOST_DIGITS
-
-
 def _names(elements: list[ET.Element]) -> list[str]:
     return [_cut(_text(element, "Name") or "") for element in elements]
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.real_time
 
 
-class Gossip:
+class ForeignUdpServer:
     """Answers every datagram, in a language that is not NatNet."""
 
     def __init__(self) -> None:
@@ -43,8 +43,8 @@ class TestNatNet(MocapContract):
         return NatNetServer(self.options)
 
     @override
-    def make_wrong_device(self, folder: Path) -> Gossip:
-        return self.opened(Gossip())
+    def make_wrong_device(self, folder: Path) -> ForeignUdpServer:
+        return self.opened(ForeignUdpServer())
 
 
 class TestNatNet41(TestNatNet):
