@@ -78,6 +78,7 @@ class LpmsCanDevice(CanDevice):
         self._used = {(channel - 1) // PER_FRAME[options.precision] for channel in options.mapping}
         self._layout = PacketLayout(TABLES[1], TABLES[1].quaternion)
         self._beat_ns: int | None = None
+
         self._to_lose = 0
         self._to_lose_frames: dict[int, int] = {}
         self.swapped = False

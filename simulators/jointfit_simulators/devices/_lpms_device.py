@@ -103,6 +103,7 @@ class LpmsDevice(SerialDevice):
         self._table = TABLES[options.generation]
         super().__init__(link, wire_noise, options.baud)
         self._decoder = LpBusCodec()
+
         self.flash = options.configuration or _FACTORY[options.generation]
         """Settings that survive a loss of power."""
         self.configuration = self.flash
@@ -110,6 +111,7 @@ class LpmsDevice(SerialDevice):
         self.streaming = options.streams_at_once
         """Whether the sensor is in stream mode."""
         self.asleep = False
+
         self.counter = 0
         """Number of samples since power-up; it is not sent."""
         self.flash_writes = 0
@@ -212,6 +214,7 @@ class LpmsDevice(SerialDevice):
             self.configuration = self.flash = _FACTORY[self._options.generation]
             self.factory_resets += 1
             self.flash_writes += 1
+        # sleep and gyroscope calibration exist in generation 1 only
         elif command == _SLEEP and self._options.generation == 1:
             self.asleep = True
         elif command == _GYRO_CALIBRATION and self._options.generation == 1:

@@ -115,6 +115,8 @@ class LslServer:
         """Send one frame now; see `NatNetServer.push`."""
         if self._outlet is None:
             return
+
+        # occluded markers and bodies have the value of absence in every channel
         absent = self.options.absent
         values: list[float] = []
         for name in self.options.markers:
@@ -123,6 +125,7 @@ class LslServer:
         for name in self.options.bodies:
             pose = bodies.get(name)
             values += (*self._scaled(pose[0]), *self._turn(*pose[1])) if pose else (absent,) * 7
+
         exposed_ns = exposure_host_ns or time.monotonic_ns()
         stamp_s = self.options.device_ns(exposed_ns) / _NS + self._difference_s
         row = (
@@ -149,6 +152,8 @@ class LslServer:
         )
         if options.description == "none":
             return info
+
+        # the convention for motion capture: label, type and owner of each channel
         channels = info.desc().append_child("channels")
         for name in options.markers:
             for axis in _AXES:
@@ -158,6 +163,7 @@ class LslServer:
                 self._describe(channels, name, axis, f"Position{axis}", is_object=True)
             for letter, axis in zip(_TURN, "wxyz", strict=True):
                 self._describe(channels, name, f"q{axis}", f"Orientation{letter}", is_object=True)
+
         info.desc().append_child("acquisition").append_child_value("manufacturer", "jointfit")
         return info
 

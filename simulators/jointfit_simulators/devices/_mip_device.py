@@ -140,6 +140,8 @@ class MipDevice(SerialDevice):
         super().__init__(link, wire_noise, options.baud)
         self._codec = MipCodec()
         self._inertial = InertialSignals()
+
+        # saved outputs of each data set, and whether its stream is on
         self._base_rates = dict(options.base_rates_hz)
         self._saved = {
             data_set: (
@@ -149,6 +151,7 @@ class MipDevice(SerialDevice):
             for data_set in self._base_rates
         }
         self._changing_speed = False
+
         self.writes = 0
         """Number of settings written."""
         self.saves = 0

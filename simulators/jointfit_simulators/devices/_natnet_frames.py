@@ -101,6 +101,7 @@ def model_definition(bodies: tuple[RigidBodyAsset, ...], version: Version) -> Mo
         Bitstream. From 4.0 bodies name their markers; from 4.2 they contain the offset quaternion
         expected by the only known client for 4.2.
     """
+    # the set of all markers is sent after those of the bodies
     every = tuple(f"{body.name}_{i}" for body in bodies for i in range(1, len(body.markers) + 1))
     sets = [MarkerSetDescription(body.name, body.markers) for body in bodies]
     described = [

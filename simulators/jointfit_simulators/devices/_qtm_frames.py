@@ -75,6 +75,7 @@ def settings_xml(
     wanted = {part.partition(":")[0].lower() for part in parts}
     everything = "all" in wanted
     text = ""
+
     if everything or "general" in wanted:
         text += (
             f"<General><Frequency>{rate_hz:g}</Frequency><External_Timestamp>"
@@ -93,8 +94,10 @@ def settings_xml(
             "<CalibrationTime>2026-01-01 12:00:00</CalibrationTime>"
             f"<Labels>{len(labels)}</Labels>{named}</The_3D>"
         )
+
     if everything or "6d" in wanted:
         text += _bodies_xml(version, bodies, relative)
+
     root = "QTM_Parameters_Ver_{}.{}".format(*version)
     return f"<{root}>{text}</{root}>"
 
@@ -162,6 +165,7 @@ def components(
     place, turn = axes
     found: list[Component] = []
     labels = [name for asset in assets for name in asset.markers]
+
     for kind in kinds:
         if kind == ComponentType.TIMECODE:
             codes = () if camera_ticks is None else (_camera_code(camera_ticks),)
@@ -174,6 +178,8 @@ def components(
                 for name in labels
             )
             found.append(ItemsComponent(kind, 0, 0, items))
+
+        # an unlabeled marker has a number in place of a name
         elif kind in (ComponentType.UNLABELED, ComponentType.UNLABELED_RESIDUAL):
             with_residual = kind == ComponentType.UNLABELED_RESIDUAL
             loose = [

@@ -265,6 +265,7 @@ class TableDevice:
         native = (w, -x, -y, -z) if options.world_to_sensor else (w, x, y, z)
         time_s = (options.first_ns + device_ns - self._epoch_ns) * 1e-9
         valid = options.valid if self._since_start >= options.invalid else 0
+
         content: dict[str, Sequence[float]] = {
             "quaternion": native,
             "time": (time_s,),
@@ -272,6 +273,7 @@ class TableDevice:
             "valid": (valid,),
         }
         content |= {name: self._inertial.value(item) or () for name, item in _SIGNALS.items()}
+
         return [
             self._number(options.fields[slot], float(content[name][slot - slots.start]), name)
             for name, slots in SLOTS.items()

@@ -91,11 +91,14 @@ class VectorNavDevice(SerialDevice):
         super().__init__(link, wire_noise, options.baud)
         self._codec = VectorNavCodec()
         self._inertial = InertialSignals()
+
+        # registers in flash
         self._stored_outputs = dict(
             zip(_OUTPUTS, (BinaryOutput(*one) for one in options.outputs), strict=False)
         )
         self._stored_text = options.text_output
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
+
         self.writes = 0
         """Number of registers written."""
         self.stores = 0
@@ -177,6 +180,7 @@ class VectorNavDevice(SerialDevice):
 
     def _reply(self, message: TextMessage) -> str:
         """Return the reply to a request, or an error."""
+        # a valid command is answered by its echo; a read adds the content
         echo = ",".join((message.command, *message.values))
         match message.command:
             case "VNASY" if message.values in {("0",), ("1",)}:
@@ -202,6 +206,7 @@ class VectorNavDevice(SerialDevice):
         if register in self.outputs:
             output = self.outputs[register]
             return encode_output(output) if output.fields else f"{output.ports},{output.divisor},00"
+
         x, y, z = (f"{value:+.6f}" for value in native_of(self._q, "NED")[1:])
         options = self._options
         return {
@@ -244,6 +249,8 @@ class VectorNavDevice(SerialDevice):
             Field.IMU_MAGNETIC_FIELD: self._inertial.field,
             Field.MAGNETIC_AND_PRESSURE: (*self._inertial.field, 25.0, 101.3),
         }
+
+        # other fields contain zeros
         places = BinaryLayout(output.fields).places
         return encode_binary(
             {

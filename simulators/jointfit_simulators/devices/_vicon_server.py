@@ -204,6 +204,8 @@ class ViconServer:
             (ObjectId.STREAM_INFO, vicon.StreamInfo(period)),
             (ObjectId.APPLICATION_INFO, vicon.ApplicationInfo(int(options.up_axis == "y"))),
         ]
+
+        # subjects, markers and segments count from 1
         for number, body in enumerate(self._bodies, 1):
             markers = tuple(
                 vicon.MarkerInfo(marker, name) for marker, name in enumerate(body.markers, 1)
@@ -223,6 +225,8 @@ class ViconServer:
             (ObjectId.LATENCY_INFO, vicon.LatencyInfo(self.options.stages)),
             (ObjectId.FRAME_RATES, vicon.FrameRates((("Camera", rate_hz),))),
         ]
+
+        # markers and segments that are not seen are left out
         recons = []
         for subject, body in enumerate(self._bodies, 1):
             for marker, name in enumerate(body.markers, 1):

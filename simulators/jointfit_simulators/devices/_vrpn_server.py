@@ -216,6 +216,7 @@ class VrpnServer:
 
     def _take(self, peer: VrpnPeer, data: bytes) -> None:
         (client,) = (client for client in self._clients if client.peer is peer)
+
         for message in client.codec.feed(data):
             match message:
                 case Cookie(major) if major != MAJOR:

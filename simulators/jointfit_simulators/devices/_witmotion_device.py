@@ -117,6 +117,7 @@ class WitMotionDevice(SerialDevice):
         super().__init__(link, wire_noise)
         self._now_s = now_s
         self._inertial = InertialSignals()
+
         self.flash = {
             int(WitMotionRegister.CONTENT): options.content,
             int(WitMotionRegister.RATE): RATE_CODES[options.rate_hz],
@@ -127,6 +128,7 @@ class WitMotionDevice(SerialDevice):
         """Registers in force; `flash` contains those that survive power-off."""
         self._unlocked_until_s = 0.0
         self._rest = b""
+
         self.counter = 0
         """Number of the next sample; the device does not send it."""
         self.saved = 0
@@ -187,7 +189,7 @@ class WitMotionDevice(SerialDevice):
             if value == _UNLOCK:
                 self._unlocked_until_s = self._now_s() + UNLOCKED_S
         elif self._now_s() >= self._unlocked_until_s:
-            return
+            return  # writes need the unlock command
         elif register == WitMotionRegister.SAVE:
             self.flash = dict(self.registers)
             self.saved += 1

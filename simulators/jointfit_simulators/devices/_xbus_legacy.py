@@ -46,6 +46,7 @@ def legacy_content(
         Item.EULER_ANGLES: roll_pitch_yaw_deg(native),
         Item.ROTATION_MATRIX: tuple(chain(*columns)),
     }
+
     for item in (Item.ACCELERATION, Item.RATE_OF_TURN, Item.MAGNETIC_FIELD):
         value = inertial.value(item)
         if value is not None:

@@ -216,11 +216,14 @@ class XImu3Device(SerialDevice):
             names = {"name": "device_name", "sn": "serial_number"}
             found = {name: self.settings[stored] for name, stored in names.items()}
             return {"interface": self._options.interface} | found
+
         if key in _ACTIONS:
             if key == "apply":
                 self.settings = dict(self._pending)
             self.saves += key == "save"
             return None
+
+        # a written value applies with the next command `apply`
         if key not in self._pending or key in self._options.missing:
             return {"error": "Unknown command"}
         if value is not None:
