@@ -136,6 +136,7 @@ def fusion_rows(quick: bool) -> list[Result]:
 # --- complete frames ----------------------------------------------------------------------------
 
 
+@cache
 def events(rate_hz: float, seconds: float) -> list[Event]:
     """Return the chunks of four IMUs during a walk, one a sample, in order of arrival."""
     period_ns = round(NS / rate_hz)

@@ -1,0 +1,110 @@
+"""Interpreted instructions of each part of the frame's path: a gate that no neighbour disturbs.
+
+The counts are of the bytecode of the project's own functions, pure Python. They are equal on every
+machine and at any load. They contain no work of NumPy and other C code, which times show.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+from unittest.mock import patch
+
+from bench.experiments.speed import codecs, core
+from bench.framework.experiment import Experiment, Result
+from bench.framework.material import THIS_MACHINE
+from bench.subjects.simulated_wearer import bench_rig
+from jointfit_daemon.pipeline import Core
+from jointfit_daemon.pipeline.events import Configured
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+    from typing import Any
+
+ROOT = f"{Path(__file__).resolve().parents[3]}/"
+PYTHON = (3, 11)
+"""Version of Python whose bytecode is counted."""
+GROWTH = 1.1
+"""Threshold: count over the one of `KNOWN`. A wanted growth, or a large gain, is entered there."""
+KNOWN = {
+    "xbus: codec, one message": 157.0,
+    "xbus: bytes to SI sample": 1089.9,
+    "slcan: codec, one CAN frame": 213.0,
+    "xcdi: 3 CAN frames to SI sample": 1213.2,
+    "natnet: codec, one frame": 1967.0,
+    "natnet: bytes to MocapFrame": 3625.0,
+    "clock: one sample": 880.4,
+    "aligner: one sample": 792.5,
+    "core: 4 × 100 Hz, not calibrated, one frame": 14721.9,
+}
+"""Instructions of one item, as last entered."""
+
+
+def count_instructions(work: Callable[[], object]) -> int:
+    """Return the number of instructions that `work` executes in functions of the project."""
+    count = 0
+
+    def trace(frame: FrameType, event: str, argument: Any) -> Any:  # noqa: ARG001 - of settrace
+        nonlocal count
+        if event == "call":
+            if not frame.f_code.co_filename.startswith(ROOT):
+                return None
+            frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        elif event == "opcode":
+            count += 1
+        return trace
+
+    before = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        work()
+    finally:
+        sys.settrace(before)
+    return count
+
+
+def _per_item(
+    name: str, prepare: Callable[[], Callable[[], object]], *, items: int, **_: Any
+) -> Result:
+    """Return the instructions of one item; in the place of the measurement of time."""
+    prepare()()  # what is cached once does not count
+    count = count_instructions(prepare()) / items
+    return Result(name, round(count, 1), round(GROWTH * KNOWN[name], 1), unit="instructions")
+
+
+def _core_frames(seconds: float) -> Result:
+    """Return the instructions of a frame of four sensors without a calibration."""
+    stream = core.events(100.0, seconds)
+
+    def prepare() -> Callable[[], object]:
+        fresh = Core()
+        fresh.feed(Configured(core.START_NS, bench_rig(), None))
+        return lambda: [fresh.feed(event) for event in stream]
+
+    frames = round(100 * seconds)
+    return _per_item("core: 4 × 100 Hz, not calibrated, one frame", prepare, items=frames)
+
+
+def counted_rows() -> list[Result]:
+    """Return the counts of all parts; nothing on another version of Python."""
+    if sys.version_info[:2] != PYTHON:
+        print("instruction-counts: only on Python 3.11, whose bytecode is counted", file=sys.stderr)
+        return []
+    with patch.object(codecs, "per_item", _per_item), patch.object(core, "per_item", _per_item):
+        parts = (
+            codecs.xbus_rows, codecs.xcdi_rows, codecs.natnet_rows, core.clock_rows, core.align_rows
+        )  # fmt: skip
+        rows = [row for part in parts for row in part(True)]
+    return [*rows, _core_frames(1.0)]
+
+
+EXPERIMENTS = (
+    Experiment(
+        "instruction-counts",
+        "Interpreted instructions of the frame's path",
+        lambda _: counted_rows(),
+        THIS_MACHINE,
+    ),
+)
