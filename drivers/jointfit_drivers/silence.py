@@ -152,7 +152,7 @@ async def explain_missing_messages(
     Raises
     ------
     DeviceLostError
-        The line is silent.
+        The line is silent, or the device sends other messages only.
     DeviceMisconfiguredError
         The device sends at another speed, or is of another kind.
     """
@@ -160,6 +160,11 @@ async def explain_missing_messages(
         raise DeviceLostError(
             f"{port.path}: silent: check its power and cable, and that the device sends without "
             "being asked"
+        )
+    if conversation.understood:
+        raise DeviceLostError(
+            f"{port.path}: the device sends messages of {family}, but no measurement: switch this "
+            "output on"
         )
 
     async def sends() -> bool:

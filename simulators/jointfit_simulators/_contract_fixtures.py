@@ -14,7 +14,13 @@ import random
 from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol
 
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
+from jointfit_daemon.driver import (
+    DeviceLostError,
+    DeviceMisconfiguredError,
+    driver_names,
+    find_driver,
+)
+from jointfit_daemon.model import ImuSample
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -134,6 +140,8 @@ async def serve_device(device: ContractDevice) -> AsyncIterator[None]:
 
 async def cancel_and_wait(task: asyncio.Task[None]) -> None:
     """Cancel a task and require that it ends with CancelledError within a second."""
+    if task.done() and not task.cancelled() and task.exception() is None:
+        require(False, "run must read until it is cancelled; it returned")
     task.cancel()
     _, pending = await asyncio.wait({task}, timeout=1.0)
     require(not pending, "a cancelled run must end within a second")
@@ -168,3 +176,33 @@ def content_of(measurement: Any) -> str:
     """Return all values of a measurement except its arrival time."""
     replace = getattr(measurement, "_replace", None) or partial(dataclasses.replace, measurement)
     return repr(replace(arrival_ns=0))
+
+
+def content_text(measurement: Any) -> str:
+    """Return the orientation of a sample, or all of another measurement, for messages."""
+    if not isinstance(measurement, ImuSample):
+        return repr(measurement)
+    return f"q_world_sensor = {_rounded(measurement.q_world_sensor)}"
+
+
+def expected_text(measurement: Any, number: int) -> str:
+    """Return the end of the message about `measurement`, which should be sample `number`."""
+    if not isinstance(measurement, ImuSample):
+        return f", expected number {number}"
+    text = _rounded(orientation(number))
+    return f", expected {text}: check the order of the components, the world and the direction"
+
+
+def _rounded(q: Quaternion) -> str:
+    return f"({', '.join(f'{part:.3f}' for part in q)})"
+
+
+def find_installed(name: str) -> type[Driver]:
+    """Return the driver of an entry point; require that it is installed."""
+    require(
+        name in driver_names(),
+        f"entry point {name!r} must be installed; there are {', '.join(driver_names())}: run "
+        "`python -m pip install --editable .` in the folder of the package, and again after a "
+        "change of its pyproject.toml",
+    )
+    return find_driver(name)

@@ -40,14 +40,17 @@ from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, ClassVar
 from unittest import SkipTest
 
-from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError, Settings, find_driver
+from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError, Settings
 from jointfit_daemon.model import Chunk, Corrupt, ImuSample
 from jointfit_simulators._contract_fixtures import (
     DecodingReceiver,
     SwitchableNoise,
     cancel_and_wait,
     content_of,
+    content_text,
     count_descriptors,
+    expected_text,
+    find_installed,
     orientation,
     require,
     require_error,
@@ -148,7 +151,7 @@ class DriverContract(ABC):
         """The daemon finds drivers by name."""
         if self.registered_as is None:
             raise SkipTest("not registered")
-        found = find_driver(self.registered_as)
+        found = find_installed(self.registered_as)
         require(
             found is type(self.make_driver(tmp_path)),
             f"entry point {self.registered_as} must name the driver; it names {found}",
@@ -164,10 +167,9 @@ class DriverContract(ABC):
                 numbers = await self._send_all(device, receiver, first, 50)
 
             received = receiver.measurements[-len(numbers) :]
-            require(
-                all(map(self.matches, numbers, received)),
-                "every sample must arrive once and in order",
-            )
+            for number, item in zip(numbers, received, strict=True):
+                self._require_sent(item, numbers, expected_text(item, number))
+                require(self.matches(number, item), "every sample must arrive once and in order")
 
             stamps = [item.arrival_ns for item in received]
             require(stamps == sorted(stamps), "arrival times must not decrease")
@@ -310,11 +312,12 @@ class DriverContract(ABC):
                 async with self._reading(device, driver, stale.stop) as (receiver, end):
                     received = receiver.measurements
 
-            fresh = range(stale.stop, end)
-            require(
-                all(any(self.matches(number, item) for number in fresh) for item in received),
-                "samples from before the opening must not arrive: discard the buffered input",
-            )
+            for item in received:
+                self._require_sent(item, range(end))
+                require(
+                    any(self.matches(number, item) for number in range(stale.stop, end)),
+                    "samples from before the opening must not arrive: discard the buffered input",
+                )
 
         asyncio.run(scene())
 
@@ -364,10 +367,8 @@ class DriverContract(ABC):
                 len(received) >= len(numbers) // 2,
                 f"at least half of the {len(numbers)} samples must arrive; {len(received)} did",
             )
-            require(
-                all(any(self.matches(number, item) for number in numbers) for item in received),
-                "every received sample must be one that was sent",
-            )
+            for item in received:
+                self._require_sent(item, numbers)
             require(receiver.decoder.discarded_bytes > 0, "the decoder must count damaged bytes")
 
         asyncio.run(scene())
@@ -397,6 +398,7 @@ class DriverContract(ABC):
                 receiver = DecodingReceiver(driver, self.measurement)
                 task = asyncio.create_task(driver.run(receiver.emit))
                 first = await self._send_first(device, receiver, task)
+                require(hasattr(device, "plug"), "the simulated device must have unplug and plug")
                 device.unplug()
                 await require_error(DeviceLostError, task, self.lost_within_s)
 
@@ -478,6 +480,12 @@ class DriverContract(ABC):
                 require(count_descriptors() == before, "run must not leave open descriptors")
 
         asyncio.run(scene())
+
+    def _require_sent(self, item: Any, numbers: range, expected: str = "") -> None:
+        require(
+            any(self.matches(number, item) for number in numbers),
+            f"every sample must arrive unchanged; {content_text(item)} was not sent{expected}",
+        )
 
     # --- driver and device at work ------------------------------------------------------------
 

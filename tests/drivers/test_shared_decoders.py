@@ -190,6 +190,19 @@ def test_missing_messages_are_explained_and_none_of_another_speed_is_emitted(
     assert not emitted
 
 
+def test_a_device_that_sends_other_messages_only_is_not_at_another_speed() -> None:
+    async def scene() -> None:
+        port = cast("SerialPort", FakePort(115_200, 115_200))
+        conversation = SerialConversation(port, lambda _: None, pair_codec)
+        assert await conversation.receive(lambda message: message.value == 9, 0.02) is None
+        await explain_missing_messages(
+            port, conversation, baud=115_200, speeds=(115_200, 57_600), family="pairs"
+        )
+
+    with pytest.raises(DeviceLostError, match="no measurement: switch this output on"):
+        asyncio.run(scene())
+
+
 # --- CAN --------------------------------------------------------------------------------------
 
 
