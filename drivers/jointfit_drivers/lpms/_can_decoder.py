@@ -19,15 +19,22 @@ from jointfit_drivers.lpms._arrival_gaps import ArrivalGaps
 from jointfit_drivers.lpms._orientation import LpmsConvention, LpmsOrientation
 from jointfit_protocols import can
 from jointfit_protocols.corrupt import CorruptBytes
+from jointfit_protocols.lpms import unit_of
 from jointfit_protocols.lpms.channels import (
     BOOTED,
+    FRAMES,
     OPERATIONAL,
     ChannelQuaternion,
     Heartbeat,
     LpmsCanCodec,
+    Precision,
+    decode_frame,
+    encode_frames,
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_drivers.lpms._can_settings import LpmsCanSettings
 
@@ -59,6 +66,7 @@ class LpmsCanDecoder:
         self._rate_hz = settings.rate_hz
         self._gaps = ArrivalGaps(settings.rate_hz)
         self._orientation = LpmsOrientation(LpmsConvention.of(settings), _NORM_REMEDY)
+        self._is_mapped = settings.mapping != _PLAIN
         self._incomplete = self._torn = self._refused = 0
         self._state: int | None = None
         self._bus = BusEvents()
@@ -127,6 +135,9 @@ class LpmsCanDecoder:
             self._orientation.events = []
         if converted is None:
             self._refused += 1
+            if not self._is_mapped and _fits_other(quaternion.values, floats=self._floats):
+                other = "int16" if self._floats else "float32"
+                self._orientation.remedy = f'the data fit precision = "{other}"'
             out.append(self._bus.discard(can.RECORD_BYTES, "quaternion norm is not 1"))
             return
         native, q = converted
@@ -163,6 +174,21 @@ class LpmsCanDecoder:
             out.append(DeviceEvent("warning", _OUT_OF_ORDER))
 
 
+def _fits_other(values: Sequence[float], *, floats: bool) -> bool:
+    """Return whether the first frame is a quaternion, or a half of one, in the other precision."""
+    own: Precision = "float32" if floats else "int16"
+    other: Precision = "int16" if floats else "float32"
+    (frame, *_) = encode_frames(range(FRAMES), [*values, *[0.0] * 12], own)
+    found = decode_frame(frame.data, other) or ()
+    if floats:
+        return unit_of(found) is not None
+    return any(found) and all(not value or _LEAST < abs(value) < _MOST for value in found)
+
+
+_PLAIN = (1, 2, 3, 4)
+"""Channels of w, x, y and z in the order of the frames."""
+_LEAST, _MOST = 1e-6, 1.01
+"""Sizes of the components of a quaternion; smaller floats are integers."""
 _NORM_REMEDY = "change `precision` or `mapping`, and remove `scale`"
 _OUT_OF_ORDER = (
     "the frames of a quaternion do not follow each other within half a period: change `rate_hz` to "

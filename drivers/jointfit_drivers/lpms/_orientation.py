@@ -57,7 +57,8 @@ class LpmsOrientation:
         self._scale = QuaternionScale(unit)
         self._unit: int | None = None
         self._gate = OrientationGate()
-        self._remedy = remedy
+        self.remedy = remedy
+        """Settings to change if hardly any quaternion has norm 1."""
         self._norms: list[float] = []
         self.events: list[Decoded] = []
         """Events since they were last taken."""
@@ -100,7 +101,7 @@ class LpmsOrientation:
 
         norm = self._gate.misconfigured_norm
         if norm is not None:
-            text = f"median quaternion norm is {norm:.4g}, expected 1: {self._remedy}"
+            text = f"median quaternion norm is {norm:.4g}, expected 1: {self.remedy}"
             self.events.append(DeviceEvent("warning", text, {"median_norm": norm}))
             return
         known = [norm for norm in self._norms if isfinite(norm)]
