@@ -27,7 +27,6 @@ from jointfit_protocols.lpms.channels import (
     ChannelQuaternion,
     Heartbeat,
     LpmsCanCodec,
-    Precision,
     decode_frame,
     encode_frames,
 )
@@ -135,9 +134,8 @@ class LpmsCanDecoder:
             self._orientation.events = []
         if converted is None:
             self._refused += 1
-            if not self._is_mapped and _fits_other(quaternion.values, floats=self._floats):
-                other = "int16" if self._floats else "float32"
-                self._orientation.remedy = f'the data fit precision = "{other}"'
+            if self._floats and not self._is_mapped and _are_integers(quaternion.values):
+                self._orientation.remedy = 'the data fit precision = "int16"'
             out.append(self._bus.discard(can.RECORD_BYTES, "quaternion norm is not 1"))
             return
         native, q = converted
@@ -174,21 +172,14 @@ class LpmsCanDecoder:
             out.append(DeviceEvent("warning", _OUT_OF_ORDER))
 
 
-def _fits_other(values: Sequence[float], *, floats: bool) -> bool:
-    """Return whether the first frame is a quaternion, or a half of one, in the other precision."""
-    own: Precision = "float32" if floats else "int16"
-    other: Precision = "int16" if floats else "float32"
-    (frame, *_) = encode_frames(range(FRAMES), [*values, *[0.0] * 12], own)
-    found = decode_frame(frame.data, other) or ()
-    if floats:
-        return unit_of(found) is not None
-    return any(found) and all(not value or _LEAST < abs(value) < _MOST for value in found)
+def _are_integers(values: Sequence[float]) -> bool:
+    """Return whether the first frame of these floats is a quaternion of 16-bit integers."""
+    frame = encode_frames(range(FRAMES), [*values, *[0.0] * 4], "float32")[0]
+    return unit_of(decode_frame(frame.data, "int16") or ()) is not None
 
 
 _PLAIN = (1, 2, 3, 4)
 """Channels of w, x, y and z in the order of the frames."""
-_LEAST, _MOST = 1e-6, 1.01
-"""Sizes of the components of a quaternion; smaller floats are integers."""
 _NORM_REMEDY = "change `precision` or `mapping`, and remove `scale`"
 _OUT_OF_ORDER = (
     "the frames of a quaternion do not follow each other within half a period: change `rate_hz` to "

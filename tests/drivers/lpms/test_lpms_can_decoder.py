@@ -168,8 +168,6 @@ def test_a_wrong_precision_is_named_with_the_norm() -> None:
     found = fed(LpmsCanDecoder(settings(precision="float32")), recorded(120))
     assert not samples(found)
     assert any('the data fit precision = "int16"' in text for text in texts(found, "warning"))
-    found = fed(LpmsCanDecoder(settings()), recorded(120, precision="float32"))
-    assert any('the data fit precision = "float32"' in text for text in texts(found, "warning"))
     found = fed(LpmsCanDecoder(settings()), recorded(120, mapping=(9, 10, 11, 12)))
     assert not samples(found)
     (text,) = texts(found, "warning")
