@@ -21,13 +21,13 @@ _MEDIAN_TO_SD = 1.4826
 
 
 def rms(values: NDArray[np.float64], empty: float = np.nan) -> float:
-    """Return the RMS of the finite values; `empty` if there are none."""
+    """Return the RMS of the finite values of any shape, in their unit; `empty` without them."""
     good = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(good**2))) if good.size else empty
 
 
 def robust_scale(magnitudes: NDArray[np.float64], floor: float = 1e-6) -> float:
-    """Return 1.4826 times the median magnitude, at least `floor`, in the unit of the residuals."""
+    """Return 1.4826 times the median of magnitudes, shape (n,), in their unit; at least `floor`."""
     return max(_MEDIAN_TO_SD * float(np.median(magnitudes)), floor)
 
 

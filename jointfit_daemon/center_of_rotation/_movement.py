@@ -70,7 +70,7 @@ class Movement:
     """Time between frames, s."""
 
     def both_markers(self) -> tuple[Array, Array] | None:
-        """Return the markers of parent and child, each in its own coordinates, m.
+        """Return the markers of parent and child in own coordinates, m, shape (n, k, 3) each.
 
         None if those of one body are unknown, fewer than three, or on a line.
         """

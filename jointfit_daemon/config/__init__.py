@@ -1,6 +1,6 @@
 """Configuration: converts rig.toml to a frozen `Rig` in SI units, or reports all its faults.
 
-Invariant: degrees and millimetres exist in this package only; no device is opened here.
+Degrees and millimetres of rig.toml are converted here. Invariant: no device is opened.
 """
 
 from jointfit_daemon.config._checks import (

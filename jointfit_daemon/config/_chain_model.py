@@ -30,6 +30,7 @@ from jointfit_daemon.files.models import (
 )
 from jointfit_daemon.files.text import MalformedFileError
 from jointfit_daemon.kinematics.chain_coordinates import default_coordinates
+from jointfit_daemon.name_lists import list_names
 from jointfit_daemon.nearest_name import nearest_name
 
 if TYPE_CHECKING:
@@ -41,8 +42,6 @@ if TYPE_CHECKING:
 
 KEY = "chain.model"
 REFINEMENT_KEY = "calibration.chain_refinement"
-_LISTED = 8
-"""Largest number of names in a message."""
 
 
 def read_chain_model(given: str | dict[str, Any]) -> LoadedModel:
@@ -103,7 +102,7 @@ def load_chain_model(
     faults += more or _check_connections(loaded.chain, carriers, _adjacent(table, carriers))
     known = set(loaded.chain.marker_names)
     if absent := [name for names in markers.values() for name in names if name not in known]:
-        remark = f"not in the model, so not tracked by it: {_listed(absent)}"
+        remark = f"not in the model, so not tracked by it: {list_names(absent)}"
         loaded = replace(loaded, remarks=(*loaded.remarks, remark))
     return loaded, faults
 
@@ -148,11 +147,6 @@ def load_refinement(
     return ChainRefinement(model, settings, table.limit_s), weights, []
 
 
-def _listed(names: Sequence[str]) -> str:
-    rest = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(names[:_LISTED]) + rest
-
-
 def _check_markers(model: ChainModel, markers: Mapping[str, Sequence[str]]) -> Iterator[Fault]:
     """Check that the rig has the markers of the model, and that they determine its segments."""
     known = [name for names in markers.values() for name in names]
@@ -160,7 +154,7 @@ def _check_markers(model: ChainModel, markers: Mapping[str, Sequence[str]]) -> I
     if other:
         yield Fault(
             KEY,
-            f"has markers that are not in mocap.markers: {_listed(other)}; add them there, or "
+            f"has markers that are not in mocap.markers: {list_names(other)}; add them there, or "
             "remove them from the model",
             near=nearest_name(other[0], [name for name in known if name not in model.marker_names]),
         )
@@ -173,7 +167,7 @@ def _check_markers(model: ChainModel, markers: Mapping[str, Sequence[str]]) -> I
     if bare:
         yield Fault(
             KEY,
-            f"has segments without markers on them or below them: {_listed(bare)}; remove them "
+            f"has segments without markers on them or below them: {list_names(bare)}; remove them "
             "from the model, or add markers",
         )
 
@@ -189,7 +183,7 @@ def _find_carriers(
         key = f"mocap.markers.{part}"
         counted = Counter(of[name] for name in names if name in of)
         if not counted:
-            text = f"none of these markers is in chain.model, which has {_listed(list(of))}"
+            text = f"none of these markers is in chain.model, which has {list_names(list(of))}"
             faults.append(Fault(key, f"{text}: rename them in one of the two", list(names)))
             continue
 

@@ -171,7 +171,10 @@ class _Repair:
         is_value = _ASSIGNED.match(line) is not None
         opened = is_value and any(mark in line for mark in ("[", "{", '"""', "'''"))
         end = at + 1
-        while opened and end < len(self.lines) and not self._begins(end):
+        while opened and end < len(self.lines):
+            # A statement begins here, as seen from within an unclosed value.
+            if _ASSIGNED.match(self.lines[end]) or _WHOLE_HEADER.fullmatch(self.lines[end]):
+                break
             end += 1
 
         text, number = _error_of("\n".join(self.lines[at:end])) or ("Invalid statement", 1)
@@ -179,11 +182,6 @@ class _Repair:
         self._report(wrong, _with_remedy(text, self.lines[wrong].strip()))
         self.lines[at:end] = [_replacement(line, at), *[""] * (end - at - 1)]
         return end - at
-
-    def _begins(self, at: int) -> bool:
-        """Return whether a statement begins at `at`, seen from within an unclosed value."""
-        line = self.lines[at]
-        return bool(_ASSIGNED.match(line) or _WHOLE_HEADER.fullmatch(line))
 
     def _remove_repeated(self, text: str, number: int | None) -> None:
         """Report and remove the statement of an error that other statements cause."""

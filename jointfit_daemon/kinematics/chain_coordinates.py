@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
-    from jointfit_daemon.kinematics.chains import ChainModel, ChainState, Joint, Segment
+    from jointfit_daemon.kinematics.chains import ChainModel, ChainState, Joint
 
 _ITERATIONS = 30
 _LARGEST_STEP = 0.2
@@ -67,16 +67,15 @@ def default_coordinates(model: ChainModel) -> tuple[JointCoordinates, ...]:
     ``NAME_ry``, ``NAME_rz``: R = Rx Ry Rz, rad; a free joint also ``NAME_tx``, ``NAME_ty``,
     ``NAME_tz``, m, in the world with z up.
     """
-    return tuple(_default(segment) for segment in model.segments)
-
-
-def _default(segment: Segment) -> JointCoordinates:
-    name, joint = segment.name, segment.joint
-    if joint.kind == "coupled":
-        return JointCoordinates(name, (f"{name}_angle",), (True,), None)
-    if joint.kind == "hinge":
-        return JointCoordinates(name, (f"{name}_angle",), (True,), partial(_hinge_pose, joint))
-    return euler_coordinates(name, is_free=joint.kind == "free")
+    found = []
+    for segment in model.segments:
+        name, joint = segment.name, segment.joint
+        if joint.kind in {"hinge", "coupled"}:
+            pose = partial(_hinge_pose, joint) if joint.kind == "hinge" else None
+            found.append(JointCoordinates(name, (f"{name}_angle",), (True,), pose))
+        else:
+            found.append(euler_coordinates(name, is_free=joint.kind == "free"))
+    return tuple(found)
 
 
 def _hinge_pose(joint: Joint, values: Array) -> tuple[Array, Array]:

@@ -41,7 +41,6 @@ from jointfit_daemon.limb_model._label_search import (
     LabelFault,
     LabelSearch,
     explain_trial,
-    join_words,
 )
 from jointfit_daemon.limb_model._leverage_variance import FARTHEST, WITHIN, LeverageVariance
 from jointfit_daemon.limb_model._marker_cluster import (
@@ -133,7 +132,6 @@ __all__ = [
     "inner_joints",
     "is_left",
     "is_line",
-    "join_words",
     "joint_parts",
     "level_axis",
     "mix_corrections",

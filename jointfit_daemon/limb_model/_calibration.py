@@ -257,22 +257,21 @@ def _chain(item: Mapping[str, Any]) -> RefinedChain:
 
 
 def _joint(item: Mapping[str, Any]) -> JointCalibration:
+    rotation = None
+    if (found := item.get("rotation")) is not None:
+        a, b, c = found["covariance"]
+        rotation = CalibratedCenter(
+            vector(found["center"]),
+            (vector(a), vector(b), vector(c)),
+            tuple(vector(direction) for direction in found["unseen"]),
+        )
     return JointCalibration(
         None if item["center"] is None else vector(item["center"]),
         item["sd"],
         item["source"],
         item["residual_rms"],
         item["gap_rms"],
-        None if item.get("rotation") is None else _center(item["rotation"]),
-    )
-
-
-def _center(item: Mapping[str, Any]) -> CalibratedCenter:
-    a, b, c = item["covariance"]
-    return CalibratedCenter(
-        vector(item["center"]),
-        (vector(a), vector(b), vector(c)),
-        tuple(vector(direction) for direction in item["unseen"]),
+        rotation,
     )
 
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_daemon.limb_model._rigid_fit import MAX_FIT_RMS_M, MIN_MARKERS, is_line
+from jointfit_daemon.name_lists import join_words
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Iterable, Mapping, Sequence
@@ -75,12 +76,6 @@ _SAMPLED = 40
 """Frames of a trial in which labels are searched."""
 _CONFIRMED = 0.5
 """Share of the suspicious frames of a trial that an explanation needs."""
-
-
-def join_words(words: Iterable[str]) -> str:
-    """Return one or more words as ``a``, ``a and b`` or ``a, b and c``."""
-    *first, last = words
-    return f"{', '.join(first)} and {last}" if first else last
 
 
 class LabelFault(NamedTuple):
@@ -225,8 +220,15 @@ class LabelSearch:
         if not len(self.clusters):
             return LabelFinding(np.zeros(0), ())
         fits = _fit(self._template, padded[self._columns], seen[self._columns])
-        fitted = self._fitted(seen)
         rms, centers = fits.rms, fits.carry(self._centers)
+
+        # The visible markers of the others determine no pose.
+        fitted = np.array(
+            [
+                seen[own].sum() >= MIN_MARKERS and not self._is_line(p, seen[own])
+                for p, own in enumerate(self._own)
+            ]
+        )
         rms[~fitted], centers[~fitted] = np.nan, np.nan
 
         # Clusters that do not fit, and both sides of a joint whose centers are apart.
@@ -247,15 +249,6 @@ class LabelSearch:
         shared = np.isfinite(self._centers[rows, :, 0]).any(axis=0)
         near = np.isfinite(self._centers[:, shared, 0]).any(axis=1)
         return frozenset(self.clusters[p].name for p in np.flatnonzero(near))
-
-    def _fitted(self, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Return the clusters whose visible markers determine a pose, shape (P,)."""
-        return np.array(
-            [
-                seen[own].sum() >= MIN_MARKERS and not self._is_line(p, seen[own])
-                for p, own in enumerate(self._own)
-            ]
-        )
 
     def _faults(
         self,
@@ -411,18 +404,18 @@ def explain_trial(search: LabelSearch, positions: Array) -> tuple[LabelFault, ..
     rows = np.unique(np.linspace(0, len(positions) - 1, _SAMPLED).astype(int))
     findings = [search.explain(positions[row]) for row in rows if len(positions)]
     votes = Counter(fault for finding in findings for fault in finding.faults)
-    return tuple(
-        fault
-        for fault, count in votes.items()
-        if count > _CONFIRMED * sum(_is_suspect(search, finding, fault) for finding in findings)
-    )
-
-
-def _is_suspect(search: LabelSearch, finding: LabelFinding, fault: LabelFault) -> bool:
-    """Return whether a cluster of a fault does not fit in one frame, or is explained by it."""
     names = [cluster.name for cluster in search.clusters]
-    bad = any(finding.rms[names.index(part)] > MAX_FIT_RMS_M for part in fault.parts)
-    return bad or fault in finding.faults
+    confirmed = []
+    for fault, count in votes.items():
+        # Frames in which a cluster of the fault does not fit, or is explained by it.
+        parts = [names.index(part) for part in fault.parts]
+        suspicious = sum(
+            bool((finding.rms[parts] > MAX_FIT_RMS_M).any()) or fault in finding.faults
+            for finding in findings
+        )
+        if count > _CONFIRMED * suspicious:
+            confirmed.append(fault)
+    return tuple(confirmed)
 
 
 def _suspicious_rms(template: Array) -> float:

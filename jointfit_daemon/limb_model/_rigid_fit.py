@@ -35,7 +35,7 @@ MAX_FIT_RMS_M = 0.03
 
 
 def visible(x: Array) -> Mask:
-    """Return the rows (last axis) without NaN."""
+    """Return the rows, last axis of shape (..., k), without NaN, shape (...)."""
     return np.asarray(np.isfinite(x).all(axis=-1), dtype=np.bool_)
 
 

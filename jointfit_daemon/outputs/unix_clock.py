@@ -46,7 +46,13 @@ class UnixClock:
             return before.offset_ns
 
         self._until_ns = now_ns + _NS_PER_S
-        reading = min(_read_offset() for _ in range(_READINGS))
+        readings = []
+        for _ in range(_READINGS):
+            before_ns, unix_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+            offset_ns = unix_ns - (before_ns + after_ns) // 2
+            readings.append(_OffsetReading(after_ns - before_ns, offset_ns))
+        reading = min(readings)
+
         if before is not None:
             slack_ns = STEP_NS + (reading.width_ns + before.width_ns) // 2
             if abs(reading.offset_ns - before.offset_ns) <= slack_ns:
@@ -54,10 +60,3 @@ class UnixClock:
 
         self._reading = reading
         return reading.offset_ns
-
-
-def _read_offset() -> _OffsetReading:
-    before_ns = time.monotonic_ns()
-    unix_ns = time.time_ns()
-    after_ns = time.monotonic_ns()
-    return _OffsetReading(after_ns - before_ns, unix_ns - (before_ns + after_ns) // 2)

@@ -127,15 +127,12 @@ def _find_axes(q: Array) -> tuple[str, str] | None:
     if np.arccos(np.clip(up @ up_again, -1.0, 1.0)) > TOLERANCE_RAD:
         return None
     printed = np.stack((sensor[1], sensor[2], sensor[0])) / turned[[1, 2, 0], None]
-    names = [_axis_name(axis) for axis in (up, *printed)]
-    if None in names:
-        return None
+
+    names = []
+    for axis in (up, *printed):
+        k = int(np.argmax(np.abs(axis)))
+        if abs(axis[k]) < np.cos(TOLERANCE_RAD):
+            return None
+        names.append(f"{'+' if axis[k] > 0.0 else '-'}{_AXES[k]}")
     pairs = zip(_AXES, names[1:], strict=True)
-    return str(names[0]), ", ".join(f"{axis} is {name}" for axis, name in pairs)
-
-
-def _axis_name(axis: Array) -> str | None:
-    k = int(np.argmax(np.abs(axis)))
-    if abs(axis[k]) < np.cos(TOLERANCE_RAD):
-        return None
-    return f"{'+' if axis[k] > 0.0 else '-'}{_AXES[k]}"
+    return names[0], ", ".join(f"{axis} is {name}" for axis, name in pairs)

@@ -22,11 +22,11 @@ from jointfit_daemon.limb_model import (
     LabelFault,
     LabelSearch,
     body_parts,
-    join_words,
     joint_parts,
     restore_cluster,
 )
 from jointfit_daemon.model import MarkerFlag
+from jointfit_daemon.name_lists import join_words
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.timing.alignment import RateDivider
 

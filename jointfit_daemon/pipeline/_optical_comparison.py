@@ -105,25 +105,21 @@ class OpticalComparison:
             return []
         done = []
         while self._waiting and self._waiting[0][0] <= state.t_ns:
-            done.append(self._compare(*self._waiting.popleft()))
+            t_ns, number, synced, reading = self._waiting.popleft()
+            pair = self._states_around(t_ns) if synced else None
+            imu: list[Quaternion | None] = (
+                [None] * len(self._chain.segments) if pair is None else _segments_at(t_ns, *pair)
+            )
+            segments = tuple(
+                self._segment(t_ns, name, q, q_imu)
+                for name, q, q_imu in zip(self._chain.segments, reading.segments, imu, strict=True)
+            )
+            joints = tuple(
+                self._joint(t_ns, i, reading, imu, _position_at(t_ns, i, pair))
+                for i in range(len(self._chain.joints))
+            )
+            done.append(OpticalState(number, t_ns, segments, joints))
         return done
-
-    def _compare(
-        self, t_ns: int, number: int, synced: bool, reading: OpticalReading
-    ) -> OpticalState:
-        pair = self._states_around(t_ns) if synced else None
-        imu: list[Quaternion | None] = (
-            [None] * len(self._chain.segments) if pair is None else _segments_at(t_ns, *pair)
-        )
-        segments = tuple(
-            self._segment(t_ns, name, q, q_imu)
-            for name, q, q_imu in zip(self._chain.segments, reading.segments, imu, strict=True)
-        )
-        joints = tuple(
-            self._joint(t_ns, i, reading, imu, _position_at(t_ns, i, pair))
-            for i in range(len(self._chain.joints))
-        )
-        return OpticalState(number, t_ns, segments, joints)
 
     def _states_around(self, t_ns: int) -> tuple[LimbState, LimbState] | None:
         """Return the last state before and the first after an instant, or None over a gap."""

@@ -125,8 +125,12 @@ class _ChangedRun:
             waiting = self._waiting
             if isinstance(event, JobFinished) and waiting is not None and waiting.job == event.job:
                 yield from self._finish_job(waiting, event.t_ns)
-        elif self._changes.calibration is None or not _changes_calibration(event):
-            yield from self._pass_on(event)
+        else:
+            # A given calibration stays: requests of another one, or of a fit, are left out.
+            requested = isinstance(event, Request) and event.command != "mark"
+            other = requested or isinstance(event, CalibrationSelected)
+            if self._changes.calibration is None or not other:
+                yield from self._pass_on(event)
 
     def finish(self) -> Iterator[tuple[Event, list[Output]]]:
         """Deliver the result of a fit that the recorded run did not finish."""
@@ -183,12 +187,6 @@ def compute_fit(job: FitJob) -> FitResult:
 
     text = orjson.dumps(run_job(job.work).to_dict(), option=orjson.OPT_SERIALIZE_NUMPY)
     return FitResult.from_dict(orjson.loads(text))
-
-
-def _changes_calibration(event: Event) -> bool:
-    """Return whether a client requested a calibration or another stored version."""
-    calibrating = isinstance(event, Request) and event.command != "mark"
-    return calibrating or isinstance(event, CalibrationSelected)
 
 
 def check_sources(recorded: Rig, wanted: Rig) -> None:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.recording import RecordingGap
     from jointfit_daemon.pipeline import StampedMeasurement
     from jointfit_daemon.pipeline.events import Event, Output
-    from jointfit_daemon.pipeline.health import ClockHealth, CoreHealth
+    from jointfit_daemon.pipeline.health import CoreHealth
 
 _NS_PER_S = 1e9
 _UNKNOWN_Q = (nan,) * 4
@@ -156,8 +156,15 @@ class SessionCollector:
         for name, device in health.devices.items():
             clock, counts = device.clock, device.wire
             wire = {"lost": counts.lost, "corrupt": counts.corrupt, "restarts": counts.restarts}
+            sigma_ns, jitter_ns = clock.sigma_ns, clock.jitter_ns
+            time = {
+                "state": clock.state,
+                "sd_us": None if sigma_ns is None else sigma_ns / 1e3,
+                "skew_ppm": clock.skew_ppm,
+                "jitter_us": None if jitter_ns is None else jitter_ns / 1e3,
+            }
             found += [
-                TimelineEvent(0.0, "clock", name, data=_clock_data(clock)),
+                TimelineEvent(0.0, "clock", name, data=time),
                 TimelineEvent(
                     0.0, "source", name, data={**device.samples, **wire, "rate_hz": rates[name]}
                 ),
@@ -230,16 +237,6 @@ class SessionCollector:
             ),
             description=description,
         )
-
-
-def _clock_data(clock: ClockHealth) -> dict[str, object]:
-    sigma_ns, jitter_ns = clock.sigma_ns, clock.jitter_ns
-    return {
-        "state": clock.state,
-        "sd_us": None if sigma_ns is None else sigma_ns / 1e3,
-        "skew_ppm": clock.skew_ppm,
-        "jitter_us": None if jitter_ns is None else jitter_ns / 1e3,
-    }
 
 
 def _number(value: float | None) -> float:

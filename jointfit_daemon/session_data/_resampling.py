@@ -28,12 +28,15 @@ _EXACT_SHARE = 1e-6
 
 
 def sample_rate_hz(t_s: Array) -> float:
-    """Return the rate of a series, Hz: one over the median interval; NaN for less than two rows."""
+    """Return the rate, Hz, of instants, s, shape (n,): one over the median interval.
+
+    NaN for less than two instants.
+    """
     return 1.0 / float(np.median(np.diff(t_s))) if len(t_s) > 1 else float("nan")
 
 
 def is_uniform(t_s: Array) -> bool:
-    """Return whether all instants lie on a uniform time axis, without gaps."""
+    """Return whether all instants, s, shape (n,), lie on a uniform time axis, without gaps."""
     if len(t_s) < 2:  # noqa: PLR2004 - an interval has two ends
         return True
     period = (t_s[-1] - t_s[0]) / (len(t_s) - 1)

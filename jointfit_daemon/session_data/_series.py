@@ -62,7 +62,7 @@ class MarkerSeries:
 
     def __post_init__(self) -> None:
         owner = "markers"
-        _check_unique(owner, self.labels)
+        check_unique(owner, self.labels)
         _check_times(owner, self.t_s)
         _check_shape(owner, "positions", self.positions, (len(self.t_s), len(self.labels), 3))
 
@@ -171,7 +171,7 @@ def _check_orientation(owner: str, q: Array, count: int) -> None:
         )
 
 
-def _check_unique(owner: str, names: tuple[str, ...]) -> None:
+def check_unique(owner: str, names: tuple[str, ...]) -> None:
     for name in names:
         if not name.isprintable() or not name.strip():
             raise SessionDataError(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jointfit_daemon.session_data._series import SessionDataError, _check_unique
+from jointfit_daemon.session_data._series import SessionDataError, check_unique
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -48,9 +48,9 @@ class SessionData:
     """Where the data come from: rig, software, calibration, file."""
 
     def __post_init__(self) -> None:
-        _check_unique("sensors", tuple(sensor.id for sensor in self.sensors))
+        check_unique("sensors", tuple(sensor.id for sensor in self.sensors))
         for group in ("segments", "joints", "optical_segments", "optical_joints"):
-            _check_unique(group, tuple(series.name for series in getattr(self, group)))
+            check_unique(group, tuple(series.name for series in getattr(self, group)))
 
         times = [event.t_s for event in self.events]
         if not np.isfinite(times).all() or sorted(times) != times:

@@ -122,9 +122,14 @@ def exit_if_refused(answer: Mapping[str, Any]) -> None:
 def _lines(answer: Mapping[str, Any]) -> list[str]:
     """Return the data of an answer as text: one line for a value, or for an entry of a list."""
     data: Mapping[str, Any] = answer.get("data") or {}
-    if "checks" in data:
-        return [_check_line(check) for check in data["checks"]]
     lines = []
+    if "checks" in data:
+        for check in data["checks"]:
+            subject = f"{check['check']} {check['id']}".strip()
+            remedy = f" → {check['remedy']}" if check["remedy"] else ""
+            lines.append(f"{check['level']:7} {subject}: {check['text']}{remedy}")
+        return lines
+
     for key, value in data.items():
         entries = (
             value if isinstance(value, list) and value and isinstance(value[0], dict) else None
@@ -136,9 +141,3 @@ def _lines(answer: Mapping[str, Any]) -> list[str]:
         else:
             lines += [orjson.dumps(entry).decode() for entry in entries]
     return lines or [str(answer.get("status"))]
-
-
-def _check_line(check: Mapping[str, Any]) -> str:
-    subject = f"{check['check']} {check['id']}".strip()
-    remedy = f" → {check['remedy']}" if check["remedy"] else ""
-    return f"{check['level']:7} {subject}: {check['text']}{remedy}"

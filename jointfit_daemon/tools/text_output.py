@@ -14,10 +14,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
 
-_SHOWN = 8
-"""Most names in a list."""
-
-
 def echo_json(data: Any) -> None:
     """Print one JSON object in a line; NaN and infinity become null."""
     typer.echo(orjson.dumps(data, option=orjson.OPT_SERIALIZE_NUMPY))
@@ -50,12 +46,6 @@ def align_columns(rows: Sequence[Sequence[str]], right: Collection[int] = ()) ->
         return "  ".join(cells).rstrip()
 
     return "\n".join(map(line, rows))
-
-
-def list_names(names: Sequence[str]) -> str:
-    """Return names as ``a, b and 3 more``."""
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
 
 
 def join_choices(names: Sequence[str]) -> str:

@@ -199,5 +199,8 @@ def _poses(track: ClusterTrack) -> BodyPoses:
 
 
 def carried_center_gap(parent: ClusterTrack, child: ClusterTrack, center: Array) -> float:
-    """Return the RMS distance between the centers fixed in the two body parts, m."""
+    """Return the RMS distance, m, between a center fixed in each of two body parts.
+
+    `center` is the joint center in the static world, m, shape (3,).
+    """
     return rms(np.linalg.norm(parent.carry(center) - child.carry(center), axis=-1), np.inf)

@@ -60,25 +60,23 @@ def apply_standing_prior(
     for i in known:
         P[at[i] : at[i] + 3, at[i] : at[i] + 3] = covariances[i]
 
-    for i, j in pairwise(range(len(centers))):
-        if i in at and j in at:
-            x, P = _plumb(x, P, at[i], at[j], sd)
+    for upper, lower in pairwise(range(len(centers))):
+        if upper not in at or lower not in at:
+            continue
+        i, j = at[upper], at[lower]
+        length = float(np.linalg.norm(x[i : i + 3] - x[j : j + 3]))
+        H = np.zeros((2, len(x)))
+        H[:, i : i + 2] = np.eye(2)
+        H[:, j : j + 2] = -np.eye(2)
+
+        # Kalman update with the measurement 0 = H x.
+        S = H @ P @ H.T + (length * sd) ** 2 * np.eye(2)
+        K = np.linalg.solve(S, H @ P).T
+        Q = P - K @ H @ P
+        x, P = x - K @ (H @ x), (Q + Q.T) / 2
 
     out: list[tuple[Array, Array] | None] = [None] * len(centers)
     for i in known:
         part = slice(at[i], at[i] + 3)
         out[i] = (x[part], P[part, part])
     return out
-
-
-def _plumb(x: Array, P: Array, i: int, j: int, sd: float) -> tuple[Array, Array]:
-    length = float(np.linalg.norm(x[i : i + 3] - x[j : j + 3]))
-    H = np.zeros((2, len(x)))
-    H[:, i : i + 2] = np.eye(2)
-    H[:, j : j + 2] = -np.eye(2)
-
-    # Kalman update with the measurement 0 = H x.
-    S = H @ P @ H.T + (length * sd) ** 2 * np.eye(2)
-    K = np.linalg.solve(S, H @ P).T
-    Q = P - K @ H @ P
-    return x - K @ (H @ x), (Q + Q.T) / 2

@@ -89,8 +89,20 @@ class GyroscopeStep:
         SensorCalibrationError
             The sensor did not rest, or the rate at rest is no bias.
         """
+        last = self._blocks.last
+        if last is None:
+            raise SensorCalibrationError(
+                "no readings arrived during the rest: check the sensor with `jointfit probe`"
+            )
         if not self.is_complete:
-            raise SensorCalibrationError(self._motion_text())
+            rest_s = (REST_BLOCKS + 1) * BLOCK_NS * 1e-9
+            raise SensorCalibrationError(
+                f"the sensor moved during the rest: expected {rest_s:.0f} s at rest, found "
+                f"{len(self._blocks.rest) * BLOCK_NS * 1e-9:.1f} s at the end, where the angular "
+                f"rate varied by {degrees(last.rate_sd):.2f} deg/s (limit {degrees(RATE_SD):g}). "
+                "Lay the sensor on a table without vibration, let go, and repeat"
+            )
+
         means = np.array([block.rate for block in self._blocks.rest[1:]])
         bias = means.mean(axis=0)
         if np.abs(bias).max() > LARGEST_BIAS:
@@ -103,15 +115,3 @@ class GyroscopeStep:
         count = len(means)
         covariance = np.cov(means.T) / count
         return GyroscopeEstimate(bias, covariance, count - 1, count * BLOCK_NS * 1e-9)
-
-    def _motion_text(self) -> str:
-        last = self._blocks.last
-        if last is None:
-            return "no readings arrived during the rest: check the sensor with `jointfit probe`"
-        rest_s = (REST_BLOCKS + 1) * BLOCK_NS * 1e-9
-        return (
-            f"the sensor moved during the rest: expected {rest_s:.0f} s at rest, found "
-            f"{len(self._blocks.rest) * BLOCK_NS * 1e-9:.1f} s at the end, where the angular rate "
-            f"varied by {degrees(last.rate_sd):.2f} deg/s (limit {degrees(RATE_SD):g}). Lay the "
-            "sensor on a table without vibration, let go, and repeat"
-        )

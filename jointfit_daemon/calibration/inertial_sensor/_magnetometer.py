@@ -32,6 +32,7 @@ from jointfit_daemon.calibration.inertial_sensor._ellipsoid_fit import (
 )
 from jointfit_daemon.calibration.inertial_sensor._refusal import SensorCalibrationError
 from jointfit_daemon.calibration.inertial_sensor._step_progress import StepProgress
+from jointfit_daemon.name_lists import list_names
 
 if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
@@ -195,18 +196,13 @@ def _directions_without(fields: Array) -> set[int]:
 def _check_coverage(missing: set[int]) -> None:
     covered = len(DIRECTIONS) - len(missing)
     if covered < FEWEST_DIRECTIONS or len([face for face in missing if face < FACES]) > 1:
+        shown = list_names(direction_names(missing), _MOST_NAMES)
         raise SensorCalibrationError(
             f"the field was measured in {covered} of {len(DIRECTIONS)} directions, expected at "
             f"least {FEWEST_DIRECTIONS} and five of the six axes; missing in sensor axes: "
-            f"{_first_names(missing)}. Turn each of these sides towards the field "
+            f"{shown}. Turn each of these sides towards the field "
             "(north and down, in the southern hemisphere north and up)"
         )
-
-
-def _first_names(missing: set[int]) -> str:
-    names = direction_names(missing)
-    more = len(names) - _MOST_NAMES
-    return ", ".join(names[:_MOST_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _check_saturation(fields: Array) -> None:

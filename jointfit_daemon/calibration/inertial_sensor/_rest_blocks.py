@@ -86,7 +86,15 @@ class RestBlocks:
         if reading.t_ns - readings[0].t_ns < BLOCK_NS or len(readings) < _FEWEST:
             return False
 
-        block = _block(readings)
+        rates = np.array([each.rate for each in readings])
+        forces = np.array([each.force for each in readings])
+        block = RestBlock(
+            rates.mean(axis=0),
+            forces.mean(axis=0),
+            float(rates.std(axis=0).max()),
+            float(forces.std(axis=0).max()),
+            np.ptp(forces, axis=0) == 0.0,
+        )
         readings.clear()
         self.last = block
         if not block.is_calm or (self.rest and not block.agrees(self.rest[0])):
@@ -94,15 +102,3 @@ class RestBlocks:
         if block.is_calm:
             self.rest.append(block)
         return True
-
-
-def _block(readings: list[SensorReading]) -> RestBlock:
-    rates = np.array([reading.rate for reading in readings])
-    forces = np.array([reading.force for reading in readings])
-    return RestBlock(
-        rates.mean(axis=0),
-        forces.mean(axis=0),
-        float(rates.std(axis=0).max()),
-        float(forces.std(axis=0).max()),
-        np.ptp(forces, axis=0) == 0.0,
-    )

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.calibration.anatomy import ClusterTrack
-    from jointfit_daemon.calibration.marker_refinement import Refinement
     from jointfit_daemon.limb_model import MarkerCluster
 
 FARTHEST_M = 0.03
@@ -90,29 +89,8 @@ def refine_clusters(
         found = refine_markers(model, [learned], validation=[unseen])
     except RefinementError as refusal:
         return RefinedClusters(clusters, None, (f"markers not refined: {refusal}",))
-    return _judged(clusters, marked, model, found)
 
-
-def _model(marked: Mapping[str, MarkerCluster]) -> ChainModel:
-    """Return the unconnected parts, in axes of the static world about their origins."""
-    return ChainModel(
-        tuple(Segment(name) for name in marked),
-        tuple(
-            Marker(marker, name, (x, y, z))
-            for name, cluster in marked.items()
-            for marker, (x, y, z) in zip(cluster.markers, cluster.template.tolist(), strict=True)
-        ),
-        "body parts",
-    )
-
-
-def _judged(
-    clusters: Mapping[str, MarkerCluster],
-    marked: Mapping[str, MarkerCluster],
-    model: ChainModel,
-    found: Refinement,
-) -> RefinedClusters:
-    """Select the parts with a smaller held-out error and plausible marker displacements."""
+    # Use the parts with a smaller held-out error and plausible marker displacements.
     judge = next(trial for trial in found.trials if not trial.trained)
     used, parts = dict(clusters), {}
     moved: dict[str, float] = {}
@@ -136,6 +114,19 @@ def _judged(
                 f"{1000 * lengths[far]:.0f} mm; check the labels of {', '.join(cluster.markers)}"
             )
     return RefinedClusters(used, MarkerQuality(parts, moved), tuple(notes))
+
+
+def _model(marked: Mapping[str, MarkerCluster]) -> ChainModel:
+    """Return the unconnected parts, in axes of the static world about their origins."""
+    return ChainModel(
+        tuple(Segment(name) for name in marked),
+        tuple(
+            Marker(marker, name, (x, y, z))
+            for name, cluster in marked.items()
+            for marker, (x, y, z) in zip(cluster.markers, cluster.template.tolist(), strict=True)
+        ),
+        "body parts",
+    )
 
 
 def fit_shape_to_pose(cluster: MarkerCluster, shape: Array) -> MarkerCluster:

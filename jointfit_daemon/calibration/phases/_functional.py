@@ -349,8 +349,21 @@ def _training(
 ) -> tuple[LimbTraining, list[str]]:
     """Return the training frames, and notes about missing data and rotated worlds."""
     training, raw, missing = limb_training(chain, functional, tracks, anatomy, sensors)
-    headings = _heading_notes(chain, raw, training) if alignment is None else []
-    return training, [*missing, *headings]
+    notes = [*missing]
+    if alignment is not None:
+        return training, notes
+
+    # Sensors whose world seems rotated; the angle includes soft-tissue artefact.
+    for segment, group in zip(chain.segments, chain.sensors, strict=True):
+        for s in group:
+            found = fit_sensor_alignment("heading", raw[s], training.reference[segment])
+            turn = float(rotation.heading_of(found.q_world))
+            if abs(turn) > MISALIGNED:
+                notes.append(
+                    f"{s}: its world seems rotated by about {np.rad2deg(turn):.0f} deg relative to "
+                    "the optical world; run the align phase"
+                )
+    return training, notes
 
 
 def _models(
@@ -362,21 +375,6 @@ def _models(
     if settings.procedure == "patent":
         return fit_verified_models(chain, training, method, share), holdout
     return fit_models(chain, training, method), holdout
-
-
-def _heading_notes(chain: Chain, raw: Mapping[str, Array], training: LimbTraining) -> list[str]:
-    """Return sensors whose world seems rotated; the angle includes soft-tissue artefact."""
-    notes = []
-    for segment, group in zip(chain.segments, chain.sensors, strict=True):
-        for s in group:
-            found = fit_sensor_alignment("heading", raw[s], training.reference[segment])
-            turn = float(rotation.heading_of(found.q_world))
-            if abs(turn) > MISALIGNED:
-                notes.append(
-                    f"{s}: its world seems rotated by about {np.rad2deg(turn):.0f} deg relative to "
-                    "the optical world; run the align phase"
-                )
-    return notes
 
 
 def _segments(

@@ -162,7 +162,7 @@ def fit_plate_alignment(
 def plate_track(
     optical: OpticalTrack, settings: CalibrationSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return time stamps and q_optical_plate, with NaN if not visible.
+    """Return time stamps, ns, shape (n,), and q_optical_plate, shape (n, 4), NaN if not visible.
 
     Raises
     ------

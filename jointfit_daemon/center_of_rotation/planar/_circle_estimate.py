@@ -210,7 +210,10 @@ def _reason_without_circle(m: CircleMoments[float], frames: int) -> str | None:
 
 
 def arc_about(points: Array, center: Array) -> float:
-    """Return the angle between the outermost of the points about a center, rad, at most 2π."""
+    """Return the angle between the outermost of the points about a center, rad, at most 2π.
+
+    Points have shape (n, 2), m, with NaN where hidden, and the center has shape (2,), m.
+    """
     seen = points[np.isfinite(points).all(axis=-1)] - center
     if len(seen) < 2 or not np.isfinite(center).all():
         return 0.0

@@ -102,7 +102,16 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
     for _ in range(_REWEIGHED if k > 1 else 0):
         if found is None:
             return None
-        again = _shrunk(found[2] / np.maximum(relative * found[1], _NOTHING_M2) * relative, paths.n)
+
+        # The relative noise variance of each marker; differences within chance are removed.
+        ratio = found[2] / np.maximum(relative * found[1], _NOTHING_M2) * relative
+        ratio = ratio / np.median(ratio) if np.median(ratio) > 0 else np.ones_like(ratio)
+        ratio = np.clip(ratio, 0.0, 1e6)
+        chance = 4.0 * 2.0 / np.maximum(paths.n, 1.0)
+        excess = (ratio - 1.0) ** 2
+        trust = np.maximum(0.0, 1.0 - chance / np.maximum(excess, 1e-300))
+        again = np.maximum(1.0 + trust * (ratio - 1.0), 0.05)
+
         done = bool(np.allclose(again, relative, rtol=0.02))
         relative = again
         if done:
@@ -121,16 +130,6 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
     floor = np.einsum("j,jab->ab", w * left, paths.S)
     information = np.einsum("j,jab->ab", w, paths.C) - floor
     return ConcentricSpheres(m, noise2, relative, R2, information, floor)
-
-
-def _shrunk(ratio: Array, n: Array) -> Array:
-    """Return the relative noise variance of each marker; differences within chance are removed."""
-    ratio = ratio / np.median(ratio) if np.median(ratio) > 0 else np.ones_like(ratio)
-    ratio = np.clip(ratio, 0.0, 1e6)
-    chance = 4.0 * 2.0 / np.maximum(n, 1.0)
-    excess = (ratio - 1.0) ** 2
-    trust = np.maximum(0.0, 1.0 - chance / np.maximum(excess, 1e-300))
-    return np.asarray(np.maximum(1.0 + trust * (ratio - 1.0), 0.05))
 
 
 def _smallest_root(paths: MarkerPaths, relative: Array) -> tuple[Array, float, Array, Array] | None:

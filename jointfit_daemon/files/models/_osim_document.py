@@ -221,7 +221,7 @@ def body_of(socket: str) -> str:
 
 
 def fixed_xyz(angles: Array) -> Array:
-    """Return the matrix of rotations about x, then the new y, then the new z; rad."""
+    """Return the matrix (3, 3) of rotations, rad, shape (3,): about x, the new y and the new z."""
     turns = []
     for axis, angle in enumerate(angles):
         j, k = (axis + 1) % 3, (axis + 2) % 3

@@ -17,6 +17,7 @@ from jointfit_daemon.files.orientations._sto import (
     write_orientations_sto,
     write_sto,
 )
+from jointfit_daemon.name_lists import list_names
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_SHOWN = 8
-"""Most names in a note."""
 LEAST_KNOWN = 0.5
 """Least share of frames in which a written column is known; of the frames with any known value."""
 
@@ -99,10 +98,9 @@ def _outcome(
     notes = []
     if not columns.all():
         left_out = [name for name, kept in zip(names, columns, strict=True) if not kept]
-        more = f" and {len(left_out) - _SHOWN} more" if len(left_out) > _SHOWN else ""
         notes.append(
             f"{path.name}: columns known in less than half of the frames left out:"
-            f" {', '.join(left_out[:_SHOWN])}{more}"
+            f" {list_names(left_out)}"
         )
     if frames < count:
         notes.append(

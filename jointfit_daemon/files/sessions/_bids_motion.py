@@ -112,7 +112,13 @@ def write_bids_session(session: SessionData, folder: Path) -> WrittenSession:
         "JointfitDescription": dict(session.description),
     }
     _write_json(root / "dataset_description.json", description)
-    (root / "README.md").write_text(_readme(session), encoding="utf-8")
+    facts = "".join(f"- {key}: {value}\n" for key, value in session.description.items())
+    text = (
+        f"# {session.name}\n\nWritten by jointfitd {jointfit_daemon.__version__}. One tracking"
+        " system for each set of series with common times. The channel latency is the time since"
+        f" the start of the session.\n\n{facts}"
+    )
+    (root / "README.md").write_text(text, encoding="utf-8")
     (root / "participants.tsv").write_text(f"participant_id\n{_SUBJECT}\n", encoding="utf-8")
 
     acquired = _MISSING
@@ -155,15 +161,6 @@ def _free_label(stream: ChannelStream, taken: set[str]) -> str:
         label = f"{base}x{count}"
     taken.add(label.lower())
     return label
-
-
-def _readme(session: SessionData) -> str:
-    facts = "".join(f"- {key}: {value}\n" for key, value in session.description.items())
-    return (
-        f"# {session.name}\n\nWritten by jointfitd {jointfit_daemon.__version__}. One tracking"
-        " system for each set of series with common times. The channel latency is the time since"
-        f" the start of the session.\n\n{facts}"
-    )
 
 
 def _write_motion(path: Path, stream: ChannelStream) -> None:

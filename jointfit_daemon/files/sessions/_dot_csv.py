@@ -23,11 +23,10 @@ from jointfit_daemon.files.sessions._xsens_columns import (
 from jointfit_daemon.files.text import (
     MalformedFileError,
     cells_of,
+    read_columns,
     read_lines,
     require_times,
-    rows_of_numbers,
     separator_of,
-    strip_trailing_empty,
 )
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.session_data import SensorSeries, SessionData
@@ -113,11 +112,12 @@ def _read_sensor(path: Path) -> _DotFile:
             f"{path}: no column {_TIME} in the first {_HEADER_LINES} lines: export the recording of"
             " the DOT sensor again, with its sample time"
         )
-    separator = separator_of(lines[at])
-    header = _header(lines[:at])
-    names = strip_trailing_empty(cells_of(lines[at], separator))
-    rows = rows_of_numbers(path, enumerate(lines[at + 1 :], at + 2), separator, len(names))
-    columns = {name: rows[:, k] for k, name in enumerate(names)}
+    header = {}  # values before the column names, by name in small letters
+    for line in lines[:at]:
+        name, mark, value = line.partition(":")
+        if mark:
+            header[name.strip().lower()] = value.strip(" ,;\t")
+    names, columns = read_columns(path, lines, at)
 
     ticks = columns[_TIME]
     if not np.isfinite(ticks).all():
@@ -139,16 +139,6 @@ def _read_sensor(path: Path) -> _DotFile:
     sensor = SensorSeries(tag, "", t_s, orientation, rate, force, magnetic)
     first = float(ticks[0]) if len(ticks) else 0.0
     return _DotFile(first, header.get("syncstatus", "").lower() == "synced", sensor)
-
-
-def _header(lines: Sequence[str]) -> dict[str, str]:
-    """Return the values before the column names, by name in small letters."""
-    found = {}
-    for line in lines:
-        name, mark, value = line.partition(":")
-        if mark:
-            found[name.strip().lower()] = value.strip(" ,;\t")
-    return found
 
 
 def _period_s(header: Mapping[str, str], t_s: Array) -> float:

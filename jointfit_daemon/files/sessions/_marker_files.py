@@ -26,7 +26,6 @@ from jointfit_daemon.files.sessions._written_session import NothingToWriteError,
 from jointfit_daemon.session_data import MarkerSeries, SessionData, TimelineEvent
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
 _LATEST_FRAME = 0xFFFF
@@ -90,7 +89,13 @@ def write_c3d_session(session: SessionData, folder: Path) -> WrittenSession:
 def read_c3d_session(path: Path) -> SessionData:
     """Return markers and events of a C3D file."""
     markers, trial = _read_markers(path), read_c3d(path)
-    start, (first_s, rate_hz) = _own_times(trial.own_texts)
+    texts = trial.own_texts
+    try:
+        start = int(texts[_START]) if texts.get(_START) else None
+        first_s, rate_hz = float(texts.get(_FIRST, "nan")), float(texts.get(_RATE, "nan"))
+    except ValueError:
+        start, first_s, rate_hz = None, math.nan, math.nan
+
     offset_s = 0.0
     if math.isfinite(first_s) and rate_hz > 0.0:
         offset_s = first_s - (int(trial.trajectories.frames[0]) - 1) / rate_hz
@@ -104,15 +109,6 @@ def read_c3d_session(path: Path) -> SessionData:
     return SessionData(
         path.stem, start, markers=markers, events=tuple(sorted(events, key=lambda e: e.t_s))
     )
-
-
-def _own_times(texts: Mapping[str, str]) -> tuple[int | None, tuple[float, float]]:
-    """Return UNIX start, first instant (s) and rate (Hz) of our own parameters, else None, NaN."""
-    try:
-        start = int(texts[_START]) if texts.get(_START) else None
-        return start, (float(texts.get(_FIRST, "nan")), float(texts.get(_RATE, "nan")))
-    except ValueError:
-        return None, (math.nan, math.nan)
 
 
 def _markers_of(session: SessionData, kind: str) -> MarkerSeries:

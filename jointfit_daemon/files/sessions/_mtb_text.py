@@ -20,12 +20,9 @@ from jointfit_daemon.files.sessions._xsens_columns import (
 )
 from jointfit_daemon.files.text import (
     MalformedFileError,
-    cells_of,
+    read_columns,
     read_lines,
     require_times,
-    rows_of_numbers,
-    separator_of,
-    strip_trailing_empty,
 )
 from jointfit_daemon.session_data import SensorSeries, SessionData
 
@@ -80,11 +77,7 @@ def _read_sensor(path: Path) -> tuple[float, SensorSeries]:
             f"{path}: no column {_COUNTER} or {_SAMPLE_TIME} after the lines of comments: export"
             " the recording again, with one of them"
         )
-    separator = separator_of(lines[at])
-    names = strip_trailing_empty(cells_of(lines[at], separator))
-    body = enumerate(lines[at + 1 :], start=at + 2)
-    rows = rows_of_numbers(path, body, separator, len(names))
-    columns = {name: rows[:, k] for k, name in enumerate(names)}
+    names, columns = read_columns(path, lines, at)
 
     rate = _RATE.search("\n".join(lines[:at]))
     start_s, t_s = _times(path, columns, None if rate is None else float(rate[1]))

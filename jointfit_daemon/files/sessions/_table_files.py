@@ -96,15 +96,12 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Table:
         if name in TEXT_COLUMNS:
             table[name] = np.array(texts, dtype=object)
         else:
-            table[name] = _numbers(path, texts)
+            try:
+                table[name] = np.array([text or "nan" for text in texts], dtype=np.float64)
+            except ValueError:  # find the cell
+                numbers = [number(path, k, text) for k, text in enumerate(texts, start=2)]
+                table[name] = np.array(numbers)
     return table
-
-
-def _numbers(path: Path, texts: Sequence[str]) -> NDArray[np.float64]:
-    try:
-        return np.array([text or "nan" for text in texts], dtype=np.float64)
-    except ValueError:  # find the cell
-        return np.array([number(path, k, text) for k, text in enumerate(texts, start=2)])
 
 
 def write_parquet_session(session: SessionData, folder: Path) -> WrittenSession:

@@ -180,11 +180,8 @@ def _add(stream: XdfStream, tag: int, content: memoryview) -> None:
             stream.t_s.append(rows["t_s"].astype(np.float64))
             stream.values.append(rows["values"].astype(np.float64).reshape(count, -1))
             return
-    _add_mixed(stream, body, count, item)
 
-
-def _add_mixed(stream: XdfStream, body: memoryview, count: int, item: np.dtype) -> None:
-    """Add samples of which some have no time stamp."""
+    # Some of the samples have no time stamp.
     at, times, values = 0, [], []
     for _ in range(count):
         t_s, at = _stamp(body, at)

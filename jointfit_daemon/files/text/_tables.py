@@ -145,6 +145,22 @@ def require_times(path: Path, t_s: NDArray[np.float64]) -> None:
         )
 
 
+def read_columns(
+    path: Path, lines: Sequence[str], at: int
+) -> tuple[list[str], dict[str, NDArray[np.float64]]]:
+    """Return the names in the line with index `at`, and the columns below it by name, shape (n,).
+
+    Raises
+    ------
+    MalformedFileError
+        As `rows_of_numbers`.
+    """
+    separator = separator_of(lines[at])
+    names = strip_trailing_empty(cells_of(lines[at], separator))
+    rows = rows_of_numbers(path, enumerate(lines[at + 1 :], at + 2), separator, len(names))
+    return names, {name: rows[:, k] for k, name in enumerate(names)}
+
+
 def rows_of_numbers(
     path: Path, lines: Iterable[tuple[int, str]], separator: str | None, width: int
 ) -> NDArray[np.float64]:

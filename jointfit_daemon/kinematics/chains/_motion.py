@@ -197,7 +197,10 @@ def place_coupled(
 
 
 def exp_matrix(r: Array) -> Array:
-    """Return rotation matrices of rotation vectors, rad: I + sin(x)/x K + (1 - cos x)/x^2 K^2."""
+    """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad.
+
+    I + sin(x)/x K + (1 - cos x)/x^2 K^2 (Rodrigues), with x the angle and K the vector as matrix.
+    """
     K = skew(r)
     angle = np.sqrt(np.einsum("...i,...i->...", r, r) + _TINY)[..., None, None]
     half = np.sin(0.5 * angle) / angle

@@ -159,22 +159,6 @@ def _stepped(
     joint: JointCoordinates, values: Array, A: Array, origin: Array
 ) -> tuple[Array, Array, bool]:
     """Return values after a step, the derivative, and whether the pose is reached."""
-    missing, G, off = _linearize(joint, values, A, origin)
-    step = spread(G) @ missing
-    turned = float(np.abs(step * joint.is_angle).max(initial=0.0))
-    scale = min(1.0, _FARTHEST_STEP / max(turned, _SMALLEST_STEP))
-    values = values + np.where(joint.is_angle, scale * step, step)
-
-    # Fewer coordinates than degrees of freedom describe a noisy pose by least squares.
-    in_part = len(values) < len(missing) and off < _FARTHEST_MISFIT
-    settled = in_part and float(np.abs(step).max(initial=0.0)) < _SETTLED
-    return values, G, off < _CLOSE or settled
-
-
-def _linearize(
-    joint: JointCoordinates, values: Array, A: Array, origin: Array
-) -> tuple[Array, Array, float]:
-    """Return the step from the pose at `values` to (A, origin), its derivative, and its size."""
     if joint.pose is None:
         raise ValueError(f"{joint.segment}: its coordinate is part of the state")
     count, rows = len(values), 3 + len(origin)
@@ -192,4 +176,14 @@ def _linearize(
 
     # the sine is also small near half a turn, where the trace is below 1
     far = float(between[0].trace()) < 1.0
-    return missing, G, np.inf if far else float(np.abs(missing).max())
+    off = np.inf if far else float(np.abs(missing).max())
+
+    step = spread(G) @ missing
+    turned = float(np.abs(step * joint.is_angle).max(initial=0.0))
+    scale = min(1.0, _FARTHEST_STEP / max(turned, _SMALLEST_STEP))
+    values = values + np.where(joint.is_angle, scale * step, step)
+
+    # Fewer coordinates than degrees of freedom describe a noisy pose by least squares.
+    in_part = len(values) < len(missing) and off < _FARTHEST_MISFIT
+    settled = in_part and float(np.abs(step).max(initial=0.0)) < _SETTLED
+    return values, G, off < _CLOSE or settled

@@ -102,7 +102,7 @@ def limits_of(model: ChainModel, weight: float) -> tuple[Band, ...]:
 
 
 def log_matrix(R: Array) -> Array:
-    """Return rotation vectors of matrices, rad; fast, without a defined direction near pi."""
+    """Return rotation vectors (..., 3), rad, of matrices (..., 3, 3); undefined direction at pi."""
     v = 0.5 * np.stack(
         (R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]),
         axis=-1,

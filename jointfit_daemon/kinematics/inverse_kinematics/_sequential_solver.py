@@ -164,7 +164,12 @@ class LiveInverseKinematics:
         self._evaluations = 0
         place, restarted = self._solve(measured, weights)
         self._lead = self._still if place.is_open or restarted else place.moved
-        self._state = place.state if self._fed % _STRAIGHTEN else _straightened(place.state)
+        self._state = place.state
+        if self._fed % _STRAIGHTEN == 0:
+            # Orthonormal rotations: one Newton step to A^T A = 1.
+            A = place.state.rotations
+            turned = 1.5 * A - 0.5 * (A @ (A.swapaxes(-1, -2) @ A))
+            self._state = replace(place.state, rotations=turned)
         return self._pose(place, seen, restarted=restarted)
 
     def _solve(self, measured: Array, weights: Array) -> tuple[_Place, bool]:

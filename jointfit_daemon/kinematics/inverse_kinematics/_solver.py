@@ -259,7 +259,7 @@ def checked_weights(model: ChainModel, weights: ArrayLike | None, seen: NDArray[
 
 
 def tracking_error(residuals: Array) -> float:
-    """Return the RMS distance of all present markers, m; NaN if there are none."""
+    """Return the RMS length, m, of residuals (..., 3) of present markers; NaN if there are none."""
     square = np.einsum("...i,...i->...", residuals, residuals)
     seen = np.isfinite(square)
     return float(np.sqrt(square[seen].mean())) if seen.any() else float("nan")

@@ -1,6 +1,6 @@
 """The two statistics that no health counter contains: latency of frames, date of the calibration.
 
-Invariant: a frame costs one search in a table of twelve limits, and no allocation.
+A frame costs one search in a table of twelve limits, and no allocation.
 """
 
 from __future__ import annotations

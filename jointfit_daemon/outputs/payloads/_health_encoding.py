@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.recording import RecordingHealth
     from jointfit_daemon.outputs.spool import SpoolHealth
     from jointfit_daemon.pipeline.health import (
-        ClockHealth,
         CoreHealth,
         DeviceHealth,
         LagHealth,
@@ -99,24 +98,13 @@ def _stage(stage: StageLatency | None) -> dict[str, float | None] | None:
 def _device(device: DeviceHealth) -> dict[str, Any]:
     wire, silent_ns = asdict(device.wire), device.silent_ns
     opened = wire.pop("opened")
+    clock, delays = device.clock, device.clock.delays
     payload = {
         "online": device.online,
         **wire,
         "reconnects": max(0, opened - 1),
         "last_age_ms": None if silent_ns is None else round(silent_ns / _NS_PER_MS, 1),
         **device.samples,
-        **_clock(device.clock),
-    }
-    if device.orientation_filter is not None:
-        payload["orientation_filter"] = device.orientation_filter
-    if device.sensor is not None:
-        payload["sensor"] = device.sensor
-    return payload
-
-
-def _clock(clock: ClockHealth) -> dict[str, Any]:
-    delays = clock.delays
-    return {
         "clock": clock.state,
         "epoch": clock.epoch,
         "offset_us": _us(clock.offset_ns),
@@ -130,6 +118,11 @@ def _clock(clock: ClockHealth) -> dict[str, Any]:
         else {"p50": _us(delays.p50_ns), "p99": _us(delays.p99_ns), "max": _us(delays.max_ns)},
         "rate_hz": None if clock.rate_hz is None else round(clock.rate_hz, 2),
     }
+    if device.orientation_filter is not None:
+        payload["orientation_filter"] = device.orientation_filter
+    if device.sensor is not None:
+        payload["sensor"] = device.sensor
+    return payload
 
 
 def lag_payload(lag: LagHealth) -> dict[str, Any]:

@@ -247,12 +247,18 @@ class TopicWriter:
         """Publish on the topic that the client requested, or on ``bridge/response/COMMAND``."""
         address = reply.reply_to
         topic = address.topic or topics.RESPONSE.name(self._base, reply.command)
+
+        # An error contains the list of its faults; a fault of the core is the only one.
+        error = None
+        if reply.error is not None:
+            fault = {key: reply.error.get(key) for key in ("key", "message")}
+            error = {"faults": [fault], "more": 0} | dict(reply.error)
         payload = {
             "v": PAYLOAD_VERSION,
             "transaction": reply.transaction,
             "status": reply.status,
             "data": reply.data,
-            "error": _error(reply),
+            "error": error,
         }
         self._outbox.respond(topic, encode(payload), correlation=address.correlation)
 
@@ -269,14 +275,6 @@ class TopicWriter:
     def _stamped(self, data: Mapping[str, object], t_ns: int | None) -> bytes:
         stamp = {} if t_ns is None else {"t_us": (t_ns + self._clock.offset_ns()) // 1000}
         return encode({"v": PAYLOAD_VERSION} | stamp | dict(data))
-
-
-def _error(reply: Reply) -> dict[str, Any] | None:
-    """Return the error of a reply with its list of faults; a fault of the core is the only one."""
-    if reply.error is None:
-        return None
-    fault = {key: reply.error.get(key) for key in ("key", "message")}
-    return {"faults": [fault], "more": 0} | dict(reply.error)
 
 
 def _sides(chain: Chain) -> dict[str, Any]:

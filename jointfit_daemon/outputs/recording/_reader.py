@@ -303,7 +303,9 @@ class _Sequencer:
             if item.sequence > self._expected:
                 reason = self.damage
                 if item.channel == GAP:
-                    reason = _reason_of(item.data)
+                    reason = ""  # of a gap in a file that was made by hand
+                    with suppress(ValueError, KeyError, TypeError):
+                        reason = str(orjson.loads(item.data)["reason"])
                 yield self._gap(item.sequence, item.t_ns, reason)
             if item.channel != GAP and self._restoring:
                 yield item
@@ -319,13 +321,6 @@ class _Sequencer:
         self._expected, self._restoring, self.damage = following, True, ""
         reason = reason or "a file of the session is missing"
         return RecordingGap(first, count, self._t_ns, t_ns, reason)
-
-
-def _reason_of(gap: bytes) -> str:
-    """Return the reason of a recorded gap; empty if the file was made by hand."""
-    with suppress(ValueError, KeyError, TypeError):
-        return str(orjson.loads(gap)["reason"])
-    return ""
 
 
 def open_recording(path: Path) -> Recording:

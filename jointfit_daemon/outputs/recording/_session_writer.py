@@ -177,7 +177,12 @@ class SessionWriter:
             self._lose_messages(batch.first_sequence, batch.next_sequence)
             return
 
-        self._add_gap(part, batch)
+        # The messages that were lost before `batch`, and the state after them.
+        if self._gap is not None:
+            gap, self._gap = self._gap, None
+            part.add(GAP, gap.to_t_ns, gap.to_t_ns, batch.first_sequence, orjson.dumps(gap))
+            self._add_snapshot(part, batch.before, batch.first_sequence)
+
         paused_until_s = time.monotonic() + _LONGEST_PAUSED_S
         for index, message in enumerate(batch.messages):
             self._add(part, batch.first_sequence + index, message)
@@ -367,13 +372,3 @@ class SessionWriter:
             reason = self.fault or "the disk is too slow"
             begin_ns = self._now_ns or now_ns
             self._lose(RecordingGap(first, following - first, begin_ns, now_ns, reason))
-
-    def _add_gap(self, part: PartFile, batch: Batch) -> None:
-        """Record the messages that were lost before `batch`, and the state after them."""
-        if self._gap is None:
-            return
-        gap, self._gap = self._gap, None
-        content = orjson.dumps(gap)
-        t_ns = gap.to_t_ns
-        part.add(GAP, t_ns, t_ns, batch.first_sequence, content)
-        self._add_snapshot(part, batch.before, batch.first_sequence)

@@ -124,9 +124,7 @@ class SpoolFiles:
         self._sizes[number] = before + sum(map(len, lines))
         if self._sizes[number] >= self._keep_bytes // FILES:
             self._open = None
-        self._drop_oldest()
 
-    def _drop_oldest(self) -> None:
         while self.size_bytes > self._keep_bytes and len(self._counts) > 1:
             oldest = next(iter(self._counts))
             self.dropped += self._counts[oldest]

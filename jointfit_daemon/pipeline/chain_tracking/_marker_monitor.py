@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from jointfit_daemon.kinematics.exchanged_labels import find_exchanged_labels
-from jointfit_daemon.limb_model import join_words
 from jointfit_daemon.model import MarkerFlag
+from jointfit_daemon.name_lists import join_words
 from jointfit_daemon.pipeline.chain_tracking._segment_labels import SegmentLabels
 
 if TYPE_CHECKING:
@@ -215,7 +215,8 @@ class MarkerMonitor:
         if self.misfit:
             ended = self._lasting(t_ns, "fits", [MarkerFlag.MISFIT] if fits else [], RECOVERY_NS)
             self.misfit = not ended
-            return [self._fits_again()] if ended else []
+            text = f"chain model {self.model.name!r} fits"
+            return [MarkerReport(self.model.name, "ok", text, {})] if ended else []
 
         new = {
             flag: suspects[flag]
@@ -224,7 +225,12 @@ class MarkerMonitor:
         }
         if new and not fits:
             self.misfit = True
-            return [self._misfit(distances)]
+            rms = float(np.sqrt(np.nanmean(distances**2)))
+            text = (
+                f"chain model {self.model.name!r} does not fit: markers are {1000 * rms:.0f} mm "
+                "RMS from their places: check the subject, the scale of the model, and the labels"
+            )
+            return [MarkerReport(self.model.name, MarkerFlag.MISFIT, text, {"rms_m": rms})]
 
         reports = []
         for flag, markers in new.items():
@@ -252,17 +258,6 @@ class MarkerMonitor:
             "place and its segment. It is excluded until then"
         )
         return MarkerReport(names[0], MarkerFlag.MISPLACED, text, {"segment": segment})
-
-    def _misfit(self, distances: Array) -> MarkerReport:
-        rms = float(np.sqrt(np.nanmean(distances**2)))
-        text = (
-            f"chain model {self.model.name!r} does not fit: markers are {1000 * rms:.0f} mm RMS "
-            "from their places: check the subject, the scale of the model, and the labels"
-        )
-        return MarkerReport(self.model.name, MarkerFlag.MISFIT, text, {"rms_m": rms})
-
-    def _fits_again(self) -> MarkerReport:
-        return MarkerReport(self.model.name, "ok", f"chain model {self.model.name!r} fits", {})
 
     def _recover(self, t_ns: int, distances: Array) -> list[MarkerReport]:
         """Use the markers of faults again that are near their places."""
@@ -309,14 +304,11 @@ class MarkerMonitor:
             fixed_elsewhere = best != own and sd[best] < _RIGID_M and sd[own] > _MOVING_M
             if seen.frames > _OBSERVED and fixed_elsewhere and not seen.reported:
                 seen.reported = True
-                reports.append(self._moves_with(m, best))
+                marker, segment = self.model.markers[m], self.model.segment_names[best]
+                text = (
+                    f"{marker.name}: moves with {segment}, but the model has it on "
+                    f"{marker.segment}: move the marker, or correct its segment"
+                )
+                data = {"segment": marker.segment, "moves_with": segment}
+                reports.append(MarkerReport(marker.name, MarkerFlag.MISPLACED, text, data))
         return reports
-
-    def _moves_with(self, m: int, other: int) -> MarkerReport:
-        marker, segment = self.model.markers[m], self.model.segment_names[other]
-        text = (
-            f"{marker.name}: moves with {segment}, but the model has it on {marker.segment}: move "
-            f"the marker, or correct its segment"
-        )
-        data = {"segment": marker.segment, "moves_with": segment}
-        return MarkerReport(marker.name, MarkerFlag.MISPLACED, text, data)

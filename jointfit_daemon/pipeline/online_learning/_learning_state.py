@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from jointfit_daemon.name_lists import list_names
 from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.pipeline.health import LearningHealth, LearningState
 
@@ -91,6 +92,4 @@ class LearningMonitor:
 
 def not_visible(markers: Sequence[str]) -> str:
     """Return the text that names the markers that are not visible."""
-    named = ", ".join(markers[:MAX_NAMES])
-    more = f" and {len(markers) - MAX_NAMES} more" if len(markers) > MAX_NAMES else ""
-    return f"not visible to the cameras: {named}{more}"
+    return f"not visible to the cameras: {list_names(markers, MAX_NAMES)}"

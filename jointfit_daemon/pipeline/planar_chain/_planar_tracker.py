@@ -162,9 +162,16 @@ class PlanarTracker:
         if fitted:
             notices = self._update_plane(t_ns)
 
-        poses = self._poses(t_ns, measured)
-        if learned and self._basis is not None:
-            self._learn(measured, poses, fit=fitted)
+        # The pose of every part with two markers, or the reason why there is none.
+        poses: dict[str, PlanarPose | MissingPose] = {}
+        if self._basis is not None:
+            poses = {
+                name: part.pose(t_ns, self._in_plane(measured[name]))
+                for name, part in self._parts.items()
+                if len(part.markers) >= LEAST_MARKERS
+            }
+            if learned:
+                self._learn(measured, poses, fit=fitted)
         return [*notices, self._figure(t_ns, frame, measured, poses)] if shown else notices
 
     def _update_plane(self, t_ns: int) -> list[Output]:
@@ -196,18 +203,6 @@ class PlanarTracker:
             return np.full(len(points), complex(np.nan, np.nan))
         flat = points @ basis
         return np.asarray(flat[:, 0] + 1j * flat[:, 1])
-
-    def _poses(
-        self, t_ns: int, measured: Mapping[str, Array]
-    ) -> dict[str, PlanarPose | MissingPose]:
-        """Return the pose of every part with two markers, or the reason why there is none."""
-        if self._basis is None:
-            return {}
-        return {
-            name: part.pose(t_ns, self._in_plane(measured[name]))
-            for name, part in self._parts.items()
-            if len(part.markers) >= LEAST_MARKERS
-        }
 
     def _learn(
         self,
@@ -254,8 +249,10 @@ class PlanarTracker:
         poses: Mapping[str, PlanarPose | MissingPose],
     ) -> PlanarJoint:
         """Return the joint in this frame, from each part that has a pose and a center."""
-        if self._basis is None:
+        basis = self._basis
+        if basis is None:
             return PlanarJoint(joint.name, None, None, None, self._plane.refused)
+        normal = np.cross(*basis.T)
         sides, reasons = [], []
         for side in joint.sides:
             pose, estimate = poses[side.parent], side.estimate
@@ -265,25 +262,18 @@ class PlanarTracker:
                 why = "no center yet" if estimate is None else estimate.refused
                 reasons.append(f"{side.child} about {joint.name}, seen from {side.parent}: {why}")
             else:
-                sides.append(self._joint_side(side, estimate, pose, measured[side.parent]))
+                # The position along the normal is that of the markers.
+                part, along = self._parts[side.parent], measured[side.parent] @ normal
+                t = basis @ (pose.origin.real, pose.origin.imag) + normal * np.nanmean(along)
+                q = rotation.exp(np.angle(pose.turn) * normal[None])
+                frame = BodyPoses(q, np.asarray(t)[None])
+                sides.append(JointSide(frame, basis, part.flat_template, part.rms, estimate))
         found = joint_trajectory(sides, 1)
         if not np.isfinite(found.positions).all():
             return PlanarJoint(joint.name, None, None, None, "; ".join(reasons))
         arc = max(side.estimate.arc for side in sides)
         position, error = vector(found.positions[0]), float(found.error[0])
         return PlanarJoint(joint.name, position, error, arc, None)
-
-    def _joint_side(
-        self, side: _Side, estimate: CenterEstimate, pose: PlanarPose, seen: Array
-    ) -> JointSide:
-        """Return one frame of a side; the position along the normal is that of the markers."""
-        basis, part = self._basis, self._parts[side.parent]
-        assert basis is not None  # noqa: S101 - there are sides only with a plane
-        normal = np.cross(*basis.T)
-        t = basis @ (pose.origin.real, pose.origin.imag) + normal * np.nanmean(seen @ normal)
-        q = rotation.exp(np.angle(pose.turn) * normal[None])
-        poses = BodyPoses(q, np.asarray(t)[None])
-        return JointSide(poses, basis, part.flat_template, part.rms, estimate)
 
     def _stick(self, part: str, seen: Array, joints: Mapping[str, PlanarJoint]) -> Stick:
         """Return the ends of a segment: its joints; at an end of the chain a marker and a joint."""

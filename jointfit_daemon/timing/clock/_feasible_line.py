@@ -121,7 +121,14 @@ def mean_feasible_line(
         low, high = max(low, near), min(high, far)
 
     grid = _weighed(rows, middle, scale, (low, high), (prior, prior_sd))
-    return _moments(grid, scale, float(ya))
+    total = sum([w for _, _, w in grid])
+    slope = sum([w * s for s, _, w in grid]) / total
+    height = sum([w * h for _, h, w in grid]) / total
+    slope_var = sum([w * (s - slope) ** 2 for s, _, w in grid]) / total
+    both = sum([w * (s - slope) * (h - height) for s, h, w in grid]) / total
+    height_var = sum([w * (h - height) ** 2 for _, h, w in grid]) / total
+
+    return FittedLine(float(ya) + height - scale, slope, height_var + scale**2, both, slope_var)
 
 
 def _on_time(
@@ -192,14 +199,3 @@ def _weighed(
         kept = [k for k, row in enumerate(grid) if row[2] > top - _TAIL]
         low, high = grid[max(0, kept[0] - 1)][0], grid[min(_STEPS, kept[-1] + 1)][0]
     return [(s, height, exp(weight - top)) for s, height, weight in grid]
-
-
-def _moments(grid: list[tuple[float, float, float]], scale: float, base: float) -> FittedLine:
-    total = sum([w for _, _, w in grid])
-    slope = sum([w * s for s, _, w in grid]) / total
-    height = sum([w * h for _, h, w in grid]) / total
-    slope_var = sum([w * (s - slope) ** 2 for s, _, w in grid]) / total
-    both = sum([w * (s - slope) * (h - height) for s, h, w in grid]) / total
-    height_var = sum([w * (h - height) ** 2 for _, h, w in grid]) / total
-
-    return FittedLine(base + height - scale, slope, height_var + scale**2, both, slope_var)

@@ -90,9 +90,6 @@ class PlausibilityMonitor:
         if excess_ns < LATE_NS or excess_ns < LATE_SIGMAS * sigma_ns:
             self.clear()
             return None
-        return self._late(excess_ns, arrival_ns)
-
-    def _late(self, excess_ns: float, arrival_ns: int) -> ClockEvent | None:
         if self._until_ns is not None and arrival_ns < self._until_ns:
             self._interval = self._interval.with_sample(excess_ns)
             return None

@@ -19,7 +19,7 @@ from jointfit_daemon import __version__
 
 if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
-    from jointfit_daemon.session_data import SessionData, TimelineEvent
+    from jointfit_daemon.session_data import SessionData
 
 STEPS = ("calibrate", "replay", "export", "report")
 """Steps in the order in which they run."""
@@ -194,6 +194,12 @@ def _measured(task: RecordingTask, session: SessionData, notes: str) -> Recordin
     losses = [found.lost_share for found in results.sources.values()]
     known = [share for share in losses if math.isfinite(share)]
     extents = [found.extent for found in results.ranges]
+
+    # The first missing parts of the recording with their times, and the number of the others.
+    missing = [event for event in session.events if event.kind == "gap"]
+    gaps = [f"at {gap.t_s:.3f} s: {gap.text}" for gap in missing[:_NAMED_GAPS]]
+    if len(missing) > _NAMED_GAPS:
+        gaps.append(f"{len(missing) - _NAMED_GAPS} more gaps")
     return RecordingResult(
         task.name,
         "done",
@@ -204,16 +210,9 @@ def _measured(task: RecordingTask, session: SessionData, notes: str) -> Recordin
         gait_cycles=sum(len(gait.cycles_s) for gait in results.gait.values()),
         lost_percent=round(100.0 * max(known), 3) if known else None,
         faults=results.faults,
-        gaps=_gaps_text([event for event in session.events if event.kind == "gap"]),
+        gaps="; ".join(gaps),
         notes=notes,
     )
-
-
-def _gaps_text(gaps: list[TimelineEvent]) -> str:
-    """Return the missing parts of a recording with their times, at most `_NAMED_GAPS` of them."""
-    texts = [f"at {gap.t_s:.3f} s: {gap.text}" for gap in gaps[:_NAMED_GAPS]]
-    more = len(gaps) - len(texts)
-    return "; ".join([*texts, f"{more} more gaps"] if more else texts)
 
 
 def _mark(task: RecordingTask) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections import Counter
 from dataclasses import asdict, fields
 from typing import TYPE_CHECKING
 from urllib.parse import quote
@@ -31,22 +32,18 @@ def write_summary(results: Sequence[RecordingResult], out: Path) -> list[Path]:
     writer.writeheader()
     writer.writerows(asdict(result) for result in ordered)  # None becomes an empty cell
 
-    texts = {"summary.csv": rows.getvalue(), "summary.html": _page(ordered, out)}
+    count = Counter(result.status for result in ordered)
+    states = [(name.title(), f"{count[name]}") for name in ("done", "differs", "failed")]
+    pairs = [("Recordings", f"{len(ordered)}"), *states]
+    cells = [_row(result, out) for result in ordered]
+    body = section("recordings", "Recordings", [table("One row a recording", _HEAD, cells, text=2)])
+    header = f"<header><h1>Batch summary</h1>{facts(pairs, 'facts head')}</header>"
+    page = document("Batch summary", f"{header}<main>{body}</main>")
+
+    texts = {"summary.csv": rows.getvalue(), "summary.html": page}
     for name, text in texts.items():
         replace_file(out / name, text)
     return [out / name for name in texts]
-
-
-def _page(results: Sequence[RecordingResult], out: Path) -> str:
-    counts = [
-        (status, sum(r.status == status for r in results))
-        for status in ("done", "differs", "failed")
-    ]
-    pairs = [("Recordings", f"{len(results)}"), *((s.title(), f"{n}") for s, n in counts)]
-    rows = [_row(result, out) for result in results]
-    body = section("recordings", "Recordings", [table("One row a recording", _HEAD, rows, text=2)])
-    header = f"<header><h1>Batch summary</h1>{facts(pairs, 'facts head')}</header>"
-    return document("Batch summary", f"{header}<main>{body}</main>")
 
 
 def _row(result: RecordingResult, out: Path) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from jointfit_daemon.tools.calibrate._phase_tracker import (
     PhaseAbortedError,
     PhaseTracker,
     RequestRefusedError,
+    raise_if_refused,
 )
 from jointfit_daemon.tools.calibrate._report import movement_lines, report
 
@@ -15,6 +16,7 @@ __all__ = [
     "RequestRefusedError",
     "calibrate",
     "movement_lines",
+    "raise_if_refused",
     "report",
     "store_offline_calibration",
 ]

@@ -19,8 +19,8 @@ import typer
 from jointfit_daemon.tools.calibrate._offline import calibrate_offline
 from jointfit_daemon.tools.calibrate._phase_tracker import (
     PhaseTracker,
-    RequestRefusedError,
     is_not_stored,
+    raise_if_refused,
 )
 from jointfit_daemon.tools.calibrate._report import ProgressLines, movement_lines, report
 from jointfit_daemon.tools.calibrate._versions import list_versions, use_version
@@ -231,8 +231,7 @@ async def _run_phase(
     request = asyncio.create_task(client.request("calibrate", arguments), name="calibrate request")
     try:
         answer = await _await_answer(client, tracker, request, name)
-        if answer.get("status") == "error":
-            raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
+        raise_if_refused(answer)
         if name in IMMEDIATE_REQUESTS:
             return {"text": IMMEDIATE_REQUESTS[name] + str(answer.get("data", {}).get("phase"))}
         ended = await tracker.wait_for_end(name)

@@ -34,6 +34,12 @@ class RequestRefusedError(Exception):
     """The daemon rejected the request; the message gives the reason."""
 
 
+def raise_if_refused(answer: Mapping[str, Any]) -> None:
+    """Raise `RequestRefusedError` with the message of the daemon if it rejected the request."""
+    if answer.get("status") == "error":
+        raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
+
+
 @dataclass(slots=True)
 class PhaseTracker:
     """Collects calibration messages and lets a task wait for the end of a phase."""

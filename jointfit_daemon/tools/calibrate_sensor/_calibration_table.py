@@ -93,8 +93,7 @@ def insert_table(text: str, name: str, calibration: SensorCalibrationSettings) -
     ):
         end += 1
     kept = _without_own(lines[begin:end])
-    while kept and (not kept[-1].strip() or kept[-1].lstrip().startswith("#")):
-        kept.pop()
+    kept = kept[: len(kept) - _trailing(kept)]
     rest = lines[end - _trailing(lines[begin:end]) :]
     new = "\n".join([*lines[:begin], *kept, "", *table_lines(calibration), *(rest or [""])])
 

@@ -84,18 +84,25 @@ def calibrate_sensor(
 
     named = _named_steps(steps)
     own = load_rig(rig)
-    source = _calibratable(_recorded_rig(recording) or own, name, _sensor(own, name))
-    names = _possible_steps(named, source)
-    findings = (
-        _run_live(source, names, step_s, json=json)
-        if recording is None
-        else _take_recording(source, names, recording)
-    )
+    configured = _sensor(own, name)
+    if recording is None:
+        source = _calibratable(own, name, configured)
+        findings = _run_live(source, _possible_steps(named, source), step_s, json=json)
+    else:
+        from jointfit_daemon.reprocessing import recorded_rig
+
+        source = _calibratable(recorded_rig(recording), name, configured)
+        findings = _take_recording(source, _possible_steps(named, source), recording)
 
     lines: list[str] = []
     written = False
     if findings.estimates:
-        calibration = _combine(findings, _sensor(own, name))
+        from jointfit_daemon.sensor_calibration import calibration_of
+        from jointfit_daemon.tools.calibrate_sensor._calibration_table import make_calibration
+
+        today = datetime.now(UTC).astimezone().date().isoformat()
+        before = calibration_of(configured.settings)
+        calibration = make_calibration(findings.estimates, today, findings.serial, before)
         lines, written = _write(rig, name, calibration, print_only=print_only)
 
     from jointfit_daemon.tools.calibrate_sensor._sensor_report import report_data, report_lines
@@ -171,12 +178,6 @@ def _possible_steps(named: list[str] | None, source: Source) -> list[str]:
     return named
 
 
-def _recorded_rig(recording: Path | None) -> Rig | None:
-    from jointfit_daemon.reprocessing import recorded_rig
-
-    return None if recording is None else recorded_rig(recording)
-
-
 def _run_live(source: Source, names: list[str], step_s: float, *, json: bool) -> SensorFindings:
     from jointfit_daemon.calibration.inertial_sensor import SensorCalibrationError
     from jointfit_daemon.tools.calibrate_sensor._guided_steps import run_steps
@@ -209,15 +210,6 @@ def _take_recording(source: Source, names: list[str], recording: Path) -> Sensor
                 yield event.chunk
 
     return take_recorded(source, names, chunks())
-
-
-def _combine(findings: SensorFindings, configured: Source) -> SensorCalibrationSettings:
-    from jointfit_daemon.sensor_calibration import calibration_of
-    from jointfit_daemon.tools.calibrate_sensor._calibration_table import make_calibration
-
-    today = datetime.now(UTC).astimezone().date().isoformat()
-    before = calibration_of(configured.settings)
-    return make_calibration(findings.estimates, today, findings.serial, before)
 
 
 def _write(

@@ -111,7 +111,7 @@ class ReadingStream:
 
     def feed(self, chunk: Chunk) -> list[SensorReading]:
         """Return the readings that a chunk completes."""
-        readings = []
+        readings, findings = [], self._findings
         for item in self._decoder.feed(chunk):
             if isinstance(item, ImuSample):
                 if item.rate is None or item.acceleration is None:
@@ -120,15 +120,11 @@ class ReadingStream:
                 vectors = (item.rate, item.acceleration, item.magnetic)
                 readings.append(SensorReading(item.arrival_ns, *vectors))
             elif isinstance(item, DeviceEvent):
-                self._take_event(item)
+                if "serial" in item.data:
+                    findings.serial = str(item.data["serial"])
+                if item.kind in {"warning", "error"} and item.text not in findings.warnings:
+                    findings.warnings.append(item.text)
         return readings
-
-    def _take_event(self, event: DeviceEvent) -> None:
-        findings = self._findings
-        if "serial" in event.data:
-            findings.serial = str(event.data["serial"])
-        if event.kind in {"warning", "error"} and event.text not in findings.warnings:
-            findings.warnings.append(event.text)
 
 
 async def run_steps(

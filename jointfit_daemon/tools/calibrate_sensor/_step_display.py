@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 
 import typer
 
-from jointfit_daemon.tools.text_output import list_names
+from jointfit_daemon.name_lists import list_names
 
 if TYPE_CHECKING:
     from jointfit_daemon.calibration.inertial_sensor import StepProgress

@@ -29,7 +29,22 @@ _TRAJECTORIES = ("joint", "known", "longest gap, s", "error, mm", "sides apart, 
 def text(trial: MarkerTrial, joints: Sequence[ChainJoint]) -> str:
     """Return the centres and a summary of the trajectories as two tables."""
     data = trial.trajectories
-    centers = [_CENTERS, *(row for joint in joints for row in _center_rows(joint))]
+    centers = [_CENTERS]
+    for joint in joints:
+        for side in joint.sides:
+            e = side.answer.estimate
+            row = (
+                joint.name,
+                ",".join(side.parent),
+                _report.point(e.center),
+                _report.mm(_report.sd_seen(side.answer)),
+                f"{degrees(e.arc):.0f}°",
+                _report.mm(e.residual),
+                _report.number(e.conditioning),
+                "" if e.refused is None else f"REFUSED: {e.refused}",
+            )
+            centers.append(row)
+
     trajectories = [_TRAJECTORIES, *(_trajectory_row(joint, data.rate_hz) for joint in joints)]
     notes = [f"note      {joint.name}: {fact}" for joint in joints for fact in _notes(joint)]
     head = (
@@ -43,21 +58,6 @@ def text(trial: MarkerTrial, joints: Sequence[ChainJoint]) -> str:
         align_columns(trajectories, range(1, 5)),
     ]
     return "\n".join([head, *warnings, "", *tables, *([""] if notes else []), *notes])
-
-
-def _center_rows(joint: ChainJoint) -> Iterator[tuple[str, ...]]:
-    for side in joint.sides:
-        e = side.answer.estimate
-        yield (
-            joint.name,
-            ",".join(side.parent),
-            _report.point(e.center),
-            _report.mm(_report.sd_seen(side.answer)),
-            f"{degrees(e.arc):.0f}°",
-            _report.mm(e.residual),
-            _report.number(e.conditioning),
-            "" if e.refused is None else f"REFUSED: {e.refused}",
-        )
 
 
 def _trajectory_row(joint: ChainJoint, rate_hz: float) -> tuple[str, ...]:

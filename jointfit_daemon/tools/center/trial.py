@@ -84,7 +84,7 @@ class WindowEstimate:
 
     @property
     def semi_axes(self) -> Array:
-        """Return the semi-axes of the 95 % ellipsoid, m, longest first; inf if unobservable."""
+        """Return the semi-axes of the 95 % ellipsoid, m, shape (d,), longest first; inf: unseen."""
         unseen = len(self.estimate.unseen)
         variances = np.linalg.eigvalsh(self.estimate.covariance)[unseen:]
         within95 = self.estimate.within95

@@ -59,34 +59,29 @@ def _figure(study: Sequence[PairMaps], methods: Sequence[tuple[str, str]], title
     figure.suptitle(title)
     grid = figure.subplots(len(study), len(methods), squeeze=False)
     for axes_row, pair in zip(grid, study, strict=True):
+        # One map a method; its rows increase upwards.
+        row_name, column_name = pair.name.split("–")
+        (y_label, y_scale), (x_label, x_scale) = _AXES[row_name], _AXES[column_name]
         last = None
         for axes, (key, label) in zip(axes_row, methods, strict=True):
-            last = _map(axes, pair, key)
+            axes.set_facecolor("white")
+            axes.patch.set_hatch("////")
+            axes.patch.set_edgecolor("0.7")
+            last = axes.pcolormesh(
+                pair.columns * x_scale,
+                pair.rows * y_scale,
+                np.ma.masked_invalid(_MM * pair.maps[key]),
+                vmin=0.0,
+                vmax=_TOP_MM[pair.name],
+                cmap="viridis",
+                shading="nearest",
+                rasterized=True,
+            )
+            axes.set_xlabel(x_label)
+            axes.set_ylabel(y_label)
             if pair is study[0]:
                 axes.set_title(label, fontsize=10)
         bar = figure.colorbar(last, ax=list(axes_row), extend="max", shrink=0.9)
         bar.set_label("mm")
 
     return figure
-
-
-def _map(axes: Any, pair: PairMaps, key: str) -> Any:
-    """Draw one map; rows increase upwards."""
-    row_name, column_name = pair.name.split("–")
-    (y_label, y_scale), (x_label, x_scale) = _AXES[row_name], _AXES[column_name]
-    axes.set_facecolor("white")
-    axes.patch.set_hatch("////")
-    axes.patch.set_edgecolor("0.7")
-    image = axes.pcolormesh(
-        pair.columns * x_scale,
-        pair.rows * y_scale,
-        np.ma.masked_invalid(_MM * pair.maps[key]),
-        vmin=0.0,
-        vmax=_TOP_MM[pair.name],
-        cmap="viridis",
-        shading="nearest",
-        rasterized=True,
-    )
-    axes.set_xlabel(x_label)
-    axes.set_ylabel(y_label)
-    return image

@@ -1,6 +1,6 @@
 """One demo run: connect, calibrate, evaluate live joint angles, count samples.
 
-Invariant: the daemon is observed over MQTT only, and ground truth comes from the simulator's log.
+The daemon is observed over MQTT only, and ground truth comes from the simulator's log.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.outputs.mqtt import MqttClient
-from jointfit_daemon.tools.calibrate import PhaseTracker, RequestRefusedError
+from jointfit_daemon.tools.calibrate import PhaseTracker, raise_if_refused
 from jointfit_daemon.tools.child_processes import time_limit
 from jointfit_daemon.tools.demo._score import DemoScore, RmsAccumulator, percentile
 
@@ -195,9 +195,8 @@ class DemoRun:
             await asyncio.sleep(SETTLE_S)
             self._tracker.begin()
             wanted_s = sum(seconds for _, seconds in motions)
-            answer = await client.request("calibrate", {"phase": phase, "seconds": wanted_s})
-            if answer.get("status") != "accepted":
-                raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
+            wanted = {"phase": phase, "seconds": wanted_s}
+            raise_if_refused(await client.request("calibrate", wanted))
             self.display.step(phase, 0.0, "")
 
             async def move(motions: tuple[tuple[str, float], ...] = motions) -> None:

@@ -11,7 +11,12 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from jointfit_daemon.tools.calibrate import PhaseAbortedError, PhaseTracker, RequestRefusedError
+from jointfit_daemon.tools.calibrate import (
+    PhaseAbortedError,
+    PhaseTracker,
+    RequestRefusedError,
+    raise_if_refused,
+)
 from jointfit_daemon.tools.child_processes import daemon, simulator, time_limit
 from jointfit_daemon.tools.dashboard.addresses import BrokerAddress
 from jointfit_daemon.tools.dashboard.server import DashboardServer
@@ -106,21 +111,16 @@ async def _calibrate(rig: Rig, process: ChildProcess) -> None:
                     await asyncio.sleep(0.1)
             await asyncio.sleep(SETTLE_S)
             for phase, seconds in PHASES:
-                await _run_phase(client, tracker, phase, seconds)
+                typer.echo(f"calibration: {phase}, {seconds:g} s")
+                tracker.begin()
+                wanted = {"phase": phase, "seconds": seconds}
+                raise_if_refused(await client.request("calibrate", wanted))
+                await tracker.wait_for_end(phase)
         except (PhaseAbortedError, RequestRefusedError) as ended:
             typer.echo(f"calibration: {ended}. Continue in the page.", err=True)
         finally:
             listener.cancel()
             await asyncio.wait([listener])
-
-
-async def _run_phase(client: MqttClient, tracker: PhaseTracker, phase: str, seconds: float) -> None:
-    typer.echo(f"calibration: {phase}, {seconds:g} s")
-    tracker.begin()
-    answer = await client.request("calibrate", {"phase": phase, "seconds": seconds})
-    if answer.get("status") != "accepted":
-        raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
-    await tracker.wait_for_end(phase)
 
 
 async def _listen(client: MqttClient, tracker: PhaseTracker, online: set[str]) -> None:

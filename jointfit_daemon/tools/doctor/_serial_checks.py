@@ -62,7 +62,13 @@ def _check_port(host: Host, path: str, ports: Sequence[SerialPortInfo]) -> Itera
     # The simulator, or a terminal program, holds both ends of a pseudo-terminal.
     is_pseudo = node.resolve().is_relative_to(host.at("/dev/pts"))
     holders = [] if is_pseudo else host.holders(node)
-    yield from _foreign_holders(path, holders)
+    for number, program in holders:
+        if program.startswith(_DAEMON_NAMES):
+            text = f"in use by {program} (process {number}), as while the daemon runs"
+            yield Finding(CHECK, path, "note", text)
+        else:
+            text = f"in use by {program} (process {number}), which takes bytes or blocks it"
+            yield Finding(CHECK, path, "error", text, f"close it: kill {number}")
     if name.startswith(_MODEM_PORTS) and _is_probed(host, name):
         yield Finding(
             CHECK, path, "warning", "ModemManager runs, and may open the port when it appears",
@@ -95,16 +101,6 @@ def _permission(host: Host, path: str, node: Path) -> Finding:
     text = f"permission denied: user {host.user} is not in the group {group}"
     remedy = f"sudo usermod -aG {group} {host.user}, then log out and in"
     return Finding(CHECK, path, "error", text, remedy)
-
-
-def _foreign_holders(path: str, holders: Sequence[tuple[int, str]]) -> Iterator[Finding]:
-    for number, name in holders:
-        if name.startswith(_DAEMON_NAMES):
-            text = f"in use by {name} (process {number}), as while the daemon runs"
-            yield Finding(CHECK, path, "note", text)
-        else:
-            text = f"in use by {name} (process {number}), which takes bytes or blocks it"
-            yield Finding(CHECK, path, "error", text, f"close it: kill {number}")
 
 
 def _is_probed(host: Host, name: str) -> bool:

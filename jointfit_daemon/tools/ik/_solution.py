@@ -29,9 +29,9 @@ from jointfit_daemon.kinematics.inverse_kinematics import (
     restart_local_minima,
     solve_frames,
 )
+from jointfit_daemon.name_lists import list_names
 from jointfit_daemon.nearest_name import did_you_mean
 from jointfit_daemon.tools.marker_model import motion_trial
-from jointfit_daemon.tools.text_output import list_names
 
 if TYPE_CHECKING:
     from pathlib import Path

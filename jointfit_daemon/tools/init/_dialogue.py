@@ -68,7 +68,13 @@ class Dialogue:
             if asked.key in self.prepared:
                 self._take_prepared(asked)
             elif self.is_script:
-                self._take_default(asked)
+                try:
+                    self.accept_answer(asked, None)
+                except AnswerError as error:
+                    raise UnansweredError(
+                        f"{asked.name} is missing, and there is no proposal: "
+                        f"{asked.text}: {asked.help}"
+                    ) from error
             else:
                 self._ask(asked)
         if self.is_script:
@@ -147,14 +153,6 @@ class Dialogue:
                 self.accept_answer(asked, value)
         except AnswerError as error:
             raise UnansweredError(f"{asked.name} = {value!r}: {error}") from error
-
-    def _take_default(self, asked: Asked) -> None:
-        try:
-            self.accept_answer(asked, None)
-        except AnswerError as error:
-            raise UnansweredError(
-                f"{asked.name} is missing, and there is no proposal: {asked.text}: {asked.help}"
-            ) from error
 
     def _refuse_unused(self) -> None:
         """Refuse answers to questions that were not asked: they are probably misspelled."""

@@ -22,7 +22,6 @@ from jointfit_daemon.tools.output_files import replace_file
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from jointfit_daemon.config import Rig
     from jointfit_daemon.tools.init._answers import Answers
     from jointfit_daemon.tools.init._found import Found
 
@@ -73,22 +72,18 @@ def write_rig(path: Path, given: Answers, found: Found) -> WrittenRig:
     if not open_places:
         state_of(path).unlink(missing_ok=True)
 
-    following = _next_commands(path, rig)
-    if open_places:
-        command = f"jointfit init --config {shlex.quote(str(path))} --force"
-        if path.name == "rig.toml":
-            command = f"jointfit init {shlex.quote(str(path.parent))} --force"
-        following = {command: "fill in these places later"} | following
-    return WrittenRig(path, table, tuple(open_places), tuple(rig_warnings(rig)), following)
-
-
-def _next_commands(path: Path, rig: Rig) -> dict[str, str]:
     scheme = "mqtt" if rig.mqtt.tls is None else "mqtts"
     broker = f"{scheme}://{rig.mqtt.host}:{rig.mqtt.tcp_port}"
     option = "" if broker in _USUAL_BROKERS else f" --broker {broker}"
     name = shlex.quote(str(path))
-    return {
+    following = {
         f"jointfit check {name}": "check the file after changes",
         f"jointfitd --config {name}": "run the daemon",
         f"jointfit dashboard{option}": "see the limb and calibrate in a browser",
     }
+    if open_places:
+        command = f"jointfit init --config {name} --force"
+        if path.name == "rig.toml":
+            command = f"jointfit init {shlex.quote(str(path.parent))} --force"
+        following = {command: "fill in these places later"} | following
+    return WrittenRig(path, table, tuple(open_places), tuple(rig_warnings(rig)), following)

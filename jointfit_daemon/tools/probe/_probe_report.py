@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from pydantic.dataclasses import dataclass
 
+from jointfit_daemon.name_lists import list_names
 from jointfit_daemon.tools.discovery import (
     CanChannel,
     CanInterface,
@@ -15,7 +16,7 @@ from jointfit_daemon.tools.discovery import (
     SerialPortInfo,
     SerialTraffic,
 )
-from jointfit_daemon.tools.text_output import align_columns, list_names
+from jointfit_daemon.tools.text_output import align_columns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -102,7 +102,12 @@ class Publication:
         if self._broker is not None:
             host, _, port = self._broker.partition(":")
             changed |= {"host": host, "port": port or 0}
-        return replace(rig, mqtt=_checked({**rig.mqtt.model_dump(), **changed}))
+        try:
+            settings = MqttSettings.model_validate({**rig.mqtt.model_dump(), **changed})
+        except ValidationError as error:
+            faults = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
+            raise ValueError(f"--base or --broker: {'; '.join(faults)}") from error
+        return replace(rig, mqtt=settings)
 
     async def start(self) -> None:
         """Connect to the broker.
@@ -145,11 +150,3 @@ class Publication:
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait([self._task])
-
-
-def _checked(table: dict[str, object]) -> MqttSettings:
-    try:
-        return MqttSettings.model_validate(table)
-    except ValidationError as error:
-        faults = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
-        raise ValueError(f"--base or --broker: {'; '.join(faults)}") from error

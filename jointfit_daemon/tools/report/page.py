@@ -108,8 +108,15 @@ def _header(results: SessionResults) -> str:
 
 def _summary(results: SessionResults) -> str:
     """Return the tiles with the results that a reader wants first."""
-    tiles = [_range_tile(results), _gait_tile(results), _camera_tile(results)]
-    tiles += [_loss_tile(results), _fault_tile(results)]
+    count = results.faults
+    faults = "see the list below" if count else "none reported"
+    tiles = [
+        _range_tile(results),
+        _gait_tile(results),
+        _camera_tile(results),
+        _loss_tile(results),
+        ("Faults", f"{count}", faults, count > 0),
+    ]
     inner = "".join(
         f'<li class="tile{" alert" if alert else ""}"><span class="label">{escape(label)}</span>'
         f'<strong>{escape(value)}</strong><span class="remark">{escape(remark)}</span></li>'
@@ -159,8 +166,3 @@ def _loss_tile(results: SessionResults) -> tuple[str, str, str, bool]:
     gaps = sum(len(found.gaps_s) for found in results.sources.values())
     remark = f"worst source: {title(worst)}; {counted(gaps, 'gap')}"
     return "Samples lost", percent(shares[worst]), remark, shares[worst] > _MUCH_LOSS
-
-
-def _fault_tile(results: SessionResults) -> tuple[str, str, str, bool]:
-    count = results.faults
-    return "Faults", f"{count}", "see the list below" if count else "none reported", count > 0
