@@ -129,6 +129,10 @@ def _shares(label: str, scores: Array, *, held: bool) -> list[Result]:
     ]
 
 
+NARROW = (
+    "the variance was chosen on the recorded legs, where it was too small; on simulated subjects "
+    "it is slightly smaller than before, which gave 0.904"
+)
 EXPERIMENTS = (
     Experiment(
         "all-methods-simulated-subjects",
@@ -136,5 +140,6 @@ EXPERIMENTS = (
         simulated,
         SIMULATED_SUBJECTS,
         long=True,
+        known_misses={f"{DEFAULT}: flexion within 1.96 sd": NARROW},
     ),
 )
