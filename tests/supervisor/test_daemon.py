@@ -400,7 +400,9 @@ async def test_a_run_of_the_real_core_gives_poses_and_health(
     assert seqs == list(range(seqs[0], seqs[0] + len(seqs)))
     assert health["process"]["rss_bytes"] > 1e6
     assert health["link"]["connected"] is True
-    stages = {name: stage for name, stage in health["latency"].items() if name != "frames"}
+    assert health["latency"].pop("frames") > 0
+    # nothing was decoded for frames that were all released at their deadline
+    stages = {name: stage for name, stage in health["latency"].items() if stage is not None}
     assert all(stage["p50"] <= stage["p99"] <= stage["max"] for stage in stages.values())
     assert stages["written_us"]["max"] <= stages["total_us"]["max"]
 
