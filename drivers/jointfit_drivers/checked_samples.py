@@ -1,6 +1,7 @@
 """Checks that every IMU sample passes: norm and sign of its quaternion, its time and its counter.
 
-Decoders of one device share them. Lost messages, restarts and a wrong scale become device events.
+Decoders of one device share them. Lost messages, restarts, a wrong scale and another rate than the
+configured one become device events.
 
 Invariant: the output depends only on the samples added; no clock and no port is read.
 """
@@ -8,6 +9,7 @@ Invariant: the output depends only on the samples added; no clock and no port is
 from __future__ import annotations
 
 from math import isfinite
+from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import Corrupt, DeviceEvent
@@ -16,6 +18,12 @@ from jointfit_protocols.orientation import OrientationGate
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Decoded, ImuSample, TickClock
+
+
+_INTERVALS = 20
+"""Intervals whose median is the period: lost messages do not change it."""
+_WRONG_RATE = 0.1
+"""Largest relative deviation of the rate from the configured one without a warning."""
 
 
 class _HeldSample(NamedTuple):
@@ -51,6 +59,9 @@ class CheckedSamples:
         self._gate = OrientationGate(tolerance)
         self._held: _HeldSample | None = None
         self._norm_checked = False
+        self._rate_hz, self._tick_ns, self._modulus = rate_hz, duration_ns(tick_clock), modulus
+        self._last_ticks: int | None = None
+        self._intervals: list[int] = []
         self.refused = self.refused_bytes = 0
         """Messages that became no sample, and their bytes."""
 
@@ -106,7 +117,10 @@ class CheckedSamples:
         """Return the sample with a unit quaternion, or the reason why it has none."""
         q = self._gate.admit(sample.q_world_sensor)
         if q is not None:
-            return [sample._replace(q_world_sensor=q)]
+            checked = sample._replace(q_world_sensor=q)
+            if sample.ticks is None or len(self._intervals) == _INTERVALS:
+                return [checked]
+            return [checked, *self._rate_warning(sample.ticks)]
         return [self.refuse(size, "quaternion norm is not 1"), *self._norm_warning()]
 
     def _norm_warning(self) -> list[Decoded]:
@@ -117,6 +131,26 @@ class CheckedSamples:
         self._norm_checked = True
         text = f"median quaternion norm is {norm:.4g}, expected 1: byte order or scale is wrong"
         return [DeviceEvent("warning", text, {"median_norm": norm} if isfinite(norm) else {})]
+
+    def _rate_warning(self, ticks: int) -> list[Decoded]:
+        """Return a warning, once, if the first samples have another rate in device time."""
+        last, self._last_ticks = self._last_ticks, ticks
+        if last is None:
+            return []
+        passed = ticks - last if self._modulus is None else (ticks - last) % self._modulus
+        if passed > 0:  # device time begins again after a restart
+            self._intervals.append(passed)
+        if len(self._intervals) < _INTERVALS:
+            return []
+
+        found_hz = 1e9 / (median(self._intervals) * self._tick_ns)
+        if abs(found_hz - self._rate_hz) <= _WRONG_RATE * self._rate_hz:
+            return []
+        text = (
+            f"{found_hz:.4g} samples per second by the time of the device, expected "
+            f"{self._rate_hz:g}: set rate_hz = {found_hz:.4g}, or the rate of the device"
+        )
+        return [DeviceEvent("warning", text, {"rate_hz": round(found_hz, 2)})]
 
 
 def _restart_text(first: ImuSample) -> str:

@@ -82,6 +82,18 @@ def test_a_wrong_scale_is_reported_once() -> None:
     assert checked.refused == 300
 
 
+@pytest.mark.parametrize(("every", "rate_hz"), [(1, None), (2, 50.0)])
+def test_another_rate_than_the_configured_one_is_reported_once(
+    every: int, rate_hz: float | None
+) -> None:
+    start = (1 << 32) - 10 * PERIOD
+    sent = [sample(n, ticks=start + n * PERIOD * every) for n in range(100) if n != 5]
+    _, found = add_all(sent)
+    warnings = [item for item in found if isinstance(item, DeviceEvent) and item.kind == "warning"]
+    assert [item.data["rate_hz"] for item in warnings] == ([] if rate_hz is None else [rate_hz])
+    assert all("set rate_hz = 50" in item.text for item in warnings)
+
+
 def test_samples_without_time_and_counter_pass() -> None:
     checked = CheckedSamples(100.0, None, None)
     bare = sample(1)._replace(ticks=None, counter=None)

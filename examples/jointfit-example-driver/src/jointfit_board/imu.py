@@ -38,7 +38,13 @@ class BoardDecoder(SerialDecoder[BoardFrame]):
         """Return the sample of one frame, after the checks of its norm, time and counter."""
         w, x, y, z = (count / SCALE for count in message.counts)
         q = (w, x, y, z)  # sensor to east-north-up, scalar first: canonical already
-        sample = ImuSample(arrival_ns, q, q, message.time_us, message.counter)
+        sample = ImuSample(
+            arrival_ns=arrival_ns,
+            q_world_sensor=q,
+            q_native=q,
+            ticks=message.time_us,
+            counter=message.counter,
+        )
         return self.samples.add(sample, message.size)
 
 
