@@ -1,21 +1,22 @@
 r"""The recommended model: mean of the sensors with a posture-dependent soft-tissue correction.
 
-.. math:: \hat q = \bar q \otimes \exp\bigl(0.2 [\eta_a c_a + (1 - \eta_a) T_a]
-          + 0.8 [\eta_b c_b + (1 - \eta_b) T_b]\bigr)
+.. math:: \hat q = \bar q \otimes \exp\bigl(\tfrac12 [\eta_a c_a + (1 - \eta_a) T_a]
+          + \tfrac12 [\eta_b c_b + (1 - \eta_b) T_b]\bigr)
 
 :math:`\bar q` is the mean of the sensors of the segment. The corrections :math:`c_a` and
 :math:`c_b` are two fits (`KernelExpert`) of :math:`\rho = \log(\bar q^* \otimes q_{ref})`. Expert a
-uses relative rotations only. Expert b also uses the tilt of the segment and has smaller errors
-inside the training range, so its weight is larger. Outside, their corrections fade (:math:`\eta`)
-into the linear trend T of `_kernel_trend`, which extrapolates best. Expert b fades at the limit of
-the training range, expert a at a larger distance. The trend has no component about the long axis:
-there the correction of b fades to that of a, and the correction of a fades to zero.
+uses relative rotations only and generalizes to other movements. Expert b also uses the tilt of the
+segment and has smaller errors on the trained movements. Inside the training range both have equal
+weight. Outside, their corrections fade (:math:`\eta`) into the linear trend T of `_kernel_trend`,
+which extrapolates best. Expert b fades at the limit of the training range, expert a at a larger
+distance. The trend has no component about the long axis: there the correction of b fades to that of
+a, and the correction of a fades to zero.
 
 Invariants: the correction is zero if the segment is upright, the joint is straight and the sensors
 agree. A rotation of the world about the vertical does not change the correction.
 
 The claimed standard deviations come from held-out frames, for each axis, and increase with the
-larger leverage ratio of the two experts, and with the difference of their corrections.
+larger leverage ratio of the two experts.
 """
 
 from __future__ import annotations
@@ -56,9 +57,9 @@ HULL = 3.0
 The weight of expert b is the inverse of its ratio from 1 on."""
 OUTSIDE = 3.0
 """Leverage ratio of either expert above which a frame counts as extrapolation."""
-SHARE = 0.8
-"""Weight of expert b. Held-out frames of one training hardly distinguish two similar experts, so it
-is the same for all."""
+SHARE = 0.5
+"""Weight of expert b. Held-out frames hardly distinguish two similar experts, so weights are
+equal."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ class KernelModel(SegmentModel):
     def predict_one(
         self, sensors: Sequence[Quaternion], q_other: Quaternion | None = None
     ) -> Prediction:
-        """Return the corrected mean of one frame and its standard deviations."""
+        """Return the corrected mean of one frame and its standard deviations from the leverage."""
         mean = fuse_one(sensors, equal_weights(len(sensors)))
         if q_other is None:
             return Prediction(mean, self.mean_sd, False)
@@ -136,8 +137,7 @@ class KernelModel(SegmentModel):
         )
 
         far = max(ratio, b_ratio)
-        apart = ((ax - bx) ** 2 + (ay - by) ** 2 + (az - bz) ** 2) / 3.0
-        sds = self.spread.at(far, apart)
+        sds = self.spread.at(far)
         x, y, z = sds
         sd = sqrt((x * x + y * y + z * z) / 3.0)
         return Prediction(perturb_one(mean, c), sd, far > OUTSIDE, sds)

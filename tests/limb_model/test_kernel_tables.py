@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jointfit_daemon.limb_model import KernelModel, SegmentModel
+from jointfit_daemon.limb_model import SegmentModel
 
 EXPERT: dict[str, Any] = {
     "width": 0.5,
@@ -31,7 +31,7 @@ MODEL: dict[str, Any] = {
     "plain": EXPERT,
     "tilted": TILTED,
     "trend": [[0.0] * 10] * 2,
-    "spread": {"inside": [1e-4] * 3, "outside": [1e-4] * 3, "disagreement": [1.0] * 3},
+    "spread": {"inside": [1e-4] * 3, "outside": [1e-4] * 3},
     "residual_sd": 0.02,
     "mean_sd": 0.03,
 }
@@ -39,13 +39,6 @@ MODEL: dict[str, Any] = {
 
 def test_a_kernel_model_is_restored_from_its_json_form() -> None:
     assert SegmentModel.from_dict(MODEL).to_dict() == MODEL
-
-
-def test_a_model_of_an_earlier_version_does_not_know_the_disagreement() -> None:
-    earlier = MODEL | {"spread": {"inside": [1e-4] * 3, "outside": [1e-4] * 3}}
-    model = SegmentModel.from_dict(earlier)
-    assert isinstance(model, KernelModel)
-    assert model.spread.at(0.2, 1.0) == pytest.approx((0.01, 0.01, 0.01))
 
 
 @pytest.mark.parametrize(

@@ -182,6 +182,11 @@ EXCHANGED_FLEXION = (
     "flexion depends on which sensor has which filter error; the average over the assignments is "
     "slightly worse than that of the best other method"
 )
+SHORT_TRAINING = (
+    "the first 60 % of a 1.3 s walk contain half a stride, so cross-validation underestimates the "
+    "error of the rest; equal weights of short and long movements in the variance increase this "
+    "coverage, and make the standard deviations of movements left out too large"
+)
 EXPERIMENTS = (
     Experiment(
         "sit-to-stand-both-legs",
@@ -200,6 +205,7 @@ EXPERIMENTS = (
         headline=True,
         known_misses={
             "right, walking1: flexion": WALKING_FLEXION,
+            "left, walking1: flexion": WALKING_FLEXION,
             "left, DJ1: flexion": JUMP_FLEXION,
         },
     ),
@@ -209,6 +215,10 @@ EXPERIMENTS = (
         coverage,
         BOTH_KNEES,
         _DATA,
+        known_misses={
+            "later parts: flexion within 1 sd": SHORT_TRAINING,
+            "later parts: flexion within 1.96 sd": SHORT_TRAINING,
+        },
     ),
     Experiment(
         "static-pose-correction",

@@ -66,24 +66,18 @@ def fit_kernel_with_residuals(training: SegmentTraining) -> tuple[KernelModel, A
     plain = fit_expert(u, rho, count, ways, tilted=False)
     tilted = fit_expert(u, rho, count, ways, tilted=True)
 
-    # Residuals of held-out frames.
+    # Residuals of held-out frames and their distance from the training range.
     lines = [unseen_trend(u, rho, groups) for groups in ways]
     unseen = list(zip(lines, plain.unseen, plain.ratios, tilted.unseen, tilted.ratios, strict=True))
     residuals = [rho - mix_corrections(*each) for each in unseen]
-
-    # The variance comes from the blocks in time. Whole trials held out would widen it in the
-    # trained movements, too; in others the experts disagree.
-    _, a, a_ratio, b, b_ratio = unseen[0]
-    spread = measure_spread(
-        np.maximum(a_ratio, b_ratio), np.mean((a - b) ** 2, axis=1), residuals[0]
-    )
+    distances = [np.maximum(a_ratio, b_ratio) for _, _, a_ratio, _, b_ratio in unseen]
 
     model = KernelModel(
         sensors=count,
         plain=plain.expert,
         tilted=tilted.expert,
         trend=fit_trend(u, rho),
-        spread=spread,
+        spread=measure_spread(distances, residuals),
         residual_sd=_sd(residuals[-1]),
         mean_sd=_sd(rho),
     )

@@ -1,4 +1,4 @@
-"""Fit of the claimed variance against distance from the training range and disagreement."""
+"""Fit of the claimed variance against the distance from the training range."""
 
 from __future__ import annotations
 
@@ -21,17 +21,11 @@ FAR = 1.5
 outside."""
 FAR_FACTOR = 3.0
 """Error of the prior observation relative to the RMS error."""
-FAR_DISAGREEMENT = 2.0
-"""Disagreement of the prior observation relative to the mean of all frames."""
 FAR_SHARE = 0.1
 """Weight of the prior observation relative to all frames."""
 
 LEAST = 0.15
 """Lower bound of a and b as a share of the mean square error."""
-
-LEAST_DISAGREEMENT = 1.0
-"""Lower bound of g. If the errors of both experts have the correlation c, the variance of their
-mean is (1 + c) / (4 (1 - c)) of the mean squared difference: 1 for c = 0.6."""
 
 PASSES = 5
 """Iterations of the gamma regression."""
@@ -56,23 +50,25 @@ def hull(smooth: Array) -> Array:
     return found
 
 
-def measure_spread(distances: Array, disagreements: Array, residuals: Array) -> LeverageVariance:
-    """Fit the variance as a function of leverage ratio and disagreement over held-out frames.
+def measure_spread(ratios_of: Sequence[Array], residuals: Sequence[Array]) -> LeverageVariance:
+    """Fit the variance as a function of the leverage ratio over all held-out frames.
 
-    A prior observation (`FAR`, `FAR_FACTOR`) represents movements absent from the training.
+    Every grouping contributes: blocks of a trial are close to the rest of it, whole trials are far.
+    A prior observation (`FAR`, `FAR_FACTOR`) represents movements absent from all trials.
 
     Parameters
     ----------
-    distances : ndarray, shape (n,)
-        Leverage ratio of each frame relative to the other groups.
-    disagreements : ndarray, shape (n,)
-        Mean squared difference of the corrections of both experts over the axes, rad².
-    residuals : ndarray, shape (n, 3)
-        Residual of each frame with its group held out, rad.
+    ratios_of : sequence of ndarray, shape (n,)
+        Leverage ratio of each frame relative to the other groups, for each grouping.
+    residuals : sequence of ndarray, shape (n, 3)
+        Residual of each frame with its group held out, for each grouping, rad.
     """
-    lines = [_line(distances, disagreements, square) for square in (residuals**2).T]
-    (ax, bx, gx), (ay, by, gy), (az, bz, gz) = lines
-    return LeverageVariance((ax, ay, az), (bx, by, bz), (gx, gy, gz))
+    distances = np.concatenate(ratios_of)
+    squares = np.concatenate([each**2 for each in residuals])
+    shares = np.full(len(distances), 1.0 / len(distances))
+    found = [_line(distances, square, shares) for square in squares.T]
+    (ax, bx), (ay, by), (az, bz) = found
+    return LeverageVariance((ax, ay, az), (bx, by, bz))
 
 
 def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
@@ -93,22 +89,21 @@ def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
     return np.minimum(found, FARTHEST)
 
 
-def _line(distances: Array, disagreements: Array, squares: Array) -> tuple[float, float, float]:
-    """Return a, b, g of E(square) = a + b max(r - 1/2, 0) + g D by gamma regression."""
-    n = len(distances)
+def _line(distances: Array, squares: Array, shares: Array) -> tuple[float, float]:
+    """Return a, b of E(square) = a + b max(r - 1/2, 0) by gamma regression in five iterations."""
     typical = float(np.mean(squares)) + SMALLEST_VARIANCE
-    far = (1.0, FAR - WITHIN, FAR_DISAGREEMENT * float(np.mean(disagreements)))
-    beyond = np.maximum(distances - WITHIN, 0.0)
-    design = np.vstack([np.stack([np.ones(n), beyond, disagreements], axis=1), far])
+    distances = np.append(distances, FAR)
     squares = np.append(squares, FAR_FACTOR**2 * typical)
-    shares = np.append(np.full(n, 1.0 / n), FAR_SHARE)
+    shares = np.append(shares, FAR_SHARE)
+
+    beyond = np.maximum(distances - WITHIN, 0.0)
+    design = np.stack([np.ones_like(beyond), beyond], axis=1)
     from scipy.optimize import nnls  # noqa: PLC0415 - only fits need it, not the running daemon
 
     # Weights are the inverse of the current variance.
-    least = np.array([LEAST * typical, LEAST * typical, LEAST_DISAGREEMENT])
-    line = np.array([typical, 0.0, 0.0])
+    line = np.array([typical, 0.0])
     for _ in range(PASSES):
         scale = np.sqrt(shares) / (design @ line)
-        line = np.maximum(nnls(design * scale[:, None], squares * scale)[0], least)
-    a, b, g = line.tolist()
-    return a, b, g
+        line = nnls(design * scale[:, None], squares * scale)[0]
+        line = np.maximum(line, LEAST * typical)
+    return float(line[0]), float(line[1])
