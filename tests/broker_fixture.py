@@ -119,8 +119,8 @@ class MosquittoBroker(Broker):
 
     def __init__(self, folder: Path, *, port: int | None = None, more: str = "") -> None:
         super().__init__(port)
-        self._config = folder / f"mosquitto-{self.port}-{zlib.crc32(more.encode()):08x}.conf"
-        self._config.write_text(
+        self.config = folder / f"mosquitto-{self.port}-{zlib.crc32(more.encode()):08x}.conf"
+        self.config.write_text(
             f"listener {self.port} {HOST}\nallow_anonymous true\npersistence false\n"
             f"set_tcp_nodelay true\nuser {os.environ.get('USER') or 'root'}\n{more}",
             encoding="utf-8",
@@ -137,7 +137,7 @@ class MosquittoBroker(Broker):
     def _command(self) -> list[str]:
         program = shutil.which("mosquitto", path=self.PATH)
         assert program is not None, self.missing()
-        return [program, "-c", str(self._config)]
+        return [program, "-c", str(self.config)]
 
 
 class EmbeddedBroker(Broker):
@@ -146,8 +146,8 @@ class EmbeddedBroker(Broker):
     def __init__(self, folder: Path) -> None:
         super().__init__()
         self._port_of_3_1_1 = free_port()
-        self._config = folder / f"iotcore-{self.port}.toml"
-        self._config.write_text(self._config_text(), encoding="utf-8")
+        self.config = folder / f"iotcore-{self.port}.toml"
+        self.config.write_text(self._config_text(), encoding="utf-8")
 
     @classmethod
     @override
@@ -162,7 +162,7 @@ class EmbeddedBroker(Broker):
 
     @override
     def _command(self) -> list[str]:
-        return [sys.executable, "-P", "-c", _SERVE, str(self._config)]
+        return [sys.executable, "-P", "-c", _SERVE, str(self.config)]
 
     def _config_text(self) -> str:
         router = """id = 0

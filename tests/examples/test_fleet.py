@@ -95,9 +95,8 @@ def station(tmp_path: Path) -> Iterator[MosquittoBroker]:
     acl.chmod(0o600)
     more = f"password_file {passwords}\nacl_file {acl}\n"
     broker = MosquittoBroker(tmp_path, more=more)
-    config = tmp_path / f"mosquitto-{broker.port}.conf"
-    text = config.read_text(encoding="utf-8")
-    config.write_text(text.replace("allow_anonymous true", "allow_anonymous false"))
+    text = broker.config.read_text(encoding="utf-8")
+    broker.config.write_text(text.replace("allow_anonymous true", "allow_anonymous false"))
     with running(broker):
         yield broker
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from jointfit_daemon.arrays import Array
+    from jointfit_daemon.limb_model import SegmentModel
 
     Errors = tuple[float, float, float]
 
@@ -183,13 +184,18 @@ def flexion_scores(
     taught: list[KneeTrial], judged: KneeTrial, method: str = DEFAULT
 ) -> NDArray[np.float64]:
     """Return the flexion errors divided by their predicted deviations, shape (n,)."""
+    alike = fusion_methods.correlation(taught) if method == DEFAULT else 0.0
+    return joint_scores(fusion_methods.models(taught, method), alike, judged)
+
+
+def joint_scores(
+    models: Sequence[SegmentModel], alike: float, judged: KneeTrial
+) -> NDArray[np.float64]:
+    """Return the flexion errors of two models, whose errors have the correlation `alike`."""
     said, claimed = [], []
-    for model, segment in zip(
-        fusion_methods.models(taught, method), fusion_methods.segments(judged), strict=True
-    ):
+    for model, segment in zip(models, fusion_methods.segments(judged), strict=True):
         said.append(model.predict(segment.sensors, segment.other))
         claimed.append(fusion_methods.axis_deviations(model, segment)[:, 0])
-    alike = fusion_methods.correlation(taught) if method == DEFAULT else 0.0
     first, second = claimed
     variance = first**2 + second**2 - 2.0 * alike * first * second
     q = rotation.multiply(rotation.conjugate(said[0]), said[1])
@@ -221,6 +227,10 @@ WALKING_FLEXION = (
     "in walking the thigh and shank errors of patent12 are large, nearly equal, and cancel in "
     "flexion; the "
     "training movements do not show which correction extrapolates to walking"
+)
+WIDE = (
+    "after squats the experts disagree more than they err on this leg; on both legs with three "
+    "deals the standard deviations have the right size or are too small"
 )
 EXPERIMENTS = (
     Experiment(
@@ -268,5 +278,6 @@ EXPERIMENTS = (
         KNEE,
         _DATA,
         headline=True,
+        known_misses={"all together: flexion within 1 sd": WIDE},
     ),
 )
