@@ -34,9 +34,10 @@ LARGEST = 20
 WORKERS_THAT_WAIT = 2
 """Number of workers that begin with tests in real time: they wait for half of their time."""
 FIT_NICE = 10
-"""Decrease of the priority of a worker that begins with tests that compute: that of a fit.
+"""Decrease of the priority of a worker whose tests compute: that of a fit.
 
-Daemons and devices in real time come first, and their fits do not wait for all other tests.
+Daemons and devices in real time come first, and their fits do not wait for all other tests. A
+process cannot raise its priority again, so after the last of these tests another worker begins.
 """
 
 
@@ -112,7 +113,7 @@ class _Worker:
     process: ForkProcess
     channel: connection.Connection
     waiting: bool
-    """Whether it takes the tests that wait first."""
+    """Whether it takes the tests that wait first, and then the others, instead of these alone."""
     left: Batch = field(default_factory=list)
     """Tests of its batches that it has not finished; it runs the first."""
 
@@ -178,7 +179,7 @@ class _Workers:
     def _take(self, worker: _Worker) -> Batch:
         if self._session.shouldfail or self._session.shouldstop:
             return []
-        for kind in (worker.waiting, not worker.waiting):
+        for kind in (True, False) if worker.waiting else (False,):
             while self._queues[kind]:
                 if batch := self._queues[kind].popleft():
                     return batch
@@ -192,6 +193,8 @@ class _Workers:
             self._report_death(worker)
             self._queues[worker.waiting].appendleft(worker.left[1:])
             self._start(waiting=worker.waiting)
+        elif not worker.waiting and any(self._queues.values()):
+            self._start(waiting=True)
 
     def _report_death(self, worker: _Worker) -> None:
         item = self._session.items[worker.left[0]]

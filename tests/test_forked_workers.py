@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -65,3 +66,36 @@ def test_every_test_is_reported_once_and_a_death_of_a_worker_fails_one(tmp_path:
     for name in ("one", "two"):
         lines = (tmp_path / name / "once.txt").read_text().splitlines()
         assert [line.partition(" ")[2] for line in lines] == ["set-up", "torn down"]
+
+
+PRIORITIES = """\
+import os, time
+import pytest
+
+USUAL = int(os.environ["USUAL"])
+
+@pytest.mark.experiment
+@pytest.mark.parametrize("number", range(4))
+def test_computes(number):
+    assert os.getpriority(os.PRIO_PROCESS, 0) in {USUAL, min(USUAL + 10, 19)}
+
+@pytest.mark.system
+@pytest.mark.experiment
+@pytest.mark.parametrize("number", range(12))
+def test_in_real_time(number):
+    time.sleep(0.05)
+    assert os.getpriority(os.PRIO_PROCESS, 0) == USUAL
+"""
+
+
+def test_a_test_in_real_time_never_runs_at_the_priority_of_those_that_compute(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "test_priorities.py").write_text(PRIORITIES)
+    options = ["-c", "pyproject.toml", f"--rootdir={tmp_path}", "--workers=4"]
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "tests.forked_workers", *options, str(tmp_path)],
+        cwd=ROOT, check=False, capture_output=True, text=True,
+        env=os.environ | {"USUAL": str(os.getpriority(os.PRIO_PROCESS, 0))},
+    )  # fmt: skip
+    assert run.stdout.splitlines()[-1].startswith("16 passed"), run.stdout
