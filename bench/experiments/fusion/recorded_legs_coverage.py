@@ -118,7 +118,6 @@ APART = (
     "of the two corrections widens it here, but its form must not be chosen on these recordings"
 )
 MISSES = {
-    "later parts, fitted, STS1: flexion": SHORT,
     "later parts, fitted, walking1: thigh": SHORT,
     "later parts, fitted, walking1: flexion": SHORT,
     "later parts, fitted, DJ1: thigh": LONG_AXIS,
