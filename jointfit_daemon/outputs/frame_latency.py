@@ -1,7 +1,7 @@
 """Latency of frames by stage: from the arrival of the last chunk to the socket of the broker.
 
-Invariant: a sample costs one reading of the clock. A frame costs four more, one addition to a
-histogram per stage, and two small objects.
+Invariant: a chunk of bytes costs one reading of the clock. A frame costs four more, one addition to
+a histogram per stage, and two small objects.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class FrameLatency:
         self.end_interval()
 
     def end_interval(self) -> None:
-        """Set `health` to the latency since the last call, and begin anew."""
+        """Set `health` to the latency since the last call, and start the next interval."""
         found = self._histograms
         self._histograms = {stage: LatencyHistogram() for stage in STAGES}
         stages = {stage: _quantiles(histogram) for stage, histogram in found.items()}

@@ -224,7 +224,7 @@ class LabelMonitor:
 
 
 def _centers(chain: Chain, calibration: Calibration) -> dict[tuple[str, str], Vector]:
-    """Return the known joint centers, static world, m, by the body parts beside each joint."""
+    """Return the known joint centers, static world, m, by the two body parts of each joint."""
     parts, found = body_parts(chain), {}
     for name, (proximal, distal) in zip(chain.joints, joint_parts(chain), strict=True):
         joint = calibration.joint.get(name)

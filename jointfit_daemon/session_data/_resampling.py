@@ -1,7 +1,7 @@
 """Time axes of series: their rate, whether they are uniform, and values at other instants.
 
 Gaps are not bridged: a row between two rows that are further apart than `MAX_GAP_SAMPLES` periods,
-or beside an unknown row, is unknown.
+or next to an unknown row, is unknown.
 """
 
 from __future__ import annotations

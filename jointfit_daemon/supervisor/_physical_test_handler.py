@@ -1,4 +1,4 @@
-"""The request `physical-test`: the guided test of one sensor, beside its normal operation.
+"""The request `physical-test`: the guided test of one sensor, during its normal operation.
 
 Invariant: a test that is not completed, or not asked for its state any more, ends by itself, so
 that its chunks do not accumulate.

@@ -40,7 +40,7 @@ class LpmsCanImu:
 
     @classmethod
     def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterator[dict[str, Any]]:
-        """Yield the settings of sensors that may send what was received.
+        """Yield the settings of sensors that may have sent the received frames.
 
         A candidate has a first frame of 8 bytes: of a node in CANopen style, or the first of four
         consecutive ones. Both precisions are candidates. See `jointfit_daemon.device_search`.

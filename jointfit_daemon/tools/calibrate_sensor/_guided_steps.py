@@ -60,7 +60,7 @@ class SensorFindings:
     refused: dict[str, str] = field(default_factory=dict)
     """Reason why a step has no result."""
     not_estimated: dict[str, str] = field(default_factory=dict)
-    """Reason why a quantity that a step yields beside its result is not estimated."""
+    """Reason why the additional quantity of a step is not estimated."""
     serial: str | None = None
     """Serial number, if the sensor reported one."""
     warnings: list[str] = field(default_factory=list)

@@ -43,15 +43,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.init._answers import Answers
 
 _DIALOGUE_KEYS = {"id", "segment", "driver", "port", "can", "ids", "fields", "server"}
-"""Keys without default that the dialogue can answer, beside those with few values; drivers with
-others are not offered."""
+"""Keys without default that the dialogue can answer, in addition to those with few values. Drivers
+with others are not offered."""
 _LAYOUT_KEYS = (
     "frame", "text", "ids", "extended_ids", "sequence", "dbc", "fields", "byte_order", "world",
     "direction", "orientation", "magnetometer",
 )  # fmt: skip
 """Keys of ``[[imu]]`` that a file with a layout may have."""
 _CONNECTION_KEYS = {"driver", "can", "ids"}
-"""Keys of ``[[imu]]`` that say where a sensor on CAN is."""
+"""Keys of ``[[imu]]`` that locate a sensor on CAN."""
 _PROPOSED_FIRST = ("xbus", "xcdi", "natnet")
 """Drivers that lead the list of their kind; the others follow by name."""
 LISTEN_S = 1.0

@@ -1,4 +1,4 @@
-"""The access list of the broker refuses messages on the daemon its topics."""
+"""The access list of the broker does not let the daemon write to its topics."""
 
 from __future__ import annotations
 
