@@ -12,7 +12,10 @@ from math import isfinite
 from statistics import median
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.model import Corrupt, DeviceEvent
+from typing_extensions import override
+
+from jointfit_daemon.model import DeviceEvent
+from jointfit_drivers.refusals import Refusals
 from jointfit_drivers.table_samples import RecordContinuity, duration_ns
 from jointfit_protocols.orientation import OrientationGate
 
@@ -31,7 +34,7 @@ class _HeldSample(NamedTuple):
     size: int
 
 
-class CheckedSamples:
+class CheckedSamples(Refusals):
     """Checks the samples of one device.
 
     Parameters
@@ -53,6 +56,7 @@ class CheckedSamples:
         counts: int | None,
         tolerance: float = 0.01,
     ) -> None:
+        super().__init__()
         self.tick_clock = tick_clock
         modulus = None if tick_clock is None else tick_clock.modulus
         self._continuity = RecordContinuity(rate_hz, duration_ns(tick_clock), modulus, counts)
@@ -62,8 +66,6 @@ class CheckedSamples:
         self._rate_hz, self._tick_ns, self._modulus = rate_hz, duration_ns(tick_clock), modulus
         self._last_ticks: int | None = None
         self._intervals: list[int] = []
-        self.refused = self.refused_bytes = 0
-        """Messages that became no sample, and their bytes."""
 
     def add(self, sample: ImuSample, size: int) -> list[Decoded]:
         """Return the events and samples that the next sample completes.
@@ -100,18 +102,13 @@ class CheckedSamples:
             out.append(DeviceEvent("gap", f"{lost} samples lost", {"lost": lost}))
         return out + self._admit(sample, size)
 
+    @override
     def flush(self) -> list[Decoded]:
         """Refuse a sample that no later one confirmed."""
         held, self._held = self._held, None
         if held is None:
             return []
         return [self.refuse(held.size, "time and counter disagree with the other samples")]
-
-    def refuse(self, size: int, reason: str) -> Corrupt:
-        """Count a message of `size` bytes that becomes no sample."""
-        self.refused += 1
-        self.refused_bytes += size
-        return Corrupt(size, reason)
 
     def _admit(self, sample: ImuSample, size: int) -> list[Decoded]:
         """Return the sample with a unit quaternion, or the reason why it has none."""

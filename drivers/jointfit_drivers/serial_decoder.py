@@ -1,4 +1,4 @@
-"""Base of decoders of IMUs on a serial line: all but the conversion of one message.
+"""Bases of decoders of IMUs on a serial line: all but the conversion of one message.
 
 Invariant: the output depends only on the chunks fed; no clock and no port is read.
 """
@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Generic, Protocol
+
+from typing_extensions import override
 
 from jointfit_daemon.model import Corrupt
 from jointfit_drivers.serial_conversation import Found_co, Message, StreamCodec
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.model import Chunk, Decoded, TickClock
     from jointfit_drivers.checked_samples import CheckedSamples
+    from jointfit_drivers.refusals import Refusals
 
 
 class CountingCodec(StreamCodec[Found_co], Protocol[Found_co]):
@@ -30,19 +33,18 @@ class CountingCodec(StreamCodec[Found_co], Protocol[Found_co]):
         """Bytes without a message so far."""
 
 
-class SerialDecoder(ABC, Generic[Message]):
-    """Decoder of one device; a subclass converts one message.
+class SerialMessageDecoder(ABC, Generic[Message]):
+    """Decoder of one device; a subclass converts one message, and stamps it if it needs a stamp.
 
-    A sample is stamped with the arrival of its first byte. After a silence, the rest of an
-    incomplete message is not awaited.
+    After a silence, the rest of an incomplete message is not awaited.
 
     Parameters
     ----------
     codec : CountingCodec
         New codec. Its messages have `size`, bytes on the wire, and `end`, bytes fed up to and
         including the last one.
-    samples : CheckedSamples
-        New checks; `convert` adds its samples to them.
+    refusals : Refusals
+        Count of its messages that became no sample.
     baud : int, optional
         Line speed, bit/s, for back-dating of stamps; None for USB, whose bytes take no time.
     longest : int
@@ -52,12 +54,82 @@ class SerialDecoder(ABC, Generic[Message]):
     def __init__(
         self,
         codec: CountingCodec[Message],
-        samples: CheckedSamples,
+        refusals: Refusals,
         baud: int | None,
         longest: int,
     ) -> None:
         self._codec = codec
+        self._refusals = refusals
         self._stamps = ArrivalStamps(baud, longest)
+
+    @abstractmethod
+    def _take(self, message: Message) -> Iterable[Decoded]:
+        """Return the samples and events of one message."""
+
+    @property
+    def messages(self) -> int:
+        """Well-formed messages so far."""
+        return self._codec.messages - self._refusals.refused
+
+    @property
+    def discarded_bytes(self) -> int:
+        """Bytes so far that belong to no message, or to a message that was rejected."""
+        return self._codec.discarded + self._refusals.refused_bytes
+
+    def feed(self, chunk: Chunk) -> list[Decoded]:
+        """Return the content that `chunk` completed, in wire order; never raises."""
+        out: list[Decoded] = []
+        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
+            self._append(self._codec.flush(), out)  # the rest of the message was lost
+        self._stamps.start_chunk(chunk.t_ns)
+
+        found = self._codec.feed(chunk.data)
+        if len(found) == 1 and type(found[0]) is not CorruptBytes:  # the usual chunk
+            out += self._take(found[0])
+        else:
+            self._append(found, out)
+        return out
+
+    def flush(self) -> list[Decoded]:
+        """Discard an incomplete message and a sample that waits for confirmation."""
+        out: list[Decoded] = []
+        self._append(self._codec.flush(), out)
+        return out + self._refusals.flush()
+
+    def _append(self, found: Sequence[Message | CorruptBytes], out: list[Decoded]) -> None:
+        for item in found:
+            if type(item) is CorruptBytes:  # half the time of isinstance()
+                out.append(Corrupt(item.discarded, item.reason))
+            else:
+                out += self._take(item)
+
+    def _arrival_of(self, message: Message) -> int:
+        """Return the arrival of the first byte of `message`, monotonic ns."""
+        return self._stamps.stamp(self._codec.fed - message.end + message.size)
+
+
+class SerialDecoder(SerialMessageDecoder[Message]):
+    """Decoder of one device whose samples pass `CheckedSamples`; a subclass converts one message.
+
+    A sample is stamped with the arrival of its first byte. After a silence, the rest of an
+    incomplete message is not awaited.
+
+    Parameters
+    ----------
+    codec, baud, longest
+        As those of `SerialMessageDecoder`.
+    samples : CheckedSamples
+        New checks; `convert` adds its samples to them.
+    """
+
+    def __init__(
+        self,
+        codec: CountingCodec[Message],
+        samples: CheckedSamples,
+        baud: int | None,
+        longest: int,
+    ) -> None:
+        super().__init__(codec, samples, baud, longest)
         self.samples = samples
 
     @abstractmethod
@@ -77,34 +149,6 @@ class SerialDecoder(ABC, Generic[Message]):
         """Unit and modulus of the device time; None without one."""
         return self.samples.tick_clock
 
-    @property
-    def messages(self) -> int:
-        """Well-formed messages so far."""
-        return self._codec.messages - self.samples.refused
-
-    @property
-    def discarded_bytes(self) -> int:
-        """Bytes so far that belong to no message, or to a message that was rejected."""
-        return self._codec.discarded + self.samples.refused_bytes
-
-    def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
-        out: list[Decoded] = []
-        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
-            out = self._take(self._codec.flush())
-        self._stamps.start_chunk(chunk.t_ns)
-        return out + self._take(self._codec.feed(chunk.data))
-
-    def flush(self) -> list[Decoded]:
-        """Discard an incomplete message and a sample that waits for confirmation."""
-        return self._take(self._codec.flush()) + self.samples.flush()
-
-    def _take(self, found: Sequence[Message | CorruptBytes]) -> list[Decoded]:
-        out: list[Decoded] = []
-        for item in found:
-            if isinstance(item, CorruptBytes):
-                out.append(Corrupt(item.discarded, item.reason))
-            else:
-                since = self._codec.fed - item.end + item.size
-                out += self.convert(item, self._stamps.stamp(since))
-        return out
+    @override
+    def _take(self, message: Message) -> Iterable[Decoded]:
+        return self.convert(message, self._arrival_of(message))

@@ -11,8 +11,11 @@ from __future__ import annotations
 from math import isfinite
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
+from typing_extensions import override
+
+from jointfit_daemon.model import DeviceEvent, ImuSample
 from jointfit_drivers.gateway_orientation import RawReading, RawStamp, is_plausible
+from jointfit_drivers.refusals import Refusals
 from jointfit_drivers.time_continuity import TimeContinuity
 from jointfit_protocols.orientation import OrientationGate, Quaternion
 
@@ -50,7 +53,7 @@ class TimedReading(NamedTuple):
     raw: RawVectors | None = None
 
 
-class TimedSamples:
+class TimedSamples(Refusals):
     """Computes the samples of one device.
 
     Parameters
@@ -62,6 +65,7 @@ class TimedSamples:
     """
 
     def __init__(self, make_raw: Callable[[], RawSamples] | None, untimed_remedy: str) -> None:
+        super().__init__()
         self._make_raw = make_raw
         self._raw = None if make_raw is None else make_raw()
         self._untimed_remedy = untimed_remedy
@@ -70,10 +74,6 @@ class TimedSamples:
         self._gate = OrientationGate()
         self._raw_ns: int | None = None
         self._timed = self._untimed = self._norm_checked = False
-        self.refused = 0
-        """Messages rejected so far."""
-        self.refused_bytes = 0
-        """Bytes of these messages."""
 
     def add(self, reading: TimedReading) -> list[Decoded]:
         """Return the events and samples that a reading completes."""
@@ -100,16 +100,11 @@ class TimedSamples:
             out.append(DeviceEvent("gap", f"{step.lost} messages lost", {"lost": step.lost}))
         return out + self._samples(reading)
 
+    @override
     def flush(self) -> list[Decoded]:
         """Reject a reading that no later one confirmed."""
         held, self._held = self._held, None
         return [] if held is None else [self.refuse(held.size, "time disagrees with the others")]
-
-    def refuse(self, size: int, reason: str) -> Corrupt:
-        """Count a message of `size` bytes as rejected."""
-        self.refused += 1
-        self.refused_bytes += size
-        return Corrupt(size, reason)
 
     def _add_untimed(self, reading: TimedReading) -> list[Decoded]:
         """Return a sample stamped with its arrival; reject it if others have a time."""

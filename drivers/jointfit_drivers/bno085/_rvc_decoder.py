@@ -18,16 +18,18 @@ from __future__ import annotations
 from math import cos, hypot, radians, sin, sqrt
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
-from jointfit_drivers.serial_imu import ArrivalStamps
+from typing_extensions import override
+
+from jointfit_daemon.model import DeviceEvent, ImuSample
+from jointfit_drivers.refusals import Refusals
+from jointfit_drivers.serial_decoder import SerialMessageDecoder
 from jointfit_protocols.bno085 import RVC_BYTES, RvcCodec, RvcFrame
 from jointfit_protocols.orientation import OrientationGate, Quaternion
 
 if TYPE_CHECKING:
     from typing import Literal
 
-    from jointfit_daemon.model import Chunk, Decoded, Vector
-    from jointfit_protocols.corrupt import CorruptBytes
+    from jointfit_daemon.model import Decoded, Vector
 
 _ANGLE = radians(0.01)
 """Angle of one count, rad."""
@@ -47,7 +49,7 @@ _BETTER = 3.0
 _G_COUNTS = 1000.0
 
 
-class RvcDecoder:
+class RvcDecoder(SerialMessageDecoder[RvcFrame]):
     """Decoder of one device in the mode UART-RVC.
 
     Parameters
@@ -61,60 +63,30 @@ class RvcDecoder:
     tick_clock = None  # a frame has an index, but no time
 
     def __init__(self, baud: int | None, euler: Literal["zxy", "zyx"] = "zxy") -> None:
+        super().__init__(RvcCodec(), Refusals(), baud, RVC_BYTES)
         self._euler = euler
-        self._codec, self._gate = RvcCodec(), OrientationGate()
-        self._stamps = ArrivalStamps(baud, RVC_BYTES)
+        self._gate = OrientationGate()
         self._number: int | None = None
         self._compared = 0
         self._deviations = [0.0, 0.0]  # of this order and of the other one
 
-    @property
-    def messages(self) -> int:
-        """Well-formed frames so far."""
-        return self._codec.messages
-
-    @property
-    def discarded_bytes(self) -> int:
-        """Bytes so far that belong to no frame."""
-        return self._codec.discarded
-
-    def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
+    @override
+    def _take(self, message: RvcFrame) -> list[Decoded]:
         out: list[Decoded] = []
-        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
-            out = self.flush()
-        self._stamps.start_chunk(chunk.t_ns)
-        return out + self._take(self._codec.feed(chunk.data))
-
-    def flush(self) -> list[Decoded]:
-        """Discard a pending frame."""
-        return self._take(self._codec.flush())
-
-    def _take(self, found: list[RvcFrame | CorruptBytes]) -> list[Decoded]:
-        out: list[Decoded] = []
-        for event in found:
-            if isinstance(event, RvcFrame):
-                out += self._sample(event)
-            else:
-                out.append(Corrupt(event.discarded, event.reason))
-        return out
-
-    def _sample(self, frame: RvcFrame) -> list[Decoded]:
-        out: list[Decoded] = []
-        step = 1 if self._number is None else (frame.number - self._number) % _COUNTS
-        self._number = frame.number
+        step = 1 if self._number is None else (message.number - self._number) % _COUNTS
+        self._number = message.number
         if 1 < step < _MOST_LOST:
             out.append(DeviceEvent("gap", f"{step - 1} messages lost", {"lost": step - 1}))
 
-        native = quaternion_of(frame.angles, self._euler)
+        native = quaternion_of(message.angles, self._euler)
         q = self._gate.admit(native)
-        arrival_ns = self._stamps.stamp(self._codec.fed - frame.end + RVC_BYTES)
-        x, y, z = frame.acceleration
+        arrival_ns = self._arrival_of(message)
+        x, y, z = message.acceleration
         force = (_FORCE * x, _FORCE * y, _FORCE * z)
         if q is not None:  # the norm is 1 but for rounding
-            out.append(ImuSample(arrival_ns, q, native, None, frame.number, acceleration=force))
+            out.append(ImuSample(arrival_ns, q, native, None, message.number, acceleration=force))
         if self._compared < _COMPARED:
-            out += self._compare(frame)
+            out += self._compare(message)
         return out
 
     def _compare(self, frame: RvcFrame) -> list[Decoded]:

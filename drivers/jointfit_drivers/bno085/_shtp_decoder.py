@@ -12,9 +12,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
+from typing_extensions import override
+
+from jointfit_daemon.model import DeviceEvent, ImuSample
 from jointfit_drivers.gateway_orientation import RawReading, RawStamp, is_plausible
-from jointfit_drivers.serial_imu import ArrivalStamps
+from jointfit_drivers.refusals import Refusals
+from jointfit_drivers.serial_decoder import SerialMessageDecoder
 from jointfit_protocols.bno085 import (
     ACCURACY,
     MOST_PAYLOAD,
@@ -22,6 +25,7 @@ from jointfit_protocols.bno085 import (
     TICK_NS,
     HubReport,
     HubReportId,
+    ShtpBufferStatus,
     ShtpChannel,
     ShtpCodec,
     ShtpPacket,
@@ -31,13 +35,11 @@ from jointfit_protocols.bno085 import (
     decode_report,
     split_reports,
 )
-from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.orientation import OrientationGate
 
 if TYPE_CHECKING:
-    from jointfit_daemon.model import Chunk, Decoded, Vector
+    from jointfit_daemon.model import Decoded, Vector
     from jointfit_drivers.gateway_orientation import RawSamples
-    from jointfit_protocols.bno085 import ShtpBufferStatus
 
 _COUNTS = 256
 _MOST_LOST = 128
@@ -54,7 +56,7 @@ _SATURATED = 32_760
 _RATE_COUNT, _FORCE_COUNT = 2.0**-9, 2.0**-8
 
 
-class ShtpDecoder:
+class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
     """Decoder of one device in the mode UART-SHTP.
 
     Parameters
@@ -68,11 +70,10 @@ class ShtpDecoder:
     tick_clock = None  # reports have an age, but no time
 
     def __init__(self, baud: int | None, raw: RawSamples | None = None) -> None:
-        self._codec, self._gate, self._raw = ShtpCodec(), OrientationGate(), raw
-        self._stamps = ArrivalStamps(baud, MOST_PAYLOAD)
+        super().__init__(ShtpCodec(), Refusals(), baud, MOST_PAYLOAD)
+        self._gate, self._raw = OrientationGate(), raw
         self._arrival_ns = 0
         self._sequences: dict[int, int] = {}
-        self._rejected = self._rejected_bytes = 0
         self._measuring = False
         self._accuracy: int | None = None
         self._force: HubReport | None = None
@@ -80,55 +81,27 @@ class ShtpDecoder:
         self._force_age = 0
         self._reading_ns = self._readings = self._first_ns = 0
 
-    @property
-    def messages(self) -> int:
-        """Well-formed packets so far."""
-        return self._codec.packets - self._rejected
-
-    @property
-    def discarded_bytes(self) -> int:
-        """Bytes so far that belong to no packet, or to one that was rejected."""
-        return self._codec.discarded + self._rejected_bytes
-
-    def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
-        out: list[Decoded] = []
-        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
-            out = self.flush()
-        self._stamps.start_chunk(chunk.t_ns)
-        return out + self._take(self._codec.feed(chunk.data))
-
-    def flush(self) -> list[Decoded]:
-        """Discard a pending packet."""
-        return self._take(self._codec.flush())
-
-    def _take(self, found: list[ShtpPacket | ShtpBufferStatus | CorruptBytes]) -> list[Decoded]:
-        out: list[Decoded] = []
-        for event in found:
-            if isinstance(event, ShtpPacket):
-                out += self._packet(event)
-            elif isinstance(event, CorruptBytes):
-                out.append(Corrupt(event.discarded, event.reason))
-        return out
-
-    def _packet(self, packet: ShtpPacket) -> list[Decoded]:
-        channel = packet.channel
+    @override
+    def _take(self, message: ShtpPacket | ShtpBufferStatus) -> list[Decoded]:
+        if isinstance(message, ShtpBufferStatus):
+            return []
+        channel = message.channel
         if channel == ShtpChannel.EXECUTABLE:
-            return self._reset() if packet.payload == _RESET_COMPLETE else []
+            return self._reset() if message.payload == _RESET_COMPLETE else []
         if channel not in {ShtpChannel.CONTROL, ShtpChannel.INPUT, ShtpChannel.WAKE_INPUT}:
             return []  # advertisements
-        reports = split_reports(packet.payload)
+        reports = split_reports(message.payload)
         if reports is None:
-            return [self._reject(packet, "reports do not fill the packet")]
+            return [self._refusals.refuse(message.size - 2, "reports do not fill the packet")]
         if channel == ShtpChannel.CONTROL:
             return [event for report in reports for event in _device_events(report)]
-        return self._reports(packet, reports)
+        return self._reports(message, reports)
 
     def _reports(self, packet: ShtpPacket, reports: list[bytes]) -> list[Decoded]:
         """Return the samples of a packet of measurements."""
         out: list[Decoded] = []
         base = 0
-        sent_ns = self._stamps.stamp(self._codec.fed - packet.end + packet.size)
+        sent_ns = self._arrival_of(packet)
         for data in reports:
             shift = base_time(data)
             if shift is not None:
@@ -139,7 +112,7 @@ class ShtpDecoder:
                 continue
             age = -(base + report.delay)
             if not -_OLDEST <= age <= _OLDEST:
-                return [*out, self._reject(packet, "time out of range")]
+                return [*out, self._refusals.refuse(packet.size - 2, "time out of range")]
 
             # an older measurement may follow a younger one of another sensor: stamps never decrease
             self._arrival_ns = max(self._arrival_ns, sent_ns - max(age, 0) * TICK_NS)
@@ -155,7 +128,7 @@ class ShtpDecoder:
         native = (real, i, j, k)
         q = self._gate.admit(native)
         if q is None:
-            return [self._reject(packet, "quaternion norm is not 1")]
+            return [self._refusals.refuse(packet.size - 2, "quaternion norm is not 1")]
         _, out = self._step(report)
         self._measuring = True
         counter, status = report.sequence, report.status
@@ -229,11 +202,6 @@ class ShtpDecoder:
             return []
         self._measuring = False
         return [DeviceEvent("restart", "device restarted: it lost its settings")]
-
-    def _reject(self, packet: ShtpPacket, reason: str) -> Corrupt:
-        self._rejected += 1
-        self._rejected_bytes += packet.size - 2
-        return Corrupt(packet.size - 2, reason)
 
 
 def _vector(report: HubReport) -> Vector:

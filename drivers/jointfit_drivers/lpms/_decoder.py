@@ -11,10 +11,13 @@ from __future__ import annotations
 from math import isfinite
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, TickClock
+from typing_extensions import override
+
+from jointfit_daemon.model import DeviceEvent, ImuSample, TickClock
 from jointfit_drivers.lpms._orientation import LpmsConvention, LpmsOrientation
 from jointfit_drivers.lpms._tick_rate import TickRateCheck
-from jointfit_drivers.serial_imu import ArrivalStamps
+from jointfit_drivers.refusals import Refusals
+from jointfit_drivers.serial_decoder import SerialMessageDecoder
 from jointfit_drivers.time_continuity import TimeContinuity
 from jointfit_protocols.lpms import MAX_MESSAGE, LpBusCodec, LpBusMessage
 from jointfit_protocols.lpms.configuration import (
@@ -31,7 +34,6 @@ from jointfit_protocols.lpms.measurement import TICK_MODULUS, PacketLayout, seco
 if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_drivers.lpms._settings import LpmsSettings
-    from jointfit_protocols.corrupt import CorruptBytes
     from jointfit_protocols.lpms.measurement import LpmsMeasurement
 
 _NS = 1_000_000_000
@@ -53,7 +55,7 @@ class _Packet(NamedTuple):
     measurement: LpmsMeasurement
 
 
-class LpmsDecoder:
+class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
     """Decoder of one LPMS sensor.
 
     Parameters
@@ -63,10 +65,9 @@ class LpmsDecoder:
     """
 
     def __init__(self, settings: LpmsSettings) -> None:
+        super().__init__(LpBusCodec(), Refusals(), settings.line_baud, MAX_MESSAGE)
         self._table = settings.table
         self._sensor_id = settings.sensor_id
-        self._lpbus = LpBusCodec()
-        self._stamps = ArrivalStamps(settings.line_baud, MAX_MESSAGE)
         self._continuity = TimeContinuity()
         self._orientation = LpmsOrientation(LpmsConvention.of(settings), _NORM_REMEDY)
         self._layout = PacketLayout(self._table, self._table.quaternion)
@@ -78,7 +79,6 @@ class LpmsDecoder:
         self._is_seconds = settings.device_time == "seconds"
         self._check = self._new_check()
         self._last_tick = self._unwrapped = 0
-        self._refused = self._refused_bytes = 0
         self._id_reported = False
         self._sizes: set[int] = set()
         self._noise = b""
@@ -88,41 +88,23 @@ class LpmsDecoder:
         """Unit and modulus of the device time."""
         return _SECONDS_CLOCK if self._is_seconds else self._ticks_clock
 
-    @property
-    def messages(self) -> int:
-        """Well-formed messages so far."""
-        return self._lpbus.messages - self._refused
-
-    @property
-    def discarded_bytes(self) -> int:
-        """Bytes so far that belong to no message, or to a message that was rejected."""
-        return self._lpbus.discarded + self._refused_bytes
-
+    @override
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the content that `chunk` completed, in wire order; never raises."""
-        out: list[Decoded] = []
-        if self._lpbus.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
-            out = self._take(self._lpbus.flush())  # the rest of the pending message was lost
-        self._stamps.start_chunk(chunk.t_ns)
-        if not self._lpbus.messages:
-            out += self._text_warning(chunk.data)
-        found = self._lpbus.feed(chunk.data)
-        return out + self._take(found) if found else out
+        if self._codec.messages:
+            return super().feed(chunk)
+        return self._text_warning(chunk.data) + super().feed(chunk)
 
+    @override
     def flush(self) -> list[Decoded]:
         """Discard a pending message and a packet that waits for confirmation."""
-        return self._take(self._lpbus.flush()) + self._drop_held()
+        return super().flush() + self._drop_held()
 
-    def _take(self, found: list[LpBusMessage | CorruptBytes]) -> list[Decoded]:
-        out: list[Decoded] = []
-        for event in found:
-            if not isinstance(event, LpBusMessage):
-                out.append(Corrupt(event.discarded, event.reason))
-            elif event.command == _DATA and event.data:
-                out += self._decode_packet(event)
-            else:
-                out += self._property_events(event)
-        return out
+    @override
+    def _take(self, message: LpBusMessage) -> list[Decoded]:
+        if message.command == _DATA and message.data:
+            return self._decode_packet(message)
+        return self._property_events(message)
 
     def _decode_packet(self, message: LpBusMessage) -> list[Decoded]:
         """Return the content of a data packet after the check of its time."""
@@ -130,7 +112,7 @@ class LpmsDecoder:
         if measurement is None or "quaternion" not in self._layout.places:
             return self._length_warning(message)  # a sound message, of other outputs
 
-        arrival_ns = self._stamps.stamp(self._lpbus.fed - message.end + message.size)
+        arrival_ns = self._arrival_of(message)
         out: list[Decoded] = []
         if not self._check.done:
             out += self._time_warning(measurement.tick, arrival_ns)
@@ -142,7 +124,10 @@ class LpmsDecoder:
 
         ticks = self._device_ticks(measurement.tick)
         if ticks is None:
-            return [*out, self._refuse(message, "device time is not a number of seconds")]
+            return [
+                *out,
+                self._refusals.refuse(message.size, "device time is not a number of seconds"),
+            ]
         device_ns = ticks * 1_000 if self._is_seconds else ticks * _NS // self._ticks_per_s
         step = self._continuity.add(device_ns, arrival_ns)
         packet = _Packet(message, arrival_ns, ticks, measurement)
@@ -182,7 +167,7 @@ class LpmsDecoder:
         out, self._orientation.events = self._orientation.events, []
 
         if converted is None:
-            return [*out, self._refuse(packet.message, "quaternion norm is not 1")]
+            return [*out, self._refusals.refuse(packet.message.size, "quaternion norm is not 1")]
         native, q = converted
         ticks = packet.ticks if self._is_seconds else measurement.tick
         return [*out, ImuSample(packet.arrival_ns, q, native, ticks, None)]
@@ -269,17 +254,13 @@ class LpmsDecoder:
             return []
         return [DeviceEvent("warning", f"it sends text: {TEXT_REMEDY}")]
 
-    def _refuse(self, message: LpBusMessage, reason: str) -> Corrupt:
-        self._refused += 1
-        self._refused_bytes += message.size
-        return Corrupt(message.size, reason)
-
     def _drop_held(self) -> list[Decoded]:
         """Reject a packet that no later one confirmed."""
         held, self._held = self._held, None
         if held is None:
             return []
-        return [self._refuse(held.message, "device time disagrees with the other messages")]
+        reason = "device time disagrees with the other messages"
+        return [self._refusals.refuse(held.message.size, reason)]
 
 
 def is_text(data: bytes) -> bool:

@@ -11,10 +11,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, TickClock
+from typing_extensions import override
+
+from jointfit_daemon.model import DeviceEvent, TickClock
 from jointfit_drivers.mip._device_replies import reply_events
 from jointfit_drivers.mip._required_fields import GPS_TIMES, QUATERNIONS
-from jointfit_drivers.serial_imu import ArrivalStamps
+from jointfit_drivers.serial_decoder import SerialMessageDecoder
 from jointfit_drivers.timed_samples import RawVectors, TimedReading, TimedSamples
 from jointfit_protocols.mip import MAX_PACKET, MipCodec, MipPacket
 from jointfit_protocols.mip.data import (
@@ -30,10 +32,9 @@ from jointfit_protocols.orientation import canonical
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from jointfit_daemon.model import Chunk, Decoded, Vector
+    from jointfit_daemon.model import Decoded, Vector
     from jointfit_drivers.gateway_orientation import RawSamples
     from jointfit_drivers.mip._required_fields import RequiredFields
-    from jointfit_protocols.corrupt import CorruptBytes
 
 _CLOCK = TickClock(1, None)
 _TIME = int(SharedField.REFERENCE_TIME)
@@ -47,7 +48,7 @@ _REPORT_NS = 10_000_000_000
 """Least time between two reports of invalid orientations, ns."""
 
 
-class MipDecoder:
+class MipDecoder(SerialMessageDecoder[MipPacket]):
     """Decoder of one MIP device.
 
     Parameters
@@ -77,48 +78,19 @@ class MipDecoder:
         self._other = {int(one): int(field) for one, field in QUATERNIONS.items()}
         del self._other[self._set]
 
-        self._codec = MipCodec()
-        self._stamps = ArrivalStamps(baud, MAX_PACKET)
         self._samples = TimedSamples(make_raw, "give the time field the same decimation")
+        super().__init__(MipCodec(), self._samples, baud, MAX_PACKET)
         self._foreign = 0
         self._invalid_since_ns: int | None = None
         self._invalid_reported_ns = -_REPORT_NS
 
-    @property
-    def messages(self) -> int:
-        """Well-formed packets so far."""
-        return self._codec.messages - self._samples.refused
-
-    @property
-    def discarded_bytes(self) -> int:
-        """Bytes so far that belong to no packet, or to a packet that was rejected."""
-        return self._codec.discarded + self._samples.refused_bytes
-
-    def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
-        out: list[Decoded] = []
-        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
-            out = self._take(self._codec.flush())
-        self._stamps.start_chunk(chunk.t_ns)
-        found = self._codec.feed(chunk.data)
-        return out + self._take(found) if found else out
-
-    def flush(self) -> list[Decoded]:
-        """Discard a pending packet and an orientation that waits for confirmation."""
-        return self._take(self._codec.flush()) + self._samples.flush()
-
-    def _take(self, found: list[MipPacket | CorruptBytes]) -> list[Decoded]:
-        out: list[Decoded] = []
-        for event in found:
-            if not isinstance(event, MipPacket):
-                out.append(Corrupt(event.discarded, event.reason))
-            elif event.descriptor_set == self._set:
-                out += self._decode_data(event)
-            elif event.descriptor_set < _DATA:
-                out += reply_events(event)
-            else:
-                out += self._note_other_set(event)
-        return out
+    @override
+    def _take(self, message: MipPacket) -> list[Decoded]:
+        if message.descriptor_set == self._set:
+            return self._decode_data(message)
+        if message.descriptor_set < _DATA:
+            return reply_events(message)
+        return self._note_other_set(message)
 
     def _decode_data(self, packet: MipPacket) -> list[Decoded]:
         """Return the content of a packet of the expected data set."""
@@ -134,7 +106,7 @@ class MipDecoder:
             return []
 
         self._foreign = 0
-        arrival_ns = self._stamps.stamp(self._codec.fed - packet.end + packet.size)
+        arrival_ns = self._arrival_of(packet)
         ticks = self._time_in(values)
         if self._is_raw:
             x, y, z = values[_FORCE]

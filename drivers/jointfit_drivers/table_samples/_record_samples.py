@@ -9,13 +9,16 @@ from __future__ import annotations
 from operator import add, mul
 from typing import TYPE_CHECKING, cast
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample
+from typing_extensions import override
+
+from jointfit_daemon.model import DeviceEvent, ImuSample
 from jointfit_drivers.gateway_orientation import (
     RawReading,
     RawSamples,
     RawStamp,
     is_plausible,
 )
+from jointfit_drivers.refusals import Refusals
 from jointfit_drivers.table_samples._continuity import RecordContinuity
 from jointfit_drivers.table_samples._plausibility import PlausibilityChecks
 from jointfit_drivers.table_samples._records import SampleForm, TableRecord, duration_ns
@@ -35,7 +38,7 @@ _RECHECK = 100
 """Refused records after which the settings are checked again; then ten times as many."""
 
 
-class RecordSamples:
+class RecordSamples(Refusals):
     """Converts the records of one device.
 
     Parameters
@@ -45,6 +48,7 @@ class RecordSamples:
     """
 
     def __init__(self, form: SampleForm) -> None:
+        super().__init__()
         self._form = form
         self.tick_clock = form.tick_clock
         present = {slot: at for at, slot in enumerate(form.slots)}
@@ -74,8 +78,6 @@ class RecordSamples:
         self._held: TableRecord | None = None
         self._checks: PlausibilityChecks | None = PlausibilityChecks(form, self._places)
         self._recheck, self._is_reported = _RECHECK, False
-        self.refused = self.refused_bytes = 0
-        """Records that became no sample, and their bytes."""
 
     def take(self, record: TableRecord) -> list[Decoded]:
         """Return the samples and events of the next record."""
@@ -88,7 +90,7 @@ class RecordSamples:
             self._is_reported = self._is_reported or bool(findings)
             self._checks = None if self._checks.done else self._checks
         if self._valid is not None and not self._is_valid(values[self._valid]):
-            return [*out, self._refuse(record, "the device reports it as invalid")]
+            return [*out, self.refuse(record.size, "the device reports it as invalid")]
 
         if ticks is None and counter is None:
             return out + self._sample(record, ticks, counter)
@@ -126,12 +128,13 @@ class RecordSamples:
             out.append(DeviceEvent("restart", f"device restarted at {clock}"))
         return out + self._sample(held, ticks, self._count(held.values))
 
+    @override
     def flush(self) -> list[Decoded]:
         """Refuse a record that waits for the next one."""
         held, self._held = self._held, None
         if held is None:
             return []
-        return [self._refuse(held, "time and counter disagree with the other samples")]
+        return [self.refuse(held.size, "time and counter disagree with the other samples")]
 
     def _sample(self, record: TableRecord, ticks: int | None, counter: int | None) -> list[Decoded]:
         """Return the sample of an accepted record."""
@@ -158,7 +161,7 @@ class RecordSamples:
             ):  # the first samples were good by chance
                 self._recheck *= 10
                 self._checks = PlausibilityChecks(form, self._places)
-            return [self._refuse(record, "quaternion norm is not 1")]
+            return [self.refuse(record.size, "quaternion norm is not 1")]
         vectors = (
             _vector(si, self._rate),
             _vector(si, self._acceleration),
@@ -176,7 +179,7 @@ class RecordSamples:
             now, passed_ns = record.arrival_ns, float(record.arrival_ns - self._raw_at)
         else:
             if stamp.ticks is None:  # its frame was lost
-                return [self._refuse(record, "raw measurements without device time")]
+                return [self.refuse(record.size, "raw measurements without device time")]
             now, modulus = stamp.ticks, clock.modulus
             step = now - self._raw_at
             passed_ns = (step if modulus is None else step % modulus) * duration_ns(clock)
@@ -185,7 +188,9 @@ class RecordSamples:
         magnetic = _vector(si, self._magnetic) if raw.magnetometer else None
         reading = RawReading(t_ns, cast("Vector", rate), cast("Vector", force), magnetic)
         if now == self._raw_at or not is_plausible(reading):
-            return [self._refuse(record, "raw measurements out of range, or of the same instant")]
+            return [
+                self.refuse(record.size, "raw measurements out of range, or of the same instant")
+            ]
         self._raw_ns, self._raw_at = t_ns, now
         clipped = any(
             value in limits for value, limits in zip(record.values, self._limits, strict=False)
@@ -229,11 +234,6 @@ class RecordSamples:
         except (ValueError, OverflowError):
             return False
         return bits != 0 if self._form.equals is None else bits == self._form.equals
-
-    def _refuse(self, record: TableRecord, reason: str) -> Corrupt:
-        self.refused += 1
-        self.refused_bytes += record.size
-        return Corrupt(record.size, reason)
 
 
 def _vector(si: tuple[float, ...], place: slice | None) -> Vector | None:

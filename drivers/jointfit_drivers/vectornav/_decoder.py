@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, cast
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, TickClock
-from jointfit_drivers.serial_imu import ArrivalStamps
+from typing_extensions import override
+
+from jointfit_daemon.model import DeviceEvent, TickClock
+from jointfit_drivers.serial_decoder import SerialMessageDecoder
 from jointfit_drivers.timed_samples import RawVectors, TimedReading, TimedSamples
 from jointfit_drivers.vectornav._rate_check import RateCheck
 from jointfit_protocols.orientation import canonical
@@ -24,11 +26,10 @@ from jointfit_protocols.vectornav import (
 from jointfit_protocols.vectornav.registers import Register, decode_output, decode_rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
-    from jointfit_daemon.model import Chunk, Decoded, Vector
+    from jointfit_daemon.model import Decoded, Vector
     from jointfit_drivers.gateway_orientation import RawSamples
-    from jointfit_protocols.corrupt import CorruptBytes
 
 _CLOCK = TickClock(1, None)
 _TIMES = (int(Field.TIME_STARTUP), int(Field.TIME_GROUP_STARTUP))
@@ -57,7 +58,7 @@ class _Places:
         self.field = None if field is None else slice(field.start, field.start + 3)
 
 
-class VectorNavDecoder:
+class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
     """Decoder of one VectorNav device.
 
     Parameters
@@ -86,47 +87,18 @@ class VectorNavDecoder:
         output: int = 1,
     ) -> None:
         self._inverse, self._is_raw = world_to_sensor, make_raw is not None
-        self._codec = VectorNavCodec()
-        self._stamps = ArrivalStamps(baud, MAX_MESSAGE)
         self._samples = TimedSamples(make_raw, "add the field TimeStartup to this binary output")
+        super().__init__(VectorNavCodec(), self._samples, baud, MAX_MESSAGE)
         self._rate_check = None if rate_hz is None else RateCheck(rate_hz)
         self._register = Register.BINARY_OUTPUT + output - 1
         self._places: dict[bytes, _Places] = {}  # by header; a device sends up to three kinds
 
-    @property
-    def messages(self) -> int:
-        """Well-formed messages so far."""
-        return self._codec.messages - self._samples.refused
-
-    @property
-    def discarded_bytes(self) -> int:
-        """Bytes so far that belong to no message, or to a message that was rejected."""
-        return self._codec.discarded + self._samples.refused_bytes
-
-    def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
-        out: list[Decoded] = []
-        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
-            out = self._take(self._codec.flush())
-        self._stamps.start_chunk(chunk.t_ns)
-        found = self._codec.feed(chunk.data)
-        return out + self._take(found) if found else out
-
-    def flush(self) -> list[Decoded]:
-        """Discard a pending message and an orientation that waits for confirmation."""
-        return self._take(self._codec.flush()) + self._samples.flush()
-
-    def _take(self, found: list[VectorNavMessage | CorruptBytes]) -> list[Decoded]:
-        out: list[Decoded] = []
-        for event in found:
-            if isinstance(event, BinaryPacket):
-                out += self._decode_output(event)
-            elif isinstance(event, TextMessage):
-                out += _text_events(event)
-                self._note_divisor(event)
-            else:
-                out.append(Corrupt(event.discarded, event.reason))
-        return out
+    @override
+    def _take(self, message: VectorNavMessage) -> Iterable[Decoded]:
+        if isinstance(message, BinaryPacket):
+            return self._decode_output(message)
+        self._note_divisor(message)
+        return _text_events(message)
 
     def _decode_output(self, packet: BinaryPacket) -> list[Decoded]:
         """Return the content of a binary output; nothing for one without the needed fields."""
@@ -138,14 +110,13 @@ class VectorNavDecoder:
             places = self._places[header] = _Places(packet.layout.places)
 
         values = packet.values
-        since = self._codec.fed - packet.end + packet.size
         ticks = None if places.time is None else int(values[places.time][0])
         if self._is_raw:
             if places.rate is None or places.force is None:
                 return []
             field = None if places.field is None else _vector(values[places.field])
             raw = RawVectors(_vector(values[places.rate]), _vector(values[places.force]), field)
-            arrival_ns = self._stamps.stamp(since)
+            arrival_ns = self._arrival_of(packet)
             reading = TimedReading(packet.size, arrival_ns, ticks, raw=raw)
             return self._check_rate(ticks) + self._samples.add(reading)
 
@@ -154,7 +125,7 @@ class VectorNavDecoder:
         x, y, z, w = values[places.quaternion]
         native = (w, x, y, z)
         q = canonical(native, "NED", world_to_sensor=self._inverse)
-        arrival_ns = self._stamps.stamp(since)
+        arrival_ns = self._arrival_of(packet)
         reading = TimedReading(packet.size, arrival_ns, ticks, q, native)
         return self._check_rate(ticks) + self._samples.add(reading)
 

@@ -11,22 +11,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
+from typing_extensions import override
+
+from jointfit_daemon.model import DeviceEvent, ImuSample, SyncPulse, TickClock
 from jointfit_drivers.gateway_orientation import RawSamples
-from jointfit_drivers.serial_imu import ArrivalStamps
+from jointfit_drivers.refusals import Refusals
+from jointfit_drivers.serial_decoder import SerialMessageDecoder
 from jointfit_drivers.ximu3._continuity import XImu3Continuity, XImu3Point
 from jointfit_drivers.ximu3._device_reports import DeviceReports
 from jointfit_drivers.ximu3._orientation import is_orientation, orientation_of
 from jointfit_drivers.ximu3._raw_orientation import XImu3RawOrientation
-from jointfit_protocols.corrupt import CorruptBytes
 from jointfit_protocols.orientation import OrientationGate, canonical
-from jointfit_protocols.ximu3 import MAX_LINE, TICK_NS, DataKind, XImu3Codec, XImu3Data
+from jointfit_protocols.ximu3 import MAX_LINE, TICK_NS, DataKind, XImu3Codec, XImu3Data, XImu3Reply
 
 if TYPE_CHECKING:
-    from jointfit_daemon.model import Chunk, Decoded, Quaternion
+    from jointfit_daemon.model import Decoded, Quaternion
     from jointfit_drivers.ximu3._continuity import XImu3Step
     from jointfit_drivers.ximu3._settings import XImu3Settings
-    from jointfit_protocols.ximu3 import XImu3Reply
 
 _LATEST_TICKS = 1 << 52
 """Device time, us, that is not plausible: 142 years."""
@@ -50,7 +51,7 @@ class _Measurement(NamedTuple):
     """None for raw measurements."""
 
 
-class XImu3Decoder:
+class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
     """Decoder of one x-IMU3.
 
     Parameters
@@ -60,10 +61,9 @@ class XImu3Decoder:
     """
 
     def __init__(self, settings: XImu3Settings) -> None:
+        super().__init__(XImu3Codec(), Refusals(), settings.line_baud, MAX_LINE)
         self._settings = settings
-        self._codec = XImu3Codec()
         self._reports = DeviceReports(settings.world)
-        self._stamps = ArrivalStamps(settings.line_baud, MAX_LINE)
         make_raw = RawSamples.maker(settings)
         self._raw = None if make_raw is None else XImu3RawOrientation(make_raw)
         self._continuity = XImu3Continuity()
@@ -71,7 +71,6 @@ class XImu3Decoder:
         self._gate = OrientationGate()
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self._last_ticks = 0
-        self._refused = self._refused_bytes = 0
         self._norm_checked = self._rate_checked = False
 
     @property
@@ -79,48 +78,27 @@ class XImu3Decoder:
         """Unit of the device time: microseconds since its start, without wrap."""
         return TickClock(TICK_NS, None)
 
-    @property
-    def messages(self) -> int:
-        """Well-formed messages so far."""
-        return self._codec.messages - self._refused
-
-    @property
-    def discarded_bytes(self) -> int:
-        """Bytes so far that belong to no message, or to a message that was rejected."""
-        return self._codec.discarded + self._refused_bytes
-
-    def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
-        out: list[Decoded] = []
-        if self._codec.pending and self._stamps.is_silent_before(chunk.t_ns, len(chunk.data)):
-            out = self._take(self._codec.flush())
-        self._stamps.start_chunk(chunk.t_ns)
-        found = self._codec.feed(chunk.data)
-        return out + self._take(found) if found else out
-
+    @override
     def flush(self) -> list[Decoded]:
         """Discard a pending message and a measurement that waits for confirmation."""
-        return self._take(self._codec.flush()) + self._drop_held()
+        return super().flush() + self._drop_held()
 
-    def _take(self, found: list[XImu3Data | XImu3Reply | CorruptBytes]) -> list[Decoded]:
-        out: list[Decoded] = []
-        for event in found:
-            if isinstance(event, XImu3Data):
-                if event.channel is None:
-                    out += self._take_data(event)
-            elif isinstance(event, CorruptBytes):
-                out.append(Corrupt(event.discarded, event.reason))
-            elif event.channel is None:
-                world = self._reports.world
-                out += self._reports.reply_events(event)
-                if self._reports.world != world:  # orientations begin again
-                    self._continuity.forget()
+    @override
+    def _take(self, message: XImu3Data | XImu3Reply) -> list[Decoded]:
+        if message.channel is not None:
+            return []
+        if isinstance(message, XImu3Data):
+            return self._take_data(message)
+        world = self._reports.world
+        out = self._reports.reply_events(message)
+        if self._reports.world != world:  # orientations begin again
+            self._continuity.forget()
         return out
 
     def _take_data(self, message: XImu3Data) -> list[Decoded]:
         """Return the content of a data message of the device itself."""
         if message.ticks >= _LATEST_TICKS:
-            return [self._refuse(message, "device time out of range")]
+            return [self._refusals.refuse(message.size, "device time out of range")]
 
         kind = message.kind
         if self._raw is not None:
@@ -131,7 +109,7 @@ class XImu3Decoder:
         elif is_orientation(message):
             native = orientation_of(message)
             if native is None:
-                return [self._refuse(message, _UNUSABLE[kind])]
+                return [self._refusals.refuse(message.size, _UNUSABLE[kind])]
             return self._measure(message, native)
 
         if kind == DataKind.SYNC:
@@ -144,15 +122,14 @@ class XImu3Decoder:
         if native is not None:
             q = self._gate.admit(canonical(native, self._reports.world))
             if q is None:
-                return [self._refuse(message, "quaternion norm is not 1"), *self._norm_warning()]
+                return [
+                    self._refusals.refuse(message.size, "quaternion norm is not 1"),
+                    *self._norm_warning(),
+                ]
 
         arrived_ns = self._arrival_of(message)
         step = self._continuity.step(XImu3Point(message.ticks, arrived_ns, q))
         return self._continue(step, _Measurement(message, arrived_ns, native, q))
-
-    def _arrival_of(self, message: XImu3Data) -> int:
-        """Return the arrival of the first byte of `message`, monotonic ns."""
-        return self._stamps.stamp(self._codec.fed - message.end + message.size)
 
     def _continue(self, step: XImu3Step, measured: _Measurement) -> list[Decoded]:
         """Return the samples of the held measurement, if confirmed, then those of `measured`."""
@@ -180,7 +157,11 @@ class XImu3Decoder:
         self._last_ticks = message.ticks
         if self._raw is not None:
             found = self._raw.samples(message, arrived_ns)
-            return [self._refuse(message, "raw values out of range")] if found is None else found
+            return (
+                [self._refusals.refuse(message.size, "raw values out of range")]
+                if found is None
+                else found
+            )
         if native is None or q is None:
             return []
 
@@ -197,7 +178,11 @@ class XImu3Decoder:
         if wire is None or edge != (self._settings.sync_edge == "rising"):
             return []
         if abs(message.ticks - self._last_ticks) > _OLD_PULSE_US:
-            return [self._refuse(message, "time of an edge far from that of the measurements")]
+            return [
+                self._refusals.refuse(
+                    message.size, "time of an edge far from that of the measurements"
+                )
+            ]
         return [SyncPulse(self._arrival_of(message), message.ticks, wire)]
 
     def _rate_warning(self) -> list[Decoded]:
@@ -221,17 +206,13 @@ class XImu3Decoder:
         text = f"median quaternion norm is {norm:.4g}, expected 1: order or scale is wrong"
         return [DeviceEvent("warning", text, {"median_norm": norm})]
 
-    def _refuse(self, message: XImu3Data, reason: str) -> Corrupt:
-        self._refused += 1
-        self._refused_bytes += message.size
-        return Corrupt(message.size, reason)
-
     def _drop_held(self) -> list[Decoded]:
         """Reject a measurement that no later message confirmed."""
         held, self._held = self._held, None
         if held is None:
             return []
-        return [self._refuse(held.message, "time or motion disagrees with the other messages")]
+        reason = "time or motion disagrees with the other messages"
+        return [self._refusals.refuse(held.message.size, reason)]
 
 
 def _gap(lost: int) -> list[Decoded]:

@@ -113,7 +113,7 @@ class ShtpCodec:
         self._started = False
         self.fed = 0
         """Bytes fed so far."""
-        self.packets = 0
+        self.messages = 0
         """Packets so far."""
         self.statuses = 0
         """Buffer statuses so far."""
@@ -169,7 +169,7 @@ class ShtpCodec:
         length, channel, sequence = _HEADER.unpack_from(data, 1)
         if length & _LENGTH != len(data) - 1:
             return self._corrupt(len(segment), "length")
-        self.packets += 1
+        self.messages += 1
         return ShtpPacket(channel, sequence, data[_HEAD:], len(segment) + 2, end)
 
     def _corrupt(self, count: int, reason: str) -> CorruptBytes:

@@ -17,5 +17,10 @@ class TableMessage(NamedTuple):
     end: int
     """Bytes fed to the codec up to and including its last one, for back-dating."""
 
+    @property
+    def size(self) -> int:
+        """Bytes on the wire."""
+        return len(self.data)
+
 
 TableItem = TableMessage | CorruptBytes

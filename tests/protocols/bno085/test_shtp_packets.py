@@ -99,7 +99,7 @@ def test_a_wrong_length_is_corrupt() -> None:
     wire[2] += 1
     (found,), codec = decode([bytes(wire)])
     assert found == CorruptBytes(9, "length")
-    assert codec.packets == 0
+    assert codec.messages == 0
 
 
 def test_noise_without_flag_is_bounded() -> None:
