@@ -66,6 +66,10 @@ class SerialMessageDecoder(ABC, Generic[Message]):
     def _take(self, message: Message) -> Iterable[Decoded]:
         """Return the samples and events of one message."""
 
+    def _take_corrupt(self, found: CorruptBytes) -> list[Decoded]:
+        """Return the corrupt bytes; a subclass adds what they show."""
+        return [Corrupt(found.discarded, found.reason)]
+
     @property
     def messages(self) -> int:
         """Well-formed messages so far."""
@@ -99,7 +103,7 @@ class SerialMessageDecoder(ABC, Generic[Message]):
     def _append(self, found: Sequence[Message | CorruptBytes], out: list[Decoded]) -> None:
         for item in found:
             if type(item) is CorruptBytes:  # half the time of isinstance()
-                out.append(Corrupt(item.discarded, item.reason))
+                out += self._take_corrupt(item)
             else:
                 out += self._take(item)
 

@@ -120,21 +120,23 @@ class ArrivalStamps:
     def __init__(self, baud: int | None, most_bytes: int) -> None:
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * most_bytes * self._byte_ns, _SILENCE_FLOOR_NS)
-        self._chunk_ns = self._stamp_ns = 0
+        self.chunk_ns = 0
+        """Arrival of the present chunk, monotonic ns."""
+        self._stamp_ns = 0
 
     def is_silent_before(self, t_ns: int, size: int) -> bool:
         """Return whether the line was silent before a chunk: the rest of a message was lost."""
-        return t_ns - self._chunk_ns - size * self._byte_ns > self._silence_ns
+        return t_ns - self.chunk_ns - size * self._byte_ns > self._silence_ns
 
     def start_chunk(self, t_ns: int) -> None:
         """Stamp messages by a chunk that arrived at `t_ns` from now on."""
-        self._chunk_ns = t_ns
+        self.chunk_ns = t_ns
 
     def stamp(self, bytes_since: int) -> int:
         """Return the arrival, monotonic ns, of a byte `bytes_since` bytes before the chunk's end.
 
         USB devices and ptys are faster than the configured speed: stamps never decrease.
         """
-        at_ns = self._chunk_ns - round(bytes_since * self._byte_ns)
+        at_ns = self.chunk_ns - round(bytes_since * self._byte_ns)
         self._stamp_ns = max(self._stamp_ns, at_ns)
         return self._stamp_ns

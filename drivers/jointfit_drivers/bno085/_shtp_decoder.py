@@ -16,6 +16,7 @@ from typing_extensions import override
 
 from jointfit_daemon.model import DeviceEvent, ImuSample
 from jointfit_drivers.gateway_orientation import RawReading, RawStamp, is_plausible
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
 from jointfit_drivers.refusals import Refusals
 from jointfit_drivers.serial_decoder import SerialMessageDecoder
 from jointfit_protocols.bno085 import (
@@ -34,6 +35,7 @@ from jointfit_protocols.bno085 import (
     decode_interval,
     decode_report,
     split_reports,
+    unknown_report,
 )
 from jointfit_protocols.orientation import OrientationGate
 
@@ -53,6 +55,9 @@ _STALE_COUNTS = 2
 """Readings of the gyroscope after which an acceleration is too old."""
 _SATURATED = 32_760
 """Count of a gyroscope or accelerometer from which it is out of range."""
+_NEWEST = NewestKnown((3,), "the host that configures the device")
+"""Version of the SH-2 software that the reference manual describes."""
+_CHANNELS = frozenset(map(int, ShtpChannel))
 _RATE_COUNT, _FORCE_COUNT = 2.0**-9, 2.0**-8
 
 
@@ -75,6 +80,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         self._arrival_ns = 0
         self._sequences: dict[int, int] = {}
         self._measuring = False
+        self._newer = NewerFirmwareDetector(_NEWEST)
         self._accuracy: int | None = None
         self._force: HubReport | None = None
         self._field: HubReport | None = None
@@ -89,13 +95,32 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         if channel == ShtpChannel.EXECUTABLE:
             return self._reset() if message.payload == _RESET_COMPLETE else []
         if channel not in {ShtpChannel.CONTROL, ShtpChannel.INPUT, ShtpChannel.WAKE_INPUT}:
-            return []  # advertisements
+            return self._unknown_channel(message)  # or advertisements
         reports = split_reports(message.payload)
         if reports is None:
-            return [self._refusals.refuse(message.size - 2, "reports do not fill the packet")]
+            kind, out = unknown_report(message.payload), []
+            if kind is not None:
+                out = self._newer.take_unknown(f"reports 0x{kind:02X}", self._stamps.chunk_ns)
+            return [
+                *out, self._refusals.refuse(message.size - 2, "reports do not fill the packet")
+            ]  # fmt: skip
         if channel == ShtpChannel.CONTROL:
-            return [event for report in reports for event in _device_events(report)]
+            return [event for report in reports for event in self._device_events(report)]
         return self._reports(message, reports)
+
+    def _unknown_channel(self, packet: ShtpPacket) -> list[Decoded]:
+        if packet.channel in _CHANNELS:
+            return []
+        content = f"packets on channel {packet.channel}"
+        return self._newer.take_unknown(content, self._stamps.chunk_ns)
+
+    def _device_events(self, report: bytes) -> list[Decoded]:
+        """Return the events of a reply, with a warning about newer firmware."""
+        events = _device_events(report)
+        firmware = decode_firmware(report)
+        if firmware is None:
+            return events
+        return events + self._newer.take_version(".".join(map(str, firmware[0])))
 
     def _reports(self, packet: ShtpPacket, reports: list[bytes]) -> list[Decoded]:
         """Return the samples of a packet of measurements."""

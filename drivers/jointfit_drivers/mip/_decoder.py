@@ -16,6 +16,7 @@ from typing_extensions import override
 from jointfit_daemon.model import DeviceEvent, TickClock
 from jointfit_drivers.mip._device_replies import reply_events
 from jointfit_drivers.mip._required_fields import GPS_TIMES, QUATERNIONS
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
 from jointfit_drivers.serial_decoder import SerialMessageDecoder
 from jointfit_drivers.timed_samples import RawVectors, TimedReading, TimedSamples
 from jointfit_protocols.mip import MAX_PACKET, MipCodec, MipPacket
@@ -26,6 +27,7 @@ from jointfit_protocols.mip.data import (
     SharedField,
     decode_field,
     gps_ns,
+    known_fields,
 )
 from jointfit_protocols.orientation import canonical
 
@@ -46,6 +48,8 @@ _FOREIGN = 20
 """Orientations of the other data set, none of the expected one between them, that are reported."""
 _REPORT_NS = 10_000_000_000
 """Least time between two reports of invalid orientations, ns."""
+_NEWEST = NewestKnown((1,), "SensorConnect")
+"""Firmware of the models that the vendor's SDK describes."""
 
 
 class MipDecoder(SerialMessageDecoder[MipPacket]):
@@ -80,6 +84,8 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
 
         self._samples = TimedSamples(make_raw, "give the time field the same decimation")
         super().__init__(MipCodec(), self._samples, baud, MAX_PACKET)
+        self._known = known_fields(self._set) or frozenset()
+        self._newer = NewerFirmwareDetector(_NEWEST)
         self._foreign = 0
         self._invalid_since_ns: int | None = None
         self._invalid_reported_ns = -_REPORT_NS
@@ -89,19 +95,44 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         if message.descriptor_set == self._set:
             return self._decode_data(message)
         if message.descriptor_set < _DATA:
-            return reply_events(message)
+            return self._take_reply(message)
         return self._note_other_set(message)
 
     def _decode_data(self, packet: MipPacket) -> list[Decoded]:
         """Return the content of a packet of the expected data set."""
         values: dict[int, tuple[Any, ...]] = {}
+        unknown: list[Decoded] = []
         for descriptor, data in packet.fields:
             if descriptor in self._wanted:
                 value = decode_field(self._set, descriptor, data)
                 if value is None:
-                    reason = f"field 0x{descriptor:02X} malformed"
-                    return [self._samples.refuse(packet.size, reason)]
+                    name = f"field 0x{descriptor:02X}"
+                    unknown += self._take_unknown(f"{name} of {len(data)} bytes", packet)
+                    return [*unknown, self._samples.refuse(packet.size, f"{name} malformed")]
                 values[descriptor] = value
+            elif descriptor not in self._known:
+                unknown += self._take_unknown(f"field 0x{descriptor:02X}", packet)
+        if unknown:
+            return unknown + self._decode_values(packet, values)
+        return self._decode_values(packet, values)
+
+    def _take_unknown(self, content: str, packet: MipPacket) -> list[Decoded]:
+        name = f"{content} of data set 0x{packet.descriptor_set:02X}"
+        return self._newer.take_unknown(name, self._stamps.chunk_ns)
+
+    def _take_reply(self, packet: MipPacket) -> list[Decoded]:
+        """Return the events of a reply, with a warning about newer firmware."""
+        out: list[Decoded] = []
+        for event in reply_events(packet):
+            out.append(event)
+            if isinstance(event, DeviceEvent) and "firmware" in event.data:
+                out += self._newer.take_version(str(event.data["firmware"]))
+        return out
+
+    def _decode_values(
+        self, packet: MipPacket, values: dict[int, tuple[Any, ...]]
+    ) -> list[Decoded]:
+        """Return the samples of the decoded fields of one packet."""
         if not self._needed <= values.keys():  # fields with other decimations
             return []
 
@@ -158,7 +189,9 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         return [DeviceEvent("warning", text)]
 
     def _note_other_set(self, packet: MipPacket) -> list[Decoded]:
-        """Return a warning if the orientations belong to the other data set."""
+        """Return a warning if the orientations belong to the other data set, or it is unknown."""
+        if known_fields(packet.descriptor_set) is None:
+            return self._take_unknown("packets", packet)
         field = self._other.get(packet.descriptor_set)
         if all(descriptor != field for descriptor, _ in packet.fields):
             return []

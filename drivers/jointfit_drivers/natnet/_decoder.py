@@ -19,6 +19,7 @@ from jointfit_drivers.natnet._bitstream import FRAME_START, BitstreamTracker
 from jointfit_drivers.natnet._frame_time import FrameTime
 from jointfit_drivers.natnet._poses import PoseConverter
 from jointfit_drivers.natnet._server_checks import bitstream_response, same_instance, usable_hz
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
 from jointfit_protocols import natnet
 from jointfit_protocols.corrupt import CorruptBytes
 
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 _ECHO_LIMIT_NS = 10**9
 """Age of an echo answer, ns, after which it is useless for the clock."""
 _PENDING_ECHOES = 8
+_NEWEST = NewestKnown((4, 2), "Motive", "NatNet")
+"""Newest bitstream that was described; sections of later ones are skipped by their size."""
 _NAMED_UNKNOWN = 16
 """Unknown ids that are listed in warnings; further ones are only counted."""
 _MOST_SECONDS = 2**63 // 10**9
@@ -53,6 +56,7 @@ class NatNetDecoder:
         self._bitstream = BitstreamTracker(settings.wanted_version)
         self._latency_ms = settings.latency_ms
         self._time = FrameTime(settings)
+        self._newer = NewerFirmwareDetector(_NEWEST, sightings=1)
         self._wanted_markers, self._wanted_bodies = wanted_names(settings)
         self._poses = PoseConverter(settings.up_axis)
         self._continuity = FrameContinuity()
@@ -162,6 +166,7 @@ class NatNetDecoder:
         }
         text = f"{info.application} {firmware}, NatNet {version}, {transport}"
         out.append(DeviceEvent("info", text, data))
+        out += self._newer.take_version("{}.{}".format(*info.bitstream))
 
         if before is None or same_instance(info, before):
             self._bitstream.announce(info.bitstream)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, MocapFrame, TickClock
 from jointfit_drivers.motion_capture import renew_columns, wanted_names
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector
 from jointfit_drivers.qtm._binding import bind_settings
 from jointfit_drivers.qtm._continuity import TimestampContinuity
 from jointfit_drivers.qtm._frame_parts import FrameParts
@@ -41,6 +42,7 @@ _MISSING_TEXTS = {
     ComponentType.TIMECODE: "frames have no timecode, which QTM announces",
 }
 _VERSION_ANSWER = "version set to "
+_EVENTS = frozenset(map(int, QtmEvent))
 
 
 class QtmDecoder:
@@ -59,6 +61,7 @@ class QtmDecoder:
         self._poses = QtmPoseConverter("z" if settings.up_axis == "auto" else settings.up_axis)
         self._continuity = TimestampContinuity()
         self._parts = FrameParts()
+        self._newer = NewerFirmwareDetector(tool="QTM", sightings=1)
         self._settings: qtm.QtmSettingsXml | None = None
         self._binding: QtmBinding | None = None
         self._clock: TickClock | None = None
@@ -109,6 +112,8 @@ class QtmDecoder:
                 self._take_settings(xml, out)
             case qtm.Event(number):
                 self._event(number, out)
+                if number not in _EVENTS:
+                    out += self._newer.take_unknown(f"event {number}", chunk.t_ns)
             case qtm.NoMoreData() if not self._waiting:
                 self._waiting = True
                 text = "no measurement is running: waiting for QTM"

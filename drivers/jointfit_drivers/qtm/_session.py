@@ -208,9 +208,12 @@ class QtmSession:
             if isinstance(answer, qtm.Command) and answer.text.lower().startswith("version set"):
                 self.version = version
                 return
+        found = await self._ask("QTMVersion", qtm.Command, qtm.ErrorReply)
+        program = f" ({found.text})" if isinstance(found, qtm.Command) else ""
         raise DeviceMisconfiguredError(
-            f"{self._name} supports none of the protocol versions {VERSIONS[-1]} to {VERSIONS[0]}: "
-            "use QTM 2019 or later, and set command_port to its base port plus 1"
+            f"{self._name}{program} supports none of the protocol versions {VERSIONS[-1]} to "
+            f"{VERSIONS[0]}: if it is older than QTM 2019, update it; if it is newer than this "
+            "program, update jointfitd"
         )
 
     async def _ask(self, command: str, *kinds: type) -> qtm.Message:

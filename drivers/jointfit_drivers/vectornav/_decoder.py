@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING, Any, cast
 from typing_extensions import override
 
 from jointfit_daemon.model import DeviceEvent, TickClock
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
 from jointfit_drivers.serial_decoder import SerialMessageDecoder
 from jointfit_drivers.timed_samples import RawVectors, TimedReading, TimedSamples
 from jointfit_drivers.vectornav._rate_check import RateCheck
 from jointfit_protocols.orientation import canonical
 from jointfit_protocols.vectornav import (
     MAX_MESSAGE,
+    UNKNOWN_HEADER,
     BinaryPacket,
     Field,
     TextMessage,
@@ -26,10 +28,11 @@ from jointfit_protocols.vectornav import (
 from jointfit_protocols.vectornav.registers import Register, decode_output, decode_rotation
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterator
 
     from jointfit_daemon.model import Decoded, Vector
     from jointfit_drivers.gateway_orientation import RawSamples
+    from jointfit_protocols.corrupt import CorruptBytes
 
 _CLOCK = TickClock(1, None)
 _TIMES = (int(Field.TIME_STARTUP), int(Field.TIME_GROUP_STARTUP))
@@ -41,6 +44,8 @@ _NAMES = {Register.MODEL: "model", Register.SERIAL: "serial", Register.FIRMWARE:
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _SMALL = 1e-4
 """Element of a rotation that counts as that of the identity."""
+_NEWEST = NewestKnown((3,), "VectorNav Control Center")
+"""Firmware of the VN-100 of 2024; other models have lower numbers."""
 
 
 class _Places:
@@ -91,14 +96,26 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
         super().__init__(VectorNavCodec(), self._samples, baud, MAX_MESSAGE)
         self._rate_check = None if rate_hz is None else RateCheck(rate_hz)
         self._register = Register.BINARY_OUTPUT + output - 1
+        self._newer = NewerFirmwareDetector(_NEWEST)
         self._places: dict[bytes, _Places] = {}  # by header; a device sends up to three kinds
 
     @override
-    def _take(self, message: VectorNavMessage) -> Iterable[Decoded]:
+    def _take(self, message: VectorNavMessage) -> list[Decoded]:
         if isinstance(message, BinaryPacket):
             return self._decode_output(message)
         self._note_divisor(message)
-        return _text_events(message)
+        out = list(_text_events(message))
+        if message.register == Register.FIRMWARE and len(message.values) > 1:
+            out += self._newer.take_version(message.values[1])
+        return out
+
+    @override
+    def _take_corrupt(self, found: CorruptBytes) -> list[Decoded]:
+        out = super()._take_corrupt(found)
+        if found.reason == UNKNOWN_HEADER:  # the same size again: no noise
+            content = f"binary outputs of {found.discarded} bytes with an unknown header"
+            out += self._newer.take_unknown(content, self._stamps.chunk_ns)
+        return out
 
     def _decode_output(self, packet: BinaryPacket) -> list[Decoded]:
         """Return the content of a binary output; nothing for one without the needed fields."""

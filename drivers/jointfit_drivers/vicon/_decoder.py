@@ -12,7 +12,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, MocapFrame, TickClock
+from jointfit_daemon.name_lists import list_names
 from jointfit_drivers.motion_capture import FrameContinuity, renew_columns, wanted_names
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector
 from jointfit_drivers.vicon._binding import bind_subjects
 from jointfit_drivers.vicon._latency import AnnouncedLatency
 from jointfit_drivers.vicon._poses import ViconPoseConverter
@@ -35,6 +37,7 @@ _LONGEST_PERIOD = 10 * vicon.TICKS_PER_S
 _Y_UP = 1
 _LATENCY_AFTER = 100
 """Frames after which the announced delay is reported."""
+_KNOWN_IDS = vicon.STATIC | vicon.DYNAMIC | frozenset(map(int, ObjectId)) | vicon.REQUESTS
 
 _Found = TypeVar("_Found")
 
@@ -55,6 +58,7 @@ class ViconDecoder:
         self._poses = ViconPoseConverter("z" if settings.up_axis == "auto" else settings.up_axis)
         self._axis = ""
         self._state = SceneState()
+        self._newer = NewerFirmwareDetector(tool="the Vicon software", sightings=1)
         self._continuity = FrameContinuity()
         self._latency = AnnouncedLatency()
         self._binding: ViconBinding | None = None
@@ -103,6 +107,9 @@ class ViconDecoder:
                 self._offered = item.ids
                 data = {"model": "Vicon DataStream", "transport": "tcp"}
                 out.append(DeviceEvent("info", "Vicon DataStream", data))
+                if newer := sorted(item.ids - _KNOWN_IDS):
+                    content = f"objects {list_names(list(map(str, newer)))}"
+                    out += self._newer.take_unknown(content, chunk.t_ns)
         self._take_static(packet.objects, out)
         number = _first(packet.objects, vicon.FrameInfo)
         if number is not None:

@@ -26,6 +26,7 @@ from jointfit_drivers.motion_capture import (
     wanted_names,
     world_rotation,
 )
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
 from jointfit_drivers.vrpn._frame_assembler import FrameAssembler, ReportedFrame
 from jointfit_protocols import vrpn
 from jointfit_protocols.corrupt import CorruptBytes
@@ -47,6 +48,7 @@ _FARTHEST_M = 1_000.0
 """Largest plausible coordinate, m: servers send larger ones for bodies that are not seen."""
 _MOST_BODIES = 2000
 """Bodies of one server; those beyond are dropped, because each costs memory."""
+_NEWEST = NewestKnown((vrpn.MAJOR, vrpn.MINOR), "the camera software", "VRPN")
 _CLOCKS = {"server": TickClock(1000, None), "utc": TickClock(1000, None, None, "unix")}
 
 
@@ -62,6 +64,7 @@ class VrpnDecoder:
     def __init__(self, settings: VrpnSettings) -> None:
         self._codec = vrpn.VrpnCodec()
         self._assembler = FrameAssembler()
+        self._newer = NewerFirmwareDetector(_NEWEST, sightings=1)
         self._clock = _CLOCKS[settings.time]
         self._wanted_markers, self._wanted_bodies = wanted_names(settings)
         self._place, self._turn = world_rotation(settings.up_axis)
@@ -141,6 +144,8 @@ class VrpnDecoder:
         if cookie.major != vrpn.MAJOR:
             text = f"the server speaks VRPN {version}, expected {vrpn.MAJOR:02d}.xx"
             out.append(DeviceEvent("error", text, {"vrpn": version}))
+        else:
+            out += self._newer.take_version(version)
         self._assembler.forget()
         self._named_unknown.clear()
         self._stale_binding = True

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, TickClock
 from jointfit_drivers.gateway_orientation import RawReading, RawStamp, is_plausible
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector
 from jointfit_drivers.serial_imu import ArrivalStamps
 from jointfit_drivers.witmotion._calendar_time import CalendarTime
 from jointfit_protocols.orientation import OrientationGate, canonical
@@ -47,6 +48,7 @@ _ACCELERATION = int(WitMotionFrameKind.ACCELERATION)
 _RATE = int(WitMotionFrameKind.RATE)
 _FIELD = int(WitMotionFrameKind.MAGNETIC_FIELD)
 _QUATERNION = int(WitMotionFrameKind.QUATERNION)
+_KINDS = frozenset(map(int, WitMotionFrameKind))
 OTHER_VARIANT = (
     "it sends frames 55 61 of Bluetooth and SD models, which contain no quaternion: use a model "
     "with serial output 55 59"
@@ -86,6 +88,7 @@ class WitMotionDecoder:
         self._stamps = ArrivalStamps(baud, FRAME_BYTES)
         self._codec = WitMotionCodec()
         self._gate = OrientationGate()
+        self._newer = NewerFirmwareDetector(tool="the WitMotion software")
         self._calendar = CalendarTime()
         self._first_ns = 0
         self._ticks: int | None = None  # of the present sample
@@ -135,6 +138,8 @@ class WitMotionDecoder:
                 self._first_ns = self._arrival_of(event)
                 self._ticks = self._calendar.accept(time_of(event.data), self._first_ns)
                 self._force = self._rate = None
+            elif kind not in _KINDS:
+                out += self._newer.take_unknown(f"frames 0x{kind:02X}", self._stamps.chunk_ns)
             elif self._raw is not None:
                 out += self._measurement(event, self._raw)
             if not self._kinds_checked:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
 from jointfit_drivers.gateway_orientation import RawStamp
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
 from jointfit_drivers.xbus._continuity import XbusContinuity, XbusStep
 from jointfit_drivers.xbus._raw_orientation import RAW
 from jointfit_drivers.xbus._sync_lines import describe_entry
@@ -26,7 +27,14 @@ from jointfit_protocols.xbus import (
     XbusMessageId,
 )
 from jointfit_protocols.xbus import configuration as setup
-from jointfit_protocols.xbus.mtdata2 import Item, Trigger, decode_item, split, world_of
+from jointfit_protocols.xbus.mtdata2 import (
+    KNOWN_ITEMS,
+    Item,
+    Trigger,
+    decode_item,
+    split,
+    world_of,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,6 +59,9 @@ _STATUS_BYTE, _STATUS_WORD = int(Item.STATUS_BYTE), int(Item.STATUS_WORD)
 _WANTED = {_COUNTER, _TIME, _QUATERNION, _STATUS_BYTE, _STATUS_WORD}
 """Items that are decoded."""
 _ALIGNED = ("sensor", "local")
+_MESSAGES = frozenset(map(int, XbusMessageId))
+_NEWEST = NewestKnown((1,), "MT Manager")
+"""Firmware of all MTi series since 2012."""
 
 
 class _Orientation(NamedTuple):
@@ -105,6 +116,7 @@ class XbusDecoder:
         self._last_ns = self._arrival_ns = 0
         self._refused = self._refused_bytes = 0
         self._measuring = self._norm_checked = False
+        self._newer = NewerFirmwareDetector(_NEWEST)
 
     @property
     def tick_clock(self) -> TickClock:
@@ -178,18 +190,24 @@ class XbusDecoder:
 
         values: dict[int, Value] = {}
         world_id = 0
+        out: list[Decoded] = []
         for data_id, raw in items:
             kind = data_id & 0xFFF0
             if kind in self._wanted:
                 value = decode_item(data_id, raw)
                 if value is None:
-                    return [self._refuse(message, f"MTData2 item 0x{data_id:04X} malformed")]
+                    content = f"item 0x{data_id:04X} of {len(raw)} bytes"
+                    out = self._newer.take_unknown(content, self._last_ns)
+                    return [*out, self._refuse(message, f"MTData2 item 0x{data_id:04X} malformed")]
                 values[kind] = value
                 world_id = data_id if kind == _QUATERNION else world_id
+            elif kind not in KNOWN_ITEMS:
+                out += self._newer.take_unknown(f"item 0x{kind:04X}", self._last_ns)
 
-        if len(data) not in self._layouts:
+        # A layout skips unknown items, so they are counted before.
+        if len(data) not in self._layouts and self._newer.is_settled:
             self._layouts[len(data)] = MTData2Layout.of(items, self._wanted)
-        return self._decode_values(message, values, world_id)
+        return out + self._decode_values(message, values, world_id)
 
     def _decode_legacy(self, message: XbusMessage) -> list[Decoded]:
         """Return the content of an MTData, or why it cannot be decoded."""
@@ -326,9 +344,14 @@ class XbusDecoder:
         if self._legacy is not None:
             self._legacy.reply(mid, data)
 
+        if mid not in _MESSAGES:
+            return self._newer.take_unknown(f"message 0x{mid:02X}", self._last_ns)
         known = _device_property(mid, data)
         text = ", ".join(f"{key} {value}" for key, value in known.items())
-        return [DeviceEvent("info", text, known)] if known else []
+        properties: list[Decoded] = [DeviceEvent("info", text, known)] if known else []
+        if "firmware" in known:
+            properties += self._newer.take_version(str(known["firmware"]))
+        return properties
 
     def _drop_held(self) -> list[Decoded]:
         """Reject an orientation that no later message confirmed."""

@@ -15,6 +15,7 @@ from typing_extensions import override
 
 from jointfit_daemon.model import DeviceEvent, ImuSample, SyncPulse, TickClock
 from jointfit_drivers.gateway_orientation import RawSamples
+from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
 from jointfit_drivers.refusals import Refusals
 from jointfit_drivers.serial_decoder import SerialMessageDecoder
 from jointfit_drivers.ximu3._continuity import XImu3Continuity, XImu3Point
@@ -22,12 +23,21 @@ from jointfit_drivers.ximu3._device_reports import DeviceReports
 from jointfit_drivers.ximu3._orientation import is_orientation, orientation_of
 from jointfit_drivers.ximu3._raw_orientation import XImu3RawOrientation
 from jointfit_protocols.orientation import OrientationGate, canonical
-from jointfit_protocols.ximu3 import MAX_LINE, TICK_NS, DataKind, XImu3Codec, XImu3Data, XImu3Reply
+from jointfit_protocols.ximu3 import (
+    MAX_LINE,
+    TICK_NS,
+    UNKNOWN_KIND,
+    DataKind,
+    XImu3Codec,
+    XImu3Data,
+    XImu3Reply,
+)
 
 if TYPE_CHECKING:
     from jointfit_daemon.model import Decoded, Quaternion
     from jointfit_drivers.ximu3._continuity import XImu3Step
     from jointfit_drivers.ximu3._settings import XImu3Settings
+    from jointfit_protocols.corrupt import CorruptBytes
 
 _LATEST_TICKS = 1 << 52
 """Device time, us, that is not plausible: 142 years."""
@@ -37,7 +47,10 @@ _UNUSABLE = {
     DataKind.MATRIX: "rotation matrix is not orthonormal",
     DataKind.EULER: "Euler angles are not finite",
 }
+_NEWEST = NewestKnown((1,), "the x-IMU3 GUI")
+"""Firmware that the vendor's software of API 1.9 reads."""
 _OLD_PULSE_US = 10_000_000
+_LONGEST_VERSION = 32
 """Largest difference, us, between an edge and the last measurement."""
 
 
@@ -64,6 +77,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         super().__init__(XImu3Codec(), Refusals(), settings.line_baud, MAX_LINE)
         self._settings = settings
         self._reports = DeviceReports(settings.world)
+        self._newer = NewerFirmwareDetector(_NEWEST)
         make_raw = RawSamples.maker(settings)
         self._raw = None if make_raw is None else XImu3RawOrientation(make_raw)
         self._continuity = XImu3Continuity()
@@ -91,8 +105,18 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
             return self._take_data(message)
         world = self._reports.world
         out = self._reports.reply_events(message)
+        if message.key == "firmware_version" and message.error is None:
+            out += self._newer.take_version(str(message.value)[:_LONGEST_VERSION])
         if self._reports.world != world:  # orientations begin again
             self._continuity.forget()
+        return out
+
+    @override
+    def _take_corrupt(self, found: CorruptBytes) -> list[Decoded]:
+        out = super()._take_corrupt(found)
+        if found.reason.startswith(UNKNOWN_KIND):
+            content = f"messages {found.reason[len(UNKNOWN_KIND) :]}"
+            out += self._newer.take_unknown(content, self._stamps.chunk_ns)
         return out
 
     def _take_data(self, message: XImu3Data) -> list[Decoded]:

@@ -17,6 +17,7 @@ from jointfit_protocols.bno085._reports import (
     feature_request,
     product_request,
     split_reports,
+    unknown_report,
 )
 from jointfit_protocols.bno085._rvc import RVC_BYTES, RvcCodec, RvcFrame, encode_rvc
 from jointfit_protocols.bno085._shtp import (
@@ -57,4 +58,5 @@ __all__ = [
     "feature_request",
     "product_request",
     "split_reports",
+    "unknown_report",
 ]

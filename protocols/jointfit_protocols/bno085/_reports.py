@@ -116,6 +116,17 @@ def split_reports(payload: bytes) -> list[bytes] | None:
     return reports
 
 
+def unknown_report(payload: bytes) -> int | None:
+    """Return the first byte of the first report of unknown length; None if there is none."""
+    at = 0
+    while at < len(payload):
+        size = _LENGTHS.get(payload[at])
+        if size is None:
+            return payload[at]
+        at += size
+    return None
+
+
 def decode_report(report: bytes) -> HubReport | None:
     """Return a measurement; None for other reports, of the length that `split_reports` ensures."""
     kind = report[0]

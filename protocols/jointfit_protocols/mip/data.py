@@ -107,6 +107,25 @@ _LAYOUTS: dict[int, dict[int, struct.Struct]] = {
 }
 
 
+_SHARED_FIELDS = range(0xD0, 0xD9)
+_KNOWN_FIELDS: dict[int, tuple[range, ...]] = {
+    DataSet.SENSOR: (range(0x01, 0x19), range(0x40, 0x41), _SHARED_FIELDS),
+    DataSet.FILTER: (range(0x01, 0x52), _SHARED_FIELDS),
+}
+_KNOWN_SETS = frozenset((0x80, 0x81, 0x82, 0x90, 0x91, 0x92, 0x93, 0x94, 0x95, 0xA0))
+
+
+def known_fields(descriptor_set: int) -> frozenset[int] | None:
+    """Return the documented fields of a data set; None if the set itself is not documented.
+
+    Those of sets without orientations are not listed: every field counts as documented.
+    """
+    if descriptor_set not in _KNOWN_SETS:
+        return None
+    ranges = _KNOWN_FIELDS.get(descriptor_set, (range(0x100),))
+    return frozenset(field for each in ranges for field in each)
+
+
 def decode_field(descriptor_set: int, descriptor: int, data: bytes) -> tuple[Any, ...] | None:
     """Return the values of a field; None if it is unknown or its size is wrong."""
     layout = _LAYOUTS.get(descriptor_set, _SHARED).get(descriptor)

@@ -2,6 +2,7 @@
 
 from jointfit_protocols.vectornav._framing import (
     MAX_MESSAGE,
+    UNKNOWN_HEADER,
     BinaryPacket,
     VectorNavCodec,
     VectorNavMessage,
@@ -12,6 +13,7 @@ from jointfit_protocols.vectornav._text import TextMessage, encode_text, error_t
 
 __all__ = [
     "MAX_MESSAGE",
+    "UNKNOWN_HEADER",
     "BinaryLayout",
     "BinaryPacket",
     "Field",

@@ -47,7 +47,9 @@ _START = re.compile(rb"[\xfa$]")
 
 _NO_START = CorruptBytes(1, NO_START)
 _CHECKSUM = CorruptBytes(1, CHECKSUM)
-_HEADER = CorruptBytes(1, "header unknown to this version")
+UNKNOWN_HEADER = "header unknown to this version"
+"""Reason for the bytes of a binary output without a known layout."""
+_HEADER = CorruptBytes(1, UNKNOWN_HEADER)
 _TEXT = CorruptBytes(1, "malformed text")
 
 

@@ -49,6 +49,8 @@ STATIC = frozenset((1, 2, 28, 29, 37, 40, 28_001))
 """Ids of the objects that describe subjects and stream."""
 DYNAMIC = frozenset((5, 6, 7, 8, 9, 23, 26, 36, 39, 901))
 """Ids of the objects that belong to one frame."""
+REQUESTS = frozenset((100_005, 100_006, 100_007, 100_008))
+"""Ids of the requests of a client that this project does not send."""
 
 
 class StreamInfo(NamedTuple):

@@ -30,6 +30,8 @@ from jointfit_protocols.corrupt import CorruptBytes
 DEFAULT_PORT = 3883
 """TCP and UDP port of servers."""
 MAJOR = 7
+MINOR = 38
+"""Newest minor version whose messages are known."""
 """Version that both sides must share; a different minor version is compatible."""
 MAX_MESSAGE = 64_000
 """Most bytes of a message, the buffer of the reference implementation."""

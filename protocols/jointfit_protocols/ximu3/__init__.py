@@ -4,6 +4,7 @@ from jointfit_protocols.ximu3._framing import MAX_LINE, XImu3Codec
 from jointfit_protocols.ximu3._messages import (
     BASE_RATE_HZ,
     TICK_NS,
+    UNKNOWN_KIND,
     DataKind,
     XImu3Data,
     XImu3Reply,
@@ -17,6 +18,7 @@ __all__ = [
     "BASE_RATE_HZ",
     "MAX_LINE",
     "TICK_NS",
+    "UNKNOWN_KIND",
     "DataKind",
     "XImu3Codec",
     "XImu3Data",

@@ -97,6 +97,8 @@ LAYOUTS: dict[tuple[int, int], tuple[DataKind, struct.Struct]] = {
 _TEXTS = {ord(kind): kind for kind in DataKind if kind not in COUNTS}
 _KINDS = {ord(kind): kind for kind in DataKind}
 _NUMBER = re.compile(rb"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+_LETTERS = range(ord("A"), ord("Z") + 1)
+_UNKNOWN_ASCII = re.compile(rb"[A-Z],\d{1,16},[^,\r]", re.ASCII)
 _MOST_DIGITS = 20
 """Digits of the largest time."""
 
@@ -140,6 +142,8 @@ class MessageFault(NamedTuple):
 
 Line = XImu3Data | XImu3Reply | MessageFault
 UNKNOWN = MessageFault("no known message")
+UNKNOWN_KIND = "message of unknown kind "
+"""Beginning of the reason for a line with the form of a data message, but of unknown content."""
 _JSON = MessageFault("JSON with other than one key, or malformed")
 _STUFFING = MessageFault("escape byte before neither DC nor DD")
 _LENGTH = MessageFault("binary message of another length")
@@ -211,17 +215,27 @@ def _parse_data(plain: bytes, size: int, end: int, channel: int | None) -> Line:
 
     kind = _TEXTS.get(first ^ _BINARY)
     if kind is None:
-        return _LENGTH if first ^ _BINARY in _KINDS else UNKNOWN
+        return _unknown_binary(plain)
     if len(plain) <= _HEAD.size:
         return _LENGTH
     _, ticks = _HEAD.unpack_from(plain)
     return XImu3Data(kind, ticks, (), plain[_HEAD.size : -1], True, size, end, channel)
 
 
+def _unknown_binary(plain: bytes) -> MessageFault:
+    """Return the reason for a binary line without known layout; it names that of a newer device."""
+    letter, values = plain[0] ^ _BINARY, (len(plain) - _HEAD.size - 1) / 4
+    plausible = values >= 1 and values.is_integer()
+    if plausible and letter in _LETTERS and _HEAD.unpack_from(plain)[1] < _PLAUSIBLE_TICKS:
+        return MessageFault(f"{UNKNOWN_KIND}{letter:c} with {values:.0f} values")
+    return _LENGTH if letter in _KINDS else UNKNOWN
+
+
 def _parse_ascii(plain: bytes, size: int, end: int, channel: int | None) -> Line:
     kind = _KINDS.get(plain[0])
     if kind is None:
-        return UNKNOWN
+        form = _UNKNOWN_ASCII.match(plain)
+        return UNKNOWN if form is None else MessageFault(f"{UNKNOWN_KIND}{plain[0]:c}")
     name, _, rest = plain.rstrip(b"\r\n").partition(b",")
     time, comma, content = rest.partition(b",")
     if len(name) != 1 or not time.isdigit() or not comma or len(time) > _MOST_DIGITS:

@@ -70,6 +70,7 @@ class Bno085DeviceOptions:
     least_interval_us: int = _FASTEST_US
     """Shortest interval of reports; a shorter one is replaced by it."""
     accuracy: int = 3
+    firmware: tuple[int, int, int] = (3, 12, 4)
 
 
 class Bno085Device(SerialDevice):
@@ -174,7 +175,8 @@ class Bno085Device(SerialDevice):
     def _answer(self, request: bytes) -> None:
         kind = request[0] if request else 0
         if kind == HubReportId.PRODUCT_REQUEST:
-            self._send(ShtpChannel.CONTROL, encode_firmware((3, 12, 4), 10_004_148, 230))
+            firmware = encode_firmware(self._options.firmware, 10_004_148, 230)
+            self._send(ShtpChannel.CONTROL, firmware)
         elif kind == HubReportId.FEATURE_REQUEST:
             self._report_interval(request[1])
         elif kind == HubReportId.SET_FEATURE:

@@ -50,6 +50,8 @@ class QtmServerOptions:
     bodies: tuple[RigidBodyAsset, ...] = ()
     newest: tuple[int, int] = _NEWEST
     """Newest version of the protocol."""
+    oldest: tuple[int, int] = _OLDEST
+    """Oldest version that it accepts; a later QTM may drop old ones."""
     command_port: int = 0
     """TCP port on loopback; 0: any free port."""
     discovery_port: int | None = None
@@ -328,7 +330,7 @@ class QtmServer:
         major, _, minor = words[0].partition(".")
         if major.isdecimal() and minor.isdecimal():
             version = int(major), int(minor)
-            if _OLDEST <= version <= self.options.newest:
+            if self.options.oldest <= version <= self.options.newest:
                 client.version = version
                 return qtm.Command(f"Version set to {words[0]}")
         return qtm.ErrorReply("Version NOT supported")
