@@ -24,7 +24,8 @@ from typing import Any
 from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import load_rig
 from jointfit_daemon.tools.child_processes import daemon
-from jointfit_simulators.devices import XbusDevice
+from jointfit_protocols.xbus.mtdata2 import Item
+from jointfit_simulators.devices import XbusDevice, XbusDeviceOptions
 from tests.broker_fixture import chosen_broker
 from tests.endurance.slopes import RESULTS, slope_of, table_of
 from tests.faults.run import PAGE, render, stored
@@ -34,8 +35,11 @@ from tests.system.station import OUTCOMES, Listener, broker
 FOLDER = Path(__file__).parent
 BASE = "jointfit/endurance"
 SENSORS = ("S1", "S2", "S3", "S4")
-PERIOD_NS = 10_000_000
-"""Interval of samples in accelerated time, ns."""
+RATE_HZ = 400
+"""Samples per second of accelerated time of each sensor."""
+PERIOD_NS = 1_000_000_000 // RATE_HZ
+WAKE_S = 0.01
+"""Interval in which the sensors send what is due, s of accelerated time."""
 TURN_RAD_S = 0.8
 """Angular frequency of the movement, rad/s; its amplitude is 1 rad."""
 INTERVALS = 240
@@ -56,7 +60,7 @@ base = "{base}"
 health_s = {health_s}
 [recording]
 directory = "{folder}/recordings"
-file_mb = 50
+file_minutes = 5
 keep_gb = 0.2
 """
 IMU = """
@@ -65,6 +69,9 @@ id = "{name}"
 segment = "thigh"
 driver = "xbus"
 port = "{folder}/{name}"
+baud = 921600
+rate_hz = {rate_hz}
+silence_s = {silence_s}
 """
 
 
@@ -78,7 +85,9 @@ class Movement:
     number: int = 0
 
     def __post_init__(self) -> None:
-        self.devices = [XbusDevice(self.folder / name) for name in SENSORS]
+        outputs = (*XbusDeviceOptions().outputs[:-1], (Item.QUATERNION, RATE_HZ))
+        options = XbusDeviceOptions(outputs=outputs)
+        self.devices = [XbusDevice(self.folder / name, options=options) for name in SENSORS]
         self.unix_ns = time.time_ns() - self.begin_ns
 
     def now_ns(self) -> int:
@@ -111,7 +120,7 @@ class Movement:
                     q = (math.cos(half), math.sin(half), 0.0, 0.0)
                     for device in self.devices:
                         device.push(t_ns - self.begin_ns, q)
-                await asyncio.sleep(PERIOD_NS * 1e-9 / self.factor)
+                await asyncio.sleep(WAKE_S / self.factor)
         finally:
             for task in serving:
                 task.cancel()
@@ -155,7 +164,9 @@ async def measure(
     """Run until `samples` were received or `seconds` have passed; return the measurements."""
     movement = Movement(folder, factor)
     text = RIG.format(port=port, base=BASE, folder=folder, health_s=5)
-    text += "".join(IMU.format(name=name, folder=folder) for name in SENSORS)
+    # A second of real time: this machine stops processes for tenths of a second.
+    line = {"folder": folder, "rate_hz": RATE_HZ, "silence_s": factor}
+    text += "".join(IMU.format(name=name, **line) for name in SENSORS)
     (folder / "rig.toml").write_text(text, "utf-8")
     rig = load_rig(folder / "rig.toml")
     CalibrationStore(folder / "state" / "calibrations", rig.calibration_store).save(
@@ -176,7 +187,8 @@ async def measure(
             await listener.connected(SENSORS)
             await listener.health(lambda devices: all(d["skew_ppm"] for d in devices.values()))
             until_s = time.monotonic() + seconds
-            pause_s = min(seconds, samples / (400.0 * factor)) / INTERVALS
+            per_s = RATE_HZ * len(SENSORS) * factor
+            pause_s = min(seconds, samples / per_s) / INTERVALS
             while time.monotonic() < until_s and received(listener) < samples:
                 listener.poses.clear()
                 await asyncio.sleep(pause_s)
@@ -216,11 +228,8 @@ def check_counters(listener: Listener, movement: Movement) -> None:
 def results_of(found: list[dict[str, float]], factor: int) -> dict[str, Any]:
     """Return the slopes of a run, for the page."""
     samples = [row["samples"] for row in found]
-    slopes = {
-        name: slope_of(samples, [row[name] for row in found])
-        for name in found[0]
-        if name != "samples"
-    }
+    names = [name for name in found[0] if name != "samples"]
+    slopes = {name: slope_of(samples, [row[name] for row in found], len(names)) for name in names}
     return {
         "samples": int(samples[-1]),
         "factor": factor,
