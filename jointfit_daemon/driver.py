@@ -67,7 +67,7 @@ class DeviceAbsentError(DeviceLostError):
 class DeviceMisconfiguredError(Exception):
     """The device cannot work with these settings; the message names the setting to change.
 
-    The source pauses until another device is on its port, for one minute, or until a reload.
+    The source pauses until another device is on its port, for at most a minute, or until a reload.
     Faults that can end by themselves (a port in use, no free descriptor, a bus that is down) are a
     `DeviceLostError`.
     """

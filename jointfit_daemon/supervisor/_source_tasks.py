@@ -1,8 +1,8 @@
 """One task per source: retries a lost device, pauses a misconfigured one, propagates bugs.
 
 Invariant: a source is opened in the core with its first chunk and closed when its driver ends. No
-source stops permanently: a misconfigured one is retried with another device on its port, after one
-minute, or at a reload. Any other exception of a driver is a bug and ends the daemon.
+source stops permanently: a misconfigured one is retried with another device on its port, after at
+most one minute, or at a reload. Any other exception of a driver is a bug and ends the daemon.
 """
 
 from __future__ import annotations
@@ -33,15 +33,19 @@ FIRST_RETRY_S = 0.1
 """Wait before the first retry, s: a device that was plugged in again is available at once."""
 LAST_RETRY_S = 1.0
 """Longest wait before a retry, s: operation resumes within two seconds of plugging in."""
-HEALTHY_S = 5.0
-"""Duration of operation after which a loss is retried with the first wait again, s."""
+SERVER_RETRY_S = 0.25
+"""Longest wait before a retry of a source without a port, s: no file shows that its server is back,
+and an attempt costs a few datagrams."""
+WORKED_S = 1.0
+"""Duration of data after which the waits and pauses of a source begin with the first again, s."""
 PAUSE_S = 60.0
-"""Pause of a misconfigured source, s: a device may be reconfigured without being unplugged."""
+"""Longest pause of a misconfigured source, s: a device may be reconfigured without being unplugged.
+"""
 PLUGGED_S = 0.05
 """Interval between checks whether an absent port is back before the next retry, s."""
 SERVER_PAUSE_S = 5.0
-"""Pause of a misconfigured source without a port, s: no file shows that its server was changed, and
-a connection costs the server a few datagrams."""
+"""First pause of a misconfigured source without a port, s: no file shows that its server was
+changed. Each further pause is twice as long, up to `PAUSE_S`, until the source has worked."""
 CHECK_S = 0.5
 """Interval between checks of the port of a paused source, s; each is one stat(2)."""
 
@@ -52,12 +56,19 @@ class _SourceReporter:
     def __init__(self, source: str, deliver: Callable[[Event], None], known: asyncio.Event) -> None:
         self._source, self._deliver, self._known = source, deliver, known
         self._open = self._absent = False
+        self._opened_s = 0.0
         self._reported = ""
+
+    @property
+    def worked(self) -> bool:
+        """Whether the source has been open for `WORKED_S`."""
+        return self._open and asyncio.get_running_loop().time() - self._opened_s > WORKED_S
 
     def emit(self, chunk: Chunk) -> None:
         """Pass a chunk to the core."""
         if not self._open:
             self._open, self._absent, self._reported = True, False, ""
+            self._opened_s = asyncio.get_running_loop().time()
             self._known.set()
             self._deliver(SourceOpened(chunk.t_ns, self._source))
         self._deliver(ChunkArrived(self._source, chunk))
@@ -120,33 +131,39 @@ async def run_source(
     # one object for all attempts, which may store findings of failed ones
     driver = source.driver_class(source.settings)
     path = device_path(source.settings)
-    loop = asyncio.get_running_loop()
-    delay = FIRST_RETRY_S
+    longest_s, first_pause_s = LAST_RETRY_S, PAUSE_S
+    retried = f"retrying with another device on the port, or every {PAUSE_S:g} s"
+    if path is None:
+        longest_s, first_pause_s = SERVER_RETRY_S, SERVER_PAUSE_S
+        retried = f"retrying within {PAUSE_S:g} s"
+
+    delay_s, pause_s = FIRST_RETRY_S, first_pause_s
     while True:
-        began, device = loop.time(), _device_identity(path)
+        device, misconfigured, absent = _device_identity(path), False, False
         try:
             await driver.run(reporter.emit)
-            reporter.closed("lost", "its driver ended by itself: report it to its author; retrying")
+            text = "its driver ended by itself: report it to its author; retrying"
         except DeviceLostError as lost:
-            if loop.time() - began > HEALTHY_S:
-                delay = FIRST_RETRY_S
-            absent = isinstance(lost, DeviceAbsentError)
-            reporter.closed("lost", str(lost), absent=absent)  # the core logs the fault
+            absent, text = isinstance(lost, DeviceAbsentError), str(lost)
         except DeviceMisconfiguredError as wrong:
-            again = f"retrying with another device on the port, or every {PAUSE_S:g} s"
-            if path is None:
-                again = f"retrying every {SERVER_PAUSE_S:g} s"
-            reporter.closed("misconfigured", f"{wrong} ({again})")
-            state.paused = True
-            await _wait_for_change(path, device)
-            state.paused, delay = False, FIRST_RETRY_S
+            misconfigured, text = True, f"{wrong} ({retried})"
         except asyncio.CancelledError:
             reporter.removed()
             raise
 
+        if reporter.worked:
+            delay_s, pause_s = FIRST_RETRY_S, first_pause_s
+        # The core logs the fault. The text contains no pause, so that a repetition is recognized.
+        reporter.closed("misconfigured" if misconfigured else "lost", text, absent=absent)
+        if misconfigured:
+            state.paused = True
+            await _wait_for_change(path, device, pause_s)
+            state.paused, delay_s = False, FIRST_RETRY_S
+            pause_s = min(2 * pause_s, PAUSE_S)
+
         # Full jitter: sources that are lost together do not retry together.
-        await _wait_for_retry(path, random.uniform(0, delay))  # noqa: S311 - not security-relevant
-        delay = min(2 * delay, LAST_RETRY_S)
+        await _wait_for_retry(path, random.uniform(0, delay_s))  # noqa: S311 - not security-relevant
+        delay_s = min(2 * delay_s, longest_s)
 
 
 async def _wait_for_retry(path: str | None, delay_s: float) -> None:
@@ -160,10 +177,10 @@ async def _wait_for_retry(path: str | None, delay_s: float) -> None:
             return
 
 
-async def _wait_for_change(path: str | None, device: object) -> None:
-    """Wait until another device is at `path` than `device`; at most the pause of the source."""
+async def _wait_for_change(path: str | None, device: object, pause_s: float) -> None:
+    """Wait until another device is at `path` than `device`; at most `pause_s`."""
     with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(SERVER_PAUSE_S if path is None else PAUSE_S):
+        async with asyncio.timeout(pause_s):
             while _device_identity(path) == device:  # noqa: ASYNC110 - a file system has no event
                 await asyncio.sleep(CHECK_S)
 

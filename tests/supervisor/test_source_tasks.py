@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from jointfit_daemon.config import parse_rig
+from jointfit_daemon.config import Source, parse_rig
 from jointfit_daemon.driver import DeviceMisconfiguredError
+from jointfit_daemon.model import Chunk
 from jointfit_daemon.pipeline.events import SourceClosed
 from jointfit_daemon.supervisor import _source_tasks as sources_module
-from jointfit_daemon.supervisor._source_tasks import SourceTasks
+from jointfit_daemon.supervisor._source_tasks import SourceTasks, run_source
+from tests.supervisor.test_source_sequences import SimulatedTimeLoop
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -81,7 +84,7 @@ async def test_misconfigured_server_is_retried_sooner_than_a_port(
         await asyncio.sleep(0.3)
         assert [driver.opened for driver in drivers] == [1, 0]
         texts = {event.source: event.text for event in events if isinstance(event, SourceClosed)}
-        assert "(retrying every" in texts["server"]
+        assert "(retrying within" in texts["server"]
         assert "with another device on the port" in texts["port"]
         await sources.stop()
 
@@ -103,3 +106,37 @@ async def test_paused_source_is_retried_at_a_reload(table: dict[str, Any]) -> No
         await asyncio.sleep(0.05)
         assert driver.opened == 1
         await sources.stop()
+
+
+def test_misconfigured_server_is_retried_once_a_minute_but_soon_after_it_worked() -> None:
+    attempts: list[float] = []
+    mended = asyncio.Event()
+
+    class Server:
+        def __init__(self, _: Any) -> None:
+            pass
+
+        async def run(self, emit: Any) -> None:
+            attempts.append(asyncio.get_running_loop().time())
+            emit(Chunk(0, b"an answer, before the fault is found"))
+            if mended.is_set():
+                await asyncio.sleep(2.0)
+            raise DeviceMisconfiguredError("bitstream newer than known")
+
+    async def run() -> None:
+        driver: Any = Server
+        source = Source("cameras", "mocap", "x", 100.0, "thigh", None, driver)
+        running = asyncio.create_task(run_source(source, lambda _: None))
+        await asyncio.sleep(3600.0)
+        steps = [after - before for before, after in itertools.pairwise(attempts)]
+        assert len(attempts) < 65
+        assert all(step < 60.2 for step in steps)
+        mended.set()
+        await asyncio.sleep(62.5)
+        mended.clear()
+        await asyncio.sleep(5.2)
+        assert attempts[-1] - attempts[-2] < 7.2
+        running.cancel()
+
+    with asyncio.Runner(loop_factory=SimulatedTimeLoop) as runner:
+        runner.run(run())

@@ -12,23 +12,26 @@ if TYPE_CHECKING:
 class ServerOutput:
     """Emits what a server sends, from one connection of a driver to the next.
 
-    After a silence, answers are emitted with the first frame, because a server that only answers is
-    still lost.
+    After a silence, or a connection with answers but without a frame, answers are emitted with
+    the first frame: a server that only answers is no source of data, and is reported once.
     """
 
     def __init__(self) -> None:
         self.silent = False
         """Whether frames have stopped and none has arrived since, in any connection."""
+        self._answered = self._framed = False
         self._held: list[Chunk] = []
 
     def begin(self, emit: Emit) -> None:
         """Begin a connection, whose chunks `emit` receives."""
         self._emit = emit
+        self.silent |= self._answered and not self._framed
+        self._answered = self._framed = False
         self._held.clear()
 
     def emit_frame(self, chunk: Chunk) -> None:
         """Emit a chunk with a frame, after the answers before it."""
-        self.silent = False
+        self.silent, self._framed = False, True
         for held in self._held:
             self._emit(held)
         self._held.clear()
@@ -36,6 +39,7 @@ class ServerOutput:
 
     def emit_answer(self, chunk: Chunk) -> None:
         """Emit a chunk without frames; after a silence, with the first frame."""
+        self._answered = True
         if self.silent:
             self._held.append(chunk)
         else:

@@ -32,6 +32,7 @@ SCENARIO = Scenario(
     run=run,
     noticed_limit_s=1.0,
     recovered_limit_s=2.0,
+    recovered_median_s=0.5,
     gap_limit_s=0.2,
     kind="all",
 )
