@@ -219,7 +219,7 @@ class XbusDecoder:
             text = 'the device sends MTData, the format of older devices: set format = "mtdata"'
             if legacy is not None:
                 text = f"{legacy.fault}: set output_mode and output_settings"
-            return [DeviceEvent("warning", text)]
+            return [DeviceEvent("warning", text, {"format": "mtdata"})]
 
         values = legacy.read(message.data)
         if values is None:

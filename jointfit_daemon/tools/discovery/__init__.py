@@ -26,6 +26,7 @@ from jointfit_daemon.tools.discovery._serial_listening import (
 from jointfit_daemon.tools.discovery._serial_ports import SerialPortInfo, find_serial_ports
 from jointfit_daemon.tools.discovery._sysfs import read_attribute
 from jointfit_daemon.tools.discovery._traffic import (
+    LEAST_SAMPLES,
     DecodedDevice,
     Layouts,
     decode_frames,
@@ -34,6 +35,7 @@ from jointfit_daemon.tools.discovery._traffic import (
 )
 
 __all__ = [
+    "LEAST_SAMPLES",
     "CanChannel",
     "CanIdentifier",
     "CanInterface",

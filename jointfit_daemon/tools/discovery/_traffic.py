@@ -196,9 +196,18 @@ def decode_traffic(
     if len(samples) > 1 and (span_ns := samples[-1].arrival_ns - samples[0].arrival_ns) > 0:
         rate_hz = (len(samples) - 1) * 1e9 / span_ns
     properties = {k: v for event in events if event.kind == "info" for k, v in event.data.items()}
+
+    # A warning names the setting that removes its cause, besides the rate, which is measured here.
+    proposed = {
+        key: value
+        for event in events
+        if event.kind == "warning"
+        for key, value in event.data.items()
+        if key in driver.Settings.model_fields and key not in table and key != "rate_hz"
+    }
     return DecodedDevice(
         driver=name,
-        settings=dict(table),
+        settings={**table, **proposed},
         messages=decoder.messages,
         samples=len(samples),
         rate_hz=rate_hz,

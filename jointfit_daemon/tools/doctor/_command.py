@@ -35,8 +35,9 @@ def doctor(
     """Find the faults that keep data from the daemon, each with its remedy.
 
     Checks permissions, other programs and latency of serial ports, CAN interfaces, clock, disk,
-    memory and processor; with a rig.toml also the broker, and the cameras by a connection as the
-    daemon makes it. Changes nothing, and needs no root access. Exit codes: 0 no error, with
+    memory and processor; with a rig.toml also the broker, the family of the sensors on serial ports
+    by listening, and the cameras by a connection as the daemon makes it. Changes nothing, and needs
+    no root access. Exit codes: 0 no error, with
     warnings or without; 1 an error; 2 invalid options or rig.toml.
     """
     from rich.console import Console
@@ -104,7 +105,9 @@ def examine(
         return [*findings, Finding("rig", "", "unknown", text, "jointfit doctor --config rig.toml")]
 
     from jointfit_daemon.tools.doctor._broker_checks import check_broker
+    from jointfit_daemon.tools.doctor._device_checks import check_devices
 
+    findings += check_devices(host, rig.sources)
     findings += asyncio.run(check_broker(rig.mqtt))
     progress(0.4)
     if cameras is not None:

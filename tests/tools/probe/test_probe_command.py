@@ -9,6 +9,7 @@ import sys
 import time
 import tomllib
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import jsonschema
@@ -29,6 +30,7 @@ from jointfit_daemon.tools.discovery import (
     usual_bauds,
 )
 from jointfit_daemon.tools.probe import _probe_report, _rig_lines
+from jointfit_protocols.xbus.mtdata import MTDataLayout
 from jointfit_simulators.devices import (
     NatNetServer,
     NatNetServerOptions,
@@ -53,11 +55,13 @@ sys.addaudithook(note)
 app(["probe"])
 """
 
+STREAMING = XbusDeviceOptions(measures_at_once=True)
+
 
 @asynccontextmanager
-async def hardware(folder: Path) -> AsyncIterator[NatNetServer]:
+async def hardware(folder: Path, imu: XbusDeviceOptions = STREAMING) -> AsyncIterator[NatNetServer]:
     """A streaming IMU at `folder`/imu, and a server of motion capture."""
-    device = XbusDevice(folder / "imu", options=XbusDeviceOptions(measures_at_once=True))
+    device = XbusDevice(folder / "imu", options=imu)
     bodies = (RigidBodyAsset("Thigh", ("T1", "T2", "T3"), 1),)
     server = NatNetServer(NatNetServerOptions(bodies))
 
@@ -103,6 +107,15 @@ async def test_named_devices_are_recognized_and_become_lines_of_a_rig(tmp_path: 
     assert tables["mocap"]["command_port"] == server.command_port
     assert "xbus: " in shown.stdout
     assert "rigid bodies: Thigh" in shown.stdout
+
+
+async def test_the_lines_of_an_older_xsens_device_contain_its_format(tmp_path: Path) -> None:
+    older = replace(STREAMING, legacy=MTDataLayout(0x0004, 0x0001))
+    async with hardware(tmp_path, older):
+        words = ["probe", "--json", "--listen", "0.4", "--serial", str(tmp_path / "imu")]
+        result = await asyncio.to_thread(run, app, words)
+    (imu,) = tomllib.loads(checked(result.stdout)["rig_toml"])["imu"]
+    assert (imu["driver"], imu["format"]) == ("xbus", "mtdata")
 
 
 def test_a_silent_port_and_an_absent_one_are_faults_with_exit_code_1(tmp_path: Path) -> None:
