@@ -70,10 +70,13 @@ class XcdiIdSettings(Settings):
 
         known = [number for number in in_order if number is not None]
         if known != sorted(known):
+            keys = ("sample_time", "group_counter", "quaternion")
+            found = ", ".join(f"{key} 0x{ids[key]:X}" for key in keys if ids[key] is not None)
             yield (
                 "",
-                "sample_time < group_counter < quaternion: the lowest identifier leaves first, and "
-                "the quaternion must be the last frame of a sample",
+                f"found {found}; expected sample_time < group_counter < quaternion: the lowest "
+                "identifier leaves first, and the quaternion must be the last frame of a sample. "
+                "Set all three as in the device",
             )
 
     def resolved(self, *, extended: bool = False) -> XcdiIds:

@@ -86,8 +86,8 @@ def _compare(  # noqa: PLR0911 - one for each finding
     if not heard.devices:
         text = f"{sum(heard.received_bytes.values())} bytes, but no driver decodes them"
         remedy = (
-            "correct the port, or describe the data by a serial-table in rig.toml, then: jointfit "
-            "probe --serial PORT"
+            "correct the port, or describe the data by a serial-table; for a table of rig.toml, "
+            "`jointfitd` logs the setting that fits the data"
         )
         return Finding(CHECK, name, "error", f"{text}, expected {expected}", remedy)
 

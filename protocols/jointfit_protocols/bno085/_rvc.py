@@ -22,6 +22,7 @@ from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 RVC_BYTES = 19
 """Bytes of a frame."""
 _MARK = 0xAA
+_MARKS = b"\xaa\xaa"
 _BODY = struct.Struct("<B6h3s")
 _unpack, _new_tuple = _BODY.unpack_from, tuple.__new__
 _RUN = 1024
@@ -63,12 +64,12 @@ def _read_frame(buffer: bytes, at: int, base: int) -> RvcFrame | CorruptBytes | 
     after = at + RVC_BYTES
     if after > len(buffer):
         return None if buffer[at] == _MARK else _NO_START
-    if buffer[at] != _MARK or buffer[at + 1] != _MARK:
+    if not buffer.startswith(_MARKS, at):
         return _NO_START
     if sum(buffer[at + 2 : after - 1]) & 0xFF != buffer[after - 1]:
         return _CHECKSUM
-    body = _unpack(buffer, at + 2)
-    fields = (body[0], body[1:4], body[4:7], body[7], base + after)
+    number, yaw, pitch, roll, x, y, z, reserved = _unpack(buffer, at + 2)
+    fields = (number, (yaw, pitch, roll), (x, y, z), reserved, base + after)
     return _new_tuple(RvcFrame, fields)  # half the time of RvcFrame()
 
 
@@ -80,3 +81,14 @@ class RvcCodec(ResynchronizingCodec[RvcFrame]):
 
     def __init__(self) -> None:
         super().__init__(_read_frame, _START, _RUN, _NO_START.reason, RVC_BYTES)
+
+    def feed(self, data: bytes) -> list[RvcFrame | CorruptBytes]:  # type: ignore[explicit-override]  # Python 3.12's
+        """Return the frames that `data` completed, in wire order; never raises."""
+        # The usual piece is one frame, which needs no search.
+        if len(data) == RVC_BYTES and not self._pending and not self._run.count:
+            found = _read_frame(data, 0, self.fed)
+            if type(found) is RvcFrame:
+                self.fed += RVC_BYTES
+                self.messages += 1
+                return [found]
+        return super().feed(data)

@@ -69,6 +69,7 @@ class XImu3Codec:
         """Return the messages that `data` completed, in wire order; never raises."""
         found: list[Found] = []
         buffer = self._pending + data if self._pending else data
+        append, count = found.append, 0
         at, base = 0, self.fed - len(self._pending)
         self.fed += len(data)
 
@@ -80,8 +81,8 @@ class XImu3Codec:
             if after - at == size and buffer[at] == first and after <= escape:
                 read = unpack_from(buffer, at)
                 fields = (kind, read[0], read[1:], b"", True, size, base + after, None)
-                found.append(_new_data(XImu3Data, fields))
-                self.messages += 1
+                append(_new_data(XImu3Data, fields))
+                count += 1
                 at = after
                 continue
 
@@ -98,6 +99,7 @@ class XImu3Codec:
                 escape = find(ESCAPE, after) % _NEVER
             at = after
 
+        self.messages += count
         self._pending = self._shortened(buffer[at:], found) if at < len(buffer) else b""
         return found
 
