@@ -89,6 +89,9 @@ INJECTED = Path(__file__).parent / "injected"
 DISK_MB = 4
 """Size of the file system for recordings, MB."""
 
+REQUEST_PAUSE_S = 0.15
+"""Pause before each request, s."""
+
 
 def no_namespace() -> str | None:
     """Return why this user cannot mount a file system of their own; None if they can."""
@@ -236,6 +239,8 @@ class Gateway:
     async def request(self, name: str, **arguments: object) -> dict[str, Any]:
         """Send a request; return the answer."""
         assert self.listener.client is not None
+        # Quick scenarios in a row would exceed the ten requests a second that the daemon answers.
+        await asyncio.sleep(REQUEST_PAUSE_S)
         answer: dict[str, Any] = await self.listener.client.request(name, arguments)
         return answer
 

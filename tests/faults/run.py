@@ -10,6 +10,7 @@ from collections import deque
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from jointfit_daemon.outputs.mqtt import NoAnswerError
 from tests.endurance.slopes import RESULTS as ENDURANCE
 from tests.endurance.slopes import table_of
 from tests.faults.gateway import running_gateway
@@ -68,7 +69,7 @@ async def run_all(
                     name = waiting.popleft()
                     found = outcomes.setdefault(name, [])
                     await _run_repeatedly(name, known[name], gateway, repeat, found)
-        except (AssertionError, TimeoutError) as error:
+        except (AssertionError, TimeoutError, NoAnswerError) as error:
             outcomes.pop(name, None)
             failures.append(f"{name}: {error}")
             print(f"{name}: failed", flush=True)
