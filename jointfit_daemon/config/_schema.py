@@ -9,6 +9,8 @@ from pydantic.json_schema import models_json_schema
 from jointfit_daemon.config._tables import (
     CalibrationTable,
     ChainTable,
+    LslSettings,
+    MetricsSettings,
     MqttSettings,
     RecordingSettings,
     RigTable,
@@ -24,6 +26,8 @@ _SECTIONS: dict[str, type[BaseModel]] = {
     "calibration": CalibrationTable,
     "mqtt": MqttSettings,
     "recording": RecordingSettings,
+    "metrics": MetricsSettings,
+    "lsl": LslSettings,
 }
 
 
@@ -60,7 +64,8 @@ def rig_schema() -> dict[str, Any]:
         "title": "rig.toml of jointfitd",
         "type": "object",
         "properties": properties,
-        "required": ["rig", "chain", "imu"],
+        "required": ["rig", "chain"],
+        "anyOf": [{"required": ["imu"]}, {"required": ["mocap"]}],  # planar rigs have no IMU
         "additionalProperties": False,
         "$defs": defs,
     }

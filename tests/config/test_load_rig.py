@@ -9,11 +9,13 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from jointfit_daemon.config import ConfigError, MqttSettings, load_rig, parse_rig, rig_schema
+from jointfit_daemon.config._load import SECTIONS
 from jointfit_daemon.driver import _SLCAN_BITRATES, CanBusSettings
 from jointfit_daemon.model import AngleConvention
 from jointfit_drivers.ports._python_can_bus import PythonCanBus
@@ -22,6 +24,7 @@ from jointfit_protocols.can.slcan import BITRATES
 from jointfit_simulators.scene import RigOptions
 
 PROJECT = Path(__file__).resolve().parents[2]
+EXAMPLES = sorted((PROJECT / "examples").glob("*.toml"))
 Table = dict[str, Any]
 
 
@@ -346,7 +349,17 @@ def test_the_schema_describes_every_key() -> None:
     for name, model in schema["$defs"].items():
         for key, field in model.get("properties", {}).items():
             assert field.get("description") or "$ref" in field, f"{name}.{key}"
-    assert set(schema["properties"]) >= {"rig", "chain", "imu", "mocap", "mqtt"}
+    assert set(schema["properties"]) == set(SECTIONS)
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
+def test_the_schema_accepts_every_example(path: Path) -> None:
+    jsonschema.validate(tomllib.loads(path.read_text("utf-8")), rig_schema())
+
+
+def test_the_schema_accepts_metrics_and_lsl() -> None:
+    rig = tomllib.loads(EXAMPLES[0].read_text("utf-8")) | {"metrics": {}, "lsl": {}}
+    jsonschema.validate(rig, rig_schema())
 
 
 def test_in_the_schema_a_bus_is_a_name(fakes: object) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -12,12 +13,15 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from typer.main import get_command
 
 from jointfit_daemon.__main__ import _parser
+from jointfit_daemon.tools.__main__ import app
 
 ROOT = Path(__file__).resolve().parents[2]
 DEBIAN = ROOT / "packaging" / "debian"
 MANUALS = ROOT / "packaging" / "man"
+COMMANDS = sorted(get_command(app).commands)  # type: ignore[attr-defined]
 
 
 def tracked() -> list[Path]:
@@ -103,6 +107,16 @@ def test_every_option_of_the_daemon_is_in_its_manual_page() -> None:
     assert [name for name in options if name not in page] == []
     for code in ("0", "1", "2"):
         assert f".B {code}\n" in page
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_is_in_manual_page_and_index(command: str) -> None:
+    page = (MANUALS / "jointfit.1").read_text("utf-8").replace("\\-", "-")
+    assert re.search(rf'^\.BI? "?{command}[ "\n]', page, re.MULTILINE)
+    index = (ROOT / "docs" / "index.md").read_text("utf-8")
+    listed = re.search(r"\(`(init .*)`, each with `--help`\)", index)
+    assert listed is not None
+    assert command in shlex.split(listed[1])
 
 
 @pytest.mark.parametrize("page", sorted(MANUALS.glob("*.1")), ids=lambda page: page.name)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import orjson
 import pytest
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from jointfit_daemon import __version__
@@ -28,26 +29,7 @@ def test_the_version_is_the_packages_and_its_variant_is_named() -> None:
     assert run(app, ["--version"]).stdout.strip() == expected
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "check",
-        "probe",
-        "doctor",
-        "demo",
-        "dashboard",
-        "monitor",
-        "calibrate",
-        "mark",
-        "record",
-        "recover",
-        "request",
-        "decode",
-        "export",
-        "ik",
-        "schema",
-    ],
-)
+@pytest.mark.parametrize("command", sorted(get_command(app).commands))  # type: ignore[attr-defined]
 def test_every_command_explains_itself(command: str) -> None:
     result = run(app, [command, "--help"])
     assert result.exit_code == 0

@@ -12,7 +12,6 @@ from jointfit_drivers.can_table._dbc import read_signals
 from jointfit_drivers.ports.can_bus import bus_faults
 from jointfit_drivers.table_samples import (
     UNITS,
-    AsParts,
     FieldFaultError,
     FieldSettings,
     SampleForm,
@@ -21,6 +20,7 @@ from jointfit_drivers.table_samples import (
     binary_place,
     orientation_faults,
     overlap_faults,
+    parts_of,
     place_fields,
     sample_form,
 )
@@ -52,7 +52,7 @@ class CanFieldSettings(FieldSettings):
     )
 
 
-Parts = Annotated[tuple[CanFieldSettings, ...], AsParts]
+Parts = Annotated[tuple[CanFieldSettings, ...], parts_of(CanFieldSettings)]
 
 
 class CanFields(Settings):

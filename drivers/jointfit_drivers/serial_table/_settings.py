@@ -10,7 +10,6 @@ from typing_extensions import override
 from jointfit_daemon.driver import Settings
 from jointfit_drivers.serial_imu import SerialImuSettings
 from jointfit_drivers.table_samples import (
-    AsParts,
     ChecksumSettings,
     FieldFaultError,
     FieldSettings,
@@ -20,6 +19,7 @@ from jointfit_drivers.table_samples import (
     binary_place,
     orientation_faults,
     overlap_faults,
+    parts_of,
     place_fields,
     sample_form,
 )
@@ -50,7 +50,7 @@ class SerialFieldSettings(FieldSettings):
     )
 
 
-Parts = Annotated[tuple[SerialFieldSettings, ...], AsParts]
+Parts = Annotated[tuple[SerialFieldSettings, ...], parts_of(SerialFieldSettings)]
 
 
 class SerialFields(Settings):

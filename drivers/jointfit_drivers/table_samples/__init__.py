@@ -2,10 +2,10 @@
 
 from jointfit_drivers.table_samples._continuity import RecordContinuity
 from jointfit_drivers.table_samples._field_settings import (
-    AsParts,
     ChecksumSettings,
     FieldSettings,
     TableImuSettings,
+    parts_of,
 )
 from jointfit_drivers.table_samples._record_samples import RecordSamples
 from jointfit_drivers.table_samples._records import (
@@ -27,7 +27,6 @@ from jointfit_drivers.table_samples._units import UNITS
 
 __all__ = [
     "UNITS",
-    "AsParts",
     "ChecksumSettings",
     "Faults",
     "FieldFaultError",
@@ -42,6 +41,7 @@ __all__ = [
     "duration_ns",
     "orientation_faults",
     "overlap_faults",
+    "parts_of",
     "place_fields",
     "sample_form",
 ]

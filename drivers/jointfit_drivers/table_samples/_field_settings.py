@@ -77,7 +77,10 @@ def as_parts(value: Any) -> Any:
     return (part,)
 
 
-AsParts = BeforeValidator(as_parts)
+def parts_of(field: type[Settings]) -> BeforeValidator:
+    """Return the validator of a quantity: the table of one field, or an array of them."""
+    either = field | tuple[field, ...]  # type: ignore[valid-type]
+    return BeforeValidator(as_parts, json_schema_input_type=either)
 
 
 class ChecksumSettings(Settings):
