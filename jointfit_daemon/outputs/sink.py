@@ -1,4 +1,7 @@
-"""The interface of everything that receives the input events and the outputs of the core."""
+"""The interface of everything that receives the input events and the outputs of the core.
+
+The supervisor creates and subscribes the sinks that rig.toml requests.
+"""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
 By default every other sensor uses a UART (Xbus, one pty each) and the others use CAN (XCDI, behind
 one SLCAN adapter on a pty or on a python-can bus). The optical system is a NatNet server on
-loopback.
+loopback. The families of devices are in `_imu_families` and `_mocap_families`.
 """
 
 from __future__ import annotations
