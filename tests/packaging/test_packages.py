@@ -21,7 +21,7 @@ from jointfit_daemon.tools.__main__ import app
 ROOT = Path(__file__).resolve().parents[2]
 DEBIAN = ROOT / "packaging" / "debian"
 MANUALS = ROOT / "packaging" / "man"
-COMMANDS = sorted(get_command(app).commands)  # type: ignore[attr-defined]
+COMMANDS = sorted(get_command(app).commands)  # type: ignore[attr-defined]  # it is a group
 
 
 def tracked() -> list[Path]:

@@ -29,7 +29,7 @@ def test_the_version_is_the_packages_and_its_variant_is_named() -> None:
     assert run(app, ["--version"]).stdout.strip() == expected
 
 
-@pytest.mark.parametrize("command", sorted(get_command(app).commands))  # type: ignore[attr-defined]
+@pytest.mark.parametrize("command", sorted(get_command(app).commands))  # type: ignore[attr-defined]  # it is a group
 def test_every_command_explains_itself(command: str) -> None:
     result = run(app, [command, "--help"])
     assert result.exit_code == 0

@@ -79,7 +79,7 @@ def as_parts(value: Any) -> Any:
 
 def parts_of(field: type[Settings]) -> BeforeValidator:
     """Return the validator of a quantity: the table of one field, or an array of them."""
-    either = field | tuple[field, ...]  # type: ignore[valid-type]
+    either = field | tuple[field, ...]  # type: ignore[valid-type]  # a type at run time
     return BeforeValidator(as_parts, json_schema_input_type=either)
 
 
