@@ -25,6 +25,7 @@ from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
 from jointfit_drivers.ports._bus_faults import bus_faults
 from jointfit_drivers.ports._python_can_bus import PythonCanBus
+from jointfit_drivers.ports._silence_timer import SilenceTimer
 from jointfit_drivers.ports._slcan_bus import SlcanBus
 from jointfit_protocols.can import HOST_CORRUPT, CanFrame, pack_frames
 
@@ -62,13 +63,14 @@ class _Subscriber:
     ids: Mapping[CanKey, str]
     emit: Emit
     ended: asyncio.Future[None]
-    limit: asyncio.Timeout
     silence_s: float
     needed: CanKey
     others: int
     """Number of frames of all devices that had arrived before its subscription."""
     arrived: dict[CanKey, int] = field(default_factory=dict)
     """Time of the last arrival, ns, of each of its identifiers since its subscription."""
+    timer: SilenceTimer | None = None
+    """Limits the time without the required identifier, while the device is subscribed."""
     early: deque[Chunk] = field(default_factory=lambda: deque(maxlen=_EARLY))
 
     @property
@@ -98,8 +100,8 @@ class _Subscriber:
         except Exception as error:  # noqa: BLE001 - a loop callback's error would only be logged
             self.ended.set_exception(error)
             return
-        if self.needed in keys and not self.limit.expired():
-            self.limit.reschedule(asyncio.get_running_loop().time() + self.silence_s)
+        if self.needed in keys and self.timer is not None:
+            self.timer.note_arrival()
 
 
 class SharedBus:
@@ -201,26 +203,28 @@ class SharedBus:
                     f"({configured_by}) and set `ids` of both"
                 )
 
+        # ends with the error of the bus or of `emit`; with a result: silence
         ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        limit = asyncio.timeout(silence_s if first_s is None else first_s)
-        subscriber = _Subscriber(name, ids, emit, ended, limit, silence_s, needed, self._others)
+        subscriber = _Subscriber(name, ids, emit, ended, silence_s, needed, self._others)
+
+        def end_silent() -> None:
+            if not ended.done():
+                ended.set_result(None)
 
         if self._failed is not None:
             raise DeviceLostError(str(self._failed))
         self._subscribers.append(subscriber)
         self._ids[name] = ids
+        timer = subscriber.timer = SilenceTimer(silence_s, end_silent, first_s)
         try:
-            async with limit:
-                self._route()
-                self._claim(subscriber)
-                self._filter()
-                await ended
-        except TimeoutError as error:
-            if not limit.expired():  # raised by emit: a bug, not silence
-                raise
+            self._route()
+            self._claim(subscriber)
+            self._filter()
+            await ended
             text = self._explain_silence(subscriber, resembles, configured_by, worked=worked)
-            raise DeviceLostError(text) from error
+            raise DeviceLostError(text)
         finally:
+            timer.cancel()
             self._subscribers.remove(subscriber)
             self._route()
             if ended.done() and not ended.cancelled():

@@ -22,6 +22,7 @@ import serial
 
 from jointfit_daemon.driver import DeviceAbsentError, DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
+from jointfit_drivers.ports._silence_timer import SilenceTimer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -158,25 +159,28 @@ class SerialPort:
             The port was unplugged, or was silent for `silence_s`.
         """
         loop = asyncio.get_running_loop()
-        ended: asyncio.Future[None] = loop.create_future()
-        limit = asyncio.timeout(silence_s)
+        ended: asyncio.Future[None] = loop.create_future()  # with a result: silence
+
+        def end_silent() -> None:
+            if not ended.done():
+                ended.set_result(None)
+
+        timer = None if silence_s is None else SilenceTimer(silence_s, end_silent)
 
         def take(chunk: Chunk) -> None:
             emit(chunk)
-            if silence_s is not None and not limit.expired():
-                limit.reschedule(loop.time() + silence_s)
+            if timer is not None:
+                timer.note_arrival()
 
         try:
-            async with limit:
-                loop.add_reader(self._fd, self._reader(take, ended))
-                await ended
-        except TimeoutError as error:
-            if not limit.expired():  # raised by emit: a bug, not silence
-                raise
+            loop.add_reader(self._fd, self._reader(take, ended))
+            await ended
             raise DeviceLostError(
                 f"{self.path}: silent for {silence_s:g} s: check power and cable, and `baud`"
-            ) from error
+            )
         finally:
+            if timer is not None:
+                timer.cancel()
             loop.remove_reader(self._fd)
             if ended.done() and not ended.cancelled():
                 ended.exception()  # mark as retrieved, in case a cancellation came first
