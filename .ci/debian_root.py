@@ -35,6 +35,7 @@ def kept(
     tools: Mapping[str, str],
     make: Callable[[Path], Path],
     cache: Path = CACHE,
+    suite: str = SUITE,
 ) -> Path:
     """Return a file that is made once a week.
 
@@ -50,6 +51,8 @@ def kept(
         Makes the file in an empty folder and returns its path.
     cache
         Folder of the files that are kept.
+    suite
+        Release of Debian.
 
     Raises
     ------
@@ -59,12 +62,12 @@ def kept(
     stem, _, ending = name.partition(".")
     week = datetime.datetime.now(datetime.UTC).strftime("%G-%V").encode()
     made_by = recipe.encode() + Path(__file__).read_bytes() + week
-    path = cache / f"{stem}-{SUITE}-{hashlib.sha256(made_by).hexdigest()[:16]}.{ending}"
+    path = cache / f"{stem}-{suite}-{hashlib.sha256(made_by).hexdigest()[:16]}.{ending}"
     if path.is_file():
         return path
 
     cache.mkdir(parents=True, exist_ok=True)
-    for old in cache.glob(f"{stem}-{SUITE}-*.{ending}"):
+    for old in cache.glob(f"{stem}-{suite}-*.{ending}"):
         if time.time() - old.stat().st_mtime > _KEPT_DAYS * 86400:  # noqa: TID251 - a file's age
             old.unlink()
 
@@ -76,12 +79,16 @@ def kept(
     return path
 
 
-def bootstrap(packages: Sequence[str], hooks: Sequence[str], work: Path) -> Path:
+def bootstrap(
+    packages: Sequence[str], hooks: Sequence[str], work: Path, suite: str = SUITE
+) -> Path:
     """Make ``rootfs.tar`` in `work`: minbase and `packages`, without manual pages."""
+    # Unstable has no security updates that an old mirror would hide.
+    options = ["--aptopt=Acquire::Check-Valid-Until no"] if suite == "sid" else []
     command = [
         "mmdebstrap", "--variant=minbase", f"--include={','.join(packages)}",
         "--dpkgopt=path-exclude=/usr/share/man/*", "--dpkgopt=path-exclude=/usr/share/locale/*",
-        *(f"--customize-hook={hook}" for hook in hooks), SUITE, "rootfs.tar",
+        *(f"--customize-hook={hook}" for hook in hooks), *options, suite, "rootfs.tar",
     ]  # fmt: skip
     run(command, work)
     return work / "rootfs.tar"

@@ -1,6 +1,6 @@
 """Run the tests and the demo on a fresh minimal Debian, as a stranger would, without root.
 
-    .ci/minimal_root.py [--out DIR] [-- SHELL COMMAND]
+    .ci/minimal_root.py [--suite NAME] [--out DIR] [-- SHELL COMMAND]
 
 The system is mmdebstrap's minbase with `PACKAGES`: no broker, no name localhost.
 It is entered as an ordinary user, in namespaces of its own, on a clone of this checkout's last
@@ -23,7 +23,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from debian_root import CACHE, SEARCH, RootBuildError, bootstrap, kept, run
+from debian_root import CACHE, SEARCH, SUITE, RootBuildError, bootstrap, kept, run
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGES = ("python3", "python3-venv", "make", "git", "ca-certificates")
@@ -95,6 +95,7 @@ def main() -> int:
     """Set the system up and run the command in it; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=CHECKOUT / "build" / "minimal", metavar="DIR")
+    parser.add_argument("--suite", default=SUITE, help="release of Debian (default: %(default)s)")
     parser.add_argument("command", nargs="*", help=f"default: {COMMAND}")
     given = parser.parse_args()
     command = " ".join(given.command) or COMMAND
@@ -106,7 +107,7 @@ def main() -> int:
     try:
         tar = kept(
             "minimal.tar", " ".join(PACKAGES), {"mmdebstrap": "mmdebstrap"},
-            lambda work: bootstrap(PACKAGES, (), work),
+            lambda work: bootstrap(PACKAGES, (), work, given.suite), suite=given.suite,
         )  # fmt: skip
         work = Path(tempfile.mkdtemp(prefix="minimal-run-", dir=CACHE))
         try:
