@@ -8,7 +8,7 @@ STAMP  := $(VENV)/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root faults endurance fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom vendor audit lock clean
+.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root faults endurance fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom release vendor audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -50,8 +50,8 @@ test-compiled: compiled  ## the tests of the core, on the compiled modules
 test-cpu: $(STAMP)  ## the numerical tests as on other processors (ARGS=--all: all combinations)
 	@$(BIN)/python .ci/cpu_features.py $(ARGS)
 
-test-root:  ## the tests and the demo on a fresh minimal Debian, as a user without root (mmdebstrap; root or sudo)
-	@$(PYTHON) .ci/minimal_root.py
+test-root:  ## the tests and the demo on a fresh minimal Debian, as a user without root (mmdebstrap; root or sudo); ARGS="--suite trixie"
+	@$(PYTHON) .ci/minimal_root.py $(ARGS)
 
 test-vm: $(STAMP)  ## virtual machines: SocketCAN on a real vcan; power cuts; the .deb under real systemd, with broker and faults
 	@$(BIN)/python .ci/light_vm.py
@@ -102,6 +102,9 @@ deb: $(STAMP)  ## the Debian package in build/packages, compiled with a C compil
 
 sbom: $(STAMP)  ## what the package carries, as CycloneDX JSON in build/packages
 	@$(BIN)/python packaging/sbom.py $(ARGS)
+
+release: $(STAMP)  ## wheels, sdist, Debian packages and bill of materials with signed checksums: ARGS="--key KEY.pem"
+	@$(BIN)/python packaging/release.py $(ARGS)
 
 vendor: $(STAMP)  ## fetch the dashboard's vendored scripts again by npm, and compare their SHA-256
 	@$(BIN)/python packaging/vendor.py

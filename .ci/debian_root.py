@@ -35,6 +35,7 @@ def kept(
     tools: Mapping[str, str],
     make: Callable[[Path], Path],
     cache: Path = CACHE,
+    *,
     suite: str = SUITE,
 ) -> Path:
     """Return a file that is made once a week.
