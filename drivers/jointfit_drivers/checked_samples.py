@@ -87,7 +87,9 @@ class CheckedSamples(Refusals):
             out: list[Decoded] = []
             if step.restarted:
                 self._gate.forget()
-                out.append(DeviceEvent("restart", _restart_text(held.sample)))
+                ticks = held.sample.ticks
+                clock = "its counter" if ticks is None else f"device time {ticks}"
+                out.append(DeviceEvent("restart", f"device restarted at {clock}"))
             out += self._admit(*held)
             lost = step.lost_since
         else:
@@ -118,16 +120,16 @@ class CheckedSamples(Refusals):
             if sample.ticks is None or len(self._intervals) == _INTERVALS:
                 return [checked]
             return [checked, *self._rate_warning(sample.ticks)]
-        return [self.refuse(size, "quaternion norm is not 1"), *self._norm_warning()]
 
-    def _norm_warning(self) -> list[Decoded]:
-        """Return a warning, once, if hardly any of the first quaternions has norm 1."""
+        # Warn once if hardly any of the first quaternions has norm 1.
+        out: list[Decoded] = [self.refuse(size, "quaternion norm is not 1")]
         norm = None if self._norm_checked else self._gate.misconfigured_norm
-        if norm is None:
-            return []
-        self._norm_checked = True
-        text = f"median quaternion norm is {norm:.4g}, expected 1: byte order or scale is wrong"
-        return [DeviceEvent("warning", text, {"median_norm": norm} if isfinite(norm) else {})]
+        if norm is not None:
+            self._norm_checked = True
+            text = f"median quaternion norm is {norm:.4g}, expected 1: byte order or scale is wrong"
+            data = {"median_norm": norm} if isfinite(norm) else {}
+            out.append(DeviceEvent("warning", text, data))
+        return out
 
     def _rate_warning(self, ticks: int) -> list[Decoded]:
         """Return a warning, once, if the first samples have another rate in device time."""
@@ -148,8 +150,3 @@ class CheckedSamples(Refusals):
             f"{self._rate_hz:g}: set rate_hz = {found_hz:.4g}, or the rate of the device"
         )
         return [DeviceEvent("warning", text, {"rate_hz": round(found_hz, 2)})]
-
-
-def _restart_text(first: ImuSample) -> str:
-    clock = "its counter" if first.ticks is None else f"device time {first.ticks}"
-    return f"device restarted at {clock}"

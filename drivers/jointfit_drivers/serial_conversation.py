@@ -124,7 +124,11 @@ class SerialConversation(Generic[Message]):
             self.understood += len(messages)
             for message in messages:
                 if is_reply(message):
-                    self._begin(message)
+                    if not self._emitting:  # it and the bytes behind it; all later bytes follow
+                        since = self._codec.fed - message.end + message.size
+                        data, self._recent = self._recent[-since:], b""
+                        self._emitting = True
+                        self._emit(Chunk(self._t_ns, data))
                     return message
         return None
 
@@ -139,12 +143,3 @@ class SerialConversation(Generic[Message]):
         else:
             self._recent = (self._recent + chunk.data)[-_KEPT:]
         return self._codec.feed(chunk.data)
-
-    def _begin(self, first: Message) -> None:
-        """Emit the first reply and the bytes behind it; all later bytes follow."""
-        if self._emitting:
-            return
-        since = self._codec.fed - first.end + first.size
-        data, self._recent = self._recent[-since:], b""
-        self._emitting = True
-        self._emit(Chunk(self._t_ns, data))

@@ -78,7 +78,16 @@ class TimedSamples(Refusals):
     def add(self, reading: TimedReading) -> list[Decoded]:
         """Return the events and samples that a reading completes."""
         if reading.ticks is None:
-            return self._add_untimed(reading)
+            out: list[Decoded] = []
+            if not self._untimed:
+                self._untimed = True
+                text = f"orientation without time in its message: {self._untimed_remedy}"
+                out.append(DeviceEvent("warning", text))
+
+            # Stamped with its arrival, unless others have a time.
+            if self._timed or self._make_raw is not None:
+                return [*out, self.refuse(reading.size, "orientation without time")]
+            return out + self._samples(reading)
 
         self._timed = True
         step = self._continuity.add(reading.ticks, reading.arrival_ns)
@@ -106,21 +115,17 @@ class TimedSamples(Refusals):
         held, self._held = self._held, None
         return [] if held is None else [self.refuse(held.size, "time disagrees with the others")]
 
-    def _add_untimed(self, reading: TimedReading) -> list[Decoded]:
-        """Return a sample stamped with its arrival; reject it if others have a time."""
-        out: list[Decoded] = []
-        if not self._untimed:
-            self._untimed = True
-            text = f"orientation without time in its message: {self._untimed_remedy}"
-            out.append(DeviceEvent("warning", text))
-        if self._timed or self._make_raw is not None:
-            return [*out, self.refuse(reading.size, "orientation without time")]
-        return out + self._samples(reading)
-
     def _samples(self, reading: TimedReading) -> list[Decoded]:
         """Return the samples of an accepted reading."""
         if reading.raw is not None and self._raw is not None:
-            return self._raw_samples(reading, reading.raw, self._raw)
+            rate, force, magnetic = reading.raw
+            ticks = reading.ticks or 0
+            field = magnetic if self._raw.magnetometer else None
+            measured = RawReading(ticks, rate, force, field)
+            if ticks == self._raw_ns or not is_plausible(measured):
+                return [self.refuse(reading.size, "raw measurements out of range")]
+            self._raw_ns = ticks
+            return self._raw.take(RawStamp(reading.arrival_ns, ticks), measured)
         if reading.q_world_sensor is None:
             return []
 
@@ -143,14 +148,3 @@ class TimedSamples(Refusals):
                 data = {"median_norm": norm} if isfinite(norm) else {}
                 out.append(DeviceEvent("warning", text, data))
         return out
-
-    def _raw_samples(
-        self, reading: TimedReading, found: RawVectors, raw: RawSamples
-    ) -> list[Decoded]:
-        ticks = reading.ticks or 0
-        field = found.magnetic if raw.magnetometer else None
-        measured = RawReading(ticks, found.rate, found.force, field)
-        if ticks == self._raw_ns or not is_plausible(measured):
-            return [self.refuse(reading.size, "raw measurements out of range")]
-        self._raw_ns = ticks
-        return raw.take(RawStamp(reading.arrival_ns, ticks), measured)

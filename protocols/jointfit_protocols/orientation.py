@@ -12,7 +12,7 @@ changed: the sensor axes are those printed on the housing.
 
 from __future__ import annotations
 
-from math import isfinite, sqrt
+from math import cos, isfinite, sin, sqrt
 from statistics import median
 from typing import Literal
 
@@ -58,6 +58,19 @@ def native_of(q_world_sensor: Quaternion, world: World = "ENU") -> Quaternion:
     if world == "NED":
         return (_S * (x + y), _S * (-w - z), _S * (z - w), _S * (x - y))
     return (_S * (w + z), _S * (x + y), _S * (y - x), _S * (z - w))
+
+
+def angles_quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """Return the quaternion of R = Rz(yaw) Ry(pitch) Rx(roll), rad."""
+    cr, sr = cos(0.5 * roll), sin(0.5 * roll)
+    cp, sp = cos(0.5 * pitch), sin(0.5 * pitch)
+    cy, sy = cos(0.5 * yaw), sin(0.5 * yaw)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
 
 
 class OrientationGate:

@@ -95,7 +95,8 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         if channel == ShtpChannel.EXECUTABLE:
             return self._reset() if message.payload == _RESET_COMPLETE else []
         if channel not in {ShtpChannel.CONTROL, ShtpChannel.INPUT, ShtpChannel.WAKE_INPUT}:
-            return self._unknown_channel(message)  # or advertisements
+            content, known = f"packets on channel {channel}", channel in _CHANNELS
+            return [] if known else self._newer.take_unknown(content, self._stamps.chunk_ns)
         reports = split_reports(message.payload)
         if reports is None:
             kind, out = unknown_report(message.payload), []
@@ -107,12 +108,6 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         if channel == ShtpChannel.CONTROL:
             return [event for report in reports for event in self._device_events(report)]
         return self._reports(message, reports)
-
-    def _unknown_channel(self, packet: ShtpPacket) -> list[Decoded]:
-        if packet.channel in _CHANNELS:
-            return []
-        content = f"packets on channel {packet.channel}"
-        return self._newer.take_unknown(content, self._stamps.chunk_ns)
 
     def _device_events(self, report: bytes) -> list[Decoded]:
         """Return the events of a reply, with a warning about newer firmware."""

@@ -10,6 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from jointfit_daemon.name_lists import list_names
 from jointfit_drivers.table_samples import FieldFaultError
 from jointfit_protocols.table import Kind, TableField
 
@@ -87,8 +88,7 @@ def _signal(name: str, messages: Sequence[Any], file: str) -> DbcSignal:
     ]
     if not found:
         known = sorted({signal.name for message in messages for signal in message.signals})
-        more = f" and {len(known) - _NAMED} more" if len(known) > _NAMED else ""
-        text = f"{file} has no signal {name!r}; it has {', '.join(known[:_NAMED])}{more}"
+        text = f"{file} has no signal {name!r}; it has {list_names(known, _NAMED)}"
         raise FieldFaultError("signals", text)
     if len(found) > 1:
         choices = ", ".join(f"{message.name}.{signal_name}" for message, _ in found)

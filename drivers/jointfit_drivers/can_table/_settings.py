@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field, field_validator
 from typing_extensions import override
 
-from jointfit_daemon.driver import CanBusError, CanBusSettings, Settings
+from jointfit_daemon.driver import Settings
+from jointfit_drivers.can_imu import CanImuSettings
 from jointfit_drivers.can_table._dbc import read_signals
-from jointfit_drivers.ports.can_bus import bus_faults
 from jointfit_drivers.table_samples import (
     UNITS,
     FieldFaultError,
@@ -67,10 +67,9 @@ class CanFields(Settings):
     valid: Parts = Field((), description="status bits; samples without them are dropped")
 
 
-class CanTableSettings(TableImuSettings):
+class CanTableSettings(CanImuSettings, TableImuSettings):
     """One IMU on a CAN bus whose frames this table describes."""
 
-    can: CanBusSettings = Field(description="name of the [can.NAME] table of its bus")
     ids: dict[str, Annotated[int, Field(ge=0, le=EXTENDED_MAX)]] = Field(
         description="identifier of each frame, by a name of your choice",
         examples=[{"quaternion": 0x131}],
@@ -86,16 +85,9 @@ class CanTableSettings(TableImuSettings):
     dbc: str | None = Field(None, description="DBC file with the `signals` of the fields")
     fields: CanFields = Field(description="place, scale and unit of each quantity")
 
-    @field_validator("can")
-    @classmethod
-    def _bus_that_exists_here(cls, can: CanBusSettings) -> CanBusSettings:
-        if faults := bus_faults(can):
-            raise CanBusError(faults)
-        return can
-
     @field_validator("ids")
     @classmethod
-    def _frames(cls, ids: dict[str, int]) -> dict[str, int]:
+    def _not_empty(cls, ids: dict[str, int]) -> dict[str, int]:
         if not ids:
             raise ValueError("must not be empty: expected a frame, such as { quaternion = 0x131 }")
         return ids

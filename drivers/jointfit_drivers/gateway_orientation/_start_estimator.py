@@ -140,9 +140,16 @@ class StartEstimator:
         for _ in range(2):
             self.q_world_gyro, self._field = start[0], start[1].copy()
             self.bias, self._velocity = np.array(bias), np.zeros(3)
-            self.covariance = _first_covariance(
-                speed_sd, len(readings) * period_s, bias_sd, self._strength
-            )
+
+            # A change of velocity during the readings tilts their mean.
+            tilt_sd = TILT_SD + sqrt(2.0) * speed_sd / (GRAVITY * (len(readings) * period_s))
+            variances = np.empty(_SIZE)
+            variances[_PHI] = (tilt_sd**2, tilt_sd**2, HEADING_SD**2)
+            variances[_BIAS] = bias_sd**2
+            variances[_VELOCITY] = speed_sd**2
+            variances[_FIELD] = self._strength**2
+            self.covariance = np.diag(variances)
+
             self._squared, self._observed_s = speed_sd**2 * SPEED_KNOWN_S, SPEED_KNOWN_S
             for part in parts:
                 self._update(part, assumed)
@@ -245,20 +252,6 @@ class StartEstimator:
 
         self._squared += float(np.mean(self._velocity**2)) * duration_s
         self._observed_s += duration_s
-
-
-def _first_covariance(
-    speed_sd: float, duration_s: float, bias_sd: float, strength: float
-) -> NDArray[np.float64]:
-    """Return the covariance before the first step."""
-    # A change of velocity during the readings tilts their mean.
-    tilt_sd = TILT_SD + sqrt(2.0) * speed_sd / (GRAVITY * duration_s)
-    variances = np.empty(_SIZE)
-    variances[_PHI] = (tilt_sd**2, tilt_sd**2, HEADING_SD**2)
-    variances[_BIAS] = bias_sd**2
-    variances[_VELOCITY] = speed_sd**2
-    variances[_FIELD] = strength**2
-    return np.diag(variances)
 
 
 def _shortest_rotation(up: NDArray[np.float64]) -> Quaternion:

@@ -32,8 +32,6 @@ from jointfit_protocols.lpms.channels import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from jointfit_daemon.model import Chunk, Decoded
     from jointfit_drivers.lpms._can_settings import LpmsCanSettings
 
@@ -92,7 +90,16 @@ class LpmsCanDecoder:
                     out += self.flush()
                 out += self._bus.add_error_frame(item)
             else:
-                self._take(item, out)
+                found = self._codec.feed(item)
+                if self._codec.incomplete != self._incomplete:
+                    self._report_incomplete(out)
+                if isinstance(found, ChannelQuaternion):
+                    self._torn = 0
+                    self._sample(found, out)
+                elif isinstance(found, Heartbeat):
+                    self._heartbeat(found, out)
+                elif isinstance(found, CorruptBytes):
+                    out.append(self._bus.discard(can.RECORD_BYTES, found.reason))
         return out
 
     def flush(self) -> list[Decoded]:
@@ -101,20 +108,6 @@ class LpmsCanDecoder:
         out: list[Decoded] = []
         self._report_incomplete(out)
         return out
-
-    def _take(self, frame: can.CanFrame, out: list[Decoded]) -> None:
-        """Append the content that a frame completed."""
-        found = self._codec.feed(frame)
-        if self._codec.incomplete != self._incomplete:
-            self._report_incomplete(out)
-
-        if isinstance(found, ChannelQuaternion):
-            self._torn = 0
-            self._sample(found, out)
-        elif isinstance(found, Heartbeat):
-            self._heartbeat(found, out)
-        elif isinstance(found, CorruptBytes):
-            out.append(self._bus.discard(can.RECORD_BYTES, found.reason))
 
     def _sample(self, quaternion: ChannelQuaternion, out: list[Decoded]) -> None:
         """Append the sample of a complete quaternion."""
@@ -134,8 +127,12 @@ class LpmsCanDecoder:
             self._orientation.events = []
         if converted is None:
             self._refused += 1
-            if self._floats and not self._is_mapped and _are_integers(quaternion.values):
-                self._orientation.remedy = 'the data fit precision = "int16"'
+            if self._floats and not self._is_mapped:
+                # The first frame of these floats may be a quaternion of 16-bit integers.
+                floats = [*quaternion.values, *[0.0] * 4]
+                frame = encode_frames(range(FRAMES), floats, "float32")[0]
+                if unit_of(decode_frame(frame.data, "int16") or ()) is not None:
+                    self._orientation.remedy = 'the data fit precision = "int16"'
             out.append(self._bus.discard(can.RECORD_BYTES, "quaternion norm is not 1"))
             return
         native, q = converted
@@ -170,12 +167,6 @@ class LpmsCanDecoder:
         before, self._torn = self._torn, self._torn + count
         if before < _TORN <= self._torn:
             out.append(DeviceEvent("warning", _OUT_OF_ORDER))
-
-
-def _are_integers(values: Sequence[float]) -> bool:
-    """Return whether the first frame of these floats is a quaternion of 16-bit integers."""
-    frame = encode_frames(range(FRAMES), [*values, *[0.0] * 4], "float32")[0]
-    return unit_of(decode_frame(frame.data, "int16") or ()) is not None
 
 
 _PLAIN = (1, 2, 3, 4)

@@ -80,20 +80,21 @@ class LpmsCanImu:
             This kind of bus is not available, or another sensor of the rig uses the same
             identifiers.
         """
-        settings = self._settings
+        settings, precision = self._settings, self._settings.precision
         numbers, heartbeat = settings.channel_ids
         ids = {(number, False): f"frame{k}" for k, number in enumerate(numbers, 1)}
         if heartbeat is not None:
             ids[heartbeat, False] = "heartbeat"
-        last = frames_of(settings.mapping, settings.precision)[-1]
-        await self._reception.run(emit, ids, (numbers[last], False), self._resembles)
+        last = frames_of(settings.mapping, precision)[-1]
 
-    def _resembles(self, data: bytes) -> bool:
-        """Whether the data of a frame could be those of a quaternion, or of its half."""
-        values = decode_frame(data, self._settings.precision)
-        if values is None:
-            return False
-        if self._settings.precision == "int16":
-            return unit_of(values) in UNITS
-        sizes = [abs(value) for value in values]
-        return max(sizes) <= _MOST and any(size > _LEAST for size in sizes)
+        def resembles(data: bytes) -> bool:
+            """Whether `data` could be those of a quaternion, or of its half."""
+            values = decode_frame(data, precision)
+            if values is None:
+                return False
+            if precision == "int16":
+                return unit_of(values) in UNITS
+            sizes = [abs(value) for value in values]
+            return max(sizes) <= _MOST and any(size > _LEAST for size in sizes)
+
+        await self._reception.run(emit, ids, (numbers[last], False), resembles)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 from typing_extensions import override
 
-from jointfit_daemon.driver import CanBusError, CanBusSettings, ImuSettings, Settings
+from jointfit_daemon.driver import Settings
+from jointfit_drivers.can_imu import CanImuSettings
 from jointfit_drivers.lpms._convention_settings import LpmsConventionSettings
-from jointfit_drivers.ports.can_bus import bus_faults
 from jointfit_protocols.can import STANDARD_MAX
 from jointfit_protocols.lpms.channels import (
     FRAME_BYTES,
@@ -41,10 +41,9 @@ class LpmsCanIdSettings(Settings):
         return self.frame1, self.frame2, self.frame3, self.frame4
 
 
-class LpmsCanSettings(ImuSettings, LpmsConventionSettings):
+class LpmsCanSettings(CanImuSettings, LpmsConventionSettings):
     """One LP-Research LPMS sensor on a CAN bus."""
 
-    can: CanBusSettings = Field(description="name of the [can.NAME] table of its bus")
     mode: Literal["canopen", "sequential"] = Field(
         description="`canopen`: 0x180, 0x280, 0x380 and 0x480 plus the node number, with a "
         "heartbeat; `sequential`: four consecutive identifiers",
@@ -103,10 +102,3 @@ class LpmsCanSettings(ImuSettings, LpmsConventionSettings):
                 f"four different channels from 1 to {channels} ({self.precision}), found "
                 f"{list(self.mapping)}: set the channels of w, x, y and z",
             )
-
-    @field_validator("can")
-    @classmethod
-    def _bus_that_exists_here(cls, can: CanBusSettings) -> CanBusSettings:
-        if faults := bus_faults(can):
-            raise CanBusError(faults)
-        return can

@@ -91,9 +91,15 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
     @override
     def feed(self, chunk: Chunk) -> list[Decoded]:
         """Return the content that `chunk` completed, in wire order; never raises."""
-        if self._codec.messages:
+        if self._codec.messages or len(self._noise) >= _TEXT_BYTES:
             return super().feed(chunk)
-        return self._text_warning(chunk.data) + super().feed(chunk)
+
+        # Warn once if the device sends text in place of messages.
+        out: list[Decoded] = []
+        self._noise += chunk.data[:_TEXT_BYTES]
+        if len(self._noise) >= _TEXT_BYTES and is_text(self._noise):
+            out.append(DeviceEvent("warning", f"it sends text: {TEXT_REMEDY}"))
+        return out + super().feed(chunk)
 
     @override
     def flush(self) -> list[Decoded]:
@@ -244,15 +250,6 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
             "the driver connect again, or enable the quaternion alone"
         )
         return [DeviceEvent("warning", text, {"data_bytes": size})]
-
-    def _text_warning(self, data: bytes) -> list[Decoded]:
-        """Return a warning if the device sends text in place of messages, once."""
-        if len(self._noise) >= _TEXT_BYTES:
-            return []
-        self._noise += data[:_TEXT_BYTES]
-        if len(self._noise) < _TEXT_BYTES or not is_text(self._noise):
-            return []
-        return [DeviceEvent("warning", f"it sends text: {TEXT_REMEDY}")]
 
     def _drop_held(self) -> list[Decoded]:
         """Reject a packet that no later one confirmed."""

@@ -71,7 +71,12 @@ class LpmsOrientation:
         if not floats:
             unit = self._scale.feed(values)
             if unit != self._unit:
-                self._set_unit(unit)
+                before, self._unit = self._unit, unit
+                self._gate = OrientationGate(_COARSE_TOLERANCE if unit == COARSE else 0.01)
+                if unit is not None:
+                    text = f"16-bit quaternions in units of 1/{unit}"
+                    text += "" if before is None else f", no longer 1/{before}"
+                    self.events.append(DeviceEvent("info", text, {"scale": unit}))
             scale = 1.0 / unit if unit is not None else 1.0
             a, b, c, d = a * scale, b * scale, c * scale, d * scale
 
@@ -84,14 +89,6 @@ class LpmsOrientation:
     def forget(self) -> None:
         """Restart sign continuity: the device restarted."""
         self._gate.forget()
-
-    def _set_unit(self, unit: int | None) -> None:
-        before, self._unit = self._unit, unit
-        self._gate = OrientationGate(_COARSE_TOLERANCE if unit == COARSE else 0.01)
-        if unit is not None:
-            text = f"16-bit quaternions in units of 1/{unit}"
-            text += "" if before is None else f", no longer 1/{before}"
-            self.events.append(DeviceEvent("info", text, {"scale": unit}))
 
     def _check_norm(self, square: float) -> None:
         """Report the norms of the first quaternions once."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING, NamedTuple
 
+from jointfit_daemon.name_lists import list_names
 from jointfit_drivers.motion_capture import ModelEntry
 
 if TYPE_CHECKING:
@@ -106,12 +107,14 @@ def stream_layout(description: StreamDescription, settings: LslMarkersSettings) 
 
     if incomplete:
         warnings.append(
-            f"{_listed(incomplete)} without all three coordinates: not used; stream x, y and z"
+            f"{list_names(incomplete, _LISTED)} without all three coordinates: not used; stream x, "
+            "y and z"
         )
     if turned:
         warnings.append(
-            f"rigid bodies {_listed(turned)} have Euler angles, whose order a stream does not "
-            "describe: they are used as markers; stream quaternions, or use markers in [mocap]"
+            f"rigid bodies {list_names(turned, _LISTED)} have Euler angles, whose order a stream "
+            "does not describe: they are used as markers; stream quaternions, or use markers in "
+            "[mocap]"
         )
     unit = _unit(description, settings, columns, warnings)
     return StreamLayout(
@@ -162,12 +165,12 @@ def _described(channels: tuple[Channel, ...], warnings: list[str]) -> _Found:
         labels = [channel.label or channel.type or "(empty)" for channel in channels]
         warnings.append(
             f"no channel is a coordinate by its type (PositionX) or label (T1_X); found "
-            f"{_listed(labels)}: set names in [mocap], or select another stream"
+            f"{list_names(labels, _LISTED)}: set names in [mocap], or select another stream"
         )
     if repeated:
         warnings.append(
-            f"{_listed(repeated)} described more than once: the first channel is used; give every "
-            "marker a name of its own in the camera software"
+            f"{list_names(repeated, _LISTED)} described more than once: the first channel is used; "
+            "give every marker a name of its own in the camera software"
         )
     return found
 
@@ -191,13 +194,8 @@ def _unit(
     lengths = {_UNITS_M[text] for text in texts if text in _UNITS_M}
     if len(lengths) > 1 or (texts - {""} and not lengths):
         warnings.append(
-            f"positions described in {_listed(sorted(texts))}: metres are assumed; set unit in "
-            "[mocap]"
+            f"positions described in {list_names(sorted(texts), _LISTED)}: metres are assumed; set "
+            "unit in [mocap]"
         )
         return "m"
     return {1.0: "m", 0.01: "cm", 0.001: "mm"}[lengths.pop()] if lengths else "m"
-
-
-def _listed(names: list[str]) -> str:
-    more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
-    return ", ".join(names[:_LISTED]) + more

@@ -81,7 +81,11 @@ class LslMarkersSettings(MocapSettings):
         if self.predicate is not None:
             return self.predicate
         keys = {"name": self.stream, "type": self.stream_type, "source_id": self.source_id}
-        parts = [f"{key}={_quoted(text)}" for key, text in keys.items() if text is not None]
+        parts = []
+        for key, text in keys.items():
+            if text is not None:
+                mark = '"' if "'" in text else "'"
+                parts.append(f"{key}={mark}{text}{mark}")
         if not parts:
             # Qualisys sends Mocap, the convention is MoCap. Our own outlet has this type, too.
             parts = [
@@ -89,8 +93,3 @@ class LslMarkersSettings(MocapSettings):
                 "not(starts-with(source_id,'jointfit-'))",
             ]
         return " and ".join(parts)
-
-
-def _quoted(text: str) -> str:
-    mark = '"' if "'" in text else "'"
-    return f"{mark}{text}{mark}"

@@ -138,7 +138,12 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
 
         self._foreign = 0
         arrival_ns = self._arrival_of(packet)
-        ticks = self._time_in(values)
+        ticks: int | None = None
+        if _TIME in values:
+            ticks = int(values[_TIME][0])
+        elif self._gps_time in values:
+            time_of_week_s, week, _ = values[self._gps_time]
+            ticks = gps_ns(week, time_of_week_s)
         if self._is_raw:
             x, y, z = values[_FORCE]
             force = (STANDARD_GRAVITY * x, STANDARD_GRAVITY * y, STANDARD_GRAVITY * z)
@@ -157,15 +162,6 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         q = canonical(native, "NED")
         reading = TimedReading(packet.size, arrival_ns, ticks, q, native, status)
         return out + self._samples.add(reading) if out else self._samples.add(reading)
-
-    def _time_in(self, values: dict[int, tuple[Any, ...]]) -> int | None:
-        """Return the device time in a packet, ns."""
-        if _TIME in values:
-            return int(values[_TIME][0])
-        if self._gps_time not in values:
-            return None
-        time_of_week_s, week, _ = values[self._gps_time]
-        return gps_ns(week, time_of_week_s)
 
     def _note_validity(self, arrival_ns: int, *, is_valid: bool) -> list[Decoded]:
         """Return the event of a change between valid and invalid orientations."""

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from math import cos, sin
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.kinematics.rotation_scalar import multiply_one
 from jointfit_daemon.model import DeviceEvent
 from jointfit_protocols.mip import commands
 from jointfit_protocols.mip.commands import Base, CommandSet, FilterSetup, Setup
+from jointfit_protocols.orientation import angles_quaternion
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -50,7 +49,13 @@ def _events_of(command_set: int, descriptor: int, data: bytes) -> Iterator[Decod
             known = {"model": info.model_name, "model_number": info.model_number}
             known |= {"serial": info.serial, "firmware": info.version, "options": info.options}
     elif command_set == CommandSet.SETUP and descriptor in _FORMATS:
-        known = _format(_FORMATS[Setup(descriptor)], data)
+        data_set = _FORMATS[Setup(descriptor)]
+        prefix = data[:1] if data_set is None else b""
+        outputs = commands.decode_outputs(prefix, data)
+        if outputs is not None:
+            number = data[0] if data_set is None else data_set
+            decimations = {f"0x{one.field:02X}": one.decimation for one in outputs}
+            known = {f"outputs_0x{number:02X}": decimations}
     if known:
         yield DeviceEvent(
             "info", ", ".join(f"{key} {value}" for key, value in known.items()), known
@@ -70,16 +75,6 @@ def _events_of(command_set: int, descriptor: int, data: bytes) -> Iterator[Decod
         yield DeviceEvent("warning", text, {"sensor_to_vehicle": stored})
 
 
-def _format(data_set: int | None, data: bytes) -> dict[str, object]:
-    """Return the fields of a message format and their decimations; empty if it is malformed."""
-    prefix = data[:1] if data_set is None else b""
-    outputs = commands.decode_outputs(prefix, data)
-    if outputs is None:
-        return {}
-    number = data[0] if data_set is None else data_set
-    return {f"outputs_0x{number:02X}": {f"0x{one.field:02X}": one.decimation for one in outputs}}
-
-
 def _transform(command_set: int, descriptor: int, data: bytes) -> Quaternion | None:
     """Return the sensor-to-vehicle rotation in a reply."""
     if (command_set, descriptor) == (CommandSet.SETUP, Setup.TRANSFORM_REPLY):
@@ -88,10 +83,7 @@ def _transform(command_set: int, descriptor: int, data: bytes) -> Quaternion | N
 
     if (command_set, descriptor) == (CommandSet.FILTER, FilterSetup.ROTATION_REPLY):
         angles = commands.decode_floats(data, 3)
-        if angles is not None:  # q_z(yaw) q_y(pitch) q_x(roll)
-            roll, pitch, yaw = (angle / 2.0 for angle in angles)
-            about_z = (cos(yaw), 0.0, 0.0, sin(yaw))
-            about_y = (cos(pitch), 0.0, sin(pitch), 0.0)
-            about_x = (cos(roll), sin(roll), 0.0, 0.0)
-            return multiply_one(multiply_one(about_z, about_y), about_x)
+        if angles is not None:
+            roll, pitch, yaw = angles
+            return angles_quaternion(roll, pitch, yaw)
     return None

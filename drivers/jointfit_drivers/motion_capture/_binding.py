@@ -17,6 +17,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, NamedTuple
 
 from jointfit_daemon.model import DeviceEvent, MocapLayout
+from jointfit_daemon.name_lists import list_names
 from jointfit_daemon.nearest_name import nearest_name
 
 if TYPE_CHECKING:
@@ -181,7 +182,11 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
             known = free_entries if len(problems) < _MOST_SUGGESTED else {}
             near = None if fitting else nearest_name(name, islice(known, _MOST_COMPARED))
             free_entries.pop(near or "", None)  # two names in rig.toml are not one marker
-            problems.append(f"{what} {name!r} (mocap.{key}) {_problem(fitting, near)}")
+            problem = "is not in the stream" + (f"; did you mean {near!r}?" if near else ".")
+            if fitting:
+                choices = [repr(next(iter(e.aliases), e.name)) for e in fitting[:MOST_NAMED]]
+                problem = f"is ambiguous: write {' or '.join(choices)}."
+            problems.append(f"{what} {name!r} (mocap.{key}) {problem}")
 
     used = set(found.names)
     most = _MOST_COLUMNS + len(used)
@@ -198,17 +203,9 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
             taken.add(entry.key)
 
     if problems:
-        server = ", ".join(sorted(plain)[:MOST_NAMED]) or "none"
-        more = f" and {len(plain) - MOST_NAMED} more" if len(plain) > MOST_NAMED else ""
-        found.warnings.append(f"{' '.join(problems)} The server has: {server}{more}")
+        server = list_names(sorted(plain), MOST_NAMED) or "none"
+        found.warnings.append(f"{' '.join(problems)} The server has: {server}")
     return found
-
-
-def _problem(fitting: list[ModelEntry], near: str | None) -> str:
-    if fitting:
-        choices = [repr(next(iter(e.aliases), e.name)) for e in fitting[:MOST_NAMED]]
-        return f"is ambiguous: write {' or '.join(choices)}."
-    return "is not in the stream" + (f"; did you mean {near!r}?" if near else ".")
 
 
 def _unused_name(

@@ -74,8 +74,14 @@ def bus_faults(settings: CanBusSettings) -> dict[str, str]:
     if isinstance(backend, str):
         return {"interface": backend}
     parameters = _parameters(backend)
+    given = {"channel", *(settings.model_extra or {})}
+    missing = {
+        name: f"missing: CAN interface {kind!r} needs {name}: add it to this table"
+        for name, key in signature(backend).parameters.items()
+        if key.default is key.empty and key.kind is key.POSITIONAL_OR_KEYWORD and name not in given
+    }
     return (
-        _missing_keys(settings, backend)
+        missing
         | _unknown_keys(settings, parameters)
         | _wrong_values(settings, parameters)
         | _wrong_choices(settings, backend)
@@ -90,19 +96,6 @@ def _parameters(backend: type[can.BusABC]) -> dict[str, Any]:
     for name, parameter in signature(backend).parameters.items():
         found[name] = None if parameter.default is parameter.empty else parameter.default
     return {name: default for name, default in found.items() if name not in _INTERNAL}
-
-
-def _missing_keys(settings: CanBusSettings, backend: type[can.BusABC]) -> dict[str, str]:
-    kind, given = settings.interface, {"channel", *(settings.model_extra or {})}
-    missing = [
-        name
-        for name, key in signature(backend).parameters.items()
-        if key.default is key.empty and key.kind is key.POSITIONAL_OR_KEYWORD and name not in given
-    ]
-    return {
-        name: f"missing: CAN interface {kind!r} needs {name}: add it to this table"
-        for name in missing
-    }
 
 
 def _unknown_keys(settings: CanBusSettings, parameters: Collection[str]) -> dict[str, str]:

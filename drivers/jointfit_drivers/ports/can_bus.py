@@ -23,6 +23,7 @@ from weakref import WeakKeyDictionary
 
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import Chunk
+from jointfit_daemon.name_lists import list_names
 from jointfit_drivers.ports._bus_faults import bus_faults
 from jointfit_drivers.ports._python_can_bus import PythonCanBus
 from jointfit_drivers.ports._silence_timer import SilenceTimer
@@ -263,9 +264,8 @@ class SharedBus:
 
         unclaimed = sorted(self._seen)
         if unclaimed:
-            named = ", ".join(map(_hex, unclaimed[:_NAMED]))
-            more = f" and {len(unclaimed) - _NAMED} more" if len(unclaimed) > _NAMED else ""
-            text += f"; identifiers on the bus that no sensor claims: {named}{more}"
+            named = list_names([_hex(key) for key in unclaimed], _NAMED)
+            text += f"; identifiers on the bus that no sensor claims: {named}"
 
         alike = [key for key in unclaimed if all(map(resembles, self._seen[key]))]
         twin = (needed[0], not needed[1])

@@ -232,7 +232,15 @@ class QtmDecoder:
 
         self._waiting = False
         self.suspicious += found.suspicious
-        self._report_absent(out)
+
+        # Warn of each announced component that does not arrive.
+        absent = self._parts.absent
+        if absent != self._reported:
+            new = [kind for kind in absent if kind not in self._reported]
+            self._reported = absent
+            texts = [_MISSING_TEXTS.get(ComponentType(kind), "") for kind in new]
+            out += [DeviceEvent("warning", text) for text in texts if text]
+
         ticks = self._ticks(frame, out)
         out.append(
             MocapFrame(
@@ -246,15 +254,6 @@ class QtmDecoder:
                 self._live,
             )
         )
-
-    def _report_absent(self, out: list[Decoded]) -> None:
-        """Append a warning for each announced component that does not arrive."""
-        absent = self._parts.absent
-        if absent != self._reported:
-            new = [kind for kind in absent if kind not in self._reported]
-            self._reported = absent
-            texts = [_MISSING_TEXTS.get(ComponentType(kind), "") for kind in new]
-            out += [DeviceEvent("warning", text) for text in texts if text]
 
     def _ticks(self, frame: CompleteFrame, out: list[Decoded]) -> int | None:
         """Return the exposure in ticks of the clock in use; the clocks are not mixed."""

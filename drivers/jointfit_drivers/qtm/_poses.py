@@ -23,7 +23,7 @@ from jointfit_drivers.qtm._binding import segment_key
 from jointfit_protocols.qtm import ComponentType, ItemsComponent, SkeletonComponent
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from jointfit_daemon.arrays import Array
     from jointfit_daemon.model import Quaternion, Vector
@@ -93,20 +93,18 @@ class QtmPoseConverter:
 
         rows = [poses.get(key, ABSENT) for key in binding.body_keys]
         items = markers.items if isinstance(markers, ItemsComponent) else ()
+        columns = binding.marker_places
+        placed = np.full((len(columns), 3), np.nan)
+        if items:
+            positions = np.array(items, dtype=np.float64)[:, :3] * _MM
+            positions[~(np.abs(positions) <= FARTHEST_M).all(axis=1)] = np.nan
+            placed = positions[columns] @ self._rotation
         return QtmColumns(
-            self._markers(items, binding.marker_places),
+            placed,
             rows_array([place for place, _ in rows], 3),
             rows_array([turn for _, turn in rows], 4),
             suspicious,
         )
-
-    def _markers(self, items: tuple[tuple[float, ...], ...], keys: Sequence[int]) -> Array:
-        if not items:
-            return np.full((len(keys), 3), np.nan)
-        found = np.array(items, dtype=np.float64)[:, :3] * _MM
-        found[~(np.abs(found) <= FARTHEST_M).all(axis=1)] = np.nan
-        columns: Array = found[keys] @ self._rotation
-        return columns
 
     def _segments(
         self, component: SkeletonComponent, poses: dict[int, tuple[Vector, Quaternion]]

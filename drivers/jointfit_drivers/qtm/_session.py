@@ -89,25 +89,24 @@ class QtmSession:
         """Connect and read until cancelled; raises the errors of `QtmMocap.run`."""
         with self._link as link:
             # The data port is bound before QTM is asked to send there.
-            udp_port = self._open_udp() if self._settings.transport == "udp" else None
+            udp_port = None
+            if self._settings.transport == "udp":
+                port = self._settings.data_port or 0
+                try:
+                    udp = UdpSocket(self._route.local, port, sender=self._route.host)
+                except OSError as error:
+                    raise DeviceLostError(
+                        f"{self._name}: cannot receive at UDP port {port} "
+                        f"({error.strerror or error}): another program uses it; remove data_port"
+                    ) from error
+                link.watch(udp, partial(self._read_udp, udp))
+                udp_port = udp.port
+
             await link.open(self._route, self._settings.command_port)
             await self._greet()
             await self._negotiate()
             await self._ask("GetState", qtm.Event)
             await self._stream_frames(udp_port)
-
-    def _open_udp(self) -> int:
-        """Open the socket of the frames; return its port."""
-        port = self._settings.data_port or 0
-        try:
-            udp = UdpSocket(self._route.local, port, sender=self._route.host)
-        except OSError as error:
-            raise DeviceLostError(
-                f"{self._name}: cannot receive at UDP port {port} ({error.strerror or error}): "
-                "another program uses it; remove data_port"
-            ) from error
-        self._link.watch(udp, partial(self._read_udp, udp))
-        return udp.port
 
     # --- received packets ---------------------------------------------------------------------
 
@@ -240,12 +239,6 @@ class QtmSession:
                 if not self._answers:  # a refusal arrives before the end of the connection
                     raise
 
-    async def _request_parameters(self) -> bool:
-        """Request the settings; return whether QTM has any."""
-        parts = "General 3D 6D" + " Skeleton:global" * self._settings.skeleton
-        answer = await self._ask(f"GetParameters {parts}", qtm.SettingsReply, qtm.ErrorReply)
-        return isinstance(answer, qtm.SettingsReply)
-
     def _request_frames(self, udp_port: int | None) -> None:
         # Frames follow, or "no more data", or an error: there is no answer.
         to = "" if udp_port is None else f"UDP:{udp_port} "
@@ -260,7 +253,10 @@ class QtmSession:
             now_ns, now = time.monotonic_ns(), time.monotonic()
             if self._parameters_wanted and now >= ask_at:
                 self._parameters_wanted = False
-                if not await self._request_parameters():
+                parts = "General 3D 6D" + " Skeleton:global" * self._settings.skeleton
+                command = f"GetParameters {parts}"
+                answer = await self._ask(command, qtm.SettingsReply, qtm.ErrorReply)
+                if not isinstance(answer, qtm.SettingsReply):
                     self._parameters_wanted, self._waiting = True, True
                 ask_at = time.monotonic() + RETRY_S
             if not requested and self._described is not None:
@@ -272,19 +268,16 @@ class QtmSession:
                 self._started_ns = now_ns
                 self._request_frames(udp_port)
 
-            self._check_errors()
+            refusals = [a.text for a in self._answers if isinstance(a, qtm.ErrorReply)]
+            self._answers.clear()
+            if refusals and not self._frame_ns:
+                raise DeviceMisconfiguredError(
+                    f"{self._name} refuses to stream: {refusals[0]!r}: check its version and "
+                    "options"
+                )
             self._check_alive(max(self._frame_ns, began_ns), udp_port)
             wait_s = self._settings.silence_s / 4
             await self._link.pause(min(wait_s, RETRY_S / 2) if self._parameters_wanted else wait_s)
-
-    def _check_errors(self) -> None:
-        """Raise DeviceMisconfiguredError if QTM refuses to stream."""
-        refusals = [a.text for a in self._answers if isinstance(a, qtm.ErrorReply)]
-        self._answers.clear()
-        if refusals and not self._frame_ns:
-            raise DeviceMisconfiguredError(
-                f"{self._name} refuses to stream: {refusals[0]!r}: check its version and options"
-            )
 
     def _check_alive(self, last_ns: int, udp_port: int | None) -> None:
         """Raise DeviceLostError without frames, except while QTM waits for a measurement."""

@@ -103,8 +103,10 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
     if wire.checksum is not None:
         valid = sum(_is_valid(frame, wire.checksum, wire) for frame in frames)
     if wire.checksum is not None and valid < _SHARE * len(frames):
-        fitting = _fitting_checksum(frames, wire)
-        known = "" if fitting is None else f"; the data fit {fitting}"
+        usual = _usual_checksums(len(wire.sync)) if len(frames) >= _FEW else ()
+        fits = (one for one in usual if all(_is_valid(frame, one, wire) for frame in frames))
+        fitting = next(fits, None)
+        known = "" if fitting is None else f"; the data fit {_described(fitting)}"
         return (
             f"no checksum of frames with {spacing} bytes is valid{known}: correct `frame.checksum`"
         )
@@ -136,16 +138,6 @@ def _length_finding(
         return None
     remedy = f"set `frame.length_field.adds` = {spacing - value}"
     return f"frames of {spacing} bytes have the length {value}: {remedy}"
-
-
-def _fitting_checksum(frames: list[bytes], wire: FrameFormat) -> str | None:
-    """Return the parameters of a usual checksum that all frames have."""
-    if len(frames) < _FEW:
-        return None
-    for checksum in _usual_checksums(len(wire.sync)):
-        if all(_is_valid(frame, checksum, wire) for frame in frames):
-            return _described(checksum)
-    return None
 
 
 def _is_valid(frame: bytes, checksum: Checksum, wire: FrameFormat) -> bool:

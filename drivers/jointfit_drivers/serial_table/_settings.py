@@ -180,7 +180,7 @@ class SerialTableSettings(SerialImuSettings, TableImuSettings):
     def places(self) -> TableForm:
         """Return the place of every number."""
         quantities: Any = dict(self.fields)
-        return place_fields(quantities, self._column if self.text else self._offset)
+        return place_fields(quantities, self._place_part)
 
     def sample_form(self) -> SampleForm:
         """Return the meaning of the numbers."""
@@ -216,16 +216,15 @@ class SerialTableSettings(SerialImuSettings, TableImuSettings):
             None if selects is None or message is None else (selects, message.equals),
         )
 
-    def _offset(self, name: Quantity, part: FieldSettings, count: int) -> list[TableField]:
-        del name
-        if getattr(part, "column", None) is not None:
-            raise FieldFaultError("column", "is for text lines: give `offset` and `type`")
-        return binary_place(part, count, self.byte_order)
-
-    def _column(self, name: Quantity, part: FieldSettings, count: int) -> list[TableField]:
-        """Return the columns of a part in the form of places."""
+    def _place_part(self, name: Quantity, part: FieldSettings, count: int) -> list[TableField]:
+        """Return the places of a part; columns have the form of places."""
         del name
         column = getattr(part, "column", None)
+        if self.text is None:
+            if column is not None:
+                raise FieldFaultError("column", "is for text lines: give `offset` and `type`")
+            return binary_place(part, count, self.byte_order)
+
         for key in ("offset", "type", "byte_order"):
             if getattr(part, key) is not None:
                 raise FieldFaultError(key, "is for binary frames: give `column`")

@@ -116,7 +116,9 @@ def _typical(norms: Sequence[float], quantity: Quantity) -> float | None:
 def _scale_key(quantity: Quantity, typical: float, target: float) -> str:
     """Return the key that scales a norm of `typical` counts to `target`."""
     if quantity == "quaternion":
-        return _divisor_key(typical, _SNAP[quantity])
+        known = min(_DIVISORS, key=lambda each: abs(typical / each - 1))
+        is_known = abs(typical / known - 1) <= _SNAP[quantity]
+        return f"divisor = {known:.0f}" if is_known else f"divisor = {typical:.6g}"
     fits: list[tuple[float, bool, str]] = []
     for unit, si in UNITS["acceleration"].items():
         counts = typical * si / target
@@ -126,10 +128,3 @@ def _scale_key(quantity: Quantity, typical: float, target: float) -> str:
             key = f'unit = "{unit}"' + ("" if divisor == 1.0 else f", divisor = {divisor:.0f}")
             fits.append((round(error, 2), divisor != 1.0, key))
     return min(fits)[2] if fits else f'unit = "m/s2", scale = {target / typical:.3g}'
-
-
-def _divisor_key(divisor: float, snap: float) -> str:
-    known = min(_DIVISORS, key=lambda each: abs(divisor / each - 1))
-    if abs(divisor / known - 1) <= snap:
-        return f"divisor = {known:.0f}"
-    return f"divisor = {divisor:.6g}"

@@ -68,8 +68,16 @@ class RateUnitCheck:
             self._predicted += p * p
             self._observed += d * d
         self._steps += 1
-        if self._steps % _STEPS == 0:
-            self._evaluate()
+        if self._steps % _STEPS:
+            return
+
+        self.done = self._steps >= _MOST_STEPS
+        spread = self._predicted * self._observed
+        if spread > 0.0 and self._cross**2 >= _EXPLAINED * spread:
+            self.done = True
+            slope = self._cross / self._predicted
+            if not _LOW <= slope <= _HIGH:
+                self.slope = slope
 
     def fitting_unit(self, configured: float) -> str | None:
         """Return the unit with which k is 1; `configured` is the SI value of the present one."""
@@ -79,13 +87,3 @@ class RateUnitCheck:
             if _LOW <= self.slope * configured / si <= _HIGH:
                 return unit
         return None
-
-    def _evaluate(self) -> None:
-        self.done = self._steps >= _MOST_STEPS
-        spread = self._predicted * self._observed
-        if spread <= 0.0 or self._cross**2 < _EXPLAINED * spread:
-            return
-        self.done = True
-        slope = self._cross / self._predicted
-        if not _LOW <= slope <= _HIGH:
-            self.slope = slope

@@ -287,7 +287,15 @@ def _order(name: Quantity, part: FieldSettings, letters: str) -> str:
 
 def _scaled(name: Quantity, part: FieldSettings, place: TableField) -> TableField:
     """Return the place with the scale to SI units."""
-    _check_keys(name, part)
+    if part.scale is not None and part.divisor is not None:
+        raise FieldFaultError("divisor", "expected either `scale` or `divisor`")
+    owners: dict[Literal["modulus", "mask", "equals"], tuple[Quantity, ...]] = {
+        "modulus": ("time", "counter"), "mask": ("valid",), "equals": ("valid",),
+    }  # fmt: skip
+    for key, owned in owners.items():
+        if name not in owned and getattr(part, key) is not None:
+            raise FieldFaultError(key, f"is for {' and '.join(owned)}: remove it")
+
     units = UNITS.get(name, {})
     unit = 1.0
     if part.unit is not None or name == "time":
@@ -303,18 +311,6 @@ def _scaled(name: Quantity, part: FieldSettings, place: TableField) -> TableFiel
     if scale == 0.0:
         raise FieldFaultError("scale", "must not be 0")
     return place._replace(scale=scale, zero=(place.zero * own + part.zero) * unit)
-
-
-def _check_keys(name: Quantity, part: FieldSettings) -> None:
-    """Refuse keys that another quantity has."""
-    if part.scale is not None and part.divisor is not None:
-        raise FieldFaultError("divisor", "expected either `scale` or `divisor`")
-    owners: dict[Literal["modulus", "mask", "equals"], tuple[Quantity, ...]] = {
-        "modulus": ("time", "counter"), "mask": ("valid",), "equals": ("valid",),
-    }  # fmt: skip
-    for key, owned in owners.items():
-        if name not in owned and getattr(part, key) is not None:
-            raise FieldFaultError(key, f"is for {' and '.join(owned)}: remove it")
 
 
 def _quantity(slot: int) -> str:

@@ -103,7 +103,12 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
     def _take(self, message: VectorNavMessage) -> list[Decoded]:
         if isinstance(message, BinaryPacket):
             return self._decode_output(message)
-        self._note_divisor(message)
+
+        # The check of the rate starts when the device confirms its output.
+        if self._rate_check is not None and message.register == self._register:
+            output = decode_output(message.values[1:])
+            if output is not None and output.divisor:
+                self._rate_check.start(output.divisor)
         out = list(_text_events(message))
         if message.register == Register.FIRMWARE and len(message.values) > 1:
             out += self._newer.take_version(message.values[1])
@@ -145,13 +150,6 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
         arrival_ns = self._arrival_of(packet)
         reading = TimedReading(packet.size, arrival_ns, ticks, q, native)
         return self._check_rate(ticks) + self._samples.add(reading)
-
-    def _note_divisor(self, message: TextMessage) -> None:
-        """Start the check of the rate when the device confirms its output."""
-        if self._rate_check is not None and message.register == self._register:
-            output = decode_output(message.values[1:])
-            if output is not None and output.divisor:
-                self._rate_check.start(output.divisor)
 
     def _check_rate(self, ticks: int | None) -> list[Decoded]:
         warning = None

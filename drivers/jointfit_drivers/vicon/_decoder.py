@@ -189,7 +189,12 @@ class ViconDecoder:
         self._latency.add_frame(_first(state.dynamic(ObjectId.LATENCY_INFO), vicon.LatencyInfo))
         self._frames += 1
         if self._frames == _LATENCY_AFTER:
-            out.append(self._latency_event())
+            delay_ms, sd_ms = self._latency.delay_ns / 1e6, self._latency.uncertainty_ns / 1e6
+            data = {"delay_ms": delay_ms, "delay_sd_ms": sd_ms}
+            text = f"announced delay {delay_ms:.1f} ms ± {sd_ms:.1f} ms"
+            announced = DeviceEvent("info", text, data)
+            text = "the server announces no latency: set latency_ms in [mocap] to the whole delay"
+            out.append(announced if self._latency.announced else DeviceEvent("warning", text))
 
         binding = self._binding or self._bind(state.subjects, out)
         found = self._poses.columns(state, binding)
@@ -207,15 +212,6 @@ class ViconDecoder:
                 found.body_orientations,
             )
         )
-
-    def _latency_event(self) -> DeviceEvent:
-        """Return the announced delay, or the warning that there is none."""
-        if not self._latency.announced:
-            text = "the server announces no latency: set latency_ms in [mocap] to the whole delay"
-            return DeviceEvent("warning", text)
-        delay_ms, sd_ms = self._latency.delay_ns / 1e6, self._latency.uncertainty_ns / 1e6
-        text = f"announced delay {delay_ms:.1f} ms ± {sd_ms:.1f} ms"
-        return DeviceEvent("info", text, {"delay_ms": delay_ms, "delay_sd_ms": sd_ms})
 
 
 _STATIC_TYPES = (

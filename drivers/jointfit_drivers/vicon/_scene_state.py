@@ -34,8 +34,10 @@ class SceneState:
         for item in objects:
             if isinstance(item, vicon.Contents):
                 unchanged |= item.unchanged
+            elif isinstance(item, vicon.Segments | vicon.OpaqueObject):
+                found.setdefault(item.id, []).append(item)
             else:
-                found.setdefault(_object_id(item), []).append(item)
+                found.setdefault(_IDS.get(type(item), -1), []).append(item)
 
         for kinds, current in ((vicon.STATIC, self._static), (vicon.DYNAMIC, self._dynamic)):
             present = {kind: items for kind, items in found.items() if kind in kinds}
@@ -72,9 +74,3 @@ _IDS: dict[type, int] = {
     vicon.FrameRates: vicon.ObjectId.FRAME_RATES,
     vicon.ObjectQuality: vicon.ObjectId.OBJECT_QUALITY,
 }
-
-
-def _object_id(item: Object) -> int:
-    if isinstance(item, vicon.Segments | vicon.OpaqueObject):
-        return item.id
-    return _IDS.get(type(item), -1)

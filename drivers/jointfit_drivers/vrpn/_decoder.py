@@ -120,7 +120,17 @@ class VrpnDecoder:
                 case CorruptBytes():
                     out.append(Corrupt(message.discarded, message.reason))
                 case vrpn.Cookie():
-                    self._connected(message, out)
+                    # another connection: start again with its server
+                    version = f"{message.major:02d}.{message.minor:02d}"
+                    out.append(DeviceEvent("info", f"VRPN {version}", {"vrpn": version}))
+                    if message.major != vrpn.MAJOR:
+                        text = f"the server speaks VRPN {version}, expected {vrpn.MAJOR:02d}.xx"
+                        out.append(DeviceEvent("error", text, {"vrpn": version}))
+                    else:
+                        out += self._newer.take_version(version)
+                    self._assembler.forget()
+                    self._named_unknown.clear()
+                    self._stale_binding = True
                 case vrpn.SenderDescription():
                     self._stale_binding = True
                 case vrpn.Disconnect():
@@ -134,21 +144,6 @@ class VrpnDecoder:
             self._frame(frame, out)
         out += [Corrupt(item.discarded, item.reason) for item in self._codec.flush()]
         return out
-
-    # --- server -------------------------------------------------------------------------------
-
-    def _connected(self, cookie: vrpn.Cookie, out: list[Decoded]) -> None:
-        """Start again with the server of a new connection."""
-        version = f"{cookie.major:02d}.{cookie.minor:02d}"
-        out.append(DeviceEvent("info", f"VRPN {version}", {"vrpn": version}))
-        if cookie.major != vrpn.MAJOR:
-            text = f"the server speaks VRPN {version}, expected {vrpn.MAJOR:02d}.xx"
-            out.append(DeviceEvent("error", text, {"vrpn": version}))
-        else:
-            out += self._newer.take_version(version)
-        self._assembler.forget()
-        self._named_unknown.clear()
-        self._stale_binding = True
 
     # --- reports ------------------------------------------------------------------------------
 
@@ -183,12 +178,14 @@ class VrpnDecoder:
         binding = self._bound(out)
 
         poses: dict[ColumnKey, tuple[Vector, Quaternion | None]] = {}
+        scale = self._scale
         for key, report in frame.reports.items():
-            pose = self._pose(report)
-            if pose is None:
-                self.suspicious += 1
+            x, y, z = scale * report.x, scale * report.y, scale * report.z
+            if abs(x) <= _FARTHEST_M and abs(y) <= _FARTHEST_M and abs(z) <= _FARTHEST_M:
+                turn = unit_quaternion(report.qw, report.qx, report.qy, report.qz)
+                poses[key] = self._place(x, y, z), None if turn is None else self._turn(*turn)
             else:
-                poses[key] = pose
+                self.suspicious += 1
             if (text := self._unit_check.feed(report.x, report.y, report.z)) is not None:
                 out.append(DeviceEvent("warning", text))
 
@@ -208,15 +205,6 @@ class VrpnDecoder:
                 counted=False,
             )
         )
-
-    def _pose(self, report: vrpn.TrackerPose) -> tuple[Vector, Quaternion | None] | None:
-        """Return position and orientation, z up; None for an implausible position."""
-        scale, far = self._scale, _FARTHEST_M
-        x, y, z = scale * report.x, scale * report.y, scale * report.z
-        if not (abs(x) <= far and abs(y) <= far and abs(z) <= far):
-            return None
-        turn = unit_quaternion(report.qw, report.qx, report.qy, report.qz)
-        return self._place(x, y, z), None if turn is None else self._turn(*turn)
 
     def _check_clock(self, frame: ReportedFrame, out: list[Decoded]) -> None:
         """Report a step of the server's clock, which is not explained by delayed messages."""
@@ -245,20 +233,7 @@ class VrpnDecoder:
         if before is not None and not self._stale_binding:
             return before
 
-        # Markers are trackers that rig.toml names as such; all others are bodies.
-        entries = self._entries()
-        markers = [entry for entry in entries if entry.name in self._wanted_markers]
-        others = [entry for entry in entries if entry.name not in self._wanted_markers]
-        binding = bind_columns(markers, others, self._wanted_markers, self._wanted_bodies)
-        if not self._settled:
-            binding = replace(binding, warnings=(), unknown=())
-        binding, events = renew_columns(before, binding)
-        out += events
-        self._binding, self._stale_binding = binding, False
-        return binding
-
-    def _entries(self) -> list[ModelEntry]:
-        """Return the bodies that have reported, and those of rig.toml that are described."""
+        # Bodies that have reported, and those of rig.toml that are described.
         wanted = {**self._wanted_markers, **self._wanted_bodies}
         described = set(self._codec.senders.values())
         keys = dict(self._bodies)
@@ -272,4 +247,14 @@ class VrpnDecoder:
             numbered = f"{tracker}#{number}"
             plain = numbered if number or numbered in wanted else tracker
             entries.append(ModelEntry((tracker, number), "", plain, number + 1))
-        return entries
+
+        # Markers are trackers that rig.toml names as such; all others are bodies.
+        markers = [entry for entry in entries if entry.name in self._wanted_markers]
+        others = [entry for entry in entries if entry.name not in self._wanted_markers]
+        binding = bind_columns(markers, others, self._wanted_markers, self._wanted_bodies)
+        if not self._settled:
+            binding = replace(binding, warnings=(), unknown=())
+        binding, events = renew_columns(before, binding)
+        out += events
+        self._binding, self._stale_binding = binding, False
+        return binding

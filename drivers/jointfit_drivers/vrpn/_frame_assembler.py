@@ -79,8 +79,12 @@ class FrameAssembler:
             Arrival of the report, ns.
         """
         time_us = report.time_us
-        if not self._follows(key, time_us):
+        step_us = time_us - self._last_us.get(key, time_us - 1)
+        if -_REORDERED_US < step_us <= 0:  # not newer than the last report of the body
+            self.duplicates += step_us == 0
+            self.late += step_us < 0
             return []
+
         out = []
         spread_us = _FIRST_SPREAD_US if self._period_us is None else _SAME_FRAME * self._period_us
         distance_us = abs(time_us - self._time_us)
@@ -109,15 +113,6 @@ class FrameAssembler:
     def flush(self) -> list[ReportedFrame]:
         """Return the frame in progress."""
         return [self._close()] if self._reports else []
-
-    def _follows(self, key: ColumnKey, time_us: int) -> bool:
-        """Return whether a report is newer than the last one of its body; count it otherwise."""
-        step_us = time_us - self._last_us.get(key, time_us - 1)
-        if step_us == 0:
-            self.duplicates += 1
-        elif -_REORDERED_US < step_us < 0:
-            self.late += 1
-        return not -_REORDERED_US < step_us <= 0
 
     def _note(self, key: ColumnKey, time_us: int) -> None:
         """Measure the period, and await this body in the next frames."""

@@ -8,9 +8,10 @@ Invariant: the result depends only on the messages fed.
 
 from __future__ import annotations
 
-from math import cos, radians, sin, sqrt
+from math import radians, sqrt
 from typing import TYPE_CHECKING, Any
 
+from jointfit_protocols.orientation import angles_quaternion
 from jointfit_protocols.xbus import XbusMessageId
 from jointfit_protocols.xbus.mtdata import (
     NED,
@@ -70,7 +71,7 @@ class LegacyMeasurements:
         if values is None:
             return None
         if Item.EULER_ANGLES in values:
-            values[_QUATERNION] = _of_euler(*values.pop(Item.EULER_ANGLES))
+            values[_QUATERNION] = angles_quaternion(*map(radians, values.pop(Item.EULER_ANGLES)))
         elif Item.ROTATION_MATRIX in values:
             values[_QUATERNION] = _of_matrix(values.pop(Item.ROTATION_MATRIX))
         return values
@@ -83,18 +84,6 @@ class LegacyMeasurements:
             self._layout, self.fault = MTDataLayout(self._mode, self._settings), ""
         except ValueError as fault:
             self.fault = str(fault)
-
-
-def _of_euler(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return the quaternion of R = Rz(yaw) Ry(pitch) Rx(roll), degrees."""
-    r, p, y = (0.5 * radians(angle) for angle in (roll, pitch, yaw))
-    cr, sr, cp, sp, cy, sy = cos(r), sin(r), cos(p), sin(p), cos(y), sin(y)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )
 
 
 def _of_matrix(by_columns: tuple[float, ...]) -> Quaternion:

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from pydantic import Field, field_validator
+from pydantic import Field
 from typing_extensions import override
 
-from jointfit_daemon.driver import CanBusError, CanBusSettings, ImuSettings, Settings, Wire
+from jointfit_daemon.driver import Settings, Wire
+from jointfit_drivers.can_imu import CanImuSettings
 from jointfit_drivers.can_reception import CanReception
-from jointfit_drivers.ports.can_bus import bus_faults
 from jointfit_drivers.xcdi._decoder import XcdiDecoder
 from jointfit_protocols.can import EXTENDED_MAX, STANDARD_MAX
 from jointfit_protocols.corrupt import CorruptBytes
@@ -95,10 +95,9 @@ class XcdiIdSettings(Settings):
         return derived._replace(**self.model_dump(exclude_none=True), extended=extended)
 
 
-class XcdiSettings(ImuSettings):
+class XcdiSettings(CanImuSettings):
     """One Xsens / Movella IMU on a CAN bus."""
 
-    can: CanBusSettings = Field(description="name of the [can.NAME] table of its bus")
     ids: XcdiIdSettings = Field(
         default_factory=XcdiIdSettings,
         description="its identifiers; necessary if another sensor on the bus has the same ones",
@@ -125,13 +124,6 @@ class XcdiSettings(ImuSettings):
                     "identifier: correct it, or set extended_ids = true if the sensor sends 29-bit "
                     "identifiers",
                 )
-
-    @field_validator("can")
-    @classmethod
-    def _bus_that_exists_here(cls, can: CanBusSettings) -> CanBusSettings:
-        if faults := bus_faults(can):
-            raise CanBusError(faults)
-        return can
 
     @property
     @override

@@ -155,7 +155,11 @@ class XImu3Continuity:
             return False
         if held.q is None or point.q is None:
             return True
-        return _distance(held.q, point.q) <= _FASTEST * 1e-6 * passed + _JOLT
+
+        # twice the chord is the angle between the orientations
+        sign = 1.0 if sum(a * b for a, b in zip(held.q, point.q, strict=True)) >= 0.0 else -1.0
+        square = sum((a - sign * b) ** 2 for a, b in zip(held.q, point.q, strict=True))
+        return 2.0 * sqrt(square) <= _FASTEST * 1e-6 * passed + _JOLT
 
     def _deviation_of(self, last: XImu3Point, point: XImu3Point) -> float:
         """Return the deviation from a uniform motion, rad; 0 if it is unknown."""
@@ -213,9 +217,3 @@ class XImu3Continuity:
         if self._sum_periods >= _LEARNED:
             return self._sum_us / self._sum_periods
         return self._shortest
-
-
-def _distance(p: Quaternion, q: Quaternion) -> float:
-    """Return the angle between two orientations, rad, as twice the chord."""
-    sign = 1.0 if sum(a * b for a, b in zip(p, q, strict=True)) >= 0.0 else -1.0
-    return 2.0 * sqrt(sum((a - sign * b) ** 2 for a, b in zip(p, q, strict=True)))

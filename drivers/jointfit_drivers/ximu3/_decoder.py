@@ -146,10 +146,17 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         if native is not None:
             q = self._gate.admit(canonical(native, self._reports.world))
             if q is None:
-                return [
-                    self._refusals.refuse(message.size, "quaternion norm is not 1"),
-                    *self._norm_warning(),
+                out: list[Decoded] = [
+                    self._refusals.refuse(message.size, "quaternion norm is not 1")
                 ]
+                # Warn once if hardly any quaternion has norm 1.
+                norm = None if self._norm_checked else self._gate.misconfigured_norm
+                if norm is not None:
+                    self._norm_checked = True
+                    text = f"median quaternion norm is {norm:.4g}, expected 1"
+                    text += ": order or scale is wrong"
+                    out.append(DeviceEvent("warning", text, {"median_norm": norm}))
+                return out
 
         arrived_ns = self._arrival_of(message)
         step = self._continuity.step(XImu3Point(message.ticks, arrived_ns, q))
@@ -220,15 +227,6 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
             return []
         text = f"the device sends at {found_hz:.4g} Hz, rate_hz is {rate_hz:g}: correct one of them"
         return [DeviceEvent("warning", text, {"rate_hz": round(found_hz, 3)})]
-
-    def _norm_warning(self) -> list[Decoded]:
-        """Return a warning, once, if hardly any quaternion has norm 1."""
-        norm = None if self._norm_checked else self._gate.misconfigured_norm
-        if norm is None:
-            return []
-        self._norm_checked = True
-        text = f"median quaternion norm is {norm:.4g}, expected 1: order or scale is wrong"
-        return [DeviceEvent("warning", text, {"median_norm": norm})]
 
     def _drop_held(self) -> list[Decoded]:
         """Reject a measurement that no later message confirmed."""

@@ -67,7 +67,14 @@ class DeviceReports:
         if key == "ahrs_axes_convention":
             return self._world_events(value)
         if key == "axes_alignment" and type(value) is int and 0 <= value < len(ALIGNMENTS):
-            return _alignment_events(value)
+            out = _properties({key: value})
+            if value:
+                text = (
+                    f"axes_alignment is {value} ({ALIGNMENTS[value]}): the sensor axes are not "
+                    "those printed on the housing"
+                )
+                out.append(DeviceEvent("warning", text, {key: value}))
+            return out
         if key in _PROPERTIES:
             return _properties({_PROPERTIES[key]: _shown(value)})
         return _properties({key: value} if key in _SETTINGS and isinstance(value, int) else {})
@@ -79,7 +86,17 @@ class DeviceReports:
             return [DeviceEvent("error", f"device reports: {text}", {"error": text})]
         if message.kind == DataKind.NOTIFICATION:
             return [DeviceEvent("info", f"device reports: {text}", {"notification": text})]
-        return self._battery_events(message.values[0]) if message.kind == DataKind.BATTERY else []
+        if message.kind != DataKind.BATTERY:
+            return []
+
+        # Warn when the charge falls below the limit.
+        percent = message.values[0]
+        low = percent < (_CHARGED_PERCENT if self._low else _LOW_PERCENT)
+        fell, self._low = low and not self._low, low
+        if not fell:
+            return []
+        text = f"battery {percent:.0f} %: charge it, or connect USB"
+        return [DeviceEvent("warning", text, {"battery_percent": percent})]
 
     def _world_events(self, value: object) -> list[Decoded]:
         if type(value) is not int or not 0 <= value < len(WORLDS):
@@ -90,26 +107,6 @@ class DeviceReports:
         if known and world != before:
             return [DeviceEvent("setting", f"world changed from {before} to {world}")]
         return _properties({"world": world})
-
-    def _battery_events(self, percent: float) -> list[Decoded]:
-        """Return a warning when the charge falls below the limit."""
-        low = percent < (_CHARGED_PERCENT if self._low else _LOW_PERCENT)
-        fell, self._low = low and not self._low, low
-        if not fell:
-            return []
-        text = f"battery {percent:.0f} %: charge it, or connect USB"
-        return [DeviceEvent("warning", text, {"battery_percent": percent})]
-
-
-def _alignment_events(value: int) -> list[Decoded]:
-    found = _properties({"axes_alignment": value})
-    if value:
-        text = (
-            f"axes_alignment is {value} ({ALIGNMENTS[value]}): the sensor axes are not those "
-            "printed on the housing"
-        )
-        found.append(DeviceEvent("warning", text, {"axes_alignment": value}))
-    return found
 
 
 def _properties(known: dict[str, object]) -> list[Decoded]:

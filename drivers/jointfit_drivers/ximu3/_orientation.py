@@ -7,9 +7,10 @@ with yaw, pitch and roll in the order of the message: roll, pitch, yaw.
 
 from __future__ import annotations
 
-from math import cos, isfinite, radians, sin, sqrt
+from math import isfinite, radians, sqrt
 from typing import TYPE_CHECKING, cast
 
+from jointfit_protocols.orientation import angles_quaternion
 from jointfit_protocols.ximu3 import DataKind
 
 if TYPE_CHECKING:
@@ -41,7 +42,10 @@ def orientation_of(message: XImu3Data) -> Quaternion | None:
     if message.kind == DataKind.MATRIX:
         return _quaternion_of_matrix(values)
     if message.kind == DataKind.EULER:
-        return _quaternion_of_angles(*values) if all(map(isfinite, values)) else None
+        if not all(map(isfinite, values)):
+            return None
+        roll, pitch, yaw = map(radians, values)
+        return angles_quaternion(roll, pitch, yaw)
     return cast("Quaternion", values[:4])
 
 
@@ -69,15 +73,3 @@ def _quaternion_of_matrix(rows: Sequence[float]) -> Quaternion | None:
     half = 0.5 * double
     found = ((half, a, b, c), (a, half, d, e), (b, d, half, f), (c, e, f, half))
     return found[largest]
-
-
-def _quaternion_of_angles(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return the quaternion of Euler angles, deg."""
-    halves = [0.5 * radians(angle) for angle in (roll, pitch, yaw)]
-    (a, b, c), (i, j, k) = map(cos, halves), map(sin, halves)
-    return (
-        c * b * a + k * j * i,
-        c * b * i - k * j * a,
-        c * j * a + k * b * i,
-        k * b * a - c * j * i,
-    )

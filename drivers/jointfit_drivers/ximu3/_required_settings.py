@@ -74,7 +74,11 @@ def differences(
         key: f"{key} is {describe_value(key, found.get(key))}, expected "
         f"{describe_value(key, values[0])}"
         for key, values in required
-        if not any(_equal(found.get(key), value) for value in values)
+        # equal and of one JSON type: 1 is not true
+        if not any(
+            found.get(key) == value and isinstance(found.get(key), bool) == isinstance(value, bool)
+            for value in values
+        )
     }
 
 
@@ -99,11 +103,6 @@ def describe_value(key: str, value: object) -> str:
         if key in _RATES:
             return f"{value} ({f'{BASE_RATE_HZ / value:.6g} Hz' if value > 0 else 'off'})"
     return "missing" if value is None else str(value)
-
-
-def _equal(found: object, value: object) -> bool:
-    """Whether values are equal and of one JSON type: 1 is not true."""
-    return found == value and isinstance(found, bool) == isinstance(value, bool)
 
 
 _RATES = ("ahrs_message_rate_divisor", "inertial_message_rate_divisor")
