@@ -85,7 +85,7 @@ class ClusterPose:
         if not all(map(isfinite, (*position, *now))):
             return None
         q = multiply_one(now, conjugate_one(as_quaternion(self._cluster.q_body)))
-        turned = [rotate_one(q, offset) for offset in _vectors(self._offsets)]
+        turned = [rotate_one(q, (x, y, z)) for x, y, z in self._offsets.tolist()]
         return FittedPose(q, [(x + dx, y + dy, z + dz) for dx, dy, dz in turned])
 
     def _fit_markers(self, seen: Array) -> FittedPose | None:
@@ -137,10 +137,6 @@ def _columns(cluster: MarkerCluster, layout: MocapLayout) -> list[int] | None:
     if any(marker not in layout.markers for marker in cluster.markers):
         return None
     return [layout.markers.index(marker) for marker in cluster.markers]
-
-
-def _vectors(points: Array) -> list[Vector]:
-    return [(x, y, z) for x, y, z in points.tolist()]
 
 
 def _determinant(m: list[list[float]]) -> float:

@@ -105,7 +105,12 @@ class FrameLatency:
         """Set `health` to the latency since the last call, and start the next interval."""
         found = self._histograms
         self._histograms = {stage: LatencyHistogram() for stage in STAGES}
-        stages = {stage: _quantiles(histogram) for stage, histogram in found.items()}
+        stages: dict[str, StageLatency | None] = {}
+        for stage, histogram in found.items():
+            p50_ns, p99_ns = histogram.quantile_ns(0.5), histogram.quantile_ns(0.99)
+            stages[stage] = None
+            if p50_ns is not None and p99_ns is not None:
+                stages[stage] = StageLatency(p50_ns, p99_ns, histogram.longest_ns)
         self.health = LatencyHealth(found["fused"].total, stages)
 
     def mark_decoded(self, arrival_ns: int) -> None:
@@ -146,10 +151,3 @@ class FrameLatency:
         now_ns = self._clock()
         self._histograms["written"].add(now_ns - encoded_ns)
         self._histograms["total"].add(now_ns - began_ns)
-
-
-def _quantiles(histogram: LatencyHistogram) -> StageLatency | None:
-    p50_ns, p99_ns = histogram.quantile_ns(0.5), histogram.quantile_ns(0.99)
-    if p50_ns is None or p99_ns is None:
-        return None
-    return StageLatency(p50_ns, p99_ns, histogram.longest_ns)

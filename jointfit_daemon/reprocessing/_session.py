@@ -70,7 +70,10 @@ def load_session(
             last_rig = event.rig
         for output in outputs:
             if isinstance(output, CalibrationStatus):
-                in_force = _calibration_text(output)
+                in_force = "none"
+                if output.phase in (CalibrationPhase.CALIBRATED, CalibrationPhase.POSED):
+                    version = output.version
+                    in_force = "not stored" if version is None else f"version {version}"
     if last_rig is None:
         raise ReprocessingError(f"{path}: the recording contains no events")
 
@@ -136,10 +139,3 @@ def load_calibration(path: Path) -> Calibration:
             f"{path}: cannot be used as a calibration ({str(error) or type(error).__name__:.300}): "
             "choose a file of a calibration store"
         ) from error
-
-
-def _calibration_text(status: CalibrationStatus) -> str:
-    """Return the calibration in force according to a status."""
-    if status.phase in (CalibrationPhase.CALIBRATED, CalibrationPhase.POSED):
-        return "not stored" if status.version is None else f"version {status.version}"
-    return "none"

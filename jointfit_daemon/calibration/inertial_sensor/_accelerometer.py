@@ -219,8 +219,18 @@ class AccelerometerStep:
                 f"the six faces; missing: {', '.join(self.progress.missing)}. Repeat, and let the "
                 "sensor lie still for two seconds in each pose"
             )
-        forces = np.array(self._forces)
-        self._check_saturation(forces)
+
+        # At the end of the range, noise does not change the reading.
+        forces, constant = np.array(self._forces), np.array(self._constant)
+        for axis, name in enumerate("xyz"):
+            for end in (forces[:, axis].max(), forces[:, axis].min()):
+                at_end = (forces[:, axis] == end) & constant[:, axis]
+                if at_end.sum() > 1 and abs(end) > _SATURATED:
+                    raise SensorCalibrationError(
+                        f"the acceleration along {name} is {end:.3f} m/s² in {at_end.sum()} "
+                        "different poses: it is saturated. Set a larger range of the "
+                        "accelerometer in the device, and repeat"
+                    )
         return fit_accelerometer(forces)
 
     def finish_gyroscope_scale(self, estimate: AccelerometerEstimate) -> GyroscopeScaleEstimate:
@@ -245,18 +255,6 @@ class AccelerometerStep:
             for name, (one, other) in _PLANES.items():
                 found[name] += min(unit[one], unit[other]) > _TILTED
         return {name: 2 - count for name, count in found.items() if count < 2}
-
-    def _check_saturation(self, forces: Array) -> None:
-        """Refuse poses at the end of the range: there, noise does not change the reading."""
-        for axis, name in enumerate("xyz"):
-            for end in (forces[:, axis].max(), forces[:, axis].min()):
-                at_end = (forces[:, axis] == end) & np.array(self._constant)[:, axis]
-                if at_end.sum() > 1 and abs(end) > _SATURATED:
-                    raise SensorCalibrationError(
-                        f"the acceleration along {name} is {end:.3f} m/s² in {at_end.sum()} "
-                        "different poses: it is saturated. Set a larger range of the "
-                        "accelerometer in the device, and repeat"
-                    )
 
 
 def _rms(values: Array) -> float:

@@ -83,15 +83,13 @@ class TurnCollector:
         if self._before is not None and len(rest) == REST_BLOCKS + 1:  # this rest is new
             t_s = np.array([each.t_ns - since[0].t_ns for each in since]) * 1e-9
             rates = np.array([each.rate for each in since])
-            self.turns.append(Turn(_without_jitter(t_s), rates, self._before, after))
+
+            # Equal intervals, if the arrivals deviate from them by jitter alone.
+            number = np.arange(len(t_s)) - 0.5 * (len(t_s) - 1)
+            period_s = float(number @ t_s / (number @ number))
+            regular = t_s.mean() + period_s * number
+            if float(np.abs(t_s - regular).max()) < LARGEST_JITTER * period_s:
+                t_s = regular
+            self.turns.append(Turn(t_s, rates, self._before, after))
         self._before = after
         self._since = [reading]
-
-
-def _without_jitter(t_s: Array) -> Array:
-    """Return equal intervals if the arrivals deviate from them by jitter alone."""
-    number = np.arange(len(t_s)) - 0.5 * (len(t_s) - 1)
-    period_s = float(number @ t_s / (number @ number))
-    regular = t_s.mean() + period_s * number
-    is_jitter = float(np.abs(t_s - regular).max()) < LARGEST_JITTER * period_s
-    return np.asarray(regular) if is_jitter else t_s

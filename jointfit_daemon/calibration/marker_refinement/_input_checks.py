@@ -79,7 +79,14 @@ def check(
 
     if faults:
         raise RefinementError("; ".join(faults))
-    usable, notes = [], [*held, *_gaps(model, every), *_stretches(model, every)]
+    usable, notes = [], [*held, *_gaps(model, every)]
+    for trial in every:
+        size = _stretch(model, trial)
+        if np.isfinite(size) and not 1.0 / _NOTED_STRETCH < size < _NOTED_STRETCH:
+            notes.append(
+                f"{trial.name}: {size:.2f} times as large as the model: scale the model, otherwise"
+                " the refinement compensates for its size"
+            )
     for trial in trials:
         cleaned, remarks, wrong = _labels(model, trial)
         usable.append(cleaned)
@@ -133,16 +140,6 @@ def _stretch(model: ChainModel, trial: MotionTrial) -> float:
             measured = np.linalg.norm(y[both, i] - y[both, j], axis=-1)
             ratios.append(float(np.median(measured)) / apart)
     return float(np.median(ratios)) if ratios else float("nan")
-
-
-def _stretches(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
-    return [
-        f"{trial.name}: {stretch:.2f} times as large as the model: scale the model, otherwise the"
-        " refinement compensates for its size"
-        for trial in trials
-        if np.isfinite(stretch := _stretch(model, trial))
-        and not 1.0 / _NOTED_STRETCH < stretch < _NOTED_STRETCH
-    ]
 
 
 def _movable(

@@ -122,7 +122,13 @@ class RunningCircle:
         if self._window is not None:
             self._slide((x, y, weight))
         if self._robust and self.frames >= _SETTLED_FRAMES:
-            self._update_circle()
+            # Circle and noise weight the next frame.
+            found = self.circle()
+            if found is not None:
+                m = self.moments()
+                square = found[2] * found[2]
+                rest = sum_of_squares(m, found[0] - m.x, found[1] - m.y, square) / (4.0 * square)
+                self._circle, self._noise = found, sqrt(max(rest, 0.0))
 
     def _add(self, x: float, y: float, w: float) -> None:
         mu = self._forgetting
@@ -264,16 +270,6 @@ class RunningCircle:
         off = abs(sqrt((x - cx) ** 2 + (y - cy) ** 2) - radius)
         allowed = _HUBER * max(self._noise, _LEAST_NOISE_M)
         return 1.0 if off <= allowed else allowed / off
-
-    def _update_circle(self) -> None:
-        """Store circle and noise for weighting the next frame."""
-        found = self.circle()
-        if found is None:
-            return
-        m = self.moments()
-        square = found[2] * found[2]
-        rest = sum_of_squares(m, found[0] - m.x, found[1] - m.y, square) / (4.0 * square)
-        self._circle, self._noise = found, sqrt(max(rest, 0.0))
 
 
 def _scaled(sums: Sums, factor: float) -> Sums:

@@ -76,9 +76,16 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     noise = np.maximum(noise, _LEAST_NOISE_M)
     found, H = start, np.zeros((len(z), 4, 4))
 
+    # the scale part without angle noise; the angles grow evenly from frame to frame
+    values, U = _wandering(n, interval)
+    even = np.arange(n) - 0.5 * (n - 1)
+    g = _TOLD.gain * np.outer(theta @ even, even) / (even @ even)
+
     for _ in range(2):  # the angular noise is computed at a fixed radius; two passes suffice
         radius = np.maximum(found[:, 2], 0.01)
-        weights = _weights(theta, noise / radius, interval)
+        d = 1.0 / (values + (noise / radius)[:, None] ** 2)
+        h = ((g @ U) * d) @ U.T
+        weights = _Weights(U, d, h / np.sqrt(1.0 + (g * h).sum(axis=-1, keepdims=True)))
         found, H = _descend(_Runs(z, theta, noise, weights, weights.diagonal(), radius), found)
 
     return np.asarray(_guarded(found[:, :2], H, circles).reshape(*shape, 2))
@@ -91,17 +98,6 @@ def _wandering(n: int, interval: float) -> tuple[Array, Array]:
     slow = _TOLD.slow**2 * np.exp(-apart / _TOLD.time)
     values, U = np.linalg.eigh(slow + _TOLD.white**2 * np.eye(n))
     return values, U
-
-
-def _weights(theta: Array, relative_noise: Array, interval: float) -> _Weights:
-    n = theta.shape[-1]
-    values, U = _wandering(n, interval)
-    d = 1.0 / (values + relative_noise[:, None] ** 2)
-    # the scale part without angle noise; the angles grow evenly from frame to frame
-    even = np.arange(n) - 0.5 * (n - 1)
-    g = _TOLD.gain * np.outer(theta @ even, even) / (even @ even)
-    h = ((g @ U) * d) @ U.T
-    return _Weights(U, d, h / np.sqrt(1.0 + (g * h).sum(axis=-1, keepdims=True)))
 
 
 class _Runs(NamedTuple):

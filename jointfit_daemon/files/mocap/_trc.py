@@ -86,7 +86,14 @@ def read_trc(path: Path) -> MarkerTrajectories:
             f"{path}, line 4: no marker names after Frame# and Time: export it again"
         )
 
-    _require_unique_names(path, names)
+    # OpenSim refuses equal names, too.
+    for name, times in Counter(filter(None, names)).items():
+        if times > 1:
+            columns = [str(3 + 3 * at) for at, other in enumerate(names) if other == name]
+            raise MalformedFileError(
+                f"{path}, line 4: marker {name!r} occurs {times} times, in columns"
+                f" {' and '.join(columns)}, expected once: rename all but one"
+            )
 
     header_separator = separator_of(lines[1])
     keys, cells = (cells_of(line, header_separator) for line in lines[1:3])
@@ -123,17 +130,6 @@ def read_trc(path: Path) -> MarkerTrajectories:
         rate_hz,
         warnings,
     )
-
-
-def _require_unique_names(path: Path, names: Sequence[str]) -> None:
-    """Raise `MalformedFileError` if two markers have the same name, as OpenSim does."""
-    for name, times in Counter(filter(None, names)).items():
-        if times > 1:
-            columns = [str(3 + 3 * at) for at, other in enumerate(names) if other == name]
-            raise MalformedFileError(
-                f"{path}, line 4: marker {name!r} occurs {times} times, in columns"
-                f" {' and '.join(columns)}, expected once: rename all but one"
-            )
 
 
 def _require_header(path: Path, lines: Sequence[str]) -> None:

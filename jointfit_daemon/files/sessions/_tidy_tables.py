@@ -62,7 +62,12 @@ _NAME, _START, _DESCRIPTION = "name", "start_unix_ns", "description."
 def tables_of(session: SessionData) -> dict[str, Table]:
     """Return the tables of a session by name; empty ones are left out."""
     parts: dict[str, list[Table]] = {name: [] for name in TABLES}
-    parts["session"] = [_session_table(session)]
+    facts = {_NAME: session.name}
+    if session.start_unix_ns is not None:
+        facts[_START] = str(session.start_unix_ns)
+    facts |= {_DESCRIPTION + key: value for key, value in session.description.items()}
+    keys, values = (np.array([*column], object) for column in (facts.keys(), facts.values()))
+    parts["session"] = [{"key": keys, "value": values}]
     parts["sensors"] = [_sensor_table(sensor) for sensor in session.sensors]
     if session.markers is not None:
         for k, label in enumerate(session.markers.labels):
@@ -90,14 +95,6 @@ def tables_of(session: SessionData) -> dict[str, Table]:
         for name, found in parts.items()
         if found
     }
-
-
-def _session_table(session: SessionData) -> Table:
-    facts = {_NAME: session.name}
-    if session.start_unix_ns is not None:
-        facts[_START] = str(session.start_unix_ns)
-    facts |= {_DESCRIPTION + key: value for key, value in session.description.items()}
-    return {"key": np.array([*facts], object), "value": np.array([*facts.values()], object)}
 
 
 def _sensor_table(sensor: SensorSeries) -> Table:

@@ -7,7 +7,7 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jointfit_daemon.outputs.frame_latency import LatencyHealth, StageLatency
+    from jointfit_daemon.outputs.frame_latency import LatencyHealth
     from jointfit_daemon.outputs.mqtt import LinkHealth
     from jointfit_daemon.outputs.recording import RecordingHealth
     from jointfit_daemon.outputs.spool import SpoolHealth
@@ -85,14 +85,13 @@ def core_payload(core: CoreHealth) -> dict[str, Any]:
 
 
 def _latency(latency: LatencyHealth) -> dict[str, Any]:
-    stages = {f"{name}_us": _stage(stage) for name, stage in latency.stages.items()}
+    stages = {
+        f"{name}_us": None
+        if stage is None
+        else {"p50": _us(stage.p50_ns), "p99": _us(stage.p99_ns), "max": _us(stage.max_ns)}
+        for name, stage in latency.stages.items()
+    }
     return {"frames": latency.frames, **stages}
-
-
-def _stage(stage: StageLatency | None) -> dict[str, float | None] | None:
-    if stage is None:
-        return None
-    return {"p50": _us(stage.p50_ns), "p99": _us(stage.p99_ns), "max": _us(stage.max_ns)}
 
 
 def _device(device: DeviceHealth) -> dict[str, Any]:

@@ -221,7 +221,14 @@ def _described(
     seen = np.isfinite(found.residuals).all(axis=-1)
     solved = found.converged & (seen.sum(axis=1) >= _FEWEST_MARKERS)
     covariance, determined = pose_covariance(model, found)
-    known = _known(loaded, determined) & solved[:, None]
+
+    # coordinates of joints with markers for all degrees of freedom, shape (T, K)
+    whole = [
+        determined[:, columns].all(axis=1)
+        for columns, joint in zip(loaded.chain.columns, loaded.coordinates, strict=True)
+        for _ in joint.names
+    ]
+    known = np.stack(whole, axis=1) & solved[:, None]
     table = coordinate_table(model, found.state, covariance, loaded.coordinates, known)
     notes += [
         f"{segment}: rotates by up to {np.degrees(most):.1f}° outside of its coordinates"
@@ -255,13 +262,3 @@ def _described(
         int(improved.sum()),
         tuple(notes),
     )
-
-
-def _known(loaded: LoadedModel, determined: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the coordinates of joints with markers for all degrees of freedom, shape (T, K)."""
-    whole = [
-        determined[:, columns].all(axis=1)
-        for columns, joint in zip(loaded.chain.columns, loaded.coordinates, strict=True)
-        for _ in joint.names
-    ]
-    return np.stack(whole, axis=1)

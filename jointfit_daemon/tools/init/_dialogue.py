@@ -77,8 +77,14 @@ class Dialogue:
                     ) from error
             else:
                 self._ask(asked)
-        if self.is_script:
-            self._refuse_unused()
+
+        # Answers to questions that were not asked are probably misspelled.
+        for key, subject in self.prepared.keys() - self.answers.keys() if self.is_script else ():
+            name = f"{key}.{subject}" if subject else key
+            known = [f"{k}.{s}" if s else k for k, s in self.answers]
+            raise UnansweredError(
+                f"{name}: there is no such question with these answers; {did_you_mean(name, known)}"
+            )
         return self.answers
 
     def next(self) -> Asked | None:
@@ -153,15 +159,6 @@ class Dialogue:
                 self.accept_answer(asked, value)
         except AnswerError as error:
             raise UnansweredError(f"{asked.name} = {value!r}: {error}") from error
-
-    def _refuse_unused(self) -> None:
-        """Refuse answers to questions that were not asked: they are probably misspelled."""
-        for key, subject in self.prepared.keys() - self.answers.keys():
-            name = f"{key}.{subject}" if subject else key
-            known = [f"{k}.{s}" if s else k for k, s in self.answers]
-            raise UnansweredError(
-                f"{name}: there is no such question with these answers; {did_you_mean(name, known)}"
-            )
 
     # --- terminal ----------------------------------------------------------------------------
 

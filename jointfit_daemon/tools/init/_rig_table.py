@@ -46,7 +46,9 @@ def rig_table(answers: Given, found: Found) -> dict[str, Any]:
     }
 
     if not limb_of(answers).is_planar:
-        buses = _buses(answers)
+        devices = dict.fromkeys(answers["device", name] for name in sensors_of(answers))
+        on_can = [device for device in devices if wiring_of(answers, device) == "can"]
+        buses = {device: f"can{at}" for at, device in enumerate(on_can)}
         table["imu"] = [_imu(answers, found, buses, name) for name in sensors_of(answers)]
         if buses:
             table["can"] = {name: _bus(answers, device) for device, name in buses.items()}
@@ -74,23 +76,12 @@ def _chain(answers: Given) -> dict[str, Any]:
     if known := {name: length for name, length in lengths.items() if length is not None}:
         table["lengths_m"] = known
     if limb.branches:
-        table["joint"] = [_joint(answers, dict(joint)) for joint in limb.branches]
+        table["joint"] = [dict(joint) for joint in limb.branches]
+        for joint in table["joint"]:  # a distal body part without markers is omitted
+            child = joint["child"]
+            if child not in limb.segments and not answers.get(("markers", child)):
+                del joint["child"]
     return table
-
-
-def _joint(answers: Given, joint: dict[str, Any]) -> dict[str, Any]:
-    """Return the table of a joint; a distal body part without markers is omitted."""
-    child = joint["child"]
-    if child not in limb_of(answers).segments and not answers.get(("markers", child)):
-        del joint["child"]
-    return joint
-
-
-def _buses(answers: Given) -> dict[str, str]:
-    """Return the name of the table of every CAN bus by its device."""
-    devices = dict.fromkeys(answers["device", name] for name in sensors_of(answers))
-    buses = [device for device in devices if wiring_of(answers, device) == "can"]
-    return {device: f"can{at}" for at, device in enumerate(buses)}
 
 
 def _bus(answers: Given, device: str) -> dict[str, Any]:

@@ -67,7 +67,11 @@ def drivers_found() -> Found:
     for name, driver in known:
         fields: Mapping[str, FieldInfo] = driver.Settings.model_fields
         required = {key for key, field in fields.items() if field.is_required()}
-        choices = _key_choices(fields)
+        choices = tuple(
+            KeyChoice(key, get_args(field.annotation), str(field.description or ""))
+            for key, field in fields.items()
+            if field.is_required() and get_origin(field.annotation) is Literal
+        )
         if not required <= _DIALOGUE_KEYS | {choice.key for choice in choices}:
             continue
         if issubclass(driver.Settings, ImuSettings) and required & {"port", "can"}:
@@ -96,14 +100,6 @@ def _devices_of(driver: type[Driver]) -> str:
     for article in _ARTICLES:
         text = text.removeprefix(article)
     return text
-
-
-def _key_choices(fields: Mapping[str, FieldInfo]) -> tuple[KeyChoice, ...]:
-    return tuple(
-        KeyChoice(key, get_args(field.annotation), str(field.description or ""))
-        for key, field in fields.items()
-        if field.is_required() and get_origin(field.annotation) is Literal
-    )
 
 
 def _imu_driver(name: str, fields: Mapping[str, FieldInfo]) -> ImuDriver:

@@ -373,20 +373,18 @@ def _difference_figure(found: AngleDifference) -> str:
     limits = padded(min(0.0, float(values.min())), max(0.0, float(values.max())))
     span = (float(found.t_s[0]), float(found.t_s[-1]))
     area = PlotArea(_HALF, 200.0, span, limits)
+
+    # NaN where the cameras saw nothing for a while, so that no line bridges it.
+    t_s = found.t_s
+    if len(t_s) > 1:
+        wide = np.flatnonzero(np.diff(t_s) > 5.0 * np.median(np.diff(t_s))) + 1
+        t_s, values = np.insert(t_s, wide, t_s[wide]), np.insert(values, wide, np.nan)
     parts = [
         frame(area, second_ticks(area), degree_ticks(area), "degrees"),
-        line(area, *_broken(found.t_s, values), "imu"),
+        line(area, t_s, values, "imu"),
     ]
     caption = f"{name}: difference over time, RMS {degree(found.rms)}"
     return figure(image(_HALF, 200.0, caption, parts), caption)
-
-
-def _broken(t_s: Array, values: Array) -> tuple[Array, Array]:
-    """Insert NaN where the cameras saw nothing for a while, so that no line bridges it."""
-    if len(t_s) < 2:  # noqa: PLR2004 - a gap has two ends
-        return t_s, values
-    wide = np.flatnonzero(np.diff(t_s) > 5.0 * np.median(np.diff(t_s))) + 1
-    return np.insert(t_s, wide, t_s[wide]), np.insert(values, wide, np.nan)
 
 
 def _agreement_figure(found: AngleDifference) -> str:

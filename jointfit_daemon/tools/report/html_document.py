@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from functools import cache
 from html import escape
 from importlib.resources import files
 from typing import TYPE_CHECKING
@@ -41,7 +40,13 @@ class Link(str):
 
 def document(title: str, body: str) -> str:
     """Return a page; `body` is HTML, the title is escaped."""
-    style = _style()
+    tools = files("jointfit_daemon.tools")
+    theme = (tools / "dashboard" / "page" / "css" / "theme.css").read_text("utf-8")
+    own = (tools / "report" / "report.css").read_text("utf-8")
+
+    # Colours of the dashboard, but paper is white, whatever the colours of the screen.
+    dark = "(prefers-color-scheme: dark)"
+    style = f"{theme.replace(dark, f'screen and {dark}')}\n{own}"
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
@@ -57,17 +62,6 @@ def document(title: str, body: str) -> str:
 def footer(text: str) -> str:
     """Return the end of a page, with the version of the software."""
     return f"<footer><p>{escape(text)}</p><p>Made by jointfitd {__version__}.</p></footer>"
-
-
-@cache
-def _style() -> str:
-    """Return the style sheet: colours of the dashboard, and the layout of the report."""
-    tools = files("jointfit_daemon.tools")
-    theme = (tools / "dashboard" / "page" / "css" / "theme.css").read_text("utf-8")
-    own = (tools / "report" / "report.css").read_text("utf-8")
-    # Paper is white, whatever the colours of the screen.
-    dark = "(prefers-color-scheme: dark)"
-    return f"{theme.replace(dark, f'screen and {dark}')}\n{own}"
 
 
 def section(anchor: str, title: str, parts: Iterable[str]) -> str:
