@@ -32,7 +32,7 @@ from tests.limb_model.plain_calibration import plain_calibration
 from tests.system.station import Listener, broker, sensors_in
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator, Callable
+    from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 
     from tests.broker_fixture import Broker
     from tests.faults.scenario import Kind
@@ -244,6 +244,41 @@ class Gateway:
         answer: dict[str, Any] = await self.listener.client.request(name, arguments)
         return answer
 
+    async def start_fit(self) -> set[int]:
+        """Begin a static phase at rest; return the processes of its fit once they run."""
+        self.rest(resting=True)
+        await asyncio.sleep(0.5)
+        answer = await self.request("calibrate", phase="static", seconds=2.0, force=True)
+        assert answer["status"] == "accepted", answer
+        async with asyncio.timeout(30.0):
+            while not (workers := _children(self.pid)):
+                await asyncio.sleep(0.002)
+        return workers
+
+    @contextlib.contextmanager
+    def other_broker(self, other: Broker) -> Iterator[None]:
+        """Run another broker in place of the broker."""
+        self.broker.stop()
+        other.start()
+        try:
+            yield
+        finally:
+            other.stop()
+            self.broker.start()
+
+    @contextlib.asynccontextmanager
+    async def other_server(
+        self, serve: Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]]
+    ) -> AsyncIterator[None]:
+        """Serve the connections of the daemon in place of the broker."""
+        self.broker.stop()
+        port = self.broker.port
+        try:
+            async with await asyncio.start_server(serve, "127.0.0.1", port, reuse_address=True):
+                yield
+        finally:
+            self.broker.start()
+
     async def logged(self, text: str, since: int = 0) -> float:
         """Wait for a text in the log behind its first `since` characters; return the time, s."""
         return await self.seconds(lambda: text in self.log[since:])
@@ -358,6 +393,17 @@ class Gateway:
         t_us = [pose["t_us"] for pose in self.listener.poses[max(0, since - 1) :]]
         steps = [after - before for before, after in itertools.pairwise(t_us)]
         return max(steps, default=0) / 1e6
+
+
+def _children(pid: int) -> set[int]:
+    """Return the processes that a process has started and that run."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            text = path.read_text("utf-8", "replace")
+            if int(text.rpartition(")")[2].split()[1]) == pid:
+                found.add(int(path.parent.name))
+    return found
 
 
 @contextlib.asynccontextmanager

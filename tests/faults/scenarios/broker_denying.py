@@ -18,13 +18,8 @@ async def run(gateway: Gateway) -> Outcome:
     rights.chmod(0o600)
     denying = MosquittoBroker(gateway.folder, port=gateway.broker.port, more=f"acl_file {rights}\n")
     since = len(gateway.log)
-    gateway.broker.stop()
-    denying.start()
-    try:
+    with gateway.other_broker(denying):
         noticed_s = await gateway.logged("the broker refuses messages on", since)
-    finally:
-        denying.stop()
-        gateway.broker.start()
     recovered_s = await gateway.used("S1", "S2")
     return Outcome(noticed_s, recovered_s, 0.0, 0)
 

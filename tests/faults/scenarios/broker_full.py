@@ -17,7 +17,6 @@ QUOTA_EXCEEDED = b"\x20\x03\x00\x97\x00"
 async def run(gateway: Gateway) -> Outcome:
     """Answer every connection with the reason code for a used-up quota."""
     since = len(gateway.log)
-    gateway.broker.stop()
 
     async def refuse(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         await reader.read(1)
@@ -26,13 +25,9 @@ async def run(gateway: Gateway) -> Outcome:
         await reader.read(1000)
         writer.close()
 
-    server = await asyncio.start_server(
-        refuse, "127.0.0.1", gateway.broker.port, reuse_address=True
-    )
-    async with server:
+    async with gateway.other_server(refuse):
         noticed_s = await gateway.logged("quota", since)
         await asyncio.sleep(1.0)
-    gateway.broker.start()
     recovered_s = await gateway.used("S1", "S2")
     return Outcome(noticed_s, recovered_s, 0.0, 0)
 

@@ -18,14 +18,9 @@ async def run(gateway: Gateway) -> Outcome:
         gateway.folder, port=gateway.broker.port, more="allow_anonymous false\n"
     )
     since = len(gateway.log)
-    gateway.broker.stop()
-    refusing.start()
-    try:
+    with gateway.other_broker(refusing):
         noticed_s = await gateway.logged("correct username and password_file", since)
         await asyncio.sleep(1.0)
-    finally:
-        refusing.stop()
-        gateway.broker.start()
     recovered_s = await gateway.used("S1", "S2")
     return Outcome(noticed_s, recovered_s, 0.0, 0)
 

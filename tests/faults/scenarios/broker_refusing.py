@@ -13,18 +13,13 @@ if TYPE_CHECKING:
 
 async def run(gateway: Gateway) -> Outcome:
     """Replace the broker by a server that closes every connection."""
-    gateway.broker.stop()
 
     async def refuse(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.close()
 
-    server = await asyncio.start_server(
-        refuse, "127.0.0.1", gateway.broker.port, reuse_address=True
-    )
-    async with server:
+    async with gateway.other_server(refuse):
         noticed_s = await gateway.disconnected()
         await asyncio.sleep(1.0)
-    gateway.broker.start()
     recovered_s = await gateway.used("S1", "S2")
     return Outcome(noticed_s, recovered_s, 0.0, 0)
 

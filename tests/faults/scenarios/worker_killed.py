@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
 import os
 import signal
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tests.faults.scenario import Outcome, Scenario
@@ -15,30 +12,10 @@ if TYPE_CHECKING:
     from tests.faults.gateway import Gateway
 
 
-def children(pid: int) -> list[int]:
-    """Return the processes that a process has started and that run."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            text = path.read_text("utf-8", "replace")
-            if int(text.rpartition(")")[2].split()[1]) == pid:
-                found.append(int(path.parent.name))
-    return found
-
-
 async def run(gateway: Gateway) -> Outcome:
     """Kill the worker of a static phase, and repeat the phase."""
     since = len(gateway.listener.poses)
-    gateway.rest(resting=True)
-    await asyncio.sleep(0.5)
-    answer = await gateway.request("calibrate", phase="static", seconds=2.0, force=True)
-    assert answer["status"] == "accepted", answer
-    loop = asyncio.get_running_loop()
-    until_s = loop.time() + 30.0
-    while not (workers := children(gateway.pid)):
-        assert loop.time() < until_s, "no worker was started"
-        await asyncio.sleep(0.002)
-    for worker in workers:
+    for worker in await gateway.start_fit():
         os.kill(worker, signal.SIGKILL)
     noticed_s = await gateway.seconds(
         lambda: (

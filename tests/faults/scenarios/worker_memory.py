@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 import resource
 from typing import TYPE_CHECKING
 
 from tests.faults.scenario import Outcome, Scenario
-from tests.faults.scenarios.worker_killed import children
 
 if TYPE_CHECKING:
     from tests.faults.gateway import Gateway
@@ -19,16 +17,7 @@ LIMIT_BYTES = 30_000_000
 async def run(gateway: Gateway) -> Outcome:
     """Limit the address space of the worker of a static phase."""
     since = len(gateway.listener.poses)
-    gateway.rest(resting=True)
-    await asyncio.sleep(0.5)
-    answer = await gateway.request("calibrate", phase="static", seconds=2.0, force=True)
-    assert answer["status"] == "accepted", answer
-    loop = asyncio.get_running_loop()
-    until_s = loop.time() + 30.0
-    while not (workers := children(gateway.pid)):
-        assert loop.time() < until_s, "no worker was started"
-        await asyncio.sleep(0.002)
-    for worker in workers:
+    for worker in await gateway.start_fit():
         resource.prlimit(worker, resource.RLIMIT_AS, (LIMIT_BYTES, LIMIT_BYTES))
     noticed_s = await gateway.seconds(
         lambda: (
