@@ -31,7 +31,11 @@ from jointfit_daemon.outputs.mqtt._connection import (
     Outgoing,
     stop_if_cancelled,
 )
-from jointfit_daemon.outputs.mqtt._error_messages import CONNECTION_CLOSED, CONNECTION_LOST
+from jointfit_daemon.outputs.mqtt._error_messages import (
+    CONNECTION_CLOSED,
+    CONNECTION_LOST,
+    NO_ANSWER,
+)
 from jointfit_daemon.outputs.mqtt._secret_files import missing_password, security_warnings
 from jointfit_daemon.outputs.token_bucket import TokenBucket
 from jointfit_daemon.outputs.topics import OFFLINE, ONLINE
@@ -195,7 +199,9 @@ class MqttPublisher:
                 delay_s = _FIRST_RETRY_S
 
             try:
-                if not await self._gave_way(lasted_s):
+                # A takeover closes the connection, so a broker that fell silent is not one.
+                silent = NO_ANSWER in reason
+                if silent or not await self._gave_way(lasted_s):
                     self._report_loss(reason, lasted_s)
             except BrokerLostError as lost:
                 self._report(str(lost))

@@ -195,6 +195,28 @@ async def test_takeover_reason_of_the_broker_suffices(caplog: pytest.LogCaptureF
     await asyncio.gather(*filter(None, serving))
 
 
+@pytest.mark.usefixtures("unseen")
+async def test_broker_that_falls_silent_raises_no_suspicion(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("jointfit_daemon.outputs.mqtt._connection.ANSWER_S", 0.1)
+    serving: list[asyncio.Task[None] | None] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        serving.append(asyncio.current_task())
+        await reader.read(1000)
+        writer.write(CONNACK)
+        while await reader.read(1000):  # reads everything, answers nothing
+            pass
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    async with server, daemon_link(server.sockets[0].getsockname()[1], "5") as link:
+        await until(lambda: link.connects >= 3)
+        assert link._takeovers._losses == 0
+    await asyncio.gather(*filter(None, serving))
+
+
 def test_one_short_connection_raises_suspicion_only_with_a_reason() -> None:
     detector = TakeoverDetector()
     assert detector.suspects(0.1, taken_over=True)
