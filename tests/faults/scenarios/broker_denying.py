@@ -21,6 +21,7 @@ async def run(gateway: Gateway) -> Outcome:
     with gateway.other_broker(denying):
         noticed_s = await gateway.logged("the broker refuses messages on", since)
     recovered_s = await gateway.used("S1", "S2")
+    await gateway.seconds(lambda: not gateway.listener.latest["bridge/health"]["link"]["denied"])
     return Outcome(noticed_s, recovered_s, 0.0, 0)
 
 
