@@ -8,7 +8,7 @@ STAMP  := $(VENV)/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root faults endurance fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom release vendor audit lock clean
+.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root faults endurance load fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom release vendor audit lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -63,6 +63,9 @@ faults: $(STAMP)  ## every fault of docs/reliability.md on the real daemon (ARGS
 
 endurance: $(STAMP)  ## the daemon for 50 million samples, faster than real time: nothing grows (ARGS="--samples 1000000")
 	@$(BIN)/python -m tests.endurance $(ARGS)
+
+load: $(STAMP)  ## every input of the daemon at its full rate for 30 minutes: nothing is lost (ARGS="--minutes 1")
+	@$(BIN)/python -m tests.load $(ARGS)
 
 $(VENV)/.fuzz: $(STAMP)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --group fuzz

@@ -14,6 +14,8 @@ from jointfit_daemon.outputs.mqtt import NoAnswerError
 from tests.endurance.slopes import RESULTS as ENDURANCE
 from tests.endurance.slopes import table_of
 from tests.faults.gateway import running_gateway
+from tests.load.table import RESULTS as LOAD
+from tests.load.table import table_of as load_table_of
 
 if TYPE_CHECKING:
     from tests.broker_fixture import Broker
@@ -133,6 +135,9 @@ def render(results: dict[str, Any]) -> str:
     samples = f"{endurance['samples']:,}".replace(",", " ")
     factor = f"{endurance['factor']} times real time"
     page = page.replace("{samples}", samples).replace("{factor}", factor)
+    load = json.loads(LOAD.read_text("utf-8"))
+    page = page.replace("{minutes}", f"{load['seconds'] / 60.0:g}")
+    page = page.replace("{load}", load_table_of(load))
     return page.replace("{slopes}", table_of(endurance))
 
 

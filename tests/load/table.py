@@ -1,0 +1,34 @@
+"""The table of ``make load`` on docs/reliability.md."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).parent / "results.json"
+COUNTERS = ("lost", "corrupt", "dropped", "late")
+
+
+def table_of(results: dict[str, Any]) -> str:
+    """Return the counts of all inputs as a table."""
+    rows = [
+        f"| input | rate, Hz | sent | received | {' | '.join(COUNTERS)} |",
+        "| --- | --: | --: | --: | --: | --: | --: | --: |",
+    ]
+    for name, found in results["inputs"].items():
+        counts = " | ".join(str(found[key]) for key in COUNTERS)
+        rows.append(
+            f"| {name} | {found['rate_hz']} | {found['sent']} | {found['received']} | {counts} |"
+        )
+    return "\n".join(rows)
+
+
+def faults_of(results: dict[str, Any]) -> list[str]:
+    """Return the inputs with samples that were not received, or have no outcome."""
+    return [
+        f"{name}: {found}"
+        for name, found in results["inputs"].items()
+        if found["sent"] != found["received"]
+        or found["unaccounted"]
+        or any(found[key] for key in ("lost", "corrupt", "dropped"))
+    ]
