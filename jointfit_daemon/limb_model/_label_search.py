@@ -64,6 +64,9 @@ _NEAR_M = 0.025
 """RMS residual up to which a label is at the place of a hidden marker, m."""
 _TOLERANCE_M = 0.03
 """Greatest difference of the distance of two markers from that in the cluster, m."""
+_MOST_COMPARED = 12
+"""Markers of a cluster up to which all exchanges are compared, 5000; their number grows with the
+fourth power. Of more markers, each is exchanged with its nearest one."""
 _MOST_CHANGED = 4
 """Largest number of changed labels in one cluster."""
 _BEST = 16
@@ -424,12 +427,19 @@ def _suspicious_rms(template: Array) -> float:
     It is smaller for a cluster that looks almost the same after an exchange of its labels.
     """
     count = len(template)
-    orders = [
-        order
-        for moved in (2, 3, 4)
-        for rows in combinations(range(count), moved)
-        for order in _orders(count, rows)
-    ]
+    if count <= _MOST_COMPARED:
+        orders = [
+            order
+            for moved in (2, 3, 4)
+            for rows in combinations(range(count), moved)
+            for order in _orders(count, rows)
+        ]
+    else:
+        # A rigid fit hardly absorbs few exchanges among many markers, so close ones look alike.
+        distances = np.linalg.norm(template[:, None] - template, axis=2)
+        np.fill_diagonal(distances, np.inf)
+        pairs = {(min(a, b), max(a, b)) for a, b in enumerate(distances.argmin(axis=1).tolist())}
+        orders = [order for rows in sorted(pairs) for order in _orders(count, rows)]
     if not orders:
         return SUSPICIOUS_M
     tiled = np.broadcast_to(template, (len(orders), count, 3))

@@ -44,6 +44,16 @@ def test_residuals_are_those_of_the_fit_of_a_trial() -> None:
             assert found[p] == pytest.approx(expected, abs=1e-9, nan_ok=True)
 
 
+def test_a_cluster_of_hundreds_of_markers_is_searched_and_fits() -> None:
+    points = np.random.default_rng(3).uniform(-0.2, 0.2, (300, 3))
+    names = tuple(f"M{i}" for i in range(300))
+    upright = np.array((1.0, 0.0, 0.0, 0.0))
+    cluster = MarkerCluster("thigh", names, None, points, np.zeros(3), upright)
+    finding = LabelSearch([cluster]).explain(points)
+    assert finding.rms[0] < 1e-9
+    assert finding.faults == ()
+
+
 @pytest.mark.parametrize("labels", EXCHANGES, ids="-".join)
 def test_an_exchange_is_named_in_most_frames_and_hardly_ever_another_one(
     labels: tuple[str, ...],

@@ -36,7 +36,7 @@ from jointfit_daemon.limb_model import axis_heading_one, inner_joints, up_one
 from jointfit_daemon.model import FrameFlag
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping
+    from collections.abc import Collection, Mapping, Sequence
 
     from jointfit_daemon.fusion.faults._sensor_monitor import SensorReport
     from jointfit_daemon.limb_model import Calibration, InnerJoint, SensorLink
@@ -55,6 +55,23 @@ REPORTED_DRIFT = radians(5.0)
 """Heading drift that is reported, rad."""
 MAJORITY = 3
 """Fewest sensors on a segment among which a slipped one can be identified."""
+MOST_PAIRED = 5
+"""Sensors of a segment up to which every pair is compared. The number of pairs grows with their
+square."""
+
+
+def compared_pairs(group: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the pairs of sensors of one segment that are compared, in the order of `group`.
+
+    Of many sensors, the first is compared with all others, and each of these with its neighbours in
+    a ring. A single slipped sensor then contradicts exactly its own pairs, also if one is lost.
+    """
+    pairs, last = combinations(range(len(group)), 2), len(group) - 1
+    return [
+        (group[i], group[k])
+        for i, k in pairs
+        if len(group) <= MOST_PAIRED or i == 0 or k == i + 1 or (i, k) == (1, last)
+    ]
 
 
 class ConsistencyResult(NamedTuple):
@@ -87,7 +104,7 @@ class ConsistencyMonitor:
     ) -> None:
         self._chain = chain
         links = {(link.a, link.b): link for link in calibration.links}
-        couples = [[*combinations(group, 2)] for group in chain.sensors]
+        couples = [compared_pairs(group) for group in chain.sensors]
         self._pairs = [
             [SlipDetector(links.get(pair) or untrained_link(*pair)) for pair in pairs]
             for pairs in couples
@@ -384,7 +401,13 @@ class ConsistencyMonitor:
             if pair.inconsistent and pair.link.a in present and pair.link.b in present
         ]
         for name in present:
-            if len(inconsistent) == len(present) - 1 and all(name in p for p in inconsistent):
+            own = sum(
+                name in (pair.link.a, pair.link.b)
+                and pair.link.a in present
+                and pair.link.b in present
+                for pair in self._pairs[i]
+            )
+            if own > 1 and len(inconsistent) == own and all(name in p for p in inconsistent):
                 return name
         return None
 

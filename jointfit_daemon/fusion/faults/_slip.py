@@ -8,7 +8,7 @@ as consistent after the difference has been well below the limit for a longer ti
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from math import exp, hypot, radians, sqrt
 from typing import TYPE_CHECKING
 
@@ -59,14 +59,14 @@ def pair_corrections(pairs: Sequence[SlipDetector]) -> dict[str, Quaternion]:
     Every sensor gets an equal share of the excess of its pairs, so none is preferred. The rotations
     are in segment axes.
     """
-    names = {name for pair in pairs for name in (pair.link.a, pair.link.b)}
+    of_sensor = Counter(name for pair in pairs for name in (pair.link.a, pair.link.b))
     corrections = {}
 
-    for name in names:
+    for name, count in of_sensor.items():
         x = y = z = 0.0
         for pair in pairs:
             if pair.exceeded and name in (pair.link.a, pair.link.b):
-                share = (1.0 if name == pair.link.a else -1.0) / len(names)
+                share = (1.0 if name == pair.link.a else -1.0) / (count + 1)
                 vx, vy, vz = pair.excess_vector
                 x, y, z = x + share * vx, y + share * vy, z + share * vz
         corrections[name] = exp_one((x, y, z))

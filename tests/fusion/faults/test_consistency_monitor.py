@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from jointfit_daemon.calibration.phases import fit_static
 from jointfit_daemon.calibration.phases._static_pose import fit_static_only
 from jointfit_daemon.fusion import LimbFuser
+from jointfit_daemon.fusion.faults._consistency_monitor import compared_pairs
 from jointfit_daemon.kinematics import rotation
 from jointfit_daemon.limb_model import Calibration
 from tests.calibration.synthetic_limb import (
@@ -226,8 +228,20 @@ def test_disturbed_segment_preserves_joint_angles_and_makes_headings_uncertain(
     assert states[-1].flags == ()
 
 
-def test_slipped_sensor_of_three_is_identified_and_excluded() -> None:
-    chain = replace(CHAIN, sensors=(("S1", "S2", "S3"), ("S4",)))
+def test_the_number_of_compared_pairs_grows_with_that_of_the_sensors() -> None:
+    groups = [[f"S{i}" for i in range(count)] for count in (2, 5, 6, 16, 32)]
+    assert [len(compared_pairs(group)) for group in groups] == [1, 10, 10, 30, 62]
+    for group in groups[2:]:
+        for lost in (None, *group):  # each sensor keeps two partners, whichever other one is lost
+            partners = Counter(
+                n for pair in compared_pairs(group) if lost not in pair for n in pair
+            )
+            assert min(partners.values()) >= 2
+
+
+@pytest.mark.parametrize("thigh", [("S1", "S2", "S3"), ("S1", "S2", "S3", "S5", "S6", "S7", "S8")])
+def test_slipped_sensor_of_several_is_identified_and_excluded(thigh: tuple[str, ...]) -> None:
+    chain = replace(CHAIN, sensors=(thigh, ("S4",)))
     rng = np.random.default_rng(5)
     t_s = np.arange(0.0, 20.0, 0.04)
     swing = Rotation.from_rotvec(np.outer(0.5 * np.sin(4 * t_s), [1.0, 0.0, 0.0]))
@@ -238,6 +252,8 @@ def test_slipped_sensor_of_three_is_identified_and_excluded() -> None:
             q = swing**share * scatter if share < 1 else swing * scatter
             mounted[name] = q.as_quat(scalar_first=True)
     static = record(SUBJECT, motion(SUBJECT, 6.0, 400.0, still=True), 1, cameras=False)
+    more = dict.fromkeys(thigh, static.sensors["S1"])
+    static = replace(static, sensors=more | dict(static.sensors))
     pose = fit_static(static, SETTINGS, chain)
     calibration = fit_static_only(pose, None, chain)
     bias = {s: item.q_sensor_segment for s, item in calibration.sensor.items()}
@@ -247,7 +263,7 @@ def test_slipped_sensor_of_three_is_identified_and_excluded() -> None:
     assert {name for _, name, _ in reported} == {"thigh"}
     assert reported[0][0] < 10.0
     assert "slipped:S2" in states[-1].flags
-    assert states[-1].segments[0].used == ("S1", "S3")
+    assert states[-1].segments[0].used == tuple(name for name in thigh if name != "S2")
     clean = play(LimbFuser(chain, calibration), t_s, measured)[0]
     apart = rotation.angle_between(oriented(states, 0)[-1], oriented(clean, 0)[-1])
     assert np.degrees(apart) < 1.0
