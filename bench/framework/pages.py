@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.framework import storage
+from bench.framework.growth_plot import growth_plot
 from bench.framework.table import markdown_table, value_text
 
 if TYPE_CHECKING:
@@ -64,12 +65,13 @@ def write(docs: Path = ROOT / "docs") -> list[Path]:
 
 
 def render_all() -> dict[str, str]:
-    """Return the generated pages by their path below docs."""
+    """Return the generated pages and drawings by their path below docs."""
     stored.cache_clear()
-    return {
+    written = {
         path.relative_to(TEMPLATES).as_posix(): render(path.read_text(encoding="utf-8"))
         for path in sorted(TEMPLATES.rglob("*.md"))
     }
+    return written | {"pictures/growth.svg": growth_plot()}
 
 
 def render(template: str) -> str:

@@ -33,23 +33,24 @@ BITSTREAM = (3, 1)
 _SERVER = ServerInfo("Motive", (2, 3, 0, 0), (3, 1, 0, 0), 10_000_000)
 
 
-def xbus_messages(orientations: Sequence[Quaternion], period_ns: int) -> list[bytes]:
+def xbus_message(number: int, ticks: int, q: Quaternion) -> bytes:
     """Counter, time, status and quaternion: the outputs of a configured MTi."""
-    quaternion = mtdata2.real_id(mtdata2.Item.QUATERNION)
-    return [
-        xbus.encode(
-            xbus.XbusMessageId.MT_DATA2,
-            mtdata2.encode_items(
-                [
-                    (mtdata2.Item.PACKET_COUNTER, k & 0xFFFF),
-                    (mtdata2.Item.SAMPLE_TIME_FINE, k * period_ns // TICK_NS),
-                    (mtdata2.Item.STATUS_WORD, 2),
-                    (quaternion, q),
-                ]
-            ),
-        )
-        for k, q in enumerate(orientations)
-    ]
+    return xbus.encode(
+        xbus.XbusMessageId.MT_DATA2,
+        mtdata2.encode_items(
+            [
+                (mtdata2.Item.PACKET_COUNTER, number & 0xFFFF),
+                (mtdata2.Item.SAMPLE_TIME_FINE, ticks & 0xFFFFFFFF),
+                (mtdata2.Item.STATUS_WORD, 2),
+                (mtdata2.real_id(mtdata2.Item.QUATERNION), q),
+            ]
+        ),
+    )
+
+
+def xbus_messages(orientations: Sequence[Quaternion], period_ns: int) -> list[bytes]:
+    """One message per sample."""
+    return [xbus_message(k, k * period_ns // TICK_NS, q) for k, q in enumerate(orientations)]
 
 
 def xcdi_frames(

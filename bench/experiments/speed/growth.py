@@ -1,0 +1,166 @@
+"""Growth of the core's CPU time and memory with sensors, segments and markers.
+
+A rig of each size is fed the same way: all chunks of a frame, then the next frame. The sizes take
+turns, so that a busy machine slows all of them. The cost of a size is the median over the turns of
+the mean CPU time of a frame.
+"""
+
+from __future__ import annotations
+
+import gc
+import statistics
+import time
+from functools import partial
+from typing import TYPE_CHECKING
+
+from bench.experiments.timing.memory import held
+from bench.framework.experiment import Result
+from bench.framework.exponents import growth_exponent
+from bench.framework.measurement import speed_experiment, timed_result
+from bench.subjects.growing_rigs import BEGIN_NS, GrowingRig
+from jointfit_daemon.model import LimbState
+from jointfit_daemon.pipeline import Core
+from jointfit_daemon.pipeline.events import Configured, SourceOpened
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+SENSORS = (1, 2, 4, 8, 16, 32)
+SEGMENTS = (1, 2, 4, 8, 16)
+MARKERS = (3, 10, 30, 100, 300)
+SETTLE = 300
+"""Frames in which clocks and windows of a new core settle, not measured."""
+ROUNDS, QUICK_ROUNDS = 15, 3
+BLOCK = 100
+"""Frames whose mean CPU time is one measurement."""
+LARGEST = 1.05
+"""Threshold of the exponents in sensors, segments and markers."""
+
+
+class LoadedCore:
+    """A core with its rig, and the number of the next frame."""
+
+    def __init__(self, rig: GrowingRig) -> None:
+        self._rig = rig
+        self.core = Core()
+        configured = rig.rig()
+        calibration = rig.calibration(configured.chain)
+        assert calibration.fits(configured.chain)
+        self.core.feed(Configured(BEGIN_NS, configured, calibration, 1))
+        for source in configured.sources:
+            self.core.feed(SourceOpened(BEGIN_NS, source.id))
+        for event in rig.opening():
+            self.core.feed(event)
+        self._next = 0
+
+    def cpu_s(self, count: int) -> float:
+        """Feed frames; return the mean CPU time of one, s."""
+        frames = [self._rig.frame(k) for k in range(self._next, self._next + count)]
+        self._next += count
+        core, states, spent = self.core, 0, 0.0
+        for events in frames:
+            began = time.thread_time()
+            for event in events:
+                outputs = core.feed(event)
+                _ = core.next_deadline_ns  # the runner requests it after every event
+                states += sum(isinstance(output, LimbState) for output in outputs)
+            spent += time.thread_time() - began
+        assert abs(states - count) <= 3, f"{states} limb states of {count} frames"
+        return spent / count
+
+
+def frame_costs(rigs: Mapping[int, GrowingRig], rounds: int) -> dict[int, float]:
+    """Return the CPU time of a frame by size, s: the sizes take turns."""
+    cores = {size: LoadedCore(rig) for size, rig in rigs.items()}
+    for core in cores.values():
+        core.cpu_s(SETTLE)
+    times: dict[int, list[float]] = {size: [] for size in rigs}
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(rounds):
+            for size, core in cores.items():
+                times[size].append(core.cpu_s(BLOCK))
+    finally:
+        gc.enable()
+    return {size: statistics.median(found) for size, found in times.items()}
+
+
+def size_rows(
+    name: str,
+    make: Callable[[int], GrowingRig],
+    sizes: tuple[int, ...],
+    quick: bool,
+) -> list[Result]:
+    """Return the exponent in one size, the marginal cost of the largest step, and all costs."""
+    costs = frame_costs({size: make(size) for size in sizes}, QUICK_ROUNDS if quick else ROUNDS)
+    us = [1e6 * costs[size] for size in sizes]
+    found = growth_exponent(sizes, us)
+    step = (us[-1] - us[-2]) / (sizes[-1] - sizes[-2])
+    return [
+        # a short run has too few frames for the threshold: it finds only a cost that explodes
+        Result(
+            f"{name}: exponent", round(found.value, 3), 1.5 if quick else LARGEST, unit="",
+            note=f"± {found.half_width:.3f}, {sizes[0]} to {sizes[-1]}",
+        ),
+        timed_result(f"{name}: one more of {sizes[-1]}", round(step, 2), "µs a frame"),
+        *(
+            timed_result(f"{name}: {size}", round(cost, 1), "µs a frame")
+            for size, cost in zip(sizes, us, strict=True)
+        ),
+    ]  # fmt: skip
+
+
+def memory_rows(quick: bool) -> list[Result]:
+    """Return the memory of the core for each sensor, and the time to configure a core."""
+    sizes = (1, 8, 32)
+    kib, start_ms = [], []
+    for size in sizes:
+        rig = GrowingRig(1, size)
+        LoadedCore(rig)  # warm up
+        began = time.thread_time()
+        core = LoadedCore(rig)
+        start_ms.append(1e3 * (time.thread_time() - began))
+        core.cpu_s(SETTLE if quick else 4 * SETTLE)
+        core.core.health(BEGIN_NS)
+        kib.append(held(core.core, 0.0).size / 1024)
+    return [
+        timed_result("memory: one sensor", round(kib[0], 1), "KiB"),
+        timed_result(
+            "memory: each further sensor", round((kib[-1] - kib[0]) / (sizes[-1] - sizes[0]), 1),
+            "KiB", 40, 80,
+        ),
+        timed_result("start: rig and core of one sensor", round(start_ms[0], 2), "ms"),
+        timed_result(
+            f"start: rig and core of {sizes[-1]} sensors", round(start_ms[-1], 2), "ms", 50, 500
+        ),
+    ]  # fmt: skip
+
+
+def sensor_rows(quick: bool) -> list[Result]:
+    """Sensors of one segment, and the memory of each."""
+    rows = size_rows("sensors of a segment", partial(GrowingRig, 1), SENSORS, quick)
+    return rows + memory_rows(quick)
+
+
+def segment_rows(quick: bool) -> list[Result]:
+    """Segments with one sensor each."""
+    return size_rows("segments", lambda count: GrowingRig(count, 1), SEGMENTS, quick)
+
+
+def marker_rows(quick: bool) -> list[Result]:
+    """Markers of one segment, with one sensor; and the configuration with the most markers."""
+    rows = size_rows("markers", lambda count: GrowingRig(1, 1, count), MARKERS, quick)
+    rig = GrowingRig(1, 1, MARKERS[-1])
+    began = time.thread_time()
+    LoadedCore(rig)
+    took_s = time.thread_time() - began
+    name = f"start: rig and core of {MARKERS[-1]} markers"
+    return [*rows, timed_result(name, round(1e3 * took_s, 1), "ms", 100, 1000)]
+
+
+EXPERIMENTS = (
+    speed_experiment("growth-sensors", "Growth with the sensors of a segment", sensor_rows),
+    speed_experiment("growth-segments", "Growth with the segments of a limb", segment_rows),
+    speed_experiment("growth-markers", "Growth with the markers of a segment", marker_rows),
+)
