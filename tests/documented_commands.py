@@ -60,6 +60,7 @@ NOT_RUN = {
     r"^jointfit report ": "needs a recording: tests/tools/report makes one",
     r"^jointfit batch ": "needs recordings: tests/tools/batch makes some",
     r"^dask ": "runs until it is stopped: tests/tools/batch starts a cluster",
+    r"SHA256SUMS": "needs the files of a release: tests/packaging/test_release.py makes one",
     r"/dev/|^candump |^ip link|^udevadm ": "needs hardware",
 }
 """Patterns of commands that a test cannot run, each with the reason."""

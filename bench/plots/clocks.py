@@ -35,7 +35,7 @@ def run(directory: Path, recorded: Path | None) -> list[Path]:
     Raises
     ------
     ValueError
-        The file is no recording, or contains no sample.
+        The file is not a recording, or contains no sample.
     OSError
         The file cannot be read, or the plots cannot be written.
     """

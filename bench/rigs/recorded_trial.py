@@ -79,7 +79,7 @@ class Gateway:
     sensors: dict[int, dict[str, Any]] = field(default_factory=dict)
     """Sensors of `sensors/pose` by frame number."""
     regression: dict[str, Any] = field(default_factory=dict)
-    """Coefficients of `calibration` by segment; empty if the method is no regression."""
+    """Coefficients of `calibration` by segment; empty if the method is not a regression."""
     _phases: asyncio.Queue[dict[str, Any]] = field(default_factory=asyncio.Queue)
 
     async def listen(self) -> None:

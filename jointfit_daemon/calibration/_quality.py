@@ -280,7 +280,7 @@ class CalibrationQuality:
     anatomy: AnatomyQuality
     holdout: HoldoutQuality
     regression: Mapping[str, RegressionQuality] | None = None
-    """Coefficients of every segment; None if the method is no regression."""
+    """Coefficients of every segment; None if the method is not a regression."""
 
 
 def sensor_rotations(sensors: Mapping[str, SensorCalibration]) -> dict[str, SensorRotations]:

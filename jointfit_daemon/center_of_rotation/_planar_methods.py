@@ -54,7 +54,7 @@ def circle(method: CircleMethod) -> MarkerFit:
 
 
 def running(p: Array, _: Movement) -> CenterEstimate:
-    """Estimate the center with `RunningCircle`, fed with one marker frame by frame."""
+    """Estimate the center with `RunningCircle` from the positions of one marker, frame by frame."""
     stream = RunningCircle(limits=LIMITS)
     for x, y in p.tolist():
         stream.feed(x, y)

@@ -398,7 +398,7 @@ def check_can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
 def missing_files(mqtt: MqttSettings) -> list[str]:
     """Return a warning for every configured file that does not exist.
 
-    It is no fault: the files may be created after the check, or by another user.
+    It is not a fault: the files may be created after the check, or by another user.
     """
     tls = mqtt.tls
     files = {"password_file": mqtt.password_file, "request_key_file": mqtt.request_key_file}

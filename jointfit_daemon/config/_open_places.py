@@ -88,6 +88,6 @@ def _filled_cameras(mocap: Mapping[str, Any]) -> tuple[dict[str, Any], list[Faul
 
 
 def with_known_ids(sources: Iterable[Source], faults: Iterable[Fault]) -> list[Source]:
-    """Return the sensors whose identifiers are no open place."""
+    """Return the sensors whose identifiers are not open places."""
     open_keys = {fault.key for fault in faults if fault.value == LATER}
     return [source for source in sources if f"imu[{source.id}].ids" not in open_keys]

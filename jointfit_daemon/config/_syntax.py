@@ -102,7 +102,7 @@ def _error_of(text: str) -> tuple[str, int | None] | None:
     except ValueError as error:  # an integer of 5000 digits is a plain ValueError
         found = _POSITION.fullmatch(str(error))
         if found is None or type(error) is ValueError:
-            return f"is no TOML value: {error}", None
+            return f"is not a TOML value: {error}", None
         return found[1], int(found[2]) if found[2] else None
     return None
 

@@ -70,7 +70,7 @@ class AlignedModel(SegmentModel):
     @classmethod
     @override
     def read(cls, data: Mapping[str, Any]) -> AlignedModel:
-        """Return the model of its JSON form."""
+        """Return the model described by its JSON form."""
         return cls(
             tuple(as_quaternion(q) for q in data["worlds"]),
             tuple(as_quaternion(q) for q in data["mounts"]),

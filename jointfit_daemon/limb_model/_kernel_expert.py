@@ -70,7 +70,7 @@ class KernelExpert:
 
     @staticmethod
     def read(data: Mapping[str, Any]) -> KernelExpert:
-        """Return the expert of its JSON form."""
+        """Return the expert described by its JSON form."""
         return KernelExpert(
             width=data["width"],
             tilted=data["tilted"],

@@ -145,7 +145,7 @@ class KernelModel(SegmentModel):
     @classmethod
     @override
     def read(cls, data: Mapping[str, Any]) -> KernelModel:
-        """Return the model of its JSON form."""
+        """Return the model described by its JSON form."""
         trend_x, trend_y = as_rows(data["trend"])
         return cls(
             sensors=data["sensors"],

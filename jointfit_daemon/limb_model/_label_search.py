@@ -284,7 +284,7 @@ class LabelSearch:
             own = self._own[p].tolist()
             place_of |= {c: s for c, s in zip(columns, own, strict=True) if c not in (-1, s)}
             kept = {c for others in best for c in others}
-            # A fit without one marker is always better: soft-tissue artefact is no fault.
+            # A fit without one marker is always better: soft-tissue artefact is not a fault.
             if rms[p] > DISPLACED_M:
                 elsewhere += [s for s in own if seen[s] and s not in kept]
         for label in elsewhere:

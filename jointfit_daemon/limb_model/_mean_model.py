@@ -45,5 +45,5 @@ class MeanModel(SegmentModel):
     @classmethod
     @override
     def read(cls, data: Mapping[str, Any]) -> MeanModel:
-        """Return the model of its JSON form."""
+        """Return the model described by its JSON form."""
         return cls(tuple(data["weights"]), data["residual_sd"])

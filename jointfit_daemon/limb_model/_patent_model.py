@@ -82,7 +82,7 @@ class PatentModel(SegmentModel):
     @classmethod
     @override
     def read(cls, data: Mapping[str, Any]) -> PatentModel:
-        """Return the model of its JSON form."""
+        """Return the model described by its JSON form."""
         return cls(
             data["reading"],
             tuple(tuple(row) for row in data["coefficients"]),

@@ -113,7 +113,7 @@ def explain_frames(received: Array) -> str:
 def _find_axes(q: Array) -> tuple[str, str] | None:
     """Return the vertical axis of the world and the printed axes, each as the nearest axis.
 
-    None if the rotations are no quarter turns, or their axes do not agree.
+    None if the rotations are not quarter turns, or their axes do not agree.
     """
     back = rotation.conjugate(q)
     world = rotation.log(rotation.multiply(q[1:], back[:-1]))

@@ -19,7 +19,7 @@ STILL_RAD = radians(1.5)
 """Largest deviation from the mean orientation during a rest, rad. Filters of devices settle more
 slowly than the hand."""
 MOVED_RAD = radians(45.0)
-"""Smallest rotation between two rests, rad: a pause on the way is no rest."""
+"""Smallest rotation between two rests, rad: a pause on the way is not a rest."""
 _FEWEST = 5
 """Samples that a rest needs."""
 _NS = 1_000_000_000

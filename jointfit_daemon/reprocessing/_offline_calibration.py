@@ -67,7 +67,7 @@ def calibrate_recording(
     ConfigError
         The recorded rig cannot be loaded, because a driver is not installed.
     ValueError, OSError
-        The file is no recording, or cannot be read.
+        The file is not a recording, or cannot be read.
     """
     run = _CalibrationRun(report)
     for event, outputs in process_events(

@@ -76,8 +76,8 @@ def process_events(
     Raises
     ------
     ReprocessingError
-        The first event is no configuration, or the rig or calibration of `changes` does not fit the
-        recording.
+        The first event is not a configuration, or the rig or calibration of `changes` does not fit
+        the recording.
     """
     core = core or Core()
     changed = None if changes is None or not changes.any else _ChangedRun(core, changes)

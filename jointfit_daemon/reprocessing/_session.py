@@ -51,7 +51,7 @@ def load_session(
     ConfigError
         The recorded rig cannot be loaded, because a driver is not installed.
     ValueError
-        The file is no recording.
+        The file is not a recording.
     OSError
         It cannot be read.
     """
@@ -114,7 +114,7 @@ def recorded_rig(path: Path) -> Rig:
     ConfigError
         The recorded rig cannot be loaded, because a driver is not installed.
     ValueError, OSError
-        The file is no recording, or cannot be read.
+        The file is not a recording, or cannot be read.
     """
     for event in read_events(path):
         if isinstance(event, Configured):

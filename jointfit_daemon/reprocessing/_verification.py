@@ -172,7 +172,7 @@ def verify_recording(path: Path) -> Verification:
     ConfigError
         The recorded rig cannot be loaded, because a driver is not installed.
     ValueError, OSError
-        The file is no recording, or cannot be read.
+        The file is not a recording, or cannot be read.
     """
     recording = open_recording(path)
     if recording.began_with_daemon:

@@ -167,7 +167,7 @@ def _objection(times: Array, rates: Array, cycle: tuple[float, float]) -> str | 
     if not SHORTEST_S <= end - start <= LONGEST_S:
         return (
             f"the movements repeat after less than {SHORTEST_S} s or more than {LONGEST_S} s, which"
-            " is no walking"
+            " is not walking"
         )
     inside = rates[(times >= start) & (times < end)]
     share = float((inside > 0.0).mean())

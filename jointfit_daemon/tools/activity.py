@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def show_activity(label: str) -> Iterator[None]:
-    """Show a moving bar and the elapsed time on standard error; nothing if that is no terminal."""
+    """Show a moving bar and the elapsed time on standard error if that is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 MOST_SHOWN = 8
 """Most identifiers in a message."""
 SHOWN = 60
-"""Most characters of a setting quoted in a message."""
+"""Maximum number of characters of a setting quoted in a message."""
 
 
 @dataclass(slots=True)

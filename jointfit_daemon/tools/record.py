@@ -33,7 +33,7 @@ def record(
     Exit codes: as for `jointfit request`.
     """
     if action not in ACTIONS:
-        raise ValueError(f"{action!r} is no action: expected {join_choices(ACTIONS)}")
+        raise ValueError(f"{action!r} is not an action: expected {join_choices(ACTIONS)}")
     if (action == "mark") is not bool(text):
         raise ValueError("expected a text after mark, and only there: jointfit record mark TEXT")
     if action == "mark":

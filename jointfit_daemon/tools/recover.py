@@ -23,7 +23,8 @@ def recover(
     """Copy the readable messages of a damaged recording to a clean file, and list what is missing.
 
     All commands read damaged recordings without it; other programs need a clean file. The source is
-    not changed. Exit codes: 0 copied; 1 the file cannot be read or written; 2 it is no recording.
+    not changed. Exit codes: 0 copied; 1 the file cannot be read or written; 2 it is not a
+    recording.
     """
     from jointfit_daemon.outputs.recording import repair_recording
 

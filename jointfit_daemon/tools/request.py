@@ -97,7 +97,9 @@ def send_request(
 
     settings = load_rig(rig).mqtt
     if "/" in name or any(letter in name for letter in "+#\0"):
-        raise ValueError(f"{name!r} is no name of a request: expected one word, such as selftest")
+        raise ValueError(
+            f"{name!r} is not the name of a request: expected one word, such as selftest"
+        )
 
     async def exchange() -> dict[str, Any]:
         async with MqttClient(settings) as client:

@@ -1,7 +1,8 @@
 """Interpreted instructions of each part of the frame's path: a gate that no neighbour disturbs.
 
 The counts are of the bytecode of the project's own functions, pure Python. They are equal on every
-machine and at any load. They contain no work of NumPy and other C code, which times show.
+machine and at any load. The counts do not include work done in NumPy or other C code, which times
+show.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ class Bno085Imu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is no serial port, the device is of another kind or in another mode, or it
+            The file is not a serial port, the device is of another kind or in another mode, or it
             does not accept the rate.
         """
         settings = self._settings

@@ -40,8 +40,8 @@ class LpmsImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is no serial port, no LPMS sensor answers, its speed, generation or address are
-            others, or it does not accept the settings.
+            The file is not a serial port, no LPMS sensor answers, its speed, generation or address
+            differ, or it does not accept the settings.
         """
         settings = self._settings
         await self._reception.run(

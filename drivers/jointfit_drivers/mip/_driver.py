@@ -42,7 +42,7 @@ class MipImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is no serial port, the speed is another, no MIP device answers, or it cannot
+            The file is not a serial port, the speed is another, no MIP device answers, or it cannot
             send the orientation at this rate.
         """
         settings = self._settings

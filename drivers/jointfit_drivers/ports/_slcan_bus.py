@@ -64,8 +64,8 @@ class SlcanBus:
         DeviceLostError
             The port is absent or in use, or the adapter refuses to open the bus.
         DeviceMisconfiguredError
-            The file is no serial port, the device does not answer in SLCAN, or it refuses the bit
-            rate.
+            The file is not a serial port, the device does not answer in SLCAN, or it refuses the
+            bit rate.
         """
         self._port.__enter__()
         try:

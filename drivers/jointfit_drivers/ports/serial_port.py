@@ -39,7 +39,7 @@ _WRITE_TIMEOUT_S = 2.0
 _NOT_A_PORT = frozenset(
     {errno.ENOTTY, errno.EINVAL, errno.EISDIR, errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG}
 )
-"""Error numbers of a file that is no terminal; all others concern the system or the hardware."""
+"""Error numbers of a file that is not a terminal; all others concern the system or the hardware."""
 
 _LOST: dict[int, str] = {
     errno.ENOENT: "is not there",
@@ -79,7 +79,7 @@ class SerialPort:
     DeviceLostError
         On entry: the port is absent, in use, or not permitted (yet). Later: unplugged or silent.
     DeviceMisconfiguredError
-        On entry: the file is no serial port, or the port does not support the speed.
+        On entry: the file is not a serial port, or the port does not support the speed.
     """
 
     def __init__(self, path: str, baud: int, key: str = "port") -> None:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from jointfit_drivers.ports._socket_stamps import ANCILLARY_BYTES, SocketStamps
 
 READ_BYTES = 1 << 16
-"""Most bytes of one read."""
+"""Maximum number of bytes of one read."""
 RECEIVE_BUFFER = 1 << 20
 """Requested receive buffer, bytes: half a second of large frames while the host is busy."""
 IDLE_S, PROBE_S, PROBES = 5, 2, 3

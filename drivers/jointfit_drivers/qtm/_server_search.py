@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk
 
 DISCOVERY_PORT = 22226
-"""UDP port at which QTM answers to discovery."""
+"""UDP port on which QTM answers discovery requests."""
 _TRIES = 3
-"""Requests to a network, because a datagram may be lost."""
+"""Number of discovery requests sent to each network, because a datagram may be lost."""
 
 
 class _Announcements(asyncio.DatagramProtocol):
-    """Answers at one local address, by the server that sent them."""
+    """Replies received at one local address, keyed by the address of the server."""
 
     def __init__(self) -> None:
         self.servers: dict[str, qtm.ServerAnnouncement] = {}
@@ -45,7 +45,7 @@ class _Announcements(asyncio.DatagramProtocol):
 
     @override
     def error_received(self, exc: Exception) -> None:
-        """Ignore refusals: the host does not answer."""
+        """Ignore ICMP errors such as "port unreachable": such a host does not answer."""
 
 
 async def find_servers(

@@ -53,7 +53,7 @@ class SerialTableImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is no serial port, or the received bytes contain no message of the table.
+            The file is not a serial port, or the received bytes contain no message of the table.
         """
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:

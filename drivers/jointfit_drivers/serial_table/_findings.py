@@ -66,7 +66,7 @@ def _explain_lines(data: bytes, wire: LineFormat) -> str:
         return f"lines such as {example} have {found} columns, expected {needed}: {remedy}"
     if wire.checksum is not None:
         return f"no line has a valid checksum, such as {example}: correct `text.checksum`"
-    return f"a column is no number in lines such as {example}: correct `column` of the fields"
+    return f"a column is not a number in lines such as {example}: correct `column` of the fields"
 
 
 def _likely_separator(lines: Sequence[bytes], wire: LineFormat) -> str | None:

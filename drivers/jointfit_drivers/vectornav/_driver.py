@@ -49,7 +49,7 @@ class VectorNavImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is no serial port, the speed is another, no VectorNav device answers, or it
+            The file is not a serial port, the speed is another, no VectorNav device answers, or it
             cannot send the orientation at this rate.
         """
         settings = self._settings

@@ -34,7 +34,7 @@ class CalendarTime:
         Parameters
         ----------
         ticks
-            Time as sent; None if it is no time.
+            Time as sent; None if it is not a time.
         arrival_ns
             Its arrival, monotonic ns.
         """

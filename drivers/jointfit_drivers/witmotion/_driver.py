@@ -50,7 +50,7 @@ class WitMotionImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is no serial port, the speed is another, no WitMotion device answers, or it
+            The file is not a serial port, the speed is another, no WitMotion device answers, or it
             does not send the required frames even on request.
         """
         settings = self._settings

@@ -55,8 +55,8 @@ class XbusImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is no serial port, the speed is another, no Xbus device answers, or the output
-            configuration differs while ``persist`` is false.
+            The file is not a serial port, the speed is another, no Xbus device answers, or the
+            output configuration differs while ``persist`` is false.
         """
         settings = self._settings
         await self._reception.run(

@@ -35,7 +35,7 @@ _LOW_PERCENT = 10.0
 _CHARGED_PERCENT = 20.0
 """Charge above which the next warning is possible."""
 _LONGEST_TEXT = 200
-"""Most characters of a text of the device in an event."""
+"""Maximum number of characters of a text of the device in an event."""
 
 
 class DeviceReports:

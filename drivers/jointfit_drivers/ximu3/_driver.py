@@ -42,7 +42,7 @@ class XImu3Imu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is no serial port, the speed is another, no x-IMU3 answers, or its settings
+            The file is not a serial port, the speed is another, no x-IMU3 answers, or its settings
             differ while ``persist`` is false.
         """
         settings = self._settings

@@ -58,7 +58,7 @@ MIN_SEEN = 0.5
 MAX_MISFITS = 0.1
 """Share of frames with displaced markers above which the operator is informed."""
 PATIENCE_S = 2.0
-"""Time before the first message on markers, s: a short occlusion is no fault."""
+"""Time before the first message on markers, s: a short occlusion is not a fault."""
 
 
 @dataclass(frozen=True, slots=True)

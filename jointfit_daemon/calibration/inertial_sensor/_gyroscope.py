@@ -87,7 +87,7 @@ class GyroscopeStep:
         Raises
         ------
         SensorCalibrationError
-            The sensor did not rest, or the rate at rest is no bias.
+            The sensor did not rest, or the rate at rest is not a bias.
         """
         last = self._blocks.last
         if last is None:

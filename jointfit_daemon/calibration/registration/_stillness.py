@@ -30,8 +30,8 @@ class StillnessMonitor:
     """Detects from live samples whether one sensor was at rest for a complete window.
 
     A window is at rest if the rotation from its first step to every later one is below the limit. A
-    step is the mean of its samples, so that white noise of a third of a degree is no movement. The
-    window ends with the last complete step, so a movement is detected at most one step late. A
+    step is the mean of its samples, so that white noise of a third of a degree is not a movement.
+    The window ends with the last complete step, so a movement is detected at most one step late. A
     pause in the data or time running backwards starts a new window.
     """
 

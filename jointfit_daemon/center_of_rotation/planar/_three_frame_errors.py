@@ -88,7 +88,7 @@ def three_frame_mean_squares(angles: ArrayLike, noise: ArrayLike) -> Array:
     side = (_next(spoke) - _next(_next(spoke)))[..., ::-1]
     above = (radial * side**2).sum(axis=-2)
 
-    # Q is twice the area of the triangle of unit spokes; a multiple of rounding is no area
+    # Q is twice the area of the triangle of unit spokes; a multiple of rounding is not an area
     double_area = (spoke[..., 0] * side[..., 0]).sum(axis=-1)[..., None]
     lost = np.abs(double_area) < 1e-15
     return np.where(lost, np.inf, above / np.where(lost, 1.0, double_area) ** 2)

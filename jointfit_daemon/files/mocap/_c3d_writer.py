@@ -37,7 +37,7 @@ _MOST_WORD = 0xFFFF
 MOST_ITEMS = 255
 """Most entries of a list parameter: events, and labels before LABELS2."""
 _MOST_BYTES = 255
-"""Most bytes of a text in a list parameter."""
+"""Maximum size of a text in a list parameter in bytes."""
 _MOST_BLOCKS = 255
 """Most blocks of all parameters."""
 

@@ -42,7 +42,7 @@ _QUATERNION = 4
 _UNKNOWN = "nan,nan,nan,nan"
 """Cell of an unknown orientation: OpenSim rejects empty cells, and ignores a sensor with NaN."""
 _SHOWN = 60
-"""Most characters of a cell quoted in a message."""
+"""Maximum number of characters of a cell quoted in a message."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -76,7 +76,7 @@ def read_dot_session(files: Sequence[Path], name: str) -> SessionData:
     together = len(read) == 1 or all(one.synchronized for one in read)
     starts_s = np.zeros(len(read))
     if together:
-        # The counter may turn between the starts of two sensors.
+        # The counter may wrap around between the starts of two sensors.
         ticks = np.array([one.first_ticks for one in read])
         ahead = np.mod(ticks - ticks[0] + _TURN / 2, _TURN) - _TURN / 2
         starts_s = (ahead - ahead.min()) * _TICK_S
@@ -164,7 +164,7 @@ def _rate_and_force(
         turns = np.column_stack([columns[f"dq_{axis}"] for axis in "WXYZ"])
         rate = rotation.log(rotation.normalize(turns)) / period_s
 
-    # FreeAcc is in the world and without gravity, so it is no specific force.
+    # FreeAcc is in world axes and excludes gravity, so it is not a specific force.
     force = axes_columns(columns, "Acc_{}")
     if force is None and all(f"dv[{k}]" in columns for k in (1, 2, 3)):
         force = np.column_stack([columns[f"dv[{k}]"] for k in (1, 2, 3)]) / period_s

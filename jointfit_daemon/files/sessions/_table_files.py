@@ -71,7 +71,7 @@ def read_csv_session(path: Path) -> SessionData:
     Raises
     ------
     MalformedFileError
-        Another table, missing columns, or a cell that is no number.
+        Another table, missing columns, or a cell that is not a number.
     """
     return _read_session(path, ".csv", _read_csv)
 

@@ -23,7 +23,7 @@ _CELLS_PER_CHARACTER = 16
 _FEW_CELLS = 1_000_000
 """Cells up to which rows may be mostly missing; larger tables must contain data."""
 _SHOWN = 40
-"""Most characters of a cell quoted in a message."""
+"""Maximum number of characters of a cell quoted in a message."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 DIGITS = 8

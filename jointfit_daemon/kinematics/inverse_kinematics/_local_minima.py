@@ -99,7 +99,7 @@ def restart_local_minima(
         )
         best.try_from(probes, start)
 
-    # the wave ends where the start from the neighbor is no improvement
+    # the wave ends where the start from the neighbor is not an improvement
     last = np.flatnonzero(best.improved)
     for _ in range(_PASSES):
         ahead = [(last + s, last) for s in (-1, 1)]

@@ -89,7 +89,7 @@ def check_age(t_us: object, now_us: int) -> None:
     Raises
     ------
     SignatureRejectedError
-        `t_us` is no time, or too far from `now_us`.
+        `t_us` is not a time, or too far from `now_us`.
     """
     if not isinstance(t_us, int) or isinstance(t_us, bool):
         raise SignatureRejectedError("t_us: expected UNIX time in whole microseconds")

@@ -153,4 +153,4 @@ ANSWERS: dict[str, type[Table]] = {
     "record": RecordAnswer,
     "physical-test": PhysicalTestAnswer,
 }
-"""Model of the ``data`` of an answer that is no error, by request."""
+"""Model of the ``data`` of an answer that is not an error, by request."""

@@ -80,7 +80,7 @@ class RecordedMessage(NamedTuple):
         Raises
         ------
         RecordingError
-            The content is no event.
+            The content is not an event.
         ConfigError
             The rig of the recording cannot be loaded (a driver is missing).
         """

@@ -29,7 +29,7 @@ BEFORE_S = 10.0
 """Age of the messages that are stored when the connection is lost, s: a silent loss is noticed
 within 8 s."""
 START_S = 3.0
-"""Time after the start within which a first connection is no outage, s."""
+"""Time after the start within which a first connection is not an outage, s."""
 WRITE_S = 0.5
 """Interval between two writes during an outage, s: a kill loses this."""
 SUBSCRIBE_S = 5.0

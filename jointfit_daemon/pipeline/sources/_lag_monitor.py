@@ -56,7 +56,7 @@ _MIN_FRAMES = 100
 
 
 _LOW_R2 = "no lag from this movement; normal on soft tissue, the lag in force stays"
-"""Cause of a low R² while tracking: the sensor moves on the skin, which is no fault."""
+"""Cause of a low R² while tracking: the sensor moves on the skin, which is not a fault."""
 
 
 class KnownLag(NamedTuple):

@@ -84,7 +84,7 @@ def rates_from_orientations(
     """
     seen = np.isfinite(q).all(axis=1)
     t = 1e-9 * np.asarray(np.asarray(t_ns)[seen] - origin_ns, dtype=np.float64)
-    if t.size < 3:  # noqa: PLR2004 - one rate is no track
+    if t.size < 3:  # noqa: PLR2004 - one rate is not a track
         return _empty()
     q = q[seen]
 

@@ -21,7 +21,7 @@ def find_recordings(
 ) -> list[RecordingTask]:
     """Return one task for each recorded session below `folder`, in the order of their names.
 
-    Files in the output folder and in hidden folders are no recordings.
+    Files in the output folder and in hidden folders are not recordings.
     """
     sessions: dict[str, list[tuple[int, str]]] = {}
     for path in sorted(folder.rglob("*")):

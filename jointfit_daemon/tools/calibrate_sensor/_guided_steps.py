@@ -40,11 +40,11 @@ STEPS: dict[str, type[Step]] = {
     "magnetometer": MagnetometerStep,
 }
 INSTRUCTIONS = {
-    "gyroscope": "Lay {id} on a table and let go of it until the next step.",
+    "gyroscope": "Lay {id} on a table and do not touch it until the next step.",
     "accelerometer": "Lay {id} on each of its six faces, then lean it in six tilted poses; let go "
-    "of it for two seconds in each. The order is free.",
-    "magnetometer": "Take {id} in the hand, away from steel, and turn it slowly in place until "
-    "every side has pointed in every direction.",
+    "of it for two seconds in each. The order does not matter.",
+    "magnetometer": "Hold {id} in your hand, away from steel, and turn it slowly on the spot until "
+    "each of its sides has pointed in every direction.",
 }
 GYROSCOPE_SCALE = "gyroscope_scale"
 """Name of the estimate that the turns between the poses of the accelerometer yield."""

@@ -33,7 +33,7 @@ _FAULTS = {
     errno.EACCES: "permission denied: sudo usermod -aG dialout $USER, then log in again",
     errno.EPERM: "permission denied: sudo usermod -aG dialout $USER, then log in again",
     errno.EBUSY: "is used by another program: stop it (fuser names it)",
-    errno.ENOTTY: "is no serial port: choose one that `jointfit probe` lists",
+    errno.ENOTTY: "is not a serial port: choose one that `jointfit probe` lists",
     errno.EIO: "has no hardware behind it: choose one that `jointfit probe` lists",
 }
 
@@ -146,7 +146,7 @@ def _set_speed(descriptor: int, baud: int) -> None:
     """Set a raw line, 8N1, without flow control, and discard bytes received at another speed."""
     speed = getattr(termios, f"B{baud}", None)
     if speed is None:
-        raise OSError(errno.EINVAL, f"{baud} baud is no speed of this system")
+        raise OSError(errno.EINVAL, f"{baud} baud is not a speed of this system")
     _, _, cflag, _, _, _, characters = _attributes(descriptor)
     cflag &= ~(termios.CSIZE | termios.PARENB | termios.CSTOPB | termios.CRTSCTS)
     cflag |= termios.CS8 | termios.CREAD | termios.CLOCAL

@@ -17,7 +17,7 @@ def read_attribute(path: Path) -> str | None:
 
 
 def read_number(path: Path, base: int = 10) -> int | None:
-    """Return an attribute as integer; None if it cannot be read or is no number."""
+    """Return an attribute as integer; None if it cannot be read or is not a number."""
     try:
         return int(read_attribute(path) or "", base)
     except ValueError:

@@ -174,7 +174,7 @@ def split_address(text: str) -> tuple[str, int]:
     Raises
     ------
     ValueError
-        The port is no number from 1 to 65535.
+        The port is not a number from 1 to 65535.
     """
     if text.startswith("["):
         host, _, rest = text[1:].partition("]")

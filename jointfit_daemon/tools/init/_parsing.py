@@ -43,7 +43,7 @@ def parse_answer(
     Raises
     ------
     AnswerError
-        `given` is no answer of this kind.
+        `given` is not an answer of this kind.
     """
     if isinstance(given, str):
         given = given.strip()
@@ -106,7 +106,7 @@ def _device(given: Any, choices: Sequence[str]) -> str:
 
 
 def _choice(given: Any, choices: Sequence[str]) -> str:
-    if str(given) in choices:  # a value that is a number is no number of the list
+    if str(given) in choices:  # a value that is a number is not a number of the list
         return str(given)
     chosen = _device(given, choices)
     if chosen not in choices:

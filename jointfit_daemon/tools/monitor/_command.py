@@ -101,8 +101,8 @@ def monitor(
         )
     if not _has_terminal():
         raise ValueError(
-            "standard input and standard error are no terminal: use ssh -t HOST jointfit monitor,"
-            " or read the topics with mosquitto_sub"
+            "standard input and standard error are not a terminal: use ssh -t HOST jointfit "
+            "monitor, or read the topics with mosquitto_sub"
         )
     try:
         from jointfit_daemon.tools.monitor._app import MonitorApp

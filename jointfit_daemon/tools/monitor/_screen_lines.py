@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 _WIDE = 60
 """Least width for the header in one line."""
 _LOSS_LINES = 3
-"""Most lines of a banner or a notice."""
+"""Maximum number of lines of a banner or a notice."""
 _CLOCK_ERROR_S = 5.0
 """Difference of the clocks of gateway and this machine, s, above which it is shown."""
 _TITLES = {

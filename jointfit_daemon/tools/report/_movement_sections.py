@@ -64,7 +64,7 @@ begin later."""
 _PANEL, _HALF = 320.0, 450.0
 """Widths of a panel, one of three or of two in a row, px."""
 _MOST_POINTS = 800
-"""Most points of a scatter plot."""
+"""Maximum number of points of a scatter plot."""
 _IMU_LEGEND = [("imu", "from the sensors"), ("band", "95 % interval")]
 _OPTICAL_LEGEND = ("optical", "from the cameras")
 

@@ -22,7 +22,7 @@ from jointfit_protocols.corrupt import CHECKSUM, NO_START, CorruptBytes
 from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 
 MAX_DATA = 1024
-"""Most bytes of data. It bounds the wait after a corrupt length."""
+"""Maximum number of bytes of data. It bounds the wait after a corrupt length."""
 OVERHEAD = 11
 """Bytes of a message besides its data."""
 MAX_MESSAGE = MAX_DATA + OVERHEAD

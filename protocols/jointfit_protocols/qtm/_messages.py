@@ -245,7 +245,9 @@ def decode_announcement(datagram: bytes) -> ServerAnnouncement | CorruptBytes:
         return CorruptBytes(len(datagram), f"{len(datagram)} bytes, expected {shortest} or more")
     size, kind = HEADER.unpack_from(datagram)
     if size != len(datagram) or kind != PacketType.COMMAND:
-        return CorruptBytes(len(datagram), f"type {kind} of {size} bytes is no answer to discovery")
+        return CorruptBytes(
+            len(datagram), f"type {kind} of {size} bytes is not an answer to discovery"
+        )
     text = datagram[HEADER.size : -_DISCOVER_PORT.size].split(b"\0", 1)[0]
     (port,) = _DISCOVER_PORT.unpack_from(datagram, len(datagram) - _DISCOVER_PORT.size)
     return ServerAnnouncement(text.decode("utf-8", "replace"), port)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 LONGEST_FRAME = 4096
-"""Most bytes of a frame; it bounds the wait after a corrupt length."""
+"""Maximum size of a frame in bytes; it bounds the wait after a corrupt length."""
 
 
 class FrameFormat(NamedTuple):
@@ -45,7 +45,7 @@ class FrameFormat(NamedTuple):
     length_adds: int = 0
     """Bytes of a frame minus its length field."""
     longest: int = LONGEST_FRAME
-    """Most bytes of a frame with a length field."""
+    """Maximum size of a frame with a length field in bytes."""
     checksum: Checksum | None = None
     end: bytes = b""
     """Last bytes of every frame."""
@@ -105,7 +105,7 @@ class FrameCodec(ResynchronizingCodec[TableMessage]):
 
     @property
     def longest(self) -> int:
-        """Most bytes of a frame."""
+        """Maximum size of a frame in bytes."""
         return self._fixed or self._form.longest
 
     def feed(self, data: bytes) -> list[TableItem]:  # type: ignore[explicit-override]  # Python 3.12's

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 LONGEST_LINE = 1024
-"""Most bytes of a line."""
+"""Maximum length of a line, in bytes."""
 _MARK = b"*"
 
 
@@ -34,12 +34,12 @@ class LineFormat(NamedTuple):
     prefix: bytes = b""
     """First bytes of every line with measurements; the first column follows."""
     width: int | None = None
-    """Number of columns; None: any that contains the fields."""
+    """Required number of columns; None accepts any number that includes all fields."""
     checksum: Checksum | None = None
 
 
 class LineCodec:
-    """Decoder of pieces of any size to records; never raises.
+    """Decodes input in pieces of any size into records; never raises.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class LineCodec:
 
     @property
     def longest(self) -> int:
-        """Most bytes of a line."""
+        """Maximum length of a line, in bytes."""
         return LONGEST_LINE
 
     def feed(self, data: bytes) -> list[TableItem]:
@@ -122,7 +122,7 @@ class LineCodec:
             self.skipped += 1
 
     def _read(self, line: bytes) -> tuple[tuple[float, ...] | None, str]:
-        """Return the record of a line, or None with the reason; without reason: to be skipped."""
+        """Return the record of a line, or None and a reason; empty if the line is to be skipped."""
         form = self._form
         text = line.rstrip(b"\r")
         if not text or not text.startswith(form.prefix):
@@ -170,4 +170,4 @@ def encode_line(form: LineFormat, values: Sequence[float]) -> bytes:
 
 _ENDLESS = "line without end"
 _NO_TEXT = "no text"
-_NO_NUMBER = "a column is no number"
+_NO_NUMBER = "a column is not a number"

@@ -34,11 +34,11 @@ MINOR = 38
 """Newest minor version whose messages are known."""
 """Version that both sides must share; a different minor version is compatible."""
 MAX_MESSAGE = 64_000
-"""Most bytes of a message, the buffer of the reference implementation."""
+"""Maximum size of a message in bytes, the buffer of the reference implementation."""
 MAX_IDS = 2000
 """Senders, and types, that a peer may describe: the limit of the reference implementation."""
 MAX_NAME = 255
-"""Most bytes of a name."""
+"""Maximum size of a name in bytes."""
 LOWEST_PORT = 1024
 """Lowest port to which a server connects back."""
 

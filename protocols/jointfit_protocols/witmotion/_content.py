@@ -67,7 +67,7 @@ def registers_of(data: bytes) -> tuple[int, int, int, int]:
 
 
 def time_of(data: bytes) -> int | None:
-    """Return the time of a frame 0x50, ms since the start of 2000; None if it is no time.
+    """Return the time of a frame 0x50, ms since the start of 2000; None if it is not a time.
 
     Month and day 0 of a clock that was never set count as 1.
     """

@@ -25,7 +25,8 @@ PREAMBLE = 0xFA
 MASTER = 0xFF
 """BID of a stand-alone device, and of every unsolicited message."""
 MAX_DATA = 2048
-"""Most bytes of data, by the vendor's documents. It bounds the wait after a corrupt length."""
+"""Maximum number of bytes of data, by the vendor's documents. It bounds the wait after a corrupt
+length."""
 MAX_MESSAGE = MAX_DATA + 7
 _EXTENDED = 0xFF
 _HEAD = 4

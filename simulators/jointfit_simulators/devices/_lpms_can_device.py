@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 _NS = 1_000_000_000
 WRAPPED = 1300
-"""Identifier of LP-BUS in CAN frames of node 0."""
+"""CAN identifier of the frames in which node 0 sends LP-BUS packets."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ _PART_NAME = re.compile(r"(.+-\d{8}T\d{6})-\d{4,}\.mcap")
 
 
 class UnplayableRecordingError(ValueError):
-    """The file is no recording, is damaged, or has devices that cannot be simulated."""
+    """The file is not a recording, is damaged, or has devices that cannot be simulated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ def read_session_chunks(path: Path) -> RecordedSession:
     Raises
     ------
     UnplayableRecordingError
-        The file is no recording, or damaged.
+        The file is not a recording, or damaged.
     OSError
         It cannot be read.
     """

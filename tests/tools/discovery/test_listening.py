@@ -97,7 +97,9 @@ def test_a_silent_port_is_not_tried_at_other_speeds() -> None:
         os.close(descriptor)
 
 
-@pytest.mark.parametrize(("name", "text"), [("gone", "is absent"), ("file", "is no serial port")])
+@pytest.mark.parametrize(
+    ("name", "text"), [("gone", "is absent"), ("file", "is not a serial port")]
+)
 def test_a_path_that_is_no_port_is_a_fault_with_a_remedy(
     tmp_path: Path, name: str, text: str
 ) -> None:
