@@ -50,7 +50,8 @@ def test_a_cluster_of_hundreds_of_markers_is_searched_and_fits() -> None:
     upright = np.array((1.0, 0.0, 0.0, 0.0))
     cluster = MarkerCluster("thigh", names, None, points, np.zeros(3), upright)
     finding = LabelSearch([cluster]).explain(points)
-    assert finding.rms[0] < 1e-9
+    # The error is a difference of squares, so it is exact to the root of their rounding only.
+    assert finding.rms[0] < 4.0 * np.sqrt(np.finfo(float).eps * np.mean(points**2))
     assert finding.faults == ()
 
 
