@@ -130,7 +130,7 @@ class MovingHand:
 
     def follow(self, line: str) -> None:
         """Begin the next movement if the line is an instruction."""
-        words = {"accelerometer": "six faces", "magnetometer": "in the hand"}
+        words = {"accelerometer": "six faces", "magnetometer": "in your hand"}
         for step, word in words.items():
             if word in line:
                 self._step, self._begin_ns = step, time.monotonic_ns()

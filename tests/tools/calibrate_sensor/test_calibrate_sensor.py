@@ -211,7 +211,7 @@ async def test_the_command_guides_and_writes_what_the_daemon_uses(tmp_path: Path
     async with held(tmp_path) as hand:
         code, text = await run_command(tmp_path, hand)
     assert code == 0, text
-    assert text.index("Lay S1 on a table") < text.index("six faces") < text.index("in the hand")
+    assert text.index("Lay S1 on a table") < text.index("six faces") < text.index("in your hand")
     assert "missing: " in text
     assert f"S1 (serial {SERIAL})" in text
 
