@@ -19,7 +19,7 @@ run = CliRunner().invoke
 def test_without_a_terminal_the_remedy_is_named() -> None:
     result = run(app, ["monitor", "--broker", "localhost"])
     assert result.exit_code == 2
-    assert "no terminal: use ssh -t" in result.stderr
+    assert "not a terminal: use ssh -t" in result.stderr
 
 
 def test_without_textual_the_pip_command_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
