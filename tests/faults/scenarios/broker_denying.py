@@ -21,7 +21,9 @@ async def run(gateway: Gateway) -> Outcome:
     with gateway.other_broker(denying):
         noticed_s = await gateway.logged("the broker refuses messages on", since)
     recovered_s = await gateway.used("S1", "S2")
-    await gateway.seconds(lambda: not gateway.listener.latest["bridge/health"]["link"]["denied"])
+    # A topic leaves the list with its next message, and not every topic has one soon.
+    health = gateway.listener.latest
+    await gateway.seconds(lambda: "pose" not in health["bridge/health"]["link"]["denied"])
     return Outcome(noticed_s, recovered_s, 0.0, 0)
 
 
