@@ -49,6 +49,9 @@ class DaemonInterface(TestedDaemon, Protocol):
     async def set_output_rate(self, rate_hz: float) -> None:
         """Apply the rig in force with another output rate."""
 
+    async def settle_store(self) -> None:
+        """Wait until no calibration is being written."""
+
 
 class RequestHandlers:
     """The handlers of one daemon.
@@ -142,6 +145,9 @@ class RequestHandlers:
 
     async def use_calibration(self, request: Request) -> Reply | None:
         """Load a stored version and pass it to the core, which answers."""
+        # Until its file is written, the calibration in force has no number: a revert would find
+        # that file as the newest stored version, and choose the calibration it should replace.
+        await self._daemon.settle_store()
         rig, in_force = self._daemon.rig, self._daemon.health().core.version
         version = request.arguments.get("version")
         try:

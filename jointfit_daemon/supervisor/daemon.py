@@ -212,13 +212,9 @@ class Daemon:
         self._sources = SourceTasks(tasks, self._core.feed)
         self._fits = FitRunner(tasks, self._core.feed)
         self._calibrations = CalibrationWriter(tasks, self._core.feed, self._report_not_stored)
-        handlers = RequestHandlers(self, self._answer_request)
-        self._requests = RequestDispatcher(
-            tasks,
-            self._core.feed,
-            self._publish_reply,
-            handlers.table(),
-        )
+        handlers = RequestHandlers(self, self._answer_request).table()
+        reply = self._publish_reply
+        self._requests = RequestDispatcher(tasks, self._core.feed, reply, handlers)
         rig, core, report = self._rig, self._core, self._report
         self._recorder = sinks.create_recorder(rig, core, tasks, report)
         if self._spool is not None:
@@ -345,6 +341,10 @@ class Daemon:
     def unsubscribe(self, sink: Sink) -> None:
         """End the subscription of `sink`."""
         self._core.unsubscribe(sink)
+
+    async def settle_store(self) -> None:
+        """Wait until no calibration is being written."""
+        await self._calibrations.settle()
 
     async def set_output_rate(self, rate_hz: float) -> None:
         """Apply the rig in force with another output rate, until the next reload."""

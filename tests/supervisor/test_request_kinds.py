@@ -347,6 +347,23 @@ async def test_stored_calibrations_are_listed_used_and_reverted(gateway: Running
         assert "'static' is running" in str(reply.error["message"])
 
 
+async def test_a_revert_waits_until_the_calibration_in_force_has_its_number(
+    gateway: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save = _calibration_store.save
+
+    def save_and_wait(*words: Any, **more: Any) -> int:
+        version = save(*words, **more)
+        time.sleep(0.2)  # the file is there, and the daemon does not know it yet
+        return version
+
+    monkeypatch.setattr(_calibration_store, "save", save_and_wait)
+    async with gateway.run():
+        await gateway.ask("use-calibration", {"version": 1})
+        reverted = await gateway.ask("use-calibration", {"revert": True})
+        assert (reverted.status, reverted.data["version"]) == ("ok", 2)
+
+
 async def test_a_calibration_of_another_limb_is_listed_and_not_used(gateway: Running) -> None:
     rig = parse_rig(gateway.table)
     other = plain_calibration(rig.chain, joints=("shoulder", "elbow", "wrist"))

@@ -61,7 +61,7 @@ async def test_requests_of_a_user_are_printed_as_text_and_as_json(
         used = await jointfit("calibrate", rig, "--use", "1")
         assert used.stdout == "version 1 is in force\n"
         reverted = await jointfit("calibrate", rig, "--revert", "--json")
-        assert orjson.loads(reverted.stdout)["version"] in (1, 2)
+        assert orjson.loads(reverted.stdout)["version"] == 2
 
         tested = await jointfit("request", "selftest", "--rig", rig)
         assert "ok      store: calibrations can be written" in tested.stdout
