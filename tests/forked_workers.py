@@ -5,7 +5,7 @@ and its forks share the modules and tests. They ask for a batch at a time. Tests
 fixtures of a module are in one batch, so that these are set up once.
 
 Invariant: every test is reported once; a test in which a worker dies fails, and the tests behind it
-run in a new worker.
+run in a new worker. The worker of a test that ignores its time limit is killed.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 import os
 import sys
+import time
 from collections import deque
 from dataclasses import dataclass, field
 from multiprocessing import connection, get_context
@@ -31,6 +32,8 @@ Batch: TypeAlias = list[int]
 
 LARGEST = 20
 """Largest number of tests in a batch of those that share no fixtures."""
+CHECK_S = 1.0
+"""Longest interval between two checks for tests that ignore their time limit, s."""
 WORKERS_THAT_WAIT = 2
 """Number of workers that begin with tests in real time: they wait for half of their time."""
 FIT_NICE = 10
@@ -44,6 +47,8 @@ process cannot raise its priority again, so after the last of these tests anothe
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the number of workers."""
     parser.addoption("--workers", type=int, metavar="N", help="run the tests in N forked workers")
+    text = "kill the worker of a test that runs S seconds longer than its time limit"
+    parser.addoption("--kill-after", type=float, metavar="S", default=60.0, help=text)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -116,6 +121,8 @@ class _Worker:
     """Whether it takes the tests that wait first, and then the others, instead of these alone."""
     left: Batch = field(default_factory=list)
     """Tests of its batches that it has not finished; it runs the first."""
+    began_s: float = 0.0
+    """Monotonic time at which it began the first of them."""
 
 
 class _Workers:
@@ -135,8 +142,9 @@ class _Workers:
             self._start(waiting=number == 1 or self._started < WORKERS_THAT_WAIT)
         try:
             while self._workers:
-                for channel in connection.wait(list(self._workers)):
+                for channel in connection.wait(list(self._workers), timeout=CHECK_S):
                     self._serve(self._workers[channel])  # type: ignore[index]  # one of ours
+                self._kill_those_that_hang()
         finally:
             for worker in self._workers.values():
                 worker.process.terminate()
@@ -166,15 +174,27 @@ class _Workers:
             self._close(worker)
         elif kind == "next":
             batch = self._take(worker)
+            if not worker.left:
+                worker.began_s = time.monotonic()
             worker.left.extend(batch)
             worker.channel.send(batch)
         elif kind == "finished":
             worker.left.remove(content)
+            worker.began_s = time.monotonic()
         else:
             report = self._config.hook.pytest_report_from_serializable(
                 config=self._config, data=content
             )
             self._config.hook.pytest_runtest_logreport(report=report)
+
+    def _kill_those_that_hang(self) -> None:
+        """End a test that ignored its time limit: asyncio swallows an exception in a callback."""
+        grace_s: float = self._config.getoption("--kill-after")
+        for worker in self._workers.values():
+            if worker.left:
+                allowed_s = limit_s(self._session.items[worker.left[0]]) + grace_s
+                if time.monotonic() - worker.began_s > allowed_s:
+                    worker.process.kill()
 
     def _take(self, worker: _Worker) -> Batch:
         if self._session.shouldfail or self._session.shouldstop:

@@ -68,6 +68,31 @@ def test_every_test_is_reported_once_and_a_death_of_a_worker_fails_one(tmp_path:
         assert [line.partition(" ")[2] for line in lines] == ["set-up", "torn down"]
 
 
+HANG = """\
+import signal, time
+import pytest
+
+@pytest.mark.timeout(1)
+def test_ignores_its_time_limit():
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    time.sleep(80)
+
+def test_behind_the_one_that_hangs(): ...
+"""
+
+
+def test_a_test_that_ignores_its_time_limit_fails_and_the_others_run(tmp_path: Path) -> None:
+    (tmp_path / "test_hang.py").write_text(HANG)
+    options = ["-c", "pyproject.toml", f"--rootdir={tmp_path}", "--workers=1", "--kill-after=1"]
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-p", "tests.forked_workers", *options, str(tmp_path)],
+        cwd=ROOT, check=False, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+
+    assert "worker died in test_hang.py::test_ignores_its_time_limit" in run.stdout
+    assert run.stdout.splitlines()[-1].startswith("1 failed, 1 passed"), run.stdout
+
+
 PRIORITIES = """\
 import os, time
 import pytest
