@@ -208,6 +208,8 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=30.0, help="time of sending")
     parser.add_argument("--store", action="store_true", help="store the counts for the page")
     options = parser.parse_args()
+    if not options.minutes > 0:
+        parser.error(f"--minutes: expected a number above 0, got {options.minutes:g}")
     with tempfile.TemporaryDirectory() as name:
         chosen = chosen_broker()(Path(name))
         chosen.start()

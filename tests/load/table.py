@@ -7,6 +7,8 @@ from typing import Any
 
 RESULTS = Path(__file__).parent / "results.json"
 COUNTERS = ("lost", "corrupt", "dropped", "late")
+SMALLEST_SHARE = 0.98
+"""Smallest share of rate and time that an input must have sent: otherwise it was not loaded."""
 
 
 def table_of(results: dict[str, Any]) -> str:
@@ -24,11 +26,12 @@ def table_of(results: dict[str, Any]) -> str:
 
 
 def faults_of(results: dict[str, Any]) -> list[str]:
-    """Return the inputs with samples that were not received, or have no outcome."""
+    """Return the inputs with samples that were not sent, not received, or have no outcome."""
     return [
         f"{name}: {found}"
         for name, found in results["inputs"].items()
-        if found["sent"] != found["received"]
+        if found["sent"] < SMALLEST_SHARE * found["rate_hz"] * results["seconds"]
+        or found["sent"] != found["received"]
         or found["unaccounted"]
         or any(found[key] for key in ("lost", "corrupt", "dropped"))
     ]
