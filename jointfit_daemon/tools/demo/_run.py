@@ -74,8 +74,6 @@ MATURE_NS = 300_000_000
 """Age, ns, at which the ground truth of a pose is written and the pose is evaluated."""
 CALIBRATIONS = "state/calibrations"
 """Calibration store of the demo, relative to its folder."""
-RECENT = 200
-"""Number of the last poses whose largest latency is the present delay of the daemon."""
 OUTCOMES = ("used", "decimated", "idle", "late", "duplicate", "dropped")
 
 
@@ -232,9 +230,6 @@ class DemoRun:
         self._evaluate()
         self._evaluating = False
 
-        # Closing a port loses what the daemon has not read: on a busy machine it may be behind.
-        await self.simulator.say("pause on")
-        await asyncio.sleep(2e-3 * max(self.latencies_ms[-RECENT:], default=0.0))
         totals = await self.simulator.quit()
         wanted = {source.id for source in self.rig.sources}
         before = self._healths
@@ -257,11 +252,13 @@ class DemoRun:
         counts["dropped"] += counts.pop("pending")
 
         # Samples without an outcome, or sent but not received, or the reverse.
-        sent, unaccounted = self._sent or {}, 0
+        sent, unaccounted = self._sent or {}, dict[str, int]()
         for name, device in devices.items():
             received = int(device.get("received") or 0)
             outcomes = sum(int(device.get(key) or 0) for key in (*OUTCOMES, "pending"))
-            unaccounted += abs(received - outcomes) + abs(int(sent.get(name, 0)) - received)
+            lost = abs(received - outcomes) + abs(int(sent.get(name, 0)) - received)
+            if lost:
+                unaccounted[name] = lost
 
         return {
             "frames": self.score.frames,
@@ -279,7 +276,8 @@ class DemoRun:
             "samples": counts,
             "corrupt": sum(int(device.get("corrupt") or 0) for device in devices.values()),
             "sent": None if self._sent is None else sum(sent.values()),
-            "unaccounted": None if self._sent is None else unaccounted,
+            "unaccounted": None if self._sent is None else sum(unaccounted.values()),
+            "unaccounted_by_source": None if self._sent is None else unaccounted,
             "within_2_sd_share": _rounded(self.score.covered / max(1, self.score.flexion.n)),
         }
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jointfit_simulators.recorded._recorded_devices import (
@@ -16,11 +17,10 @@ from jointfit_simulators.recorded._recorded_devices import (
 )
 from jointfit_simulators.recorded._rig_text import rig_for_devices, toml_text
 from jointfit_simulators.recorded._session_file import UnplayableRecordingError
-from jointfit_simulators.wires import SlcanAdapter
+from jointfit_simulators.wires import SlcanAdapter, wait_until_read
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from jointfit_simulators.recorded._session_file import RecordedSession
 
@@ -30,8 +30,6 @@ _NS = 1_000_000_000
 _POLL_S = 0.01
 _LEAD_S = 0.2
 """Time between the connection of the last device and the first chunk, s."""
-_DRAIN_S = 1.0
-"""Time in which the host reads the last bytes before the devices are disconnected, s."""
 DRIVERS = ("xbus", "xcdi", "natnet")
 """Drivers whose devices can be simulated."""
 
@@ -80,6 +78,7 @@ class RecordedScene:
             _check_driver("mocap", rig["mocap"]["driver"])
             cameras = self._devices["mocap"] = RecordedCameras(chunks["mocap"])
         self._cameras = cameras
+        self._links = [Path(port) for port in (*ports.values(), *bus_ports.values())]
         table = rig_for_devices(
             rig,
             ports=ports,
@@ -143,7 +142,7 @@ class RecordedScene:
             if ahead_ns > 0:
                 await asyncio.sleep(ahead_ns / _NS)
             active[name].send(data)
-        await asyncio.sleep(_DRAIN_S)
+        await wait_until_read(self._links)
 
 
 def _check_driver(name: str, driver: str) -> None:

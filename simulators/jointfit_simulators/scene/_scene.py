@@ -7,6 +7,7 @@ import dataclasses
 import math
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jointfit_simulators.body import (
@@ -26,10 +27,10 @@ from jointfit_simulators.scene._player import ScenePlayer
 from jointfit_simulators.scene._rig_file import RigOptions, rig_toml
 from jointfit_simulators.scene._sample_log import SampleLog
 from jointfit_simulators.scene._truth_log import TruthLog
+from jointfit_simulators.wires import wait_until_read
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
-    from pathlib import Path
 
     from jointfit_simulators.body import InstrumentedSubject
     from jointfit_simulators.devices import ClockFault
@@ -50,8 +51,6 @@ OPTICAL = "mocap"
 """Name of the motion-capture server in commands and in the ground-truth log."""
 DOWN_S = 1.0
 """Downtime of the motion-capture server during a restart."""
-LINGER_S = 0.3
-"""Delay between the last byte and closing the ports, so that the host can read all data."""
 
 
 @dataclass(frozen=True)
@@ -194,7 +193,7 @@ class Scene:
         }
 
     async def run(self, report: Callable[[dict[str, object]], None]) -> None:
-        """Run until `stop`, then wait `LINGER_S` and close all ports.
+        """Run until `stop`, then wait until all bytes are read and close all ports.
 
         Parameters
         ----------
@@ -222,7 +221,7 @@ class Scene:
                 following.cancel()
                 self._player.finish()
                 report(self.account())
-                await asyncio.sleep(LINGER_S)
+                await wait_until_read(Path(port) for port in self.ports.values())
                 for task in serving:
                     task.cancel()
         finally:  # also after an error or cancellation
