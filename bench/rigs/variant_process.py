@@ -12,7 +12,7 @@ import sys
 from typing import TYPE_CHECKING
 from unittest.mock import patch
 
-from bench.experiments.speed import codecs, core
+from bench.experiments.speed import codec_natnet, codecs, core
 from jointfit_daemon.limb_model import Calibration
 from jointfit_variant import running_variant
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 PARTS: dict[str, Callable[[bool], list[Result]]] = {
     "xbus": codecs.xbus_rows,
     "can": codecs.xcdi_rows,
-    "natnet": codecs.natnet_rows,
+    "natnet": codec_natnet.own_rows,
     "clock": core.clock_rows,
     "aligner": core.align_rows,
     "fusion": core.fusion_rows,

@@ -1,4 +1,7 @@
-"""VectorNav: codec and decoder per output; no Python package reads binary outputs."""
+"""VectorNav: codec and decoder per output.
+
+No package on PyPI reads binary outputs: `vectornav-vn200` asks for one register at a time as text.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,13 @@
-"""Codecs and decoders, per message and per sample; SLCAN of python-can in the same run."""
+"""Xbus, SLCAN and XCDI: codecs and decoders; python-can and cantools in the same run.
+
+No package on PyPI decodes Xbus messages. cantools decodes the XCDI frames from a table of the same
+signals, without grouping them.
+"""
 
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import pty
 import statistics
@@ -10,23 +15,25 @@ import struct
 import termios
 import time
 import tty
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import can
+import cantools
 
-from bench.framework.measurement import per_item, repeats, speed_experiment, timed_result
+from bench.framework.measurement import cpu_s, per_item, repeats, speed_experiment, timed_result
 from bench.subjects import device_bytes
 from jointfit_daemon.driver import CanBusSettings, find_driver
-from jointfit_daemon.model import Chunk, ImuSample, MocapFrame
-from jointfit_protocols import natnet, xbus, xcdi
+from jointfit_daemon.model import Chunk, ImuSample
+from jointfit_protocols import xbus, xcdi
 from jointfit_protocols.can import slcan
-from jointfit_simulators.body import CLUSTERS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from bench.framework.experiment import Result
     from jointfit_daemon.driver import Decoder
+    from jointfit_protocols.can import CanFrame
 
 N = 500
 ORIENTATIONS = [(0.5, -0.5, 0.1, 0.7)] * N
@@ -35,20 +42,32 @@ IDS = xcdi.id_block(0x100)
 SAMPLES = 33
 BATCH = 3 * SAMPLES
 """Frames on the pty at once: 2 kB, well below the buffer of a tty."""
+TABLE = f"""VERSION ""
+NS_ :
+BS_:
+BU_: MTI HOST
+BO_ {IDS.sample_time} SampleTime: 4 MTI
+ SG_ Ticks : 7|32@0+ (1,0) [0|0] "" HOST
+BO_ {IDS.group_counter} GroupCounter: 2 MTI
+ SG_ Counter : 7|16@0+ (1,0) [0|0] "" HOST
+BO_ {IDS.quaternion} Quaternion: 8 MTI
+ SG_ Q0 : 7|16@0- (1,0) [0|0] "" HOST
+ SG_ Q1 : 23|16@0- (1,0) [0|0] "" HOST
+ SG_ Q2 : 39|16@0- (1,0) [0|0] "" HOST
+ SG_ Q3 : 55|16@0- (1,0) [0|0] "" HOST
+"""
 
 
 def _decoding(
-    make: Callable[[], Decoder], chunks: list[Chunk], kind: type, opening: tuple[Chunk, ...] = ()
+    make: Callable[[], Decoder], chunks: list[Chunk]
 ) -> Callable[[], Callable[[], object]]:
     """Return a function that prepares a run of a decoder; check that each chunk gives a sample."""
     decoder = make()
-    given = [item for chunk in (*opening, *chunks) for item in decoder.feed(chunk)]
-    assert sum(isinstance(item, kind) for item in given) == len(chunks), given[:3]
+    given = [item for chunk in chunks for item in decoder.feed(chunk)]
+    assert sum(isinstance(item, ImuSample) for item in given) == len(chunks), given[:3]
 
     def prepare() -> Callable[[], object]:
         fresh = make()
-        for chunk in opening:
-            fresh.feed(chunk)
         return lambda: [fresh.feed(chunk) for chunk in chunks]
 
     return prepare
@@ -64,7 +83,7 @@ def xbus_rows(quick: bool) -> list[Result]:
         decoder = xbus.XbusCodec()
         return lambda: [decoder.feed(data) for data in messages]
 
-    whole = _decoding(lambda: driver(settings).decoder(), chunks, ImuSample)
+    whole = _decoding(lambda: driver(settings).decoder(), chunks)
     return [
         per_item("xbus: codec, one message", codec, items=N, goal_us=6, quick=quick),
         per_item("xbus: bytes to SI sample", whole, items=N, goal_us=25, quick=quick),
@@ -90,37 +109,47 @@ def xcdi_rows(quick: bool) -> list[Result]:
         decoder = slcan.SlcanCodec(3_000_000)
         return lambda: [decoder.feed(data, k * PERIOD_NS) for k, data in enumerate(lines)]
 
-    whole = _decoding(lambda: driver(settings).decoder(), chunks, ImuSample)
+    whole = _decoding(lambda: driver(settings).decoder(), chunks)
     return [
         per_item("slcan: codec, one CAN frame", codec, items=3 * N, goal_us=12, quick=quick),
         per_item("xcdi: 3 CAN frames to SI sample", whole, items=N, goal_us=30, quick=quick),
     ]
 
 
-def natnet_rows(quick: bool) -> list[Result]:
-    datagrams = device_bytes.natnet_datagrams(N, 8_333_333)
-    driver = find_driver("natnet")
-    settings = driver.Settings(
-        driver="natnet",
-        server="127.0.0.1",
-        up_axis="y",
-        markers={part: names for part, names in CLUSTERS.items() if part != "plate"},
-        plate="Plate",
-    )
+def _frames() -> list[CanFrame]:
+    groups = device_bytes.xcdi_frames(ORIENTATIONS, PERIOD_NS, IDS)
+    return [frame for group in groups for frame in group]
 
-    def codec() -> Callable[[], object]:
-        return lambda: [natnet.decode_frame(data, device_bytes.BITSTREAM) for data in datagrams]
 
-    whole_frame = natnet.decode_frame(datagrams[0], device_bytes.BITSTREAM)
-    assert isinstance(whole_frame, natnet.FrameOfData), whole_frame
+def _groups() -> Callable[[], object]:
+    codec = xcdi.XcdiCodec(IDS)
+    frames = _frames()
+    return lambda: [codec.feed(frame) for frame in frames]
 
-    opening = tuple(Chunk(0, data) for data in device_bytes.natnet_opening())
-    chunks = [Chunk(k * 8_333_333, data) for k, data in enumerate(datagrams, 1)]
-    whole = _decoding(lambda: driver(settings).decoder(), chunks, MocapFrame, opening)
-    size = f"{len(CLUSTERS)} bodies, {sum(map(len, CLUSTERS.values()))} markers"
+
+def _table() -> Callable[[], object]:
+    table = cantools.database.load_string(TABLE, "dbc")
+    assert isinstance(table, cantools.database.Database)
+    frames = _frames()
+    assert table.decode_message(frames[2].can_id, frames[2].data)["Q1"] == round(-0.5 * 32767)
+    return lambda: [table.decode_message(frame.can_id, frame.data) for frame in frames]
+
+
+def group_rows(quick: bool) -> list[Result]:
+    """Decode the same frames with this project and with cantools, in turns."""
+    ours: list[float] = []
+    theirs: list[float] = []
+    for _ in range(repeats(quick)):
+        for prepare, took in ((_groups, ours), (_table, theirs)):
+            work = prepare()
+            gc.collect()
+            took.append(cpu_s(work) / (3 * N))
+    ratio = statistics.median(a / b for a, b in zip(ours, theirs, strict=True))
     return [
-        per_item("natnet: codec, one frame", codec, items=N, goal_us=60, quick=quick, note=size),
-        per_item("natnet: bytes to MocapFrame", whole, items=N, goal_us=150, quick=quick),
+        *xcdi_rows(quick),
+        timed_result("xcdi: codec, one CAN frame", _us(ours), "µs", 6, 24),
+        timed_result("xcdi: cantools, one CAN frame", _us(theirs), "µs"),
+        timed_result("xcdi: time ratio to cantools", round(ratio, 4), "", 0.5, 1.0),
     ]
 
 
@@ -213,15 +242,9 @@ EXPERIMENTS = (
         "Xbus: codec and decoder",
         xbus_rows,
     ),
-    speed_experiment(
-        "can-codec",
-        "CAN: SLCAN codec and XCDI decoder",
-        xcdi_rows,
-    ),
-    speed_experiment(
-        "natnet-codec",
-        "NatNet: codec and decoder",
-        natnet_rows,
+    replace(
+        speed_experiment("can-codec", "CAN: SLCAN and XCDI codecs, with a peer", group_rows),
+        packages=("cantools",),
     ),
     speed_experiment(
         "slcan-python-can",

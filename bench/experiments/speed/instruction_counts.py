@@ -8,11 +8,12 @@ show.
 from __future__ import annotations
 
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 from unittest.mock import patch
 
-from bench.experiments.speed import codecs, core
+from bench.experiments.speed import codec_natnet, codecs, core
 from bench.framework.experiment import Experiment, Result
 from bench.framework.material import THIS_MACHINE
 from bench.subjects.simulated_wearer import bench_rig
@@ -93,9 +94,12 @@ def counted_rows() -> list[Result]:
     if sys.version_info[:2] != PYTHON:
         print("instruction-counts: only on Python 3.11, whose bytecode is counted", file=sys.stderr)
         return []
-    with patch.object(codecs, "per_item", _per_item), patch.object(core, "per_item", _per_item):
+    with ExitStack() as patches:
+        for module in (codecs, codec_natnet, core):
+            patches.enter_context(patch.object(module, "per_item", _per_item))
         parts = (
-            codecs.xbus_rows, codecs.xcdi_rows, codecs.natnet_rows, core.clock_rows, core.align_rows
+            codecs.xbus_rows, codecs.xcdi_rows, codec_natnet.own_rows,
+            core.clock_rows, core.align_rows,
         )  # fmt: skip
         rows = [row for part in parts for row in part(True)]
     return [*rows, _core_frames(1.0)]
