@@ -20,6 +20,7 @@ from jointfit_protocols.ximu3._messages import (
     XImu3Reply,
     parse_line,
     parse_rest,
+    unstuffed,
 )
 
 MAX_LINE = 4096
@@ -73,7 +74,7 @@ class XImu3Codec:
         at, base = 0, self.fed - len(self._pending)
         self.fed += len(data)
 
-        # Most lines are binary messages of one kind: their layout is known.
+        # Most lines are binary messages of one kind: their layout is known, also after escapes.
         (first, size), (kind, layout) = self._usual, LAYOUTS[self._usual]
         size, unpack_from, find = 0 if self._too_long else size, layout.unpack_from, buffer.find
         escape = find(ESCAPE) % _NEVER
@@ -86,6 +87,17 @@ class XImu3Codec:
                 at = after
                 continue
 
+            if escape < after:
+                escape = find(ESCAPE, after) % _NEVER
+                plain = unstuffed(buffer[at:after]) if buffer[at] == first else None
+                if plain is not None and len(plain) == size:
+                    read = unpack_from(plain)
+                    fields = (kind, read[0], read[1:], b"", True, after - at, base + after, None)
+                    append(_new_data(XImu3Data, fields))
+                    count += 1
+                    at = after
+                    continue
+
             message = self._message(buffer[at:after], base + after, found)
             if message is not None:
                 self.messages += 1
@@ -95,8 +107,6 @@ class XImu3Codec:
                     self._usual = usual
                     (first, size), (kind, layout) = usual, LAYOUTS[usual]
                     unpack_from = layout.unpack_from
-            if escape < after:
-                escape = find(ESCAPE, after) % _NEVER
             at = after
 
         self.messages += count
