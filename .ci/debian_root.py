@@ -1,7 +1,8 @@
 """Debian roots made with mmdebstrap once a week and kept: the disk of a machine, a minimal system.
 
 Invariant: a root holds Debian and nothing of the project, so it stays good from commit to commit.
-Its name is a digest of what made it and the week: a new week brings Debian's security updates.
+Its name is a digest of its packages and scripts and of the week: a new week brings Debian's
+security updates.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Write the software bill of materials: `python packaging/sbom.py [--out DIR]`.
 
-Law: it tells what is installed, not what was asked for: the project and what the Debian package
-carries are put into an empty environment, and that is listed. CycloneDX JSON, the same bytes for
-the same versions.
+Invariant: the list contains the packages that are installed, not those that were requested. The
+project and the extras of the Debian package are installed into an empty environment, which is then
+listed as CycloneDX JSON; the same versions give the same bytes.
 """
 
 from __future__ import annotations

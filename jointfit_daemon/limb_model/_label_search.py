@@ -65,8 +65,9 @@ _NEAR_M = 0.025
 _TOLERANCE_M = 0.03
 """Greatest difference of the distance of two markers from that in the cluster, m."""
 _MOST_COMPARED = 12
-"""Markers of a cluster up to which all exchanges are compared, 5000; their number grows with the
-fourth power. Of more markers, each is exchanged with its nearest one."""
+"""Largest number of markers of a cluster for which all exchanges are compared, about 5000. The
+number of exchanges grows with its fourth power; in a larger cluster, each marker is exchanged with
+its nearest one only."""
 _MOST_CHANGED = 4
 """Largest number of changed labels in one cluster."""
 _BEST = 16

@@ -156,7 +156,7 @@ def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
         others = list(decode_frames(sizes, chunks))
     elif driver.wire == "stream":
         text += f" in {sum(len(chunk.data) for chunk in chunks)} bytes"
-        others = [each for each in decode_stream(chunks, besides=name) if each.samples]
+        others = [each for each in decode_stream(chunks, other_than=name) if each.samples]
 
     commands = []
     for other in others:

@@ -90,7 +90,7 @@ def listen_can(
     progress
         Called with the share of the work that is done, 0 to 1.
     layouts
-        Tables to try beside those that the drivers propose, by driver.
+        Tables to try in addition to those that the drivers propose, by driver.
     """
     try:
         received = _receive(interface, listen_s, progress)

@@ -93,7 +93,7 @@ def listen_serial(
     progress
         Called with the share of the work that is done, 0 to 1.
     layouts
-        Tables to try beside the drivers, by driver.
+        Tables to try in addition to the drivers, by driver.
     """
     tried = tuple(usual_bauds() if bauds is None else bauds)
     received: dict[int, int] = {}

@@ -61,7 +61,7 @@ class DecodedDevice:
 
     driver: str
     settings: dict[str, Any]
-    """Keys of its table in rig.toml, besides those of the connection."""
+    """Keys of its table in rig.toml, without those of the connection."""
     messages: int
     """Well-formed messages."""
     samples: int
@@ -89,7 +89,7 @@ def decode_stream(
     chunks: Sequence[Chunk],
     baud: int | None = None,
     *,
-    besides: str = "",
+    other_than: str = "",
     layouts: Layouts | None = None,
 ) -> tuple[DecodedDevice, ...]:
     """Return the device of every installed driver that decodes a byte stream; most samples first.
@@ -100,14 +100,14 @@ def decode_stream(
         Received bytes.
     baud
         Speed of the line, baud; None if unknown.
-    besides
+    other_than
         Driver that is left out.
     layouts
-        Tables to try beside that of each driver.
+        Tables to try in addition to that of each driver.
     """
     found = []
     for name, driver in installed_drivers():
-        if driver.wire == "stream" and name != besides:
+        if driver.wire == "stream" and name != other_than:
             fields = driver.Settings.model_fields
             table = {"baud": baud} if "baud" in fields and baud is not None else {}
             described = (layouts or {}).get(name, ())
@@ -133,7 +133,7 @@ def decode_frames(
     chunks
         Records of the frames.
     layouts
-        Tables to try beside those that the drivers propose.
+        Tables to try in addition to those that the drivers propose.
     """
     used: set[tuple[int, bool]] = set()
     for name, driver in installed_drivers():
@@ -197,7 +197,7 @@ def decode_traffic(
         rate_hz = (len(samples) - 1) * 1e9 / span_ns
     properties = {k: v for event in events if event.kind == "info" for k, v in event.data.items()}
 
-    # A warning names the setting that removes its cause, besides the rate, which is measured here.
+    # A warning names the setting that removes its cause, except the rate, which is measured here.
     proposed = {
         key: value
         for event in events
