@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import pytest
 
 from jointfit_daemon.driver import DeviceMisconfiguredError, find_driver
-from jointfit_daemon.model import DeviceEvent
+from jointfit_daemon.model import Chunk, DeviceEvent
 from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
 from jointfit_drivers.qtm import QtmMocap
 from jointfit_protocols import bno085, mip, qtm, vicon, witmotion, xbus
@@ -196,3 +196,37 @@ def test_corrupt_messages_that_pass_a_checksum_are_not_reported() -> None:
     for k in range(1000):  # bounded
         newer.take_unknown(f"message {k}", 0)
     assert len(newer._seen) <= 16
+
+
+CONTENTS = {
+    "xbus item of another size": (
+        "xbus", {}, xbus.encode(0x36, b"\x20\x10\x02\0\0"), "item 0x2010 of 2 bytes",
+    ),
+    "xbus item of unknown kind": (
+        "xbus", {}, xbus.encode(0x36, b"\x99\x90\x02\0\0"), "item 0x9990",
+    ),
+    "mip field of another size": (
+        "mip", {}, mip.encode(0x82, ((0x03, b"\0" * 4),)), "field 0x03 of 4 bytes of data set 0x82",
+    ),
+    "mip data set of unknown kind": (
+        "mip", {}, mip.encode(0xB5, ((0x01, b"\0" * 4),)), "packets of data set 0xB5",
+    ),
+    "bno085 channel of unknown kind": (
+        "bno085", {"baud": 3_000_000}, bno085.encode_shtp(9, 0, b"\0\0"), "packets on channel 9",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CONTENTS.values(), ids=CONTENTS)
+def test_contents_of_unknown_kind_or_size_are_named_once(
+    case: tuple[str, dict[str, Any], bytes, str],
+) -> None:
+    name, keys, unknown, content = case
+    kind = find_driver(name)
+    table = {"id": "S1", "segment": "thigh", "driver": name, "port": "p"} | keys
+    decoder = kind(kind.Settings.model_validate(table)).decoder()
+    events = [item for k in range(40) for item in decoder.feed(Chunk(k * S // 10, unknown))]
+    (text,) = [
+        item.text for item in events if isinstance(item, DeviceEvent) and UPDATE in item.text
+    ]
+    assert text.startswith(f"the device sends {content}, which this version does not know")
