@@ -131,7 +131,9 @@ def _table() -> Callable[[], object]:
     table = cantools.database.load_string(TABLE, "dbc")
     assert isinstance(table, cantools.database.Database)
     frames = _frames()
-    assert table.decode_message(frames[2].can_id, frames[2].data)["Q1"] == round(-0.5 * 32767)
+    values = table.decode_message(frames[2].can_id, frames[2].data)
+    assert isinstance(values, dict)
+    assert values["Q1"] == round(-0.5 * 32767)
     return lambda: [table.decode_message(frame.can_id, frame.data) for frame in frames]
 
 
