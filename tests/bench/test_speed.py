@@ -51,7 +51,7 @@ def test_codecs_keep_their_thresholds_and_slcan_is_several_times_cheaper_than_py
         "clock-time",
         "frame-alignment-time",
     )
-    assert len(rows) == 11
+    assert len(rows) == 16
     assert rows["slcan: time ratio of jointfit to python-can"]["value"] < 0.5
 
 
