@@ -109,6 +109,15 @@ def imported_modules(path: Path) -> set[str]:
     return found
 
 
+def test_no_two_classes_share_a_name() -> None:
+    places: dict[str, list[str]] = {}
+    for path in SHIPPED:
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.ClassDef):
+                places.setdefault(node.name, []).append(name_of(path))
+    assert {name: found for name, found in places.items() if len(found) > 1} == {}
+
+
 @pytest.mark.parametrize("family", [Path(package).name for package in PACKAGES])
 def test_private_modules_are_imported_within_their_package_only(family: str) -> None:
     """`jointfit_drivers.xbus._decoder` is for `jointfit_drivers/xbus` alone."""

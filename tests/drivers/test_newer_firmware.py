@@ -14,7 +14,7 @@ from jointfit_daemon.model import Chunk, DeviceEvent
 from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
 from jointfit_drivers.qtm import QtmMocap
 from jointfit_protocols import bno085, mip, qtm, vicon, witmotion, xbus
-from jointfit_protocols.mip.commands import DeviceInfo
+from jointfit_protocols.mip.commands import DeviceInformation
 from jointfit_simulators import devices
 from tests.drivers.driver_run import DriverRun, serving
 from tests.drivers.motion_capture.mocap_run import MocapRun, answering
@@ -41,8 +41,10 @@ def vectornav_of_group_8() -> bytes:
     return b"\xfa" + body + struct.pack(">H", crc_hqx(body, 0))
 
 
-def mip_info(firmware: int) -> DeviceInfo:
-    return DeviceInfo(firmware, "3DM-CV7-AHRS", "6286-9910", "6286.00042", "I03A", "5g, 500dps")
+def mip_info(firmware: int) -> DeviceInformation:
+    return DeviceInformation(
+        firmware, "3DM-CV7-AHRS", "6286-9910", "6286.00042", "I03A", "5g, 500dps"
+    )
 
 
 class Newer(NamedTuple):

@@ -36,7 +36,7 @@ def _qtm_frame(k: int) -> bytes:
     parts = (
         qtm.ItemsComponent(ComponentType.BODIES_RESIDUAL, 0, 0, bodies),
         qtm.ItemsComponent(ComponentType.MARKERS_RESIDUAL, 0, 0, markers),
-        qtm.TimecodeComponent((qtm.Timecode(2, ticks >> 32, ticks & 0xFFFFFFFF),)),
+        qtm.TimecodeComponent((qtm.QtmTimecode(2, ticks >> 32, ticks & 0xFFFFFFFF),)),
     )
     return qtm.encode(qtm.DataFrame(k * PERIOD_NS // 1000, k, parts))
 

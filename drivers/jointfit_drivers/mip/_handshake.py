@@ -14,7 +14,14 @@ from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_drivers.mip._conversation import MipConversation, MipReply
 from jointfit_drivers.silence import explain_silence
 from jointfit_protocols.mip import commands
-from jointfit_protocols.mip.commands import Base, CommandSet, FilterSetup, Function, Output, Setup
+from jointfit_protocols.mip.commands import (
+    Base,
+    CommandSet,
+    FilterSetup,
+    FormatEntry,
+    Function,
+    Setup,
+)
 from jointfit_protocols.mip.data import DataSet
 
 if TYPE_CHECKING:
@@ -164,7 +171,9 @@ class MipHandshake:
         other = "sensor" if settings.estimator == "filter" else "filter"
         return f'estimator = "{other}" or orientation = "gateway"'
 
-    async def _outputs(self, stream: StreamCommands, fields: tuple[int, ...]) -> tuple[Output, ...]:
+    async def _outputs(
+        self, stream: StreamCommands, fields: tuple[int, ...]
+    ) -> tuple[FormatEntry, ...]:
         """Return the required message format at the requested rate."""
         reply = await self._answer(CommandSet.SETUP, stream.base_rate, stream.prefix)
         self._refuse(reply, "does not report its base rate", self._alternatives())
@@ -176,9 +185,9 @@ class MipHandshake:
             )
 
         decimation = self._settings.rate_divisor(base_hz, self._model)
-        return tuple(Output(field, decimation) for field in fields)
+        return tuple(FormatEntry(field, decimation) for field in fields)
 
-    async def _ensure_format(self, stream: StreamCommands, wanted: tuple[Output, ...]) -> bool:
+    async def _ensure_format(self, stream: StreamCommands, wanted: tuple[FormatEntry, ...]) -> bool:
         """Make the device send `wanted`; return whether it was written.
 
         Further fields may remain, as long as the line can take them: their decimation matters only
@@ -210,7 +219,7 @@ class MipHandshake:
             )
         return True
 
-    async def _format(self, stream: StreamCommands) -> tuple[Output, ...]:
+    async def _format(self, stream: StreamCommands) -> tuple[FormatEntry, ...]:
         reply = await self._answer(CommandSet.SETUP, stream.format, _READ + stream.prefix)
         return commands.decode_outputs(stream.prefix, reply.data(stream.format_reply)) or ()
 
@@ -245,6 +254,6 @@ class MipHandshake:
             )
 
 
-def _describe(outputs: tuple[Output, ...]) -> str:
+def _describe(outputs: tuple[FormatEntry, ...]) -> str:
     """Return fields with their decimations."""
     return ", ".join(f"0x{one.field:02X}/{one.decimation}" for one in outputs) or "nothing"

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from jointfit_drivers.motion_capture._route import Route
-    from jointfit_drivers.ports.tcp_connection import Segment
+    from jointfit_drivers.ports.tcp_connection import ReceivedBytes
 
 CONNECT_S = 3.0
 """Longest wait for a connection, s."""
@@ -36,7 +36,7 @@ class TcpLink(SocketLink):
         Called with all received bytes, in order of arrival.
     """
 
-    def __init__(self, name: str, remedy: str, take: Callable[[Segment], None]) -> None:
+    def __init__(self, name: str, remedy: str, take: Callable[[ReceivedBytes], None]) -> None:
         super().__init__()
         self._name = name
         self._remedy = remedy

@@ -24,7 +24,7 @@ IDLE_S, PROBE_S, PROBES = 5, 2, 3
 apart."""
 
 
-class Segment(NamedTuple):
+class ReceivedBytes(NamedTuple):
     """Bytes of one read."""
 
     t_ns: int
@@ -101,7 +101,7 @@ class TcpConnection:
         if sent != len(data):  # requests are short: a full buffer means that nobody reads it
             raise OSError(errno.ENOBUFS, "the server does not read its requests")
 
-    def receive(self) -> Segment | None:
+    def receive(self) -> ReceivedBytes | None:
         """Return the bytes that have arrived; None if there are none.
 
         Raises
@@ -117,7 +117,7 @@ class TcpConnection:
         if not data:
             raise ConnectionResetError(errno.ECONNRESET, "closed by the server")
 
-        return Segment(self._stamps.arrival(ancillary, time.monotonic_ns()), data)
+        return ReceivedBytes(self._stamps.arrival(ancillary, time.monotonic_ns()), data)
 
 
 class TcpListener:

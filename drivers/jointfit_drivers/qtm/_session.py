@@ -28,7 +28,7 @@ from jointfit_protocols.qtm import ComponentType, PacketType, QtmEvent
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit
     from jointfit_drivers.motion_capture import Route
-    from jointfit_drivers.ports.tcp_connection import Segment
+    from jointfit_drivers.ports.tcp_connection import ReceivedBytes
     from jointfit_drivers.qtm._settings import QtmSettings
 
 ANSWER_S = 3.0
@@ -110,7 +110,7 @@ class QtmSession:
 
     # --- received packets ---------------------------------------------------------------------
 
-    def _read(self, segment: Segment) -> None:
+    def _read(self, segment: ReceivedBytes) -> None:
         for packet in self._stream.feed(segment.data):
             if not isinstance(packet, CorruptBytes):
                 self._take(Chunk(segment.t_ns, packet))

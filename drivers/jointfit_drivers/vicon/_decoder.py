@@ -101,7 +101,7 @@ class ViconDecoder:
         out: list[Decoded] = []
         self._state.add(packet.objects)
         for item in packet.objects:
-            if isinstance(item, vicon.Ping):
+            if isinstance(item, vicon.ViconPing):
                 self._latency.add_ping(item.number, chunk.t_ns)
             elif isinstance(item, vicon.ObjectEnums) and item.ids != self._offered:
                 self._offered = item.ids

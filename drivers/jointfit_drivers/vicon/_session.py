@@ -22,7 +22,7 @@ from jointfit_protocols.vicon import ObjectId
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit
     from jointfit_drivers.motion_capture import Route
-    from jointfit_drivers.ports.tcp_connection import Segment
+    from jointfit_drivers.ports.tcp_connection import ReceivedBytes
     from jointfit_drivers.vicon._settings import ViconSettings
 
 OFFER_S = 3.0
@@ -80,7 +80,7 @@ class ViconSession:
             while True:
                 now = time.monotonic()
                 if now >= ping_at:
-                    link.send(vicon.encode(vicon.Ping(time.monotonic_ns())))
+                    link.send(vicon.encode(vicon.ViconPing(time.monotonic_ns())))
                     ping_at = now + PING_S
 
                 silence_s = self._settings.silence_s
@@ -109,7 +109,7 @@ class ViconSession:
             )
         return self.offered
 
-    def _read(self, segment: Segment) -> None:
+    def _read(self, segment: ReceivedBytes) -> None:
         for packet in self._stream.feed(segment.data):
             if not isinstance(packet, CorruptBytes):
                 self._take(Chunk(segment.t_ns, packet))

@@ -68,7 +68,7 @@ class XbusStep(NamedTuple):
     """Whether only the counter jumped before the held orientation; no message was then lost."""
 
 
-class _Point(NamedTuple):
+class _OrientationPoint(NamedTuple):
     """One orientation: counter, time, arrival, and the number of messages received by then."""
 
     counter: int | None
@@ -96,8 +96,8 @@ class XbusContinuity:
         wrap determines it."""
         self._nominal = 1_000_000_000 / TICK_NS / rate_hz
         self._messages = 0
-        self._last: _Point | None = None
-        self._held: _Point | None = None
+        self._last: _OrientationPoint | None = None
+        self._held: _OrientationPoint | None = None
         self._trusted = False  # whether a message followed the last one
         self._sum_ticks = self._sum_counts = 0
         self._delay = BacklogDelay()
@@ -119,7 +119,7 @@ class XbusContinuity:
             Its arrival, host monotonic ns.
         """
         self._messages += 1
-        point = _Point(counter, ticks, arrival_ns, self._messages)
+        point = _OrientationPoint(counter, ticks, arrival_ns, self._messages)
 
         last, held = self._last, self._held
         if last is None:
@@ -151,7 +151,7 @@ class XbusContinuity:
         self._sum_ticks = self._sum_counts = 0
         self._delay = BacklogDelay()
 
-    def _accept(self, last: _Point, point: _Point) -> XbusStep:
+    def _accept(self, last: _OrientationPoint, point: _OrientationPoint) -> XbusStep:
         """Make `point` the last one and update the measured rate."""
         self._last, self._trusted = point, True
         self._delay_to(last, point)
@@ -164,7 +164,7 @@ class XbusContinuity:
         lost = _lost(last, point)
         return XbusStep(lost) if lost else _CONTINUES
 
-    def _classify(self, last: _Point, held: _Point) -> XbusStep:
+    def _classify(self, last: _OrientationPoint, held: _OrientationPoint) -> XbusStep:
         """Return the step between two points that do not follow."""
         ticks, counts = self._ticks(last, held), _counts(last, held)
         if ticks is None:  # counter only: it decreases at a restart only
@@ -184,13 +184,13 @@ class XbusContinuity:
         continued = device_continued(delay_ns, ticks * TICK_NS, elapsed_ns, _PACE_NS)
         return XbusStep(restarted=not continued)
 
-    def _delay_to(self, last: _Point, point: _Point) -> None:
+    def _delay_to(self, last: _OrientationPoint, point: _OrientationPoint) -> None:
         """Update the delay with a point of the same clock as the one before it."""
         ticks = self._ticks(last, point)
         if ticks is not None:
             self._delay.feed(ticks * TICK_NS, point.arrival_ns - last.arrival_ns)
 
-    def _follows(self, last: _Point, point: _Point) -> bool:
+    def _follows(self, last: _OrientationPoint, point: _OrientationPoint) -> bool:
         ticks, counts = self._ticks(last, point), _counts(last, point)
         if (ticks is None) != (last.ticks is None) or (counts is None) != (last.counter is None):
             return False  # the set of fields differs from the stream's
@@ -209,7 +209,7 @@ class XbusContinuity:
             return self._nominal
         return self._sum_ticks / self._sum_counts
 
-    def _ticks(self, last: _Point, point: _Point) -> int | None:
+    def _ticks(self, last: _OrientationPoint, point: _OrientationPoint) -> int | None:
         """Return the step of time without wraps; None if one of the points has no time."""
         if last.ticks is None or point.ticks is None:
             return None
@@ -239,14 +239,14 @@ class XbusContinuity:
         return min(off, _COUNTS - off) <= _SLACK_COUNTS + _SLACK_SHARE * expected
 
 
-def _counts(last: _Point, point: _Point) -> int | None:
+def _counts(last: _OrientationPoint, point: _OrientationPoint) -> int | None:
     """Return the step of the counter; None if one of the points has no counter."""
     if last.counter is None or point.counter is None:
         return None
     return (point.counter - last.counter) % _COUNTS
 
 
-def _lost(last: _Point, point: _Point) -> int:
+def _lost(last: _OrientationPoint, point: _OrientationPoint) -> int:
     """Return the number of messages that were lost between two points."""
     counts = _counts(last, point)
     if counts is None or counts > _DISTINCT:  # the counter went back by a few

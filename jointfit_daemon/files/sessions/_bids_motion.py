@@ -26,8 +26,8 @@ from jointfit_daemon.files.sessions._channel_streams import (
     ORIENTATION,
     POSITION,
     UNITS,
-    Channel,
     ChannelStream,
+    StreamColumn,
     merge_streams,
     session_of,
     streams_of,
@@ -172,7 +172,7 @@ def _write_motion(path: Path, stream: ChannelStream) -> None:
             file.write("\t".join((f"{t_s:.9f}", *cells)) + "\n")
 
 
-def _scale(channel: Channel) -> float:
+def _scale(channel: StreamColumn) -> float:
     return float(np.rad2deg(1.0)) if channel.quantity in _DEGREES else 1.0
 
 
@@ -304,7 +304,7 @@ def _read_stream(path: Path, facts: Mapping[str, Any]) -> ChannelStream | None:
     table = _read_motion(path, len(described))
 
     types = [row.get("type", "").upper() for row in described]
-    columns: dict[Channel, int] = {}
+    columns: dict[StreamColumn, int] = {}
     for k, row in enumerate(described):
         channel = _channel_of(row)
         if channel is not None:
@@ -345,17 +345,19 @@ def _read_motion(path: Path, width: int) -> Any:
     return np.array(rows, np.float64).reshape(len(rows), width)
 
 
-def _channel_of(row: Mapping[str, str]) -> Channel | None:
+def _channel_of(row: Mapping[str, str]) -> StreamColumn | None:
     """Return a channel of ours by its description, another by its type; None if unknown."""
     quantity, _, component = row.get("description", "").partition(" ")
     item = row.get("tracked_point", "")
     placement = row.get("placement", _MISSING)
     placement = "" if placement == _MISSING else placement
     if quantity in UNITS:
-        return Channel(item, quantity, component, placement)
+        return StreamColumn(item, quantity, component, placement)
     for quantity, kind in _TYPES.items():
         if kind == row.get("type", "").upper() and kind != "JNTANG":
-            return Channel(item, quantity, row.get("component", "").removeprefix("quat_").lower())
+            return StreamColumn(
+                item, quantity, row.get("component", "").removeprefix("quat_").lower()
+            )
     return None
 
 

@@ -49,7 +49,7 @@ UNITS = {
 _INERTIAL = ("angular_velocity", "acceleration", "magnetic_field")
 
 
-class Channel(NamedTuple):
+class StreamColumn(NamedTuple):
     """Description of one column of a stream."""
 
     object: str
@@ -81,7 +81,7 @@ class ChannelStream:
     """Name of the object, or of the group if the stream holds several objects."""
     t_s: Array
     """Instants since the start of the session, s, shape (n,)."""
-    channels: tuple[Channel, ...]
+    channels: tuple[StreamColumn, ...]
     values: Array
     """Shape (n, len(channels)); NaN where unknown."""
 
@@ -109,8 +109,8 @@ def streams_of(session: SessionData) -> list[ChannelStream]:
     for group in ("joints", "optical_joints"):
         for joint in getattr(session, group):
             angles, sds = joint.angles.items(), joint.angle_sd.items()
-            columns = {Channel(joint.name, ANGLE, name): angle for name, angle in angles}
-            columns |= {Channel(joint.name, ANGLE_SD, name): sd for name, sd in sds}
+            columns = {StreamColumn(joint.name, ANGLE, name): angle for name, angle in angles}
+            columns |= {StreamColumn(joint.name, ANGLE_SD, name): sd for name, sd in sds}
             columns |= _vectors(joint.name, POSITION, joint.position, "xyz")
             columns |= _scalar(joint.name, POSITION_SD, joint.position_sd)
             streams.append(_stream(group, joint.name, joint.t_s, columns))
@@ -187,20 +187,22 @@ def _series(stream: ChannelStream, item: str) -> SensorSeries | SegmentSeries | 
 
 def _vectors(
     item: str, quantity: str, values: Array | None, components: str, placement: str = ""
-) -> dict[Channel, Array]:
+) -> dict[StreamColumn, Array]:
     if values is None:
         return {}
     return {
-        Channel(item, quantity, component, placement): values[:, k]
+        StreamColumn(item, quantity, component, placement): values[:, k]
         for k, component in enumerate(components)
     }
 
 
-def _scalar(item: str, quantity: str, values: Array | None) -> dict[Channel, Array]:
-    return {} if values is None else {Channel(item, quantity): values}
+def _scalar(item: str, quantity: str, values: Array | None) -> dict[StreamColumn, Array]:
+    return {} if values is None else {StreamColumn(item, quantity): values}
 
 
-def _stream(group: Any, name: str, t_s: Array, columns: Mapping[Channel, Array]) -> ChannelStream:
+def _stream(
+    group: Any, name: str, t_s: Array, columns: Mapping[StreamColumn, Array]
+) -> ChannelStream:
     values = np.column_stack(list(columns.values())) if columns else np.empty((len(t_s), 0))
     return ChannelStream(group, name, t_s, tuple(columns), values)
 

@@ -22,8 +22,8 @@ from jointfit_daemon.files.sessions._channel_streams import (
     ORIENTATION,
     POSITION,
     UNITS,
-    Channel,
     ChannelStream,
+    StreamColumn,
     session_of,
     streams_of,
 )
@@ -259,7 +259,7 @@ def _read_events(stream: XdfStream, t_s: Array) -> list[TimelineEvent]:
 def _read_channels(stream: XdfStream, t_s: Array) -> ChannelStream | None:
     """Return the described channels of a stream; None if there are none."""
     elements = stream.header.findall("desc/channels/channel")[: stream.channels]
-    columns: dict[Channel, int] = {}
+    columns: dict[StreamColumn, int] = {}
     for k, element in enumerate(elements):
         channel = _channel_of(element, stream.text("name"))
         if channel is not None:
@@ -277,14 +277,14 @@ def _read_channels(stream: XdfStream, t_s: Array) -> ChannelStream | None:
     return ChannelStream(cast("Group", group), name, t_s, tuple(columns), selected)
 
 
-def _channel_of(element: ET.Element, stream: str) -> Channel | None:
+def _channel_of(element: ET.Element, stream: str) -> StreamColumn | None:
     def text(name: str) -> str:
         return (element.findtext(name) or "").strip()
 
     if text("quantity") in UNITS:
-        return Channel(text("object"), text("quantity"), text("component"), text("placement"))
+        return StreamColumn(text("object"), text("quantity"), text("component"), text("placement"))
     item = text("object") or text("marker") or stream
     for quantity, word in _MOCAP_WORDS.items():
         if text("type").startswith(word) and len(text("type")) == len(word) + 1:
-            return Channel(item, quantity, text("type")[-1].lower())
+            return StreamColumn(item, quantity, text("type")[-1].lower())
     return None

@@ -17,12 +17,12 @@ from jointfit_daemon.outputs.payload_models._answers import (
 from jointfit_daemon.outputs.payload_models._state import (
     CalibrationState,
     DeviceCounts,
-    Event,
+    EventMessage,
     Health,
     Info,
     Latency,
     Progress,
-    Recording,
+    RecordingState,
     State,
 )
 from jointfit_daemon.outputs.payload_models._streams import OpticalPose, Pose, PoseJoint
@@ -33,7 +33,7 @@ __all__ = [
     "CalibrationState",
     "CalibrationsAnswer",
     "DeviceCounts",
-    "Event",
+    "EventMessage",
     "Health",
     "Info",
     "Latency",
@@ -41,7 +41,7 @@ __all__ = [
     "Pose",
     "PoseJoint",
     "Progress",
-    "Recording",
+    "RecordingState",
     "State",
     "StoredVersion",
     "answer_schema",
@@ -57,7 +57,7 @@ PAYLOADS: dict[Topic, type[Payload]] = {
     topics.BRIDGE_STATE: _state.State,
     topics.BRIDGE_INFO: _state.Info,
     topics.BRIDGE_HEALTH: _state.Health,
-    topics.BRIDGE_EVENT: _state.Event,
+    topics.BRIDGE_EVENT: _state.EventMessage,
     topics.BRIDGE_LOG: _state.LogLine,
     topics.RESPONSE: _state.Response,
     topics.CALIBRATION: _state.CalibrationState,
@@ -72,7 +72,7 @@ PAYLOADS: dict[Topic, type[Payload]] = {
     topics.OPTICAL_CENTERS: _streams.OpticalCenters,
     topics.OPTICAL_STICKS: _streams.OpticalSticks,
     topics.JOINT: _streams.JointScalars,
-    topics.LATE_EVENT: _state.Event,
+    topics.LATE_EVENT: _state.EventMessage,
     topics.LATE_POSE: _streams.Pose,
 }
 """Model of every topic that the daemon publishes."""

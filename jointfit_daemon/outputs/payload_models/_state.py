@@ -165,7 +165,7 @@ class StateFaults(Table):
     not_stored: str | None
 
 
-class Recording(Table):
+class RecordingState(Table):
     """State of the present recording, or of the last one."""
 
     file: str
@@ -191,12 +191,12 @@ class Health(Payload):
     process: Process
     link: LinkHealth
     state: StateFaults
-    recording: Recording | None = None
+    recording: RecordingState | None = None
     spool: SpoolHealth | None = None
     latency: Latency | None = None
 
 
-class Event(Payload):
+class EventMessage(Payload):
     """``bridge/event``."""
 
     t_us: Time
@@ -248,7 +248,7 @@ class DeviceFacts(Payload):
     model_config = ConfigDict(extra="allow")
 
 
-class Fault(Table):
+class RequestFault(Table):
     """One fault of a request."""
 
     key: str
@@ -260,7 +260,7 @@ class Error(Table):
 
     key: str
     message: str
-    faults: list[Fault]
+    faults: list[RequestFault]
     more: int = Field(description="number of faults beyond those listed")
 
 

@@ -36,7 +36,7 @@ class Angles(Table):
     bending_deg: Number = None
 
 
-class Rates(Angles):
+class AnglesAndRates(Angles):
     """Angles and their rates."""
 
     flexion_deg_s: Number = None
@@ -65,7 +65,7 @@ class PoseSegment(Table):
     used: list[str] = Field(description="sensors that contributed")
 
 
-class PoseJoint(Rates):
+class PoseJoint(AnglesAndRates):
     """Position and angles of one joint."""
 
     p_m: Vector
@@ -90,7 +90,7 @@ class Pose(Payload):
     joints: dict[str, PoseJoint]
 
 
-class JointScalars(Rates, Payload):
+class JointScalars(AnglesAndRates, Payload):
     """``joint/NAME``."""
 
     t_us: Time
@@ -107,7 +107,7 @@ class JointScalars(Rates, Payload):
     patent_gimbal: bool | None = None
 
 
-class OpticalSegment(Table):
+class OpticalPoseSegment(Table):
     """Orientation of one segment by the cameras."""
 
     q: Vector
@@ -115,7 +115,7 @@ class OpticalSegment(Table):
     residual_rms_deg: Number
 
 
-class OpticalJoint(Angles):
+class OpticalPoseJoint(Angles):
     """Position and angles of one joint by the cameras."""
 
     p_m: Vector
@@ -132,11 +132,11 @@ class OpticalPose(Payload):
 
     t_us: Time
     frame: int
-    segments: dict[str, OpticalSegment]
-    joints: dict[str, OpticalJoint]
+    segments: dict[str, OpticalPoseSegment]
+    joints: dict[str, OpticalPoseJoint]
 
 
-class ModelCoordinate(Table):
+class ChainCoordinate(Table):
     """One coordinate of a chain model: an angle or a translation."""
 
     value_deg: Number = None
@@ -160,21 +160,21 @@ class OpticalChain(Payload):
     frame: int
     model: str
     refined: Any = Field(description="refinement of the model in use")
-    coordinates: dict[str, ModelCoordinate]
+    coordinates: dict[str, ChainCoordinate]
     error_m: dict[str, Number]
     fit: FitErrors | None
     recent: FitErrors | None
     flags: list[str]
 
 
-class SensorOrientation(Table):
+class SensorsPoseSensor(Table):
     """Orientation of one sensor, and of its segment from this sensor alone."""
 
     q: Vector
     q_segment: Vector
 
 
-class JointRotation(Table):
+class SensorsPoseJoint(Table):
     """Rotation between two segments."""
 
     q: Vector
@@ -185,11 +185,11 @@ class SensorsPose(Payload):
 
     seq: int
     t_us: Time
-    sensors: dict[str, SensorOrientation]
-    joints: dict[str, JointRotation]
+    sensors: dict[str, SensorsPoseSensor]
+    joints: dict[str, SensorsPoseJoint]
 
 
-class RunningCenter(Table):
+class OpticalCenter(Table):
     """Running centre of one joint."""
 
     segment: str
@@ -211,10 +211,10 @@ class OpticalCenters(Payload):
 
     t_us: Time
     memory_s: float
-    joints: dict[str, RunningCenter]
+    joints: dict[str, OpticalCenter]
 
 
-class MovementPlane(Table):
+class SticksPlane(Table):
     """Plane of a planar movement."""
 
     normal: Vector
@@ -222,7 +222,7 @@ class MovementPlane(Table):
     refused: str | None
 
 
-class PlanarJoint(Table):
+class SticksJoint(Table):
     """Position of one joint of a planar movement."""
 
     p_m: Vector
@@ -231,7 +231,7 @@ class PlanarJoint(Table):
     refused: str | None
 
 
-class Stick(Table):
+class SticksSegment(Table):
     """One segment of the stick figure."""
 
     ends_m: list[Vector]
@@ -242,6 +242,6 @@ class OpticalSticks(Payload):
 
     t_us: Time
     frame: int
-    plane: MovementPlane
-    joints: dict[str, PlanarJoint]
-    sticks: dict[str, Stick]
+    plane: SticksPlane
+    joints: dict[str, SticksJoint]
+    sticks: dict[str, SticksSegment]

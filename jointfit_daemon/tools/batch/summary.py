@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from jointfit_daemon.tools.batch.recording_task import REPORT_FILE, RecordingResult
 from jointfit_daemon.tools.output_files import replace_file
-from jointfit_daemon.tools.report.html_document import Link, document, facts, section, table
+from jointfit_daemon.tools.report.html_document import PageLink, document, facts, section, table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -49,7 +49,7 @@ def write_summary(results: Sequence[RecordingResult], out: Path) -> list[Path]:
 def _row(result: RecordingResult, out: Path) -> tuple[str, ...]:
     page = out / result.recording / REPORT_FILE
     address = f"{quote(result.recording)}/{REPORT_FILE}"
-    name = Link(result.recording, address) if page.is_file() else result.recording
+    name = PageLink(result.recording, address) if page.is_file() else result.recording
     rms = _UNKNOWN if result.rms_deg is None else f"{result.rms_deg:.1f}° {result.angle}"
     extent = _UNKNOWN if result.range_deg is None else f"{result.range_deg:.0f}°"
     return (

@@ -61,7 +61,7 @@ Action = SendRequest | ChooseRig | AskMark | Quit
 
 
 @dataclass(slots=True)
-class Notice:
+class RequestOutcome:
     """Outcome of the last request."""
 
     text: str
@@ -96,7 +96,7 @@ class MonitorState:
     stored_fault: str = ""
     listed: tuple[object, ...] | None = None
     """Calibration for which the stored versions were requested."""
-    notice: Notice | None = None
+    notice: RequestOutcome | None = None
     asked_to_stop: bool = False
     """Whether the same key again stops the recording."""
 
@@ -132,12 +132,12 @@ class MonitorState:
             self.refused(f"jointfitd refuses {command}: {_fault_text(answer)}", now_s)
         else:
             text = printable(_words_of(command, answer))
-            self.notice = Notice(text, False, now_s + _NOTICE_S)
+            self.notice = RequestOutcome(text, False, now_s + _NOTICE_S)
             self.listed = None
 
     def refused(self, reason: str, now_s: float) -> None:
         """Show why a request has no effect."""
-        self.notice = Notice(printable(reason), True, now_s + _NOTICE_S)
+        self.notice = RequestOutcome(printable(reason), True, now_s + _NOTICE_S)
 
     def versions_unreadable(self, reason: str) -> None:
         """Show why the stored calibrations cannot be read."""

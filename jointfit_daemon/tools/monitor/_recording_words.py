@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from jointfit_daemon.outputs.payload_models import Recording
+    from jointfit_daemon.outputs.payload_models import RecordingState
     from jointfit_daemon.tools.monitor._rig_view import Moment, RigView
     from jointfit_daemon.tools.monitor._text_lines import Style
 
 _GB = 1e9
 
 
-def recording_of(rig: RigView) -> Recording | None:
+def recording_of(rig: RigView) -> RecordingState | None:
     """Return the state of the recording; None while it is unknown."""
     return None if rig.health is None or rig.bridge != "online" else rig.health.recording
 
@@ -52,7 +52,7 @@ def format_bytes(count: float) -> str:
     return f"{count / _GB:.1f} GB" if count >= _GB else f"{count / 1e6:.1f} MB"
 
 
-def _duration_s(rig: RigView, recording: Recording, now: Moment) -> float:
+def _duration_s(rig: RigView, recording: RecordingState, now: Moment) -> float:
     """Return the duration of the recording; that of the message grows while it is active."""
     gateway_us = rig.gateway_us(now)
     if not recording.active or gateway_us is None or rig.health is None:

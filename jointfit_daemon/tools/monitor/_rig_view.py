@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from jointfit_daemon.outputs.payload_models import (
     CalibrationState,
-    Event,
+    EventMessage,
     Health,
     Info,
     OpticalPose,
@@ -74,9 +74,9 @@ class RigView:
     optical: OpticalPose | None = None
     optical_s: float | None = None
     availability: dict[str, str] = field(default_factory=dict)
-    last_events: dict[str, Event] = field(default_factory=dict)
+    last_events: dict[str, EventMessage] = field(default_factory=dict)
     """Newest event of each id."""
-    events: deque[Event] = field(default_factory=lambda: deque(maxlen=_MOST_EVENTS))
+    events: deque[EventMessage] = field(default_factory=lambda: deque(maxlen=_MOST_EVENTS))
     """Newest first."""
     poses: deque[AngleSample] = field(default_factory=lambda: deque(maxlen=_MOST_SAMPLES))
     opticals: deque[AngleSample] = field(default_factory=lambda: deque(maxlen=_MOST_SAMPLES))
@@ -142,7 +142,7 @@ class RigView:
                 self._take_calibration(message)
             case Progress():
                 self.progress = message
-            case Event():
+            case EventMessage():
                 self.events.appendleft(message)
                 _bounded_set(self.last_events, message.id, message)
             case _:

@@ -24,12 +24,12 @@ class Drawing(str):
     __slots__ = ()
 
 
-class Link(str):
+class PageLink(str):
     """Text that refers to another page; `address` is relative to this page."""
 
     __slots__ = ("address",)
 
-    def __new__(cls, text: str, address: str) -> Link:
+    def __new__(cls, text: str, address: str) -> PageLink:
         """Return a link."""
         made = super().__new__(cls, text)
         made.address = address
@@ -92,7 +92,7 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], text
     def cell(number: int, value: str) -> str:
         kind = "" if number < text else ' class="number"'
         inner = value if isinstance(value, Drawing) else escape(value)
-        if isinstance(value, Link):
+        if isinstance(value, PageLink):
             inner = f'<a href="{escape(value.address)}">{inner}</a>'
         if number == 0:
             return f'<th scope="row">{inner}</th>'

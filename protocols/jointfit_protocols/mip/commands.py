@@ -112,7 +112,7 @@ class Function(IntEnum):
     DEFAULT = 5
 
 
-class Output(NamedTuple):
+class FormatEntry(NamedTuple):
     """One entry of a message format."""
 
     field: int
@@ -120,7 +120,7 @@ class Output(NamedTuple):
     """Base rate divided by the output rate."""
 
 
-class DeviceInfo(NamedTuple):
+class DeviceInformation(NamedTuple):
     """Reply to 01,03."""
 
     firmware: int
@@ -212,13 +212,13 @@ def code_text(code: int) -> str:
     return f"code {code}, {CODES.get(code, 'unknown to this version')}"
 
 
-def encode_info(info: DeviceInfo) -> bytes:
+def encode_info(info: DeviceInformation) -> bytes:
     """Return the data of a device information."""
     texts = (text.encode("ascii", "replace").ljust(16) for text in map(str, info[1:]))
     return _INFO.pack(info.firmware, *texts)
 
 
-def decode_info(data: bytes) -> DeviceInfo | None:
+def decode_info(data: bytes) -> DeviceInformation | None:
     """Return a device information; None if `data` is not one."""
     if len(data) != _INFO.size:
         return None
@@ -226,7 +226,7 @@ def decode_info(data: bytes) -> DeviceInfo | None:
     name, number, serial, lot, options = (
         text.decode("ascii", "replace").strip(" \0") for text in texts
     )
-    return DeviceInfo(firmware, name, number, serial, lot, options)
+    return DeviceInformation(firmware, name, number, serial, lot, options)
 
 
 def encode_descriptors(descriptors: Iterable[int]) -> bytes:
@@ -245,7 +245,7 @@ def encode_outputs(prefix: bytes, outputs: Iterable[tuple[int, int]]) -> bytes:
     return prefix + bytes((len(entries),)) + b"".join(entries)
 
 
-def decode_outputs(prefix: bytes, data: bytes) -> tuple[Output, ...] | None:
+def decode_outputs(prefix: bytes, data: bytes) -> tuple[FormatEntry, ...] | None:
     """Return the entries of a message format; None if `data` is not one of this data set."""
     head = len(prefix)
     if not data.startswith(prefix) or len(data) <= head:
@@ -253,7 +253,7 @@ def decode_outputs(prefix: bytes, data: bytes) -> tuple[Output, ...] | None:
     count = data[head]
     if count > _MOST_OUTPUTS or len(data) != head + 1 + count * _OUTPUT.size:
         return None
-    return tuple(Output(*entry) for entry in _OUTPUT.iter_unpack(data[head + 1 :]))
+    return tuple(FormatEntry(*entry) for entry in _OUTPUT.iter_unpack(data[head + 1 :]))
 
 
 def encode_rate(prefix: bytes, rate_hz: int) -> bytes:

@@ -42,7 +42,7 @@ _Span = tuple[int, int]
 """First byte of a section, and the byte behind it."""
 
 
-class _Places(NamedTuple):
+class _FramePlaces(NamedTuple):
     """Places of the numbers of a frame."""
 
     sets: tuple[tuple[str, _Span], ...]
@@ -59,7 +59,7 @@ class FrameLayout:
 
     Parameters
     ----------
-    places : _Places
+    places : _FramePlaces
         Numbers that change from frame to frame.
     example : bytes
         Datagram of the first frame.
@@ -67,7 +67,7 @@ class FrameLayout:
 
     __slots__ = ("_fixed", "_mask", "_places", "_size")
 
-    def __init__(self, places: _Places, example: bytes) -> None:
+    def __init__(self, places: _FramePlaces, example: bytes) -> None:
         self._places, self._size = places, len(example)
         fixed = bytearray(b"\xff" * len(example))
         number = (_HEADER_BYTES, _HEADER_BYTES + I32.size)
@@ -104,7 +104,7 @@ class FrameLayout:
 
         precision = frame.precision is not None
         end = stamps + STAMPS_LAYOUT.size + (PRECISION_LAYOUT.size if precision else 0)
-        places = _Places(tuple(sets), others, bodies, markers, stamps, precision, end)
+        places = _FramePlaces(tuple(sets), others, bodies, markers, stamps, precision, end)
         return FrameLayout(places, datagram) if end + END_LAYOUT.size == len(datagram) else None
 
     def read(self, datagram: bytes) -> FrameOfData | None:

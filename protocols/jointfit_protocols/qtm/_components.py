@@ -74,7 +74,7 @@ class TimecodeType(IntEnum):
     CAMERA = 2
 
 
-class Timecode(NamedTuple):
+class QtmTimecode(NamedTuple):
     """One timecode as sent."""
 
     type: int
@@ -106,7 +106,7 @@ class Timecode(NamedTuple):
 class TimecodeComponent(NamedTuple):
     """Timecodes of the frame."""
 
-    timecodes: tuple[Timecode, ...]
+    timecodes: tuple[QtmTimecode, ...]
     type: int = ComponentType.TIMECODE
 
 
@@ -165,7 +165,9 @@ def _decode_timecodes(data: memoryview) -> TimecodeComponent | str:
     (count,) = _COUNT.unpack_from(data)
     if count * _TIMECODE.size != len(data) - _COUNT.size:
         return f"{count} timecodes in {len(data)} bytes"
-    return TimecodeComponent(tuple(map(Timecode._make, _TIMECODE.iter_unpack(data[_COUNT.size :]))))
+    return TimecodeComponent(
+        tuple(map(QtmTimecode._make, _TIMECODE.iter_unpack(data[_COUNT.size :])))
+    )
 
 
 def _decode_skeletons(data: memoryview) -> SkeletonComponent | str:

@@ -25,7 +25,6 @@ from jointfit_protocols.vicon._messages import (
     ObjectId,
     ObjectQuality,
     OpaqueObject,
-    Ping,
     RequestFrame,
     SegmentInfo,
     SegmentPose,
@@ -33,6 +32,7 @@ from jointfit_protocols.vicon._messages import (
     StreamInfo,
     StreamTimecode,
     SubjectInfo,
+    ViconPing,
 )
 from jointfit_protocols.vicon._packets import Packet, ViconStream, decode, encode
 
@@ -62,7 +62,6 @@ __all__ = [
     "ObjectQuality",
     "OpaqueObject",
     "Packet",
-    "Ping",
     "RequestFrame",
     "SegmentInfo",
     "SegmentPose",
@@ -70,6 +69,7 @@ __all__ = [
     "StreamInfo",
     "StreamTimecode",
     "SubjectInfo",
+    "ViconPing",
     "ViconStream",
     "decode",
     "encode",

@@ -194,7 +194,7 @@ class ObjectQuality(NamedTuple):
     quality: float
 
 
-class Ping(NamedTuple):
+class ViconPing(NamedTuple):
     """Question of a client, or the same object as its answer."""
 
     number: int
@@ -244,7 +244,7 @@ Object = (
     | ApplicationInfo
     | FrameRates
     | ObjectQuality
-    | Ping
+    | ViconPing
     | ObjectEnums
     | RequestFrame
     | KeepAlive

@@ -28,7 +28,6 @@ from jointfit_protocols.vicon._messages import (
     ObjectId,
     ObjectQuality,
     OpaqueObject,
-    Ping,
     RequestFrame,
     SegmentInfo,
     SegmentPose,
@@ -36,6 +35,7 @@ from jointfit_protocols.vicon._messages import (
     StreamInfo,
     StreamTimecode,
     SubjectInfo,
+    ViconPing,
 )
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ _READERS: dict[int, Callable[[_Cursor], Object]] = {
     ObjectId.APPLICATION_INFO: lambda cursor: ApplicationInfo(cursor.integer(_I8)),
     ObjectId.FRAME_RATES: lambda cursor: FrameRates(_named_numbers(cursor)),
     ObjectId.OBJECT_QUALITY: _quality,
-    ObjectId.PING: lambda cursor: Ping(cursor.integer(_U64)),
+    ObjectId.PING: lambda cursor: ViconPing(cursor.integer(_U64)),
     ObjectId.OBJECT_ENUMS: lambda cursor: ObjectEnums(
         frozenset(int(kind) for (kind,) in cursor.items(_U32))
     ),
@@ -272,7 +272,7 @@ _WRITERS: dict[type, tuple[int, Callable[..., bytes]]] = {
     ApplicationInfo: (ObjectId.APPLICATION_INFO, lambda item: _I8.pack(*item)),
     FrameRates: (ObjectId.FRAME_RATES, lambda item: _write_numbers(item.rates)),
     ObjectQuality: (ObjectId.OBJECT_QUALITY, lambda item: _QUALITY.pack(*item)),
-    Ping: (ObjectId.PING, lambda item: _U64.pack(*item)),
+    ViconPing: (ObjectId.PING, lambda item: _U64.pack(*item)),
     ObjectEnums: (ObjectId.OBJECT_ENUMS, lambda item: _vector(map(_U32.pack, sorted(item.ids)))),
     RequestFrame: (ObjectId.REQUEST_FRAME, lambda item: _I8.pack(item.stream)),
     KeepAlive: (ObjectId.KEEP_ALIVE, lambda _: b""),

@@ -17,10 +17,10 @@ from jointfit_protocols.mip import MipCodec, MipPacket, commands, encode
 from jointfit_protocols.mip.commands import (
     Base,
     CommandSet,
-    DeviceInfo,
+    DeviceInformation,
     FilterSetup,
+    FormatEntry,
     Function,
-    Output,
     Setup,
 )
 from jointfit_protocols.mip.data import (
@@ -67,14 +67,14 @@ _COMMANDS: dict[str, tuple[int, ...]] = {
 }
 
 
-_CV7 = DeviceInfo(1105, "3DM-CV7-AHRS", "6286-9910", "6286.00042", "I03A", "5g, 500dps")
+_CV7 = DeviceInformation(1105, "3DM-CV7-AHRS", "6286-9910", "6286.00042", "I03A", "5g, 500dps")
 
 
 @dataclass(frozen=True, slots=True)
 class MipDeviceOptions:
     """Model, settings and faults of a device."""
 
-    info: DeviceInfo = _CV7
+    info: DeviceInformation = _CV7
     family: Family = "current"
     base_rates_hz: tuple[tuple[int, int], ...] = ((DataSet.SENSOR, 1000), (DataSet.FILTER, 500))
     """Base rate of each data set that the device has."""
@@ -106,7 +106,7 @@ class MipDeviceOptions:
 class _StreamState:
     """Volatile settings of one data set."""
 
-    outputs: tuple[Output, ...] = ()
+    outputs: tuple[FormatEntry, ...] = ()
     is_on: bool = False
     count: int = 0
     """Samples so far."""
@@ -145,7 +145,7 @@ class MipDevice(SerialDevice):
         self._base_rates = dict(options.base_rates_hz)
         self._saved = {
             data_set: (
-                tuple(Output(*output) for output in dict(options.formats).get(data_set, ())),
+                tuple(FormatEntry(*output) for output in dict(options.formats).get(data_set, ())),
                 data_set in options.streams,
             )
             for data_set in self._base_rates

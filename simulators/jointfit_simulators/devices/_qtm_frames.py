@@ -16,7 +16,7 @@ from xml.sax.saxutils import escape, quoteattr
 from jointfit_protocols.qtm import (
     ComponentType,
     ItemsComponent,
-    Timecode,
+    QtmTimecode,
     TimecodeComponent,
     TimecodeType,
 )
@@ -200,8 +200,8 @@ def components(
     return found
 
 
-def _camera_code(ticks: int) -> Timecode:
-    return Timecode(TimecodeType.CAMERA, ticks >> 32 & 0xFFFFFFFF, ticks & 0xFFFFFFFF)
+def _camera_code(ticks: int) -> QtmTimecode:
+    return QtmTimecode(TimecodeType.CAMERA, ticks >> 32 & 0xFFFFFFFF, ticks & 0xFFFFFFFF)
 
 
 def _numbers(position: Vector | None, width: int) -> tuple[float, ...]:

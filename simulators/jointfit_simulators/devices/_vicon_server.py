@@ -281,7 +281,7 @@ class ViconServer:
             case vicon.RequestFrame(stream):
                 client.streams = stream
                 client.frames += not stream
-            case vicon.Ping():
+            case vicon.ViconPing():
                 client.wire.send(vicon.encode(item))
             case _:
                 return

@@ -49,7 +49,7 @@ _UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 @dataclass(eq=False)
-class _Client:
+class _VrpnClient:
     peer: VrpnPeer
     codec: VrpnCodec = field(default_factory=VrpnCodec)
     greeted: bool = False
@@ -87,7 +87,7 @@ class VrpnServer:
         trackers = dict.fromkeys(tracker for tracker, _ in self._sensors.values())
         self._senders = {name: n for n, name in enumerate(trackers, _FIRST_SENDER)}
         self._types = {name: n for n, name in enumerate(TYPE_NAMES, _FIRST_TYPE)}
-        self._clients: list[_Client] = []
+        self._clients: list[_VrpnClient] = []
         self.ready = asyncio.Event()
         self.number = 0
         self.stepped_ns = 0
@@ -164,7 +164,7 @@ class VrpnServer:
 
     # --- frames -------------------------------------------------------------------------------
 
-    def _send_frame(self, client: _Client, messages: list[tuple[str, VrpnContent]]) -> bool:
+    def _send_frame(self, client: _VrpnClient, messages: list[tuple[str, VrpnContent]]) -> bool:
         datagrams = [b""]
         for tracker, message in messages:
             if tracker not in client.described:
@@ -184,7 +184,7 @@ class VrpnServer:
             self._send_datagram(client, client.udp, self.options.wire_noise(data))
         return True
 
-    def _send_datagram(self, client: _Client, address: Address, data: bytes) -> None:
+    def _send_datagram(self, client: _VrpnClient, address: Address, data: bytes) -> None:
         """Send a datagram with the losses of a network."""
         options, draw = self.options, self._random.random
         if draw() < options.loss:
@@ -210,7 +210,7 @@ class VrpnServer:
         if not back and "tcp" not in self.options.connections:
             connected.close()
             return
-        client = _Client(VrpnPeer(connected, self._take))
+        client = _VrpnClient(VrpnPeer(connected, self._take))
         self._clients.append(client)
         client.peer.send(encode(Cookie(*self.options.version)))
 
@@ -232,7 +232,7 @@ class VrpnServer:
                         pong = Pong(now_us, self._senders[name])
                         peer.send(self._encoded(client, pong))
 
-    def _greet(self, client: _Client) -> None:
+    def _greet(self, client: _VrpnClient) -> None:
         """Send all descriptions to a new client."""
         descriptions: list[VrpnContent] = [SenderDescription(0, _CONTROL)]
         descriptions += [TypeDescription(number, name) for name, number in self._types.items()]
@@ -243,12 +243,12 @@ class VrpnServer:
                 self._describe(client, tracker)
         client.greeted = True
 
-    def _describe(self, client: _Client, tracker: str) -> None:
+    def _describe(self, client: _VrpnClient, tracker: str) -> None:
         client.described.add(tracker)
         description = SenderDescription(self._senders[tracker], tracker)
         client.peer.send(self._encoded(client, description))
 
-    def _encoded(self, client: _Client, message: VrpnContent) -> bytes:
+    def _encoded(self, client: _VrpnClient, message: VrpnContent) -> bytes:
         client.sequence += 1
         return encode(message, self._types, sequence=client.sequence)
 

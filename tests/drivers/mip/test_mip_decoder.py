@@ -130,7 +130,7 @@ def test_a_wrong_norm_is_rejected_and_a_wrong_scale_named() -> None:
 
 
 def test_device_information_and_transform_are_reported() -> None:
-    info = commands.DeviceInfo(1105, "3DM-CV7-AHRS", "6286-9910", "6286.00042", "lot", "5g")
+    info = commands.DeviceInformation(1105, "3DM-CV7-AHRS", "6286-9910", "6286.00042", "lot", "5g")
     wire = encode(1, ((0xF1, b"\x03\x00"), (0x81, commands.encode_info(info))))
     turned = encode(12, ((0xF1, b"\x32\x00"), (0xB2, commands.encode_floats(0.0, 1.0, 0.0, 0.0))))
     found = decoded([wire, turned])

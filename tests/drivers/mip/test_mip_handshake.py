@@ -11,7 +11,7 @@ from typing_extensions import override
 from jointfit_daemon.driver import DeviceLostError, DeviceMisconfiguredError
 from jointfit_daemon.model import DeviceEvent
 from jointfit_drivers.mip import MipImu
-from jointfit_protocols.mip.commands import Base, CommandSet, DeviceInfo, encode_command
+from jointfit_protocols.mip.commands import Base, CommandSet, DeviceInformation, encode_command
 from jointfit_simulators.devices import MipDevice, MipDeviceOptions
 from tests.drivers.driver_run import DriverRun, serving
 from tests.drivers.mip.mip_packets import settings
@@ -56,7 +56,7 @@ async def test_differences_are_written_and_saved_only_with_persist(
     tmp_path: Path, family: Any, names_descriptors: bool
 ) -> None:
     name = "3DM-GX5-25" if family == "legacy" else "3DM-CV7-AHRS"
-    info = DeviceInfo(1000, name, "", "", "", "")
+    info = DeviceInformation(1000, name, "", "", "", "")
     options = MipDeviceOptions(info=info, family=family, names_descriptors=names_descriptors)
     device = MipDevice(tmp_path / "imu", options=options)
     async with serving(device, feeding=True):

@@ -51,7 +51,7 @@ def bodies(*items: tuple[float, ...]) -> qtm.ItemsComponent:
 
 
 def camera_time(ticks: int) -> qtm.TimecodeComponent:
-    return qtm.TimecodeComponent((qtm.Timecode(2, ticks >> 32, ticks & 0xFFFFFFFF),))
+    return qtm.TimecodeComponent((qtm.QtmTimecode(2, ticks >> 32, ticks & 0xFFFFFFFF),))
 
 
 THREE = markers((100.0, 200, 300, 1), HIDDEN, (1.0, 2, 3, 1))

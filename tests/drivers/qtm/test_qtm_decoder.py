@@ -175,7 +175,7 @@ def test_a_stamp_that_no_clock_has_is_left_out() -> None:
 
 def test_smpte_timecode_is_reported_once() -> None:
     feeder = ready(settings=xml(stamp="SMPTE"))
-    code = qtm.TimecodeComponent((qtm.Timecode(0, 0, 1 | 2 << 5 | 3 << 11 | 4 << 17),))
+    code = qtm.TimecodeComponent((qtm.QtmTimecode(0, 0, 1 | 2 << 5 | 3 << 11 | 4 << 17),))
     (got, _) = feeder.frames(frame(1, TWO, THREE, code), frame(2, TWO, THREE, code))
     assert got.ticks == 10_000
     assert feeder.texts("info").count("timecode 01:02:03:04") == 1

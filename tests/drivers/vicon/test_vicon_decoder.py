@@ -183,7 +183,7 @@ def test_a_falling_number_is_a_restart_and_a_change_of_the_rate_too() -> None:
 def test_arrivals_are_back_dated_by_the_announced_delay() -> None:
     feeder = ready()
     latency = vicon.LatencyInfo((("a", 0.003), ("b", 0.001)))
-    feeder(vicon.encode(vicon.Ping(10**9 - 2_000_000)), t_ns=10**9)
+    feeder(vicon.encode(vicon.ViconPing(10**9 - 2_000_000)), t_ns=10**9)
     (got,) = feeder.frames(frame(0, latency), t_ns=2 * 10**9)
     assert got.arrival_ns == 2 * 10**9 - 4_000_000 - 1_000_000
     for number in range(1, 120):
@@ -196,7 +196,7 @@ def test_arrivals_are_back_dated_by_the_announced_delay() -> None:
 @pytest.mark.parametrize("seconds", [float("nan"), -1.0, 1e9])
 def test_an_implausible_latency_or_ping_is_ignored(seconds: float) -> None:
     feeder = ready()
-    feeder(vicon.encode(vicon.Ping(7), vicon.Ping(2**63)), t_ns=5 * 10**9)
+    feeder(vicon.encode(vicon.ViconPing(7), vicon.ViconPing(2**63)), t_ns=5 * 10**9)
     (got,) = feeder.frames(frame(0, vicon.LatencyInfo((("a", seconds),))), t_ns=5 * 10**9)
     assert got.arrival_ns == 5 * 10**9
 

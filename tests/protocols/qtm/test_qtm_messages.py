@@ -59,15 +59,15 @@ def test_discovery_and_its_answer_carry_big_endian_ports() -> None:
 @pytest.mark.parametrize(
     ("code", "text"),
     [
-        (qtm.Timecode(0, 0, 13 | 37 << 5 | 59 << 11 | 24 << 17), "13:37:59:24"),
-        (qtm.Timecode(0, 0, 13 | 37 << 5 | 59 << 11 | 24 << 17 | 80 << 22), "13:37:59:24.80"),
-        (qtm.Timecode(1, 26 | 327 << 7, 13 | 37 << 5 | 59 << 11 | 4 << 17), "26-327 13:37:59.4"),
-        (qtm.Timecode(2, 1, 2), None),
-        (qtm.Timecode(9, 1, 2), None),
+        (qtm.QtmTimecode(0, 0, 13 | 37 << 5 | 59 << 11 | 24 << 17), "13:37:59:24"),
+        (qtm.QtmTimecode(0, 0, 13 | 37 << 5 | 59 << 11 | 24 << 17 | 80 << 22), "13:37:59:24.80"),
+        (qtm.QtmTimecode(1, 26 | 327 << 7, 13 | 37 << 5 | 59 << 11 | 4 << 17), "26-327 13:37:59.4"),
+        (qtm.QtmTimecode(2, 1, 2), None),
+        (qtm.QtmTimecode(9, 1, 2), None),
     ],
 )
 def test_timecodes_have_a_text_unless_they_are_camera_time(
-    code: qtm.Timecode, text: str | None
+    code: qtm.QtmTimecode, text: str | None
 ) -> None:
     assert code.text == text
     assert (code.camera_ticks is None) == (code.type != 2)
@@ -83,7 +83,7 @@ COMPONENTS = st.one_of(
             st.lists(item_of(kind), max_size=3).map(tuple),
         )
     ),
-    st.lists(st.builds(qtm.Timecode, U32, U32, U32), max_size=3).map(
+    st.lists(st.builds(qtm.QtmTimecode, U32, U32, U32), max_size=3).map(
         lambda codes: qtm.TimecodeComponent(tuple(codes))
     ),
     st.lists(

@@ -55,7 +55,7 @@ OBJECTS = st.one_of(
     st.builds(vicon.ApplicationInfo, st.integers(-128, 127)),
     st.builds(vicon.FrameRates, several(st.tuples(NAME, F64))),
     st.builds(vicon.ObjectQuality, U32, F64),
-    st.builds(vicon.Ping, st.integers(0, 2**64 - 1)),
+    st.builds(vicon.ViconPing, st.integers(0, 2**64 - 1)),
     st.builds(vicon.ObjectEnums, st.frozensets(U32, max_size=4)),
     st.builds(vicon.RequestFrame, st.booleans()),
     st.just(vicon.KeepAlive()),
@@ -67,7 +67,7 @@ PACKETS = several(OBJECTS)
 
 def test_the_published_bytes_are_read_and_written() -> None:
     assert vicon.encode(vicon.RequestFrame(True)) == REQUEST
-    assert vicon.encode(vicon.Ping(1)) == PING
+    assert vicon.encode(vicon.ViconPing(1)) == PING
     pose = vicon.SegmentPose(1, (100, 200, 300), (0, -1, 0, 1, 0, 0, 0, 0, 1))
     objects = vicon.FrameInfo(41), vicon.Segments(ObjectId.GLOBAL_SEGMENTS, 1, (pose,))
     assert vicon.encode(*objects) == FRAME
