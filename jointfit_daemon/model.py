@@ -126,7 +126,7 @@ class SyncPulse(NamedTuple):
     """
 
     arrival_ns: int
-    """Arrival of the first byte of the message, ns; milliseconds do not matter."""
+    """Arrival of the first byte of the message, ns; an error of milliseconds does not matter."""
     ticks: int
     """Device time of the edge, in ticks of the decoder's ``tick_clock``."""
     line: int = 0
@@ -327,7 +327,7 @@ class LimbState(NamedTuple):
     mode: FusionMode
     sync: SyncState
     flags: tuple[str, ...]
-    """`FrameFlag`, those of one sensor, segment or joint with its name."""
+    """Flags of the frame; a flag of one sensor, segment or joint ends in its name."""
     segments: tuple[SegmentState, ...]
     joints: tuple[JointState, ...]
 
@@ -403,9 +403,9 @@ class RunningCenter(NamedTuple):
     refused: str | None
     """Reason for which there is no center."""
     center: Vector | None = None
-    """m."""
+    """Position of the center, m."""
     covariance: tuple[Vector, Vector, Vector] | None = None
-    """m²; 0 along unobserved directions."""
+    """Covariance of the center, m²; 0 along unobserved directions."""
     unseen: tuple[Vector, ...] = ()
     """Unit directions along which the center was not observed."""
     axis: Vector | None = None
@@ -458,7 +458,7 @@ class MarkerFitErrors(NamedTuple):
     rms: float
     maximum: float
     accepted: bool
-    """Whether both are within the limits that the field accepts."""
+    """Whether RMS and maximum are within the limits that are common in the field."""
 
 
 class ChainModelState(NamedTuple):
@@ -487,7 +487,7 @@ class PlanarJoint(NamedTuple):
 
     name: str
     position: Vector | None
-    """In the optical world, m; along the normal that of the markers."""
+    """Position in the optical world, m; its component along the normal is that of the markers."""
     error: float | None
     """Predicted RMS error of the position in the plane, m."""
     arc: float | None

@@ -1,4 +1,4 @@
-"""Nearest valid spelling of an unknown name, and other words for keys, for error messages.
+"""Nearest valid spelling of an unknown name, and synonyms of keys, for error messages.
 
 Comparison ignores case and uses the similarity ratio of `difflib.SequenceMatcher` (Ratcliff and
 Obershelp): twice the number of matching characters over the total number of characters.
@@ -63,14 +63,14 @@ _OTHER_WORDS = {
     "vertical": ("up_axis",),
     "zaxis": ("up_axis",),
 }
-"""Keys of rig.toml by other words for them, in lower case without separators. The first one that
-the table has is meant."""
+"""Keys of rig.toml by their synonyms, which are in lower case and without separators. Of several
+keys, the first one that the table has is suggested."""
 
 
 def nearest_key(key: object, known: Iterable[str]) -> str | None:
-    """Return the key of `known` that `key` is another word for, or else resembles; None without.
+    """Return the key of `known` of which `key` is a misspelling or a synonym; None without one.
 
-    A spelling that differs by case and separators only is meant before another word.
+    A key that differs in case and separators only takes precedence over a synonym.
     """
     keys = [other for other in known if other != key]
     folded = _without_separators(str(key))

@@ -1,8 +1,9 @@
 """Delay of the messages of one device, relative to its fastest ones.
 
-After a silence, buffered messages arrive together: each one is late, the last one least. Device
-time and arrival time then advance differently although the device continued. With e the elapsed
-arrival time and d the advance of device time between two messages, the delay of the second is
+After a silence, buffered messages arrive together: all of them are late, the last one by the least.
+Device time and arrival time then advance differently although the device continued. With e the
+elapsed arrival time and d the advance of device time between two messages, the delay of the second
+is
 
     L' = max(0, L + (1 - m) e - d),   m = 0.1 %.
 
@@ -17,7 +18,7 @@ from __future__ import annotations
 _SKEW = 0.001
 """Margin m, relative; twice the largest plausible skew of a device clock."""
 _BURST_SHARE = 0.5
-"""Decrease of the shortest delay, share of the advance, that shows a burst."""
+"""A delay below the shortest one by more than this share of the advance shows a burst."""
 
 
 class BacklogDelay:

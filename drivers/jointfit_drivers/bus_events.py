@@ -27,7 +27,7 @@ class BusEvents:
         self._reported_ns = 0
 
     def discard(self, count: int, reason: str) -> Corrupt:
-        """Return and count `count` corrupt bytes."""
+        """Count `count` corrupt bytes, and return them as an event."""
         self.discarded_bytes += count
         return Corrupt(count, reason)
 

@@ -18,17 +18,18 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Decoded
 
 _SIGHTINGS = 10
-"""Contents of one kind that are reported: a weak checksum accepts some corrupt messages."""
+"""Unknown contents of one kind after which a warning is returned. Fewer prove nothing, because a
+weak checksum accepts some corrupt messages."""
 _WITHIN_NS = 60_000_000_000
 """Longest time between the first and the last of these contents, ns."""
 _MOST_KINDS = 16
-"""Kinds of unknown contents that are counted and reported."""
+"""Most kinds of unknown contents that are counted and reported."""
 _NUMBER = re.compile(r"\d{1,9}")
 
 
 @dataclass(frozen=True, slots=True)
 class NewestKnown:
-    """Newest version of a family that the codec was written for, and the way back to it."""
+    """Newest version of a family that the codec supports, and the program that installs it."""
 
     version: tuple[int, ...]
     """Its leading numbers; the vendor changes further ones without changing contents."""
@@ -53,7 +54,8 @@ class NewerFirmwareDetector:
     tool : str
         Program that selects the outputs, for devices without `newest`.
     sightings : int
-        Unknown contents of one kind that are reported; 1 on a connection without errors.
+        Unknown contents of one kind after which a warning is returned; 1 on a connection without
+        errors.
     """
 
     def __init__(
@@ -117,7 +119,7 @@ class NewerFirmwareDetector:
         return [DeviceEvent("warning", text, {"unknown": content, **self._data()})]
 
     def _data(self) -> dict[str, object]:
-        """Return the version found and the newest known one, those that exist."""
+        """Return the version found and the newest known one, each if it exists."""
         newest = None if self._newest is None else self._newest.text
         known = {"found": self._found or None, "newest_known": newest}
         return {key: value for key, value in known.items() if value is not None}

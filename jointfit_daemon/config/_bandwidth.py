@@ -103,7 +103,7 @@ def least_load(settings: Any, unknown: Iterable[str]) -> Any:
 
 
 def _choices(field: FieldInfo) -> list[Any]:
-    """Return all values of a key that has few; identifiers do not change the load."""
+    """Return all values of a key with few of them; identifiers do not change the load."""
     annotation: Any = field.annotation
     if annotation is bool:
         return [False, True]

@@ -57,7 +57,7 @@ _REMEDIES = (
     ("Illegal character", "remove it, or write it as an escape sequence such as \\t"),
     ("Duplicate inline table key", "remove one of the two"),
 )
-"""Begin of an error message of tomllib, and what to do."""
+"""Beginning of an error message of tomllib, and its remedy."""
 
 
 def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:

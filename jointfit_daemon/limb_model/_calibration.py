@@ -72,9 +72,10 @@ class CalibratedCenter:
     """Center of rotation of one joint from the calibration movement alone, in the static world."""
 
     center: Vector
-    """m."""
+    """Position of the center, m."""
     covariance: tuple[Vector, Vector, Vector]
-    """m²; persistent residuals count once per posture. 0 along `unseen`."""
+    """Covariance of the center, m²; persistent residuals count once per posture. 0 along
+    `unseen`."""
     unseen: tuple[Vector, ...]
     """Unit directions along which the movement did not determine the center."""
 

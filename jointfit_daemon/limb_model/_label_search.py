@@ -2,8 +2,9 @@
 
 A hypothesis assigns a measured label to every marker of a cluster. Its cost is the negative
 logarithm of its likelihood: marker errors are Gaussian, an exchanged label is less probable than a
-correct one, and a marker that is somewhere else is less probable still. A cluster that looks the
-same after an exchange is turned by it: its joint centers leave those of the adjacent clusters.
+correct one, and a marker that is somewhere else is less probable still. If a cluster looks the same
+after an exchange, the exchange turns it: its joint centers then leave those of the adjacent
+clusters.
 
 Invariant: an explanation is unique. Every hypothesis that disagrees with it has a higher cost by
 `_MARGIN`. A search consists of short parts, which `LabelExamination` spreads over frames.
@@ -59,7 +60,7 @@ GAP_M = 0.08
 _GAP_SD_M = 0.03
 """Standard deviation of this distance, soft-tissue artefact and error of the center included, m."""
 _MOST_GAP_COST = 12.0
-"""Largest cost of the distance at one joint: it is evidence like a marker elsewhere."""
+"""Largest cost of the distance at one joint: as much as that of a marker elsewhere."""
 _NEAR_M = 0.025
 """RMS residual up to which a label is at the place of a hidden marker, m."""
 _TOLERANCE_M = 0.03

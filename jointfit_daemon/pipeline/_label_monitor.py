@@ -40,13 +40,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 RATE_HZ = 5.0
-"""Examined frames per second: a search takes milliseconds, which the frames after it share."""
+"""Examined frames per second. A search takes milliseconds and is spread over the next frames."""
 FAULT_NS = 2_000_000_000
 """Time after which a fault begins or ends, ns."""
 MISFIT_NS = 4_000_000_000
 """Time after which a cluster without explanation is reported, ns."""
 _FEWEST = 7
-"""Frames with the clusters of a fault that decide on it: more than half of those in `FAULT_NS`."""
+"""Number of frames with all clusters of a fault that a decision needs: over half of `FAULT_NS`."""
 _PRESENT = 0.6
 """Share of the frames that a fault explains at its beginning: the rest may have hidden markers."""
 _ABSENT = 0.1

@@ -135,7 +135,7 @@ def _totals(kind: str, condition: _Condition) -> dict[str, object]:
 
 
 def unix_step_notices(now_ns: int, step_ns: int) -> list[Notice]:
-    """Return the notice about UNIX time of this host having been set forward by `step_ns`."""
+    """Return the notice that UNIX time of this host was set forward by `step_ns`."""
     if abs(step_ns) < STEP_NS:
         return []
     step_s = step_ns / 1e9

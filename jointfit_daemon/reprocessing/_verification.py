@@ -108,7 +108,7 @@ class Verification:
 
     @property
     def passed(self) -> bool:
-        """Whether everything that could be compared agrees, and something could."""
+        """Whether something could be compared, and all of it agrees."""
         if self.tolerant is not None:
             return self.tolerant.agrees
         return self.difference is None and sum(self.compared.values()) > 0

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 QUANTILE_95 = 1.959963984540054
 """Half width of the 95 % interval of a normal distribution, standard deviations."""
 _LEAST_GAP_S = 0.05
-"""Shortest interval without samples that is a gap, s: an arrival late by some samples is none."""
+"""Shortest interval without samples that is a gap, s: a delay of some samples is no gap."""
 _LEAST_GAP_PERIODS = 3.0
 """Shortest interval without samples that is a gap, sample periods."""
 

@@ -24,7 +24,7 @@ MAX_GAP_SAMPLES = 1.5
 UNIFORM_SHARE = 0.01
 """Largest deviation of an instant from a uniform time axis, in sample periods."""
 _EXACT_SHARE = 1e-6
-"""An instant this close to a row takes its value, in sample periods."""
+"""Distance to a row, in sample periods, up to which an instant takes the value of the row."""
 
 
 def sample_rate_hz(t_s: Array) -> float:

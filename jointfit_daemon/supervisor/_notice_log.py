@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CLOSED_S = 1.0
-"""Longest time from the silence that a source permits to the message that it is closed, s."""
+"""Longest time from the end of the permitted silence of a source to the report of its closing,
+s."""
 LEVELS = {
     NoticeLevel.INFO: logging.INFO,
     NoticeLevel.WARNING: logging.WARNING,

@@ -36,7 +36,7 @@ class Report(Protocol):
 
 
 def create_recorder(rig: Rig, core: CoreRunner, tasks: TaskGroup, report: Report) -> Recorder:
-    """Return the recorder, which records from now on if rig.toml says so, else when requested."""
+    """Return the recorder; it records from now on if rig.toml asks for it, otherwise on request."""
     settings = rig.recording or RecordingSettings(autostart=False)
     folder = state_directory() / settings.directory
     limits = RecordingLimits(

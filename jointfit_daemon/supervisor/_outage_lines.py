@@ -1,9 +1,9 @@
 """Log lines on sensors without data: one for each sensor and outage.
 
-A source that is closed has a line with the reason. The line on its sensor, which comes first
-because the fusion notices missing data earlier, is therefore held until the source may no longer
-be closed for this silence. A source that still sends something is not closed. After a stall of
-this host, which has a line of its own, the lines are held until the sensors may have recovered.
+A source that is closed has a line with the reason. Fusion detects missing data earlier, so the line
+on the sensor would come first. It is therefore held until this silence can no longer close the
+source. A source that still sends something is not closed. After a stall of this host, which has a
+line of its own, the lines are held until the sensors may have recovered.
 
 Invariant: the line on a sensor that remains lost comes within `LONGEST_S`, also if the host stalls
 all the time.

@@ -37,7 +37,7 @@ SERVER_RETRY_S = 0.25
 """Longest wait before a retry of a source without a port, s: no file shows that its server is back,
 and an attempt costs a few datagrams."""
 WORKED_S = 1.0
-"""Duration of data after which the waits and pauses of a source begin with the first again, s."""
+"""Duration of data after which the waits and pauses of a source start at their first values, s."""
 PAUSE_S = 60.0
 """Longest pause of a misconfigured source, s: a device may be reconfigured without being unplugged.
 """

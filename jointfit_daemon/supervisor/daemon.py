@@ -242,7 +242,7 @@ class Daemon:
     async def _check_state(self, *, asked: bool = True) -> None:
         """Report a state directory without write access before a calibration needs it.
 
-        A check that no request or reload `asked` for reports changes only.
+        If neither a request nor a reload `asked` for the check, only changes are reported.
         """
         folder = store_directory(self._rig)
         before, fault = self._state_fault, await asyncio.to_thread(write_fault, folder)

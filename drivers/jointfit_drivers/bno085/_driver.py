@@ -1,8 +1,8 @@
 """Driver of Bosch / CEVA BNO085 and BNO086 on a serial port.
 
 `RvcDecoder` and `ShtpDecoder` are the pure part. `Bno085Imu.run` opens the port, makes the device
-send and reads until cancelled. The two share only chunks. The speed of the port is that of the
-mode.
+send and reads until cancelled. Nothing but chunks passes from one to the other. The mode of the
+device determines the speed of the port.
 """
 
 from __future__ import annotations

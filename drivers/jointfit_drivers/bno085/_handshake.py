@@ -67,7 +67,8 @@ class ShtpConversation(SerialConversation[ShtpPacket | ShtpBufferStatus]):
     async def control(self, data: bytes, *, tries: int) -> bytes | None:
         """Send a request on the control channel; return its reply, or None.
 
-        A request for the product id is answered with that, one for a report with its settings.
+        The reply to a request for the product id is that id. The reply to a request for a report is
+        the settings of the report.
         """
         wire = encode_shtp(ShtpChannel.CONTROL, self._sequence, data)
         self._sequence += 1
@@ -130,7 +131,7 @@ async def ensure_shtp(port: SerialPort, emit: Emit, settings: Bno085Settings) ->
     DeviceMisconfiguredError
         It is of another kind or in another mode, or does not accept the rate.
     """
-    held: list[Chunk] = []  # samples before the end are late: the line waits for the pauses
+    held: list[Chunk] = []  # late stamps: the pauses of the handshake delay them
     conversation = ShtpConversation(port, held.append)
     conversation.reset()
     if await conversation.control(product_request(), tries=3) is None:

@@ -1,8 +1,8 @@
 r"""Decoder of the mode UART-RVC: Euler angles to samples with canonical orientation.
 
-The data sheet lets yaw, pitch and roll follow each other about z, y and x. Its own example message
-contradicts this: pitch -1.10 and roll 20.85 degrees with accelerations of -371, -20 and 977 mg.
-With pitch about x and roll about y (``zxy``),
+According to the data sheet, yaw, pitch and roll are successive rotations about z, y and x. Its own
+example message contradicts this: pitch -1.10 and roll 20.85 degrees with accelerations of -371, -20
+and 977 mg. With pitch about x and roll about y (``zxy``),
 
 .. math:: R = R_z(\text{yaw})\, R_x(\text{pitch})\, R_y(\text{roll}), \qquad
     R^T e_z = (-0.356, -0.019, 0.934),
@@ -37,7 +37,7 @@ _FORCE = 9.80665e-3
 """Specific force of one count, m/s^2."""
 _COUNTS = 256
 _MOST_LOST = 128
-"""Steps of the index from which it went back."""
+"""Smallest step of the index, modulo 256, that counts as a decrease."""
 _REST = 0.06
 """Largest deviation of an acceleration from 1 g at rest, relative."""
 _DISTINCT = 0.2
@@ -68,7 +68,7 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
         self._gate = OrientationGate()
         self._number: int | None = None
         self._compared = 0
-        self._deviations = [0.0, 0.0]  # of this order and of the other one
+        self._deviations = [0.0, 0.0]  # sums: configured order of axes, other order
 
     @override
     def _take(self, message: RvcFrame) -> list[Decoded]:

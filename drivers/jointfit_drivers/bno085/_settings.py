@@ -50,10 +50,10 @@ class Bno085Settings(SerialImuSettings, GatewaySettings):
 
     @property
     def reports(self) -> tuple[HubReportId, ...]:
-        """Reports of one sample; those of UART-SHTP only."""
+        """Reports that make up one sample in UART-SHTP."""
         if self.orientation == "device":
             return (_REPORTS[self.report],)
-        # that of the gyroscope last: it completes a sample
+        # the report of the gyroscope is last: it completes a sample
         field = (HubReportId.MAGNETIC_FIELD,) if self.magnetometer else ()
         return (HubReportId.ACCELEROMETER, *field, HubReportId.GYROSCOPE_UNCALIBRATED)
 

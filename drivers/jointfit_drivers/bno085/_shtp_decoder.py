@@ -2,7 +2,7 @@
 
 Reports have a number of 8 bits and no absolute time: a packet contains the time between measurement
 and transmission. A sample is stamped with the arrival of the first byte of its packet minus that
-time. There is no checksum: packets with an impossible length or content are rejected, and
+time. There is no checksum: the decoder rejects packets with an impossible length or content, and
 quaternions whose norm is not 1.
 
 Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
@@ -45,14 +45,14 @@ if TYPE_CHECKING:
 
 _COUNTS = 256
 _MOST_LOST = 128
-"""Steps of a number from which it went back."""
+"""Smallest step of a number, modulo 256, that counts as a decrease."""
 _OLDEST = 10_000
 """Largest age of a measurement at transmission, 100 us; a larger one is corrupt."""
 _RESET_COMPLETE = b"\x01"
 _PERIOD_COUNTS = 200
 """Readings after which their measured period replaces the nominal one."""
 _STALE_COUNTS = 2
-"""Readings of the gyroscope after which an acceleration is too old."""
+"""An acceleration is too old after this many readings of the gyroscope."""
 _SATURATED = 32_760
 """Count of a gyroscope or accelerometer from which it is out of range."""
 _NEWEST = NewestKnown((3,), "the host that configures the device")

@@ -22,13 +22,13 @@ PACKAGE_MISSING = (
     "`type` of the fields"
 )
 _NAMED = 12
-"""Names listed in a message."""
+"""Most names that one error message lists."""
 _UNITS = {
     "rad/s": "rad/s", "deg/s": "deg/s", "dps": "deg/s", "°/s": "deg/s",
     "m/s2": "m/s2", "m/s^2": "m/s2", "m/s²": "m/s2", "g": "g", "mg": "mg",
     "s": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns",
 }  # fmt: skip
-"""Our units by those of DBC files."""
+"""Units of rig.toml by their spelling in DBC files."""
 
 
 class DbcSignal(NamedTuple):

@@ -1,4 +1,4 @@
-"""The ``[[imu]]`` table of a CAN device that it describes."""
+"""The ``[[imu]]`` table that describes the frames of a CAN device."""
 
 from __future__ import annotations
 

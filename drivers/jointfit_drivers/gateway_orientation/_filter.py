@@ -79,8 +79,8 @@ FIELD_RATIO = 2.0
 """Largest ratio between the strength of a field and the median, or the reverse, with which a
 reading contributes to the delay of the magnetometer."""
 RIDGE_RATE = 1.0
-"""Angular rate, rad/s, below which the delay of the magnetometer is not estimated: 2 % of the field
-in 20 ms."""
+"""Angular rate, rad/s, below which the delay of the magnetometer is not estimated: there, a delay
+of 20 ms changes the field by 2 % at most."""
 MOST_DELAY_S = 0.05
 """Largest delay of the magnetometer, s."""
 NO_FIELD = (0.0, 0.0, 0.0)

@@ -101,7 +101,7 @@ class RawSamples:
 
     @classmethod
     def maker(cls, settings: GatewaySettings) -> Callable[[], Self] | None:
-        """Return what makes new samples; None if the device computes the orientation."""
+        """Return a function that makes new samples; None if the device has the orientation."""
         return partial(cls.of, settings) if settings.orientation == "gateway" else None
 
     @property

@@ -3,8 +3,8 @@
 The settings of the sensor are read and compared. Only those that differ are set, and read again,
 because old firmware acknowledges nothing. They are stored in flash only with ``persist``.
 
-Before any command whose meaning depends on the generation, the sensor is asked for a text or number
-that both generations answer without an effect, and each in its own way.
+Some commands have another meaning in the other generation. Before the first of them, the driver
+sends a query that has no effect in either generation, and whose reply differs between them.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class LpmsHandshake:
         DeviceLostError
             The sensor is silent, unplugged, or stopped answering.
         DeviceMisconfiguredError
-            Speed, generation or address are others, the device is of another kind, or it does not
-            accept the settings.
+            Speed, generation or address differ from the settings, the device is of another kind, or
+            it does not accept the settings.
         """
         settings = self._settings
         settings.require_line_speed("the speed of the sensor")

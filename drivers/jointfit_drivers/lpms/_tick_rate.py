@@ -49,7 +49,7 @@ class TickRateCheck:
         self._since: tuple[int, int] | None = None
         self._contradictions = 0
         self.done = False
-        """Whether the unit was reported wrong, or found right."""
+        """Whether the check has ended: the unit was confirmed, or reported as wrong."""
 
     def feed(self, tick: int, arrival_ns: int) -> TimeUnitFault | None:
         """Add a data packet; return the fault once, as soon as it is certain.

@@ -39,14 +39,15 @@ if TYPE_CHECKING:
 _NS = 1_000_000_000
 _CLOCK = TickClock(1, None)
 _LATEST_S = 9e9
-"""Largest time stamp, s: 64 bit of nanoseconds."""
+"""Largest time stamp, s: its nanoseconds still fit 64 bits."""
 _BACKWARDS_NS = _NS
-"""Step backwards of the stamps that is a restart of the sender, ns."""
+"""Decrease of the stamps, ns, from which on it shows a restart of the sender."""
 _GAP_PERIODS, _LEAST_GAP_NS = 5, 100_000_000
-"""Step of the stamps of a regular stream that shows lost samples. Programs that stamp when they
-send have a jitter of several periods."""
+"""Steps of the stamps of a regular stream, periods and ns, above both of which samples were lost.
+Programs that stamp when they send have a jitter of several periods."""
 _EARLY_NS, _LATE_NS = 500_000_000, 10 * _NS
-"""A stamp on the clock of LSL is at most so much after and before its arrival, ns."""
+"""Largest time, ns, by which a stamp on the clock of LSL is later, and earlier, than its
+arrival."""
 
 
 class LslMarkersDecoder:

@@ -64,7 +64,7 @@ def search_streams(
 
 
 def _is_sender(server: str, hostname: str) -> bool:
-    """Return whether `server` is the PC with this name; a stream has no address."""
+    """Return whether `server` is the PC called `hostname`; streams contain no address."""
     name = hostname.lower()
     if server.lower() in {name, name.partition(".")[0]}:
         return True

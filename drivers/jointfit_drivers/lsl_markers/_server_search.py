@@ -1,7 +1,7 @@
 """Search for streams of motion capture, and diagnosis of missing frames.
 
-The search asks the network once; hosts that are named only select among the answers. The connection
-of the diagnosis is that of the driver.
+The search asks the network once; hosts that are named only select among the answers. The diagnosis
+connects as the driver does.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ async def find_servers(
 ) -> list[FoundServer]:
     """Return the streams that answer; see `ServerSearch.find_servers`.
 
-    Without the extra ``lsl`` there are none. A port is that of another family: LSL has no fixed
-    one.
+    Without the extra ``lsl`` there are none. With a `port` there are none either: LSL has no fixed
+    port, so the search is for another family.
     """
     if port is not None or not (hosts or broadcast):
         return []
@@ -52,7 +52,7 @@ def _search(lsl: Any, hosts: Sequence[str], broadcast: bool, wait_s: float) -> l
     query = LslMarkersSettings(driver="lsl-markers").query()
     found = {}
     for server in [None] if broadcast else list(hosts):
-        # The search lasts as long as its time, because any number of streams may answer.
+        # The search always takes the whole time, because any number of streams may answer.
         for info in search_streams(lsl, query, server, least=_MOST_STREAMS, wait_s=wait_s):
             found[info.uid()] = info
     return [_described(lsl, info, wait_s) for info in found.values()]

@@ -1,6 +1,7 @@
 """One connection to a stream: search, description, samples, and comparisons of the clocks.
 
-1. The streams that fit are searched; none is a loss, several of different sources are an error.
+1. Search for the streams that fit. Without one, the device is lost; with several of different
+sources, it is misconfigured.
 2. The description is emitted, then samples as they arrive, each time in one chunk.
 3. A second thread asks for the offset of the sender's clock, because the first reply takes half a
    second, and emits every new result.

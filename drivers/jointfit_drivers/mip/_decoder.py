@@ -1,7 +1,7 @@
 """Decoder of the MIP driver: chunks in, samples in SI units with canonical orientation out.
 
-A sample takes its time from a field of the same packet. An orientation without one is stamped with
-its arrival, or rejected if others have had a time. The two data sets with orientations have
+A sample takes its time from a field of the same packet. An orientation without time is stamped with
+its arrival. It is rejected if earlier ones had a time. The two data sets with orientations have
 different delays: only one of them is decoded.
 
 Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
@@ -45,11 +45,11 @@ _FIELD = int(SensorField.MAGNETIC_FIELD)
 _DATA = 0x80
 """Lowest descriptor set of data; lower ones are commands."""
 _FOREIGN = 20
-"""Orientations of the other data set, none of the expected one between them, that are reported."""
+"""Consecutive orientations of the other data set after which a warning is returned."""
 _REPORT_NS = 10_000_000_000
 """Least time between two reports of invalid orientations, ns."""
 _NEWEST = NewestKnown((1,), "SensorConnect")
-"""Firmware of the models that the vendor's SDK describes."""
+"""Newest firmware that the vendor's SDK describes."""
 
 
 class MipDecoder(SerialMessageDecoder[MipPacket]):

@@ -1,7 +1,7 @@
 """Driver of MicroStrain IMUs that use MIP on a serial port or USB.
 
 `MipDecoder` is the pure part. `MipImu.run` opens the port, makes the device stream and reads until
-cancelled. The two share only chunks.
+cancelled. Nothing but chunks passes from one to the other.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class MipImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the speed is another, no MIP device answers, or it cannot
-            send the orientation at this rate.
+            The file is not a serial port, the device uses another speed, no MIP device answers, or
+            it cannot send the orientation at this rate.
         """
         settings = self._settings
         await self._reception.run(

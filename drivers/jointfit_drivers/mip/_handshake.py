@@ -75,8 +75,8 @@ class MipHandshake:
         DeviceLostError
             The device is silent, unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The speed is another, the device is of another kind, or it cannot send the orientation
-            at this rate.
+            The device uses another speed, is of another kind, or it cannot send the orientation at
+            this rate.
         """
         settings = self._settings
         settings.require_line_speed()

@@ -196,7 +196,7 @@ def _columns(what: str, entries: Sequence[ModelEntry], wanted: Mapping[str, str]
             found.warnings.append(text)
             break
         free = None if entry.key in taken else _unused_name(entry, plain, used)
-        if free is not None:  # otherwise its id occurs twice, and frames with it are refused
+        if free is not None:  # None: its id occurs twice, and frames with this id are refused
             found.names.append(free)
             found.keys.append(entry.key)
             used.add(free)

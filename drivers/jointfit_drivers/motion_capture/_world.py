@@ -1,7 +1,7 @@
 """Positions and orientations of a frame: world z up, unit quaternions, NaN for missing data.
 
-The **world** is rotated, p' = R p and q' = q_R q. The axes of a body remain those of the vendor.
-A position that is not finite or not plausible is absent, and so is a rotation that is none.
+The **world** is rotated, p' = R p and q' = q_R q. The axes of a body remain those of the vendor. A
+position that is not finite or not plausible is absent. So is an orientation that is no rotation.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Diagnosis of "connected, but no data": the cause of missing frames, each with its remedy.
 
-The connection is that of the driver: it connects, receives for a while, and disconnects.
+The diagnosis connects as the driver does, receives for a while, and disconnects.
 
 | cause | evidence |
 |---|---|

@@ -78,7 +78,7 @@ class NatNetSession:
     emit : Emit
         Receives every accepted datagram of the server.
     output : ServerOutput, optional
-        That of the connections before.
+        Output of the earlier connections.
     """
 
     def __init__(

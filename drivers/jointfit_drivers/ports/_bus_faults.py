@@ -39,7 +39,8 @@ _LIBRARIES = {"pcan": "libpcanbasic.so", "kvaser": "libcanlib.so", "neousys": "l
 """Libraries of vendors that python-can loads when a bus is opened, by interface."""
 _INSTEAD = 'set interface = "socketcan", or "slcan" for a serial adapter'
 _INTERNAL = frozenset({"self", "can_filters", "timing", "kwargs", "msg", "message"})
-"""Parameters of python-can that a table cannot contain, or that are not those of opening a bus."""
+"""Parameters of python-can that a table cannot contain, or that do not concern the opening of a
+bus."""
 _DOCUMENTED = re.compile(r":param (?:[\w.\[\]]+ )?(\w+):")
 _SPEEDS = ("baudrate", "ttyBaudrate")
 """Names of python-can for the speed of a serial port."""

@@ -41,7 +41,7 @@ class QtmColumns(NamedTuple):
     body_positions: Array
     body_orientations: Array
     suspicious: int
-    """Bodies with a position whose rotation is none."""
+    """Bodies that have a position, but no valid rotation."""
 
 
 class QtmPoseConverter:

@@ -62,7 +62,7 @@ class QtmSession:
     emit : Emit
         Receives every packet of the server.
     output : ServerOutput, optional
-        That of the connections before.
+        Output of the earlier connections.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""The ``[[imu]]`` table of a serial device that it describes."""
+"""The ``[[imu]]`` table that describes the frames or lines of a serial device."""
 
 from __future__ import annotations
 

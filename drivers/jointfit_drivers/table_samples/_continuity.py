@@ -31,7 +31,7 @@ _LATE_NS = 500_000_000
 """Largest difference between the steps of device time and of the arrivals over a gap, ns."""
 _LATE_SHARE = 0.02
 _AMBIGUOUS = 0.05
-"""Tolerance of a count, share of the counter's values, from which on it confirms nothing."""
+"""A count confirms nothing if its tolerance exceeds this share of the counter's values."""
 _FASTER = 4.0
 """Factor by which messages that waited may arrive faster than their rate."""
 

@@ -45,7 +45,7 @@ class FieldFaultError(Exception):
     Parameters
     ----------
     name : str
-        Key of the part, without the part's own.
+        Key inside the part, such as ``offset``.
     text : str
         Fault and remedy.
     """
@@ -82,8 +82,8 @@ def place_fields(
     quantities
         Parts of each quantity.
     place
-        Returns the places of so many components of a part, unscaled or with the scale of its file;
-        raises `FieldFaultError`.
+        Returns the places of a given number of components of a part, unscaled or with the scale of
+        its file; raises `FieldFaultError`.
     """
     form = TableForm()
     for name, parts in quantities.items():

@@ -43,9 +43,9 @@ _FIELDS = (int(Field.IMU_MAGNETIC_FIELD), int(Field.MAGNETIC_AND_PRESSURE))
 _NAMES = {Register.MODEL: "model", Register.SERIAL: "serial", Register.FIRMWARE: "firmware"}
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _SMALL = 1e-4
-"""Element of a rotation that counts as that of the identity."""
+"""Largest difference of an element from the identity matrix in a rotation that counts as none."""
 _NEWEST = NewestKnown((3,), "VectorNav Control Center")
-"""Firmware of the VN-100 of 2024; other models have lower numbers."""
+"""Firmware of the VN-100 in 2024; the numbers of other models are lower."""
 
 
 class _Places:
@@ -117,7 +117,7 @@ class VectorNavDecoder(SerialMessageDecoder[VectorNavMessage]):
     @override
     def _take_corrupt(self, found: CorruptBytes) -> list[Decoded]:
         out = super()._take_corrupt(found)
-        if found.reason == UNKNOWN_HEADER:  # the same size again: no noise
+        if found.reason == UNKNOWN_HEADER:  # a repeated size is hardly noise
             content = f"binary outputs of {found.discarded} bytes with an unknown header"
             out += self._newer.take_unknown(content, self._stamps.chunk_ns)
         return out

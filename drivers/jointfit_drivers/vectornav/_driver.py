@@ -1,7 +1,7 @@
 """Driver of VectorNav IMUs on a serial port or USB.
 
 `VectorNavDecoder` is the pure part. `VectorNavImu.run` opens the port, makes the device stream and
-reads until cancelled. The two share only chunks.
+reads until cancelled. Nothing but chunks passes from one to the other.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class VectorNavImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the speed is another, no VectorNav device answers, or it
-            cannot send the orientation at this rate.
+            The file is not a serial port, the device uses another speed, no VectorNav device
+            answers, or it cannot send the orientation at this rate.
         """
         settings = self._settings
         await self._reception.run(

@@ -1,7 +1,8 @@
 """Comparison of the rate of a stream with the configured one. Pure.
 
 The driver derives the divisor of its output from a nominal rate of the IMU, 400 or 800 Hz by model.
-A device whose IMU was set to another rate sends at another one, without an error.
+If the IMU of a device was set to another rate, the stream has another rate, too, and the device
+reports no error.
 """
 
 from __future__ import annotations

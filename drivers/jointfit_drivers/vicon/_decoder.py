@@ -73,7 +73,7 @@ class ViconDecoder:
         self.unknown_ids = 0
         """Markers and segments dropped because no subject has them."""
         self.suspicious = 0
-        """Segments rejected because their rotation is none."""
+        """Segments rejected because their rotation is not valid."""
 
     @property
     def tick_clock(self) -> TickClock | None:

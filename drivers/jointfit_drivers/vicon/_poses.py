@@ -45,7 +45,7 @@ class ViconColumns(NamedTuple):
     body_positions: Array
     body_orientations: Array
     suspicious: int
-    """Segments with a position whose rotation is none."""
+    """Segments that have a position, but no valid rotation."""
     unknown: int
     """Markers and segments that no subject has."""
 

@@ -51,7 +51,7 @@ class ViconSession:
     emit : Emit
         Receives every packet of the server.
     output : ServerOutput, optional
-        That of the connections before.
+        Output of the earlier connections.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Search for VRPN servers, and diagnosis of missing poses.
 
-VRPN has no discovery: only hosts that are named are asked. The connection of the diagnosis is that
-of the driver.
+VRPN has no discovery: only hosts that are named are asked. The diagnosis connects as the driver
+does.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class VrpnSession:
     emit : Emit
         Receives every chunk of the server.
     output : ServerOutput, optional
-        That of the connections before.
+        Output of the earlier connections.
     """
 
     def __init__(

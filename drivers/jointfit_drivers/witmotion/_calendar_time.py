@@ -14,8 +14,7 @@ _SLACK_NS = 1_000_000_000
 """Largest difference, ns, of elapsed device and arrival time without a glitch: longer than the
 delay of buffered bytes."""
 _CONFIRMED = 3
-"""Consecutive times that follow each other after a step, and are therefore of a clock that was
-set."""
+"""Consecutive times after a step that prove that the clock was set."""
 
 
 class CalendarTime:

@@ -1,7 +1,7 @@
 """Driver of WitMotion IMUs (WT901, JY901, HWT905 and relatives) on a serial port.
 
 `WitMotionDecoder` is the pure part. `WitMotionImu.run` opens the port, makes the device send the
-required frames and reads until cancelled. The two share only chunks.
+required frames and reads until cancelled. Nothing but chunks passes from one to the other.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class WitMotionImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the speed is another, no WitMotion device answers, or it
-            does not send the required frames even on request.
+            The file is not a serial port, the device uses another speed, no WitMotion device
+            answers, or it does not send the required frames even on request.
         """
         settings = self._settings
         with SerialPort(settings.port, settings.baud) as port:

@@ -65,7 +65,7 @@ class _Reception(NamedTuple):
     counts: dict[int, int]
     """Number of frames of each kind."""
     received: int
-    """Bytes."""
+    """Number of bytes."""
     other_frames: int
     """Frames of the variant 55 61."""
     seconds: float
@@ -79,7 +79,7 @@ class WitMotionHandshake:
     Parameters
     ----------
     port, emit : SerialPort, Emit
-        Open port, and the receiver of the device's bytes once they are those required.
+        Open port, and the receiver of the device's bytes once it sends the required frames.
     settings : WitMotionSettings
         Its table of rig.toml.
     """
@@ -98,7 +98,7 @@ class WitMotionHandshake:
         DeviceLostError
             The device is silent or unplugged.
         DeviceMisconfiguredError
-            The speed is another, the device is of another kind or variant, or it does not send the
+            The device uses another speed, is of another kind or variant, or it does not send the
             frames even on request.
         """
         settings = self._settings

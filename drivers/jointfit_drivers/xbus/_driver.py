@@ -1,7 +1,7 @@
 """Driver of Xsens / Movella IMUs that use Xbus on a serial port or USB.
 
 `XbusDecoder` is the pure part. `XbusImu.run` opens the port, brings the device into measurement
-mode and reads until cancelled. The two share only chunks.
+mode and reads until cancelled. Nothing but chunks passes from one to the other.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ class XbusImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the speed is another, no Xbus device answers, or the
-            output configuration differs while ``persist`` is false.
+            The file is not a serial port, the device uses another speed, no Xbus device answers, or
+            the output configuration differs while ``persist`` is false.
         """
         settings = self._settings
         await self._reception.run(

@@ -79,8 +79,8 @@ class XbusHandshake:
         DeviceLostError
             The device is silent, unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The speed is another, the device is of another kind, or the output configuration
-            differs and may not be written.
+            The device uses another speed, is of another kind, or the output configuration differs
+            and may not be written.
         """
         settings = self._settings
         settings.require_line_speed()

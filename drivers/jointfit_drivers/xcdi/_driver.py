@@ -144,7 +144,7 @@ class XcdiImu:
 
     @classmethod
     def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterator[dict[str, Any]]:
-        """Yield the identifiers of sensors that may send what was received.
+        """Yield the identifiers of sensors that may have sent the received frames.
 
         A candidate is a Quaternion (8 bytes) with the next lower GroupCounter (2 bytes) and the
         next lower SampleTime (4 bytes), because a sensor needs ascending identifiers. Both byte

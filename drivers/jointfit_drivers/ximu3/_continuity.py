@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 _FEW = 5.5
 """Periods within which a message follows another one."""
 _FIRST_US = 1_000_000
-"""The same, us, while the period is unknown: a device at 1 Hz."""
+"""Time, us, within which a message follows while the period is unknown: that of a device at 1
+Hz."""
 _EXTRAPOLATED = 2.5
 """Largest interval, in periods, over which motion is extrapolated."""
 _STEADY = 0.005
@@ -42,13 +43,14 @@ _STEADY = 0.005
 _DECAY = 0.998
 """Factor of the largest deviation for each message: half in 3.5 s at 100 Hz."""
 _FASTEST = 60.0
-"""Largest angular rate between two messages, rad/s; the gyroscope measures 35 rad/s."""
+"""Largest angular rate between two messages, rad/s; the range of the gyroscope is 35 rad/s."""
 _JOLT = 0.05
-"""Rotation in addition to it, rad."""
+"""Rotation that is permitted in addition, rad."""
 _LEARNED = 10
-"""Periods after which the period is a mean; before, it is the shortest interval."""
+"""Number of intervals from which on the period is their mean; before, it is the shortest of
+them."""
 _LONGER = 20
-"""Intervals of the same several periods after which they are the period: the rate was changed."""
+"""Consecutive intervals of the same number of periods that prove a changed rate."""
 _MOST_COUNTED = 50
 """Longest interval, periods, that contributes to the mean."""
 _PACE_NS = 250_000_000

@@ -19,7 +19,7 @@ REPLY_S = 0.5
 TRIES = 3
 """Number of times that a command is sent: the x-IMU3 GUI retries twice."""
 _CERTAIN = 3
-"""Messages with numbers that identify the protocol: a line of noise may have the form of one."""
+"""Messages with numbers that identify the protocol: a single one may be noise."""
 
 
 class XImu3Conversation:

@@ -1,7 +1,7 @@
 """Driver of x-io x-IMU3 on a serial port or USB, and of boards that send its messages.
 
 `XImu3Decoder` is the pure part. `XImu3Imu.run` opens the port, checks the settings of the device
-and reads until cancelled. The two share only chunks.
+and reads until cancelled. Nothing but chunks passes from one to the other.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class XImu3Imu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the speed is another, no x-IMU3 answers, or its settings
-            differ while ``persist`` is false.
+            The file is not a serial port, the device uses another speed, no x-IMU3 answers, or its
+            settings differ while ``persist`` is false.
         """
         settings = self._settings
 

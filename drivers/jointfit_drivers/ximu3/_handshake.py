@@ -68,8 +68,8 @@ class XImu3Handshake:
         DeviceLostError
             The device is silent, unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The speed is another, the device is of another kind, or its settings differ and may not
-            be written.
+            The device uses another speed, is of another kind, or its settings differ and may not be
+            written.
         """
         settings = self._settings
         settings.require_line_speed("serial_baud_rate of the device")

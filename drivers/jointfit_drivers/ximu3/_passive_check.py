@@ -1,4 +1,4 @@
-"""First seconds of a device that is only listened to: its messages must be the expected ones."""
+"""First seconds of a device that receives no commands: its messages must be the expected ones."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ _MESSAGE_TYPES = (
     "quaternion", "rotation matrix", "Euler angles", "linear acceleration", "earth acceleration",
 )  # fmt: skip
 _MAGNETIC_DIVISORS = (1, 2)
-"""Of 20 Hz: the magnetometer at 20 or 10 Hz."""
+"""Divisors of the base rate of 20 Hz: the magnetometer sends at 20 or 10 Hz."""
 
 
 class RequiredSetting(NamedTuple):

@@ -124,7 +124,7 @@ def c3d_bytes(
     if last_frame <= _MOST_WORD:
         sections.append(data)
         data = b""
-    # Readers that know the header only read a longer file to its end: no frames of padding there.
+    # Readers that use only the header read a longer file to its end, so it has no padding frames.
     return b"".join(section + bytes(-len(section) % _BLOCK) for section in sections) + data
 
 

@@ -198,7 +198,7 @@ def text_of(element: ET.Element, tag: str, default: str = "") -> str:
 
 
 def numbers_of(element: ET.Element, tag: str, count: int | None = None) -> Array:
-    """Return the numbers in a child's text; `ValueError` if there are others than `count`."""
+    """Return the numbers in a child's text; `ValueError` if there are not `count` of them."""
     try:
         values = np.array([float(cell) for cell in text_of(element, tag).split()])
     except ValueError:

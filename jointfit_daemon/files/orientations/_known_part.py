@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LEAST_KNOWN = 0.5
-"""Least share of frames in which a written column is known; of the frames with any known value."""
+"""Least share of known frames in a written column, relative to the frames with any known value."""
 
 
 @dataclass(frozen=True, slots=True)

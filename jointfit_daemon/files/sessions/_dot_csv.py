@@ -1,10 +1,10 @@
 """CSV files of Xsens / Movella DOT sensors: one sensor in each file, written by app or exporter.
 
 Lines ``NAME:,VALUE`` precede the column names: ``DeviceTag``, ``OutputRate`` and ``SyncStatus`` are
-read. ``SampleTimeFine`` numbers the rows: 32 bit, 1 µs, so it turns after 71.6 minutes. Angular
+read. ``SampleTimeFine`` numbers the rows: 32 bit, 1 µs, so it wraps after 71.6 minutes. Angular
 rates are in degrees a second. The world is east, north, up; quaternions map sensor to world. Modes
-without rates have increments of a row, ``dq`` and ``dv``, which become mean rates over its period.
-Source: header and columns as in published files and programs; no recording of our own.
+without rates contain an increment for each row, ``dq`` and ``dv``, which becomes the mean rate over
+its period. Source: header and columns as in published files and programs; no recording of our own.
 """
 
 from __future__ import annotations

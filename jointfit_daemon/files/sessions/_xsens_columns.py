@@ -22,8 +22,8 @@ _EULER = (("Roll", "Pitch", "Yaw"), ("Euler_X", "Euler_Y", "Euler_Z"))
 
 
 def unwrapped(counter: Array, turn: int) -> Array:
-    """Return a counter since its first row, without its turns, ticks, shape (n,)."""
-    # A step beyond half a turn is one in the other direction: rows in disorder run backwards.
+    """Return a counter since its first row, without wraps, ticks, shape (n,)."""
+    # A step of more than half the range of the counter is a step back: rows in disorder.
     steps = np.mod(np.diff(counter) + turn / 2, turn) - turn / 2
     counted: Array = np.concatenate([[0.0], np.cumsum(steps)])[: len(counter)]
     return counted

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 MOST_EVALUATIONS = 16
 """Largest number of evaluations of the marker errors in one instant."""
 _MOST_FOLLOWING = 8
-"""Largest number without those of a restart. A search that they end continues in the next
+"""Largest number of evaluations without a restart. A search that reaches it continues in the next
 instant."""
 _TRIES = 6
 """Attempts of a step, each with more damping."""
@@ -57,7 +57,7 @@ _OPEN_SLACK = 1e-2  # the regularization may raise the marker cost slightly
 _FORGETTING = 0.02
 _FIRST_SD_M = 0.003
 _FIRST_INSTANTS = 5
-"""Instants for which the first standard deviation counts."""
+"""Weight of the initial standard deviation, in instants."""
 _MOST_PATIENCE = 32
 """Most restart intervals between two restarts of a chain that does not fit its markers."""
 _STRAIGHTEN = 32

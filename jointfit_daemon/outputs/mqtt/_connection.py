@@ -464,11 +464,11 @@ class _Client(aiomqtt.Client):
     def _on_socket_unregister_write(  # type: ignore[explicit-override]  # Python 3.12's
         self, client: Any, userdata: Any, sock: Any
     ) -> None:
-        """Have what arrives next acknowledged at once; called when everything is sent.
+        """Make the kernel acknowledge the next data at once; called when everything is sent.
 
-        After a transmission of ours, a ping for instance, the kernel delays an acknowledgement by
-        40 ms, for which a broker with Nagle's algorithm holds the next messages back (RFC 1122,
-        4.2.3.2 and 4.2.3.4).
+        After a transmission such as a ping, the kernel delays an acknowledgement by 40 ms. For this
+        time a broker with Nagle's algorithm holds back its next messages (RFC 1122, 4.2.3.2 and
+        4.2.3.4).
         """
         super()._on_socket_unregister_write(client, userdata, sock)
         with contextlib.suppress(OSError):  # closed, or not supported

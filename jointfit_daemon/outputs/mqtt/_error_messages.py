@@ -77,7 +77,7 @@ VERSION_REFUSED = (  # an answer that is not of MQTT ends in the same fault of t
     " host and port in [mqtt]"
 )
 _UNSPECIFIED = 128
-"""Reason code without a reason, in which paho converts every unknown code of MQTT 3.1.1."""
+"""Reason code without a reason, to which paho converts every unknown code of MQTT 3.1.1."""
 _SESSION_LOST = (4, 7, 128)
 """Numbers of paho for "not connected" and "connection lost", and its default reason code."""
 

@@ -1,4 +1,4 @@
-"""The log of paho, from which a connection takes the error that a broker answered with."""
+"""The log of paho: it contains the error with which a broker ended a connection."""
 
 from __future__ import annotations
 

@@ -39,8 +39,8 @@ _LONGEST_START = 64
 _WINDOW_BYTES = 1024 * 1024
 """Bytes that are searched at once."""
 _MOST_WASTED_RATIO = 20
-"""Limit of the bytes read in damaged records over the size of the file, against a file made to be
-read for hours."""
+"""Largest ratio of the bytes read in damaged records to the size of the file. It limits the time
+that a malicious file can take."""
 
 
 class RecordingError(ValueError):
@@ -92,7 +92,7 @@ Block: TypeAlias = ChunkBlock | MetadataBlock | AttachmentBlock | DamagedBlock |
 
 
 class _DamageError(ValueError):
-    """A record cannot be read; its content of `read_bytes` was read for nothing."""
+    """A record cannot be read; `read_bytes` bytes of its content were read in vain."""
 
     def __init__(self, text: str, read_bytes: int = 0) -> None:
         super().__init__(text)

@@ -90,7 +90,7 @@ class ChannelForm(NamedTuple):
     schema: str
     """Name of the schema; empty without one."""
     metadata: dict[str, str]
-    """``clock`` and ``stamp_means``, among others."""
+    """Metadata of the channel, such as ``clock`` and ``stamp_means``."""
 
 
 def channel_form(channel: str) -> ChannelForm:

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 MOST_UNWRITTEN_BYTES = 16 * 1024 * 1024
-"""Bytes that wait for a full disk, minutes of four IMUs; later messages are lost."""
+"""Most bytes that wait for a full disk: minutes of four IMUs. Later messages are lost."""
 RETRY_S = 1.0
 """Interval between attempts to create a file, s."""
 ABANDON_S = 5.0

@@ -4,7 +4,7 @@ A line is the CRC-32 of the rest in hexadecimal digits, the topic below the base
 separated by spaces. A process appends to files of its own only, so a line that a power cut tore is
 the last one of its file.
 
-Invariant: the files take `keep_bytes` at most, up to one file; the oldest one is deleted for a new
+Invariant: the files exceed `keep_bytes` by at most one file. The oldest one is deleted for a new
 one, and its messages are counted. A line with a wrong CRC is counted and skipped.
 """
 

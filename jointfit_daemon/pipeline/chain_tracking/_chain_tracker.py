@@ -40,7 +40,7 @@ the squares of larger distances would spoil the solution."""
 FEWEST_MARKERS = 3
 """Markers of a frame with a solution: fewer do not determine the position of the first segment."""
 _FEW_EVALUATIONS = 8
-"""Evaluations of the marker errors in a frame that may also search labels: those of no restart."""
+"""Most evaluations of the marker errors after which the same frame may also search labels."""
 OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
 """Up to six steps, because frames are 100 ms apart. The Huber threshold bounds the influence of an
 exchanged marker until it is excluded. A restart takes longer than a frame, so restarts that do not

@@ -175,7 +175,8 @@ class MarkerMonitor:
         far = distances > FAR_M  # False where NaN
         exchanged: list[tuple[int, ...]] = []
         if far.any() or self._by_shape:
-            # By the shapes of the segments, which exchanged markers turn; then by the places.
+            # First by the shapes of the segments, because exchanged markers turn a fitted segment;
+            # then by the places of the markers.
             self._labels.begin(t_ns, measured)
             exchanged = [*self._labels.faults]
             turned = {segments[m] for group in exchanged for m in group}
@@ -197,7 +198,7 @@ class MarkerMonitor:
         return f"{kind}:{'~'.join(self.model.markers[m].name for m in markers)}"
 
     def _lasting(self, t_ns: int, condition: str, flags: Iterable[str], least_ns: int) -> set[str]:
-        """Return the flags for which a condition has lasted; forget those that are not given."""
+        """Return the flags whose condition has lasted `least_ns`; forget those not in `flags`."""
         before = self._since_ns.get(condition, {})
         now = self._since_ns[condition] = {flag: before.get(flag, t_ns) for flag in flags}
         return {flag for flag, since_ns in now.items() if t_ns - since_ns >= least_ns}

@@ -1,7 +1,8 @@
 """Exchanged labels by the shapes of the segments of a chain model.
 
-A segment at the end of a chain turns to where its exchanged markers fit best, so that they are near
-the places of others, or only some are far from theirs. The shape of its markers does not change.
+Inverse kinematics turns a segment at the end of a chain to where its exchanged markers fit best.
+They are then near the places of other markers, or only some of them are far from their own. The
+shape of its markers does not change.
 
 Invariant: a frame takes a bounded part of a search. The last result holds until the next one.
 """

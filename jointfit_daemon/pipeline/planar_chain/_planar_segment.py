@@ -22,7 +22,7 @@ changed by 24 mm, more than soft-tissue artefact does."""
 LEAST_MARKERS = 2
 """Markers that define a pose in a plane."""
 _EXCHANGE_RAD = 2.5
-"""Rotation between two frames that only exchanged labels explain, rad."""
+"""Rotation between two frames, rad, above which the labels must have been exchanged."""
 _EXCHANGE_NS = 200_000_000
 """Longest time between these two frames, ns."""
 _MEMORY = 0.02
@@ -113,7 +113,7 @@ class PlanarSegment:
         return PlanarPose(turn, origin)
 
     def _exchanged(self, t_ns: int, angle: float) -> bool:
-        """Return whether the segment is turned about relative to the last frame, and follow it."""
+        """Return whether exchanged labels have turned the segment since the last frame."""
         before, self._angle = self._angle, angle
         recent = t_ns - self._angle_ns < _EXCHANGE_NS
         self._angle_ns = t_ns

@@ -31,7 +31,7 @@ WITHHELD = ("unpublished", "duplicates", "late")
 
 
 KEPT_SAMPLES = 1000
-"""Samples and events after a reopening for which the time base of the decoder before is used."""
+"""Samples and events after a reopening for which the time base of the previous decoder is used."""
 
 
 class StampedMeasurement(NamedTuple):
@@ -59,8 +59,9 @@ class SourceState:
     _withheld: dict[str, int] = field(default_factory=lambda: dict.fromkeys(WITHHELD, 0))
     _decoder: Decoder | None = None
     _tick_clock: TickClock | None = None
-    """Time base of the decoder before, until the decoder has determined its own, at most for the
-    next `KEPT_SAMPLES` samples, or until a restart: then it may be another device."""
+    """Time base of the previous decoder. It is used until the present decoder has determined its
+    own, for at most `KEPT_SAMPLES` samples. A restart also ends its use, because the device may be
+    another one."""
     _kept: int = 0
     """Samples left for which `_tick_clock` is used."""
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 _MM = 1000.0
 _MOST_POINTS = 600
-"""Plotted samples of a marker at most, to keep vector graphics small."""
+"""Most plotted samples of a marker, to keep vector graphics small."""
 _END_ON = 0.1
 """Length of a projected unit direction below which the direction is seen end-on."""
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 _LEAST_SEGMENTS = 2
-"""Segments of a chain at least: a joint is between two."""
+"""Fewest segments of a chain: a joint is between two."""
 
 
 @dataclass(frozen=True, slots=True)

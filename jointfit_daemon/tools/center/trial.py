@@ -37,9 +37,9 @@ _SEGMENT_M = (0.005, 2.0)
 LEAST_PLANAR = 2
 """Parent markers needed in a plane."""
 _FEWEST_FRAMES = 3
-"""Frames of a window at least: three points define a circle."""
+"""Fewest frames of a window: three points define a circle."""
 _EXCHANGE_RAD = 2.5
-"""Rotation of a planar parent between two frames, rad, that only exchanged names explain."""
+"""Rotation of a planar parent between two frames, rad, above which names were exchanged."""
 _EXCHANGE_S = 0.1
 """Longest time between these two frames, s."""
 
