@@ -144,7 +144,7 @@ async def revert(page: OpenedPage) -> None:
     await page.show("history")
     await page.page.click("text=Use version 1")
     await page.until_text("#rig-state", "Calibrated, version 3")
-    await page.until_text("#view-history", "copy of version 1, in force")
+    await page.until_text("#view-history", "in force: copy of version 1")
 
 
 async def see_the_limb_move(page: OpenedPage) -> None:

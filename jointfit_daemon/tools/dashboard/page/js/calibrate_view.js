@@ -150,7 +150,7 @@ function createStep(view, step, number, count) {
     figures.root,
     createElement(
       "div", { class: "stack step-text" },
-      createElement("p", { class: "number" }, `Step ${number} of ${count}`),
+      createElement("p", { class: "number" }, `Step ${number}`),
       createElement("h2", { id: `step-${step.phase}`, class: "step-title" }, step.title),
       instructions, work,
     ),

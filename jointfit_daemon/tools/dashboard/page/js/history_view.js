@@ -86,7 +86,7 @@ function stateOf(entry, inForce) {
     entry.restored_from == null ? "" : `copy of version ${entry.restored_from}`,
     entry.online ? `online learning, round ${entry.online.rounds}` : "",
   ].filter(Boolean).join(", ");
-  if (entry.version === inForce) return createElement("span", { class: "status ok" }, [origin, "in force"].filter(Boolean).join(", "));
+  if (entry.version === inForce) return createElement("span", { class: "status ok" }, ["in force", origin].filter(Boolean).join(": "));
   if (!entry.usable) return createElement("span", { class: "status unknown" }, "of another limb");
   return origin || "stored";
 }

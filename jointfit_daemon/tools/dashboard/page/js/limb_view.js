@@ -112,8 +112,9 @@ function draw(view, store, now, seconds) {
   drawFloor(view, camera, points);
   drawSegments(view, camera, limb);
   if (store.optical && now - store.opticalReceivedMs < OPTICAL_MS) drawOptical(view, camera, limb, store.opticals);
-  drawJoints(view, camera, limb, store.info);
+  drawJoints(view, camera, limb);
   drawSensors(view, camera, limb, store);
+  drawLabels(view, camera, limb, store.info); // last: the axes of a sensor must not cover a name
 }
 
 /** Return joints and segments of the drawn instant, between the last two poses. */
@@ -260,10 +261,8 @@ function opticalPosition(frames, t_us, name) {
   return mix(a, b, Math.min(1, (t_us - before.t_us) / (after.t_us - before.t_us)));
 }
 
-function drawJoints(view, camera, limb, info) {
+function drawJoints(view, camera, limb) {
   const { context, colors } = view;
-  context.font = "600 13px system-ui, sans-serif";
-  context.textBaseline = "middle";
   for (const joint of limb.joints) {
     if (!joint.p) continue;
     const at = camera.project(joint.p);
@@ -283,6 +282,15 @@ function drawJoints(view, camera, limb, info) {
     context.arc(at.x, at.y, 4.5, 0, 7);
     context.fill();
     context.stroke();
+  }
+}
+
+function drawLabels(view, camera, limb, info) {
+  view.context.font = "600 13px system-ui, sans-serif";
+  view.context.textBaseline = "middle";
+  for (const joint of limb.joints) {
+    if (!joint.p) continue;
+    const at = camera.project(joint.p);
     const side = labelSide(info, joint.name, at.x - view.size[0] / 2);
     drawLabel(view, titleOf(joint.name), at.x, at.y, side * view.camera.length * camera.pixels * 0.13);
   }
@@ -312,7 +320,6 @@ function drawSensors(view, camera, limb, store) {
   const { context, colors } = view;
   const mounts = store.calibration?.quality?.sensors;
   const length = view.camera.length * AXIS_SHARE;
-  context.font = "600 11px system-ui, sans-serif";
   for (const segment of limb.segments) {
     const names = valueOf(store.info.sensors, segment.name) ?? [];
     if (!segment.q || !segment.from.p || !segment.to.p) continue;
@@ -358,6 +365,7 @@ export function updateLimbCaption(store) {
   const ageMs = poseAgeMs(store);
   byId("limb-panel").classList.toggle("stale", store.pose !== null && ageMs > STALE_MS);
   byId("legend-optical").hidden = !(store.optical && performance.now() - store.opticalReceivedMs < OPTICAL_MS * 3);
+  byId("legend-axes").hidden = !Object.values(store.calibration?.quality?.sensors ?? {}).some((mount) => mount?.q_sensor_segment);
   if (!store.pose) return setText(caption, "No pose was received.");
   if (!store.info) return setText(caption, "The limb cannot be drawn: no message on bridge/info was received.");
   if (ageMs > STALE_MS) return setText(caption, `No pose for ${Math.round(ageMs / 1000)} s: the drawing is the last one.`);

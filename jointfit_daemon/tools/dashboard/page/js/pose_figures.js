@@ -126,17 +126,15 @@ function arrow(path) {
   const group = createSvg("g", { class: "motion" }, createSvg("path", { d: path }));
   const numbers = path.match(/-?[\d.]+/g).map(Number);
   const [x, y] = numbers.slice(-2);
-  const direction = arrowDirection(path, numbers, x, y);
+  const direction = endDirection(group.firstChild, x, y);
   const side = (turn) => [x - 8 * Math.cos(direction + turn), y - 8 * Math.sin(direction + turn)];
   const [a, b] = [side(0.6), side(-0.6)];
   group.append(createSvg("polyline", { points: `${a.join()} ${x},${y} ${b.join()}` }));
   return group;
 }
 
-// A straight arrow points along its line; an arc ends about 50° from its chord.
-function arrowDirection(path, numbers, x, y) {
-  const chord = Math.atan2(y - numbers[1], x - numbers[0]);
-  if (!path.includes("A")) return chord;
-  const sweep = numbers[numbers.length - 3];
-  return chord + (sweep === 1 ? 0.85 : -0.85);
+/** Return the direction of the last part of a path, which the head of the arrow covers. */
+function endDirection(path, x, y) {
+  const before = path.getPointAtLength(Math.max(0, path.getTotalLength() - 5));
+  return Math.atan2(y - before.y, x - before.x);
 }

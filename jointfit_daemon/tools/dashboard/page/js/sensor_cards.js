@@ -67,7 +67,7 @@ function stateOf(store, name, availability, health, flags) {
 
 function eventText(store, name) {
   const event = store.lastEvents.get(name);
-  if (!event) return "No event since this page was opened";
+  if (!event) return "No event yet";
   const now = gatewayNow(store);
   const age = now === null ? "" : `${formatDuration((now - event.t_us) / 1e6)} ago: `;
   return `${age}${event.text}`;

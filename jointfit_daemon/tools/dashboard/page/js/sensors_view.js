@@ -4,7 +4,7 @@ import { byId, createElement, createTable, patchTable } from "./dom.js";
 import { createAxesCheck } from "./axes_check.js";
 import { createPhysicalTest } from "./physical_test.js";
 import { summaryOf } from "./sensor_cards.js";
-import { UNKNOWN, formatBytes, formatDelay, formatNumber } from "./words.js";
+import { UNKNOWN, formatBytes, formatCount, formatDelay, formatNumber } from "./words.js";
 
 /** Show the health of a store's devices in a view; `openAction(name, device)` starts a request. */
 export function createSensorsView(store, link, openAction, request) {
@@ -39,8 +39,8 @@ export function createSensorsView(store, link, openAction, request) {
 function tablesOf(store, openAction) {
   if (!store.info) return [createElement("p", {}, "No rig was found yet.")];
   const number = { name: "" };
-  const columns = ["device", "state", "", "model", "received", "used", "late", "lost", "corrupt", "rate", "delay, median", "delay, 99 %", "clock"]
-    .map((name) => ({ ...number, name, text: ["state", "", "model", "clock"].includes(name) }));
+  const columns = ["device", "state", "model", "received", "used", "late", "lost", "corrupt", "rate", "delay, median", "delay, 99 %", "clock", ""]
+    .map((name) => ({ ...number, name, text: ["state", "model", "clock"].includes(name) }));
   const rows = Object.keys(store.info.devices).map((name) => {
     const summary = summaryOf(store, name);
     const health = summary.health ?? {};
@@ -48,18 +48,18 @@ function tablesOf(store, openAction) {
     return [
       summary.place ? `${name} · ${summary.place}` : name,
       createElement("span", { class: `status ${summary.level}` }, summary.state),
-      createElement("button", { class: "button small", type: "button", "aria-label": `Restart ${name}`, onclick: () => openAction("restart", name) }, "Restart…"),
       createElement("span", { class: "model" }, [info.model, info.firmware].filter(Boolean).join(" ") || UNKNOWN),
-      ...["received", "used", "late", "lost", "corrupt"].map((key) => formatNumber(health[key], 0)),
+      ...["received", "used", "late", "lost", "corrupt"].map((key) => formatCount(health[key])),
       summary.rate,
       formatDelay(health.delay_us?.p50),
       formatDelay(health.delay_us?.p99),
       createElement("span", { class: `status ${summary.clockLevel}` }, summary.clock),
+      createElement("button", { class: "button small", type: "button", "aria-label": `Restart ${name}`, onclick: () => openAction("restart", name) }, "Restart…"),
     ];
   });
-  const tables = [createTable("Devices", columns, rows), createTable("Daemon", [{ name: "item" }, { name: "value", text: true }], daemonRows(store))];
-  if (store.health?.latency) tables.push(latencyTable(store.health.latency));
-  return tables;
+  const daemon = [createTable("Daemon", [{ name: "item" }, { name: "value", text: true }], daemonRows(store))];
+  if (store.health?.latency) daemon.push(latencyTable(store.health.latency));
+  return [createTable("Devices", columns, rows), createElement("div", { class: "pair" }, ...daemon)];
 }
 
 /** Return the latency of the frames since the last health message, by stage. */
@@ -87,9 +87,9 @@ function daemonRows(store) {
   const denied = link.denied?.length ? `; refused by the broker: ${link.denied.join(", ")}` : "";
   return [
     ["Version", store.info.software ?? UNKNOWN],
-    ["Poses", `${formatNumber(health.frames?.sent, 0)} sent, ${formatNumber(health.frames?.empty, 0)} without sensors, ${formatNumber(health.frames?.skipped, 0)} skipped`],
+    ["Poses", `${formatCount(health.frames?.sent)} sent, ${formatCount(health.frames?.empty)} without sensors, ${formatCount(health.frames?.skipped)} skipped`],
     ["Processor and memory", `${formatNumber(health.process?.cpu_pct, 1, " %")}, ${formatNumber(health.process?.rss_bytes == null ? null : health.process.rss_bytes / 1e6, 0, " MB")}`],
-    ["Messages to the broker", `${formatNumber(link.sent, 0)} sent, ${formatNumber(link.dropped, 0)} dropped${denied}`],
+    ["Messages to the broker", `${formatCount(link.sent)} sent, ${formatCount(link.dropped)} dropped${denied}`],
     ["Online learning", health.learning?.reason ? `${health.learning.state}: ${health.learning.reason}` : health.learning?.state ?? UNKNOWN],
     ["Recording", recordingWords(store)],
   ];

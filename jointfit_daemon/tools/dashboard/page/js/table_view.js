@@ -45,8 +45,9 @@ function tablesOf(store) {
   });
   const columns = (...names_) => names_.map((name) => ({ name, text: name === "sensors in use" || name === "meaning" }));
   const tables = [
-    createTable("Joint angles", columns("angle", "value, °", "sd, °", "rate, °/s", "cameras, °"), angles),
-    createTable("Joint positions", columns("joint", "x, m", "y, m", "z, m", "sd, mm"), positions),
+    createElement("div", { class: "pair" },
+      createTable("Joint angles", columns("angle", "value, °", "sd, °", "rate, °/s", "cameras, °"), angles),
+      createTable("Joint positions", columns("joint", "x, m", "y, m", "z, m", "sd, mm"), positions)),
     createTable("Segment orientations (quaternion, segment to world)", columns("segment", "w", "x", "y", "z", "sd, °", "sensors in use"), segments),
   ];
   const flags = (pose.flags ?? []).map((flag) => [flag, flagSentence(flag)]);

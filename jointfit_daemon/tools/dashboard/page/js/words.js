@@ -9,6 +9,12 @@ export function formatNumber(value, decimals = 1, unit = "") {
   return `${text}${unit}`;
 }
 
+/** Return a whole number with narrow spaces between groups of three digits, from 10 000 on. */
+export function formatCount(value) {
+  const text = formatNumber(value, 0);
+  return text.length > 4 ? text.replace(/\B(?=(\d{3})+$)/g, "\u202f") : text;
+}
+
 /** Return a duration in the largest fitting unit. */
 export function formatDuration(seconds) {
   if (!Number.isFinite(seconds)) return UNKNOWN;
