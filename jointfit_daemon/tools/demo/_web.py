@@ -38,6 +38,12 @@ SETTLE_S = 3.0
 PHASES = (("align", 20.0), ("static", 5.0), ("functional", 47.0))
 """Phases of the calibration and their durations, s."""
 TOPICS = ("calibration", "calibration/progress", "device/+/availability")
+ATTEMPTS = 3
+"""Attempts at each phase: a busy computer pauses the simulated sensors, which ends a phase."""
+STOPPED_BY_USER = "abort requested"
+"""End of the reason of a phase that a user stopped in the page."""
+LIVE = "The limb is live. Calibrate again in the page; Ctrl-C stops."
+UNCALIBRATED = "The limb is not calibrated. Calibrate it in the page; Ctrl-C stops."
 
 
 async def run_web_demo(
@@ -68,10 +74,7 @@ async def run_web_demo(
                         async with daemon(folder, rig_file) as process:
                             from jointfit_daemon.config import load_rig  # slow: after the URL
 
-                            await _calibrate(load_rig(rig_file), process)
-                            typer.echo(
-                                "The limb is live. Calibrate again in the page; Ctrl-C stops."
-                            )
+                            typer.echo(await _calibrate(load_rig(rig_file), process))
                             while True:
                                 process.check()
                                 simulated.check()
@@ -95,8 +98,8 @@ def print_address(url: str, listen: ListenAddress) -> None:
     segno.make(url, error="l").terminal(compact=True)
 
 
-async def _calibrate(rig: Rig, process: ChildProcess) -> None:
-    """Run all phases unless the user takes over in the page."""
+async def _calibrate(rig: Rig, process: ChildProcess) -> str:
+    """Run all phases unless the user takes over in the page; return the sentence of the result."""
     from jointfit_daemon.outputs.mqtt import MqttClient
 
     online: set[str] = set()
@@ -111,16 +114,29 @@ async def _calibrate(rig: Rig, process: ChildProcess) -> None:
                     await asyncio.sleep(0.1)
             await asyncio.sleep(SETTLE_S)
             for phase, seconds in PHASES:
-                typer.echo(f"calibration: {phase}, {seconds:g} s")
-                tracker.begin()
-                wanted = {"phase": phase, "seconds": seconds}
-                raise_if_refused(await client.request("calibrate", wanted))
-                await tracker.wait_for_end(phase)
+                await run_phase(client, tracker, phase, seconds)
         except (PhaseAbortedError, RequestRefusedError) as ended:
-            typer.echo(f"calibration: {ended}. Continue in the page.", err=True)
+            typer.echo(f"calibration: {ended}", err=True)
         finally:
             listener.cancel()
             await asyncio.wait([listener])
+    return LIVE if tracker.status.get("version") is not None else UNCALIBRATED
+
+
+async def run_phase(client: MqttClient, tracker: PhaseTracker, phase: str, seconds: float) -> None:
+    """Run a phase, again after an abort that the user did not request, at most `ATTEMPTS` times."""
+    for attempt in range(1, ATTEMPTS + 1):
+        typer.echo(f"calibration: {phase}, {seconds:g} s")
+        tracker.begin()
+        raise_if_refused(await client.request("calibrate", {"phase": phase, "seconds": seconds}))
+        try:
+            await tracker.wait_for_end(phase)
+        except PhaseAbortedError as aborted:
+            if attempt == ATTEMPTS or str(aborted).endswith(STOPPED_BY_USER):
+                raise
+            typer.echo(f"calibration: {aborted}", err=True)
+        else:
+            return
 
 
 async def _listen(client: MqttClient, tracker: PhaseTracker, online: set[str]) -> None:

@@ -6,17 +6,20 @@ import asyncio
 import signal
 import sys
 import urllib.request
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import pytest
 
 from bench.rigs.gateway import cpu_s
+from jointfit_daemon.tools.calibrate import PhaseAbortedError, PhaseTracker
 from jointfit_daemon.tools.dashboard.addresses import ListenAddress
-from jointfit_daemon.tools.demo._web import print_address
+from jointfit_daemon.tools.demo._web import print_address, run_phase
 from tests.system.station import PATIENCE_S, restore_signals
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from jointfit_daemon.outputs.mqtt import MqttClient
 
 URL = "http://192.0.2.7:8080/"
 
@@ -56,3 +59,46 @@ async def test_the_page_answers_before_the_hardware_starts_and_ctrl_c_ends_with_
         process.send_signal(signal.SIGINT)
         await process.communicate()
     assert process.returncode == 0
+
+
+class AbortingDaemon:
+    """A client whose daemon aborts the first phases with given reasons, and completes the next."""
+
+    def __init__(self, *reasons: str) -> None:
+        self.tracker = PhaseTracker(lambda *_: None)
+        self.reasons = [*reasons]
+        self.requests: list[str] = []
+
+    async def request(self, _command: str, content: dict[str, object]) -> dict[str, object]:
+        phase = str(content["phase"])
+        self.requests.append(phase)
+        self.tracker.on_status({"phase": phase})
+        aborted = {"phase": "aborted", "text": self.reasons.pop(0)} if self.reasons else None
+        self.tracker.on_status(aborted or {"phase": "aligned"})
+        return {"status": "accepted"}
+
+    async def align(self) -> None:
+        await run_phase(cast("MqttClient", self), self.tracker, "align", 20.0)
+
+
+RESTARTED = "S1 restarted during the phase: repeat it"
+
+
+async def test_a_phase_that_a_busy_computer_ended_is_repeated() -> None:
+    daemon = AbortingDaemon(RESTARTED, RESTARTED)
+    await daemon.align()
+    assert daemon.requests == ["align"] * 3
+
+
+async def test_a_phase_that_ends_without_result_each_time_is_given_up() -> None:
+    daemon = AbortingDaemon(*[RESTARTED] * 9)
+    with pytest.raises(PhaseAbortedError, match="S1 restarted"):
+        await daemon.align()
+    assert daemon.requests == ["align"] * 3
+
+
+async def test_a_phase_that_the_user_stopped_is_not_repeated() -> None:
+    daemon = AbortingDaemon("align: abort requested")
+    with pytest.raises(PhaseAbortedError):
+        await daemon.align()
+    assert daemon.requests == ["align"]
