@@ -7,6 +7,7 @@ shown with their traceback.
 from __future__ import annotations
 
 import errno
+import inspect
 import os
 import sys
 from pathlib import Path
@@ -53,6 +54,16 @@ ON_DEMAND_ERRORS = (
 """Exit code, module and class of errors whose modules are imported on demand."""
 
 
+def join_lines(text: str) -> str:
+    """Join the lines of each paragraph; lists and indented examples stay as they are."""
+    paragraphs = inspect.cleandoc(text).split("\n\n")
+    return "\n\n".join(
+        paragraph if any(line[:1] in " -*\b" for line in paragraph.split("\n") if line)
+        else paragraph.replace("\n", " ")
+        for paragraph in paragraphs
+    )  # fmt: skip
+
+
 class CommandGroup(TyperGroup):
     """Runs a command and converts errors that a user can correct into a message."""
 
@@ -61,8 +72,16 @@ class CommandGroup(TyperGroup):
         """Return name, command and arguments; a name may have two words."""
         two = " ".join(args[:2])
         if " " in two and two in self.commands:
-            return two, self.commands[two], args[2:]
+            return two, self.get_command(ctx, two), args[2:]
         return super().resolve_command(ctx, args)
+
+    @override
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command; the terminal wraps the paragraphs of its help, not the docstring."""
+        command = super().get_command(ctx, cmd_name)
+        if command is not None and command.help:
+            command.help = join_lines(command.help)
+        return command
 
     @override
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 
 from jointfit_daemon import __version__
 from jointfit_daemon.tools.__main__ import app
-from jointfit_daemon.tools.command_group import ON_DEMAND_ERRORS
+from jointfit_daemon.tools.command_group import ON_DEMAND_ERRORS, join_lines
 from jointfit_variant import running_variant
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "knee.toml"
@@ -34,6 +34,13 @@ def test_every_command_explains_itself(command: str) -> None:
     result = run(app, [command, "--help"])
     assert result.exit_code == 0
     assert "Usage" in result.stdout
+
+
+def test_help_paragraphs_are_wrapped_by_the_terminal_only() -> None:
+    text = "One\ntwo.\n\nThree\nfour.\n\n- five\n- six"
+    assert join_lines(text) == "One two.\n\nThree four.\n\n- five\n- six"
+    shown = get_command(app).get_command(None, "doctor")  # type: ignore[attr-defined]
+    assert all("\n" not in paragraph for paragraph in shown.help.split("\n\n"))
 
 
 def completions(*words: str) -> list[str]:
