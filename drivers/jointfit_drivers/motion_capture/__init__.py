@@ -1,4 +1,4 @@
-"""What drivers of motion capture share: columns by name, poses in SI units, continuity, route."""
+"""Parts that drivers of motion capture share: named columns, poses in SI, continuity, route."""
 
 from jointfit_drivers.motion_capture._binding import (
     MOST_NAMED,

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 MIN_FRAMES = 50
 """Smallest number of frames with visible markers."""
 MAX_FRAMES = 2000
-"""Frames used at most; longer recordings are decimated."""
+"""Most frames that are used; longer recordings are decimated."""
 MIN_DIRECTION_RAD = radians(3.0)
 """RMS change of marker directions below which a direction of the center is unobserved, rad."""
 UNSEEN_SD_M = 0.03

@@ -405,7 +405,7 @@ def _flexion_axes(
 
 
 def _shoulders(chain: Chain) -> set[str]:
-    """Return the joints that move in every direction, so that their axis is that of no plane."""
+    """Return the joints that move in every direction: no plane of movement defines their axis."""
     return {
         chain.joints[joint.number]
         for joint in inner_joints(chain)

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import MocapFrame, MocapLayout
 
 _INTERVAL = 24
-"""One of so many frames is examined: a search takes milliseconds, which the next frames share."""
+"""Frames of which one is examined. A search takes milliseconds and is spread over the next ones."""
 _RECENT = 12
-"""Examined frames that decide: 2 to 3 s of camera frames at 100 to 120 Hz."""
+"""Examined frames on which a decision is based: 2 to 3 s at 100 to 120 Hz."""
 _CONFIRMED = 0.6
 """Share of them that a fault explains."""
 

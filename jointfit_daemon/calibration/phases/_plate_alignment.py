@@ -42,7 +42,7 @@ MIN_FRAMES = 200
 MAX_RMS = np.deg2rad(6.0)
 """Largest residual, rad; above it a sensor is loose or not on the plate, or markers are swapped."""
 MAX_FRAMES = 3000
-"""Frames used at most; longer recordings are decimated."""
+"""Most frames that are used; longer recordings are decimated."""
 
 
 @dataclass(frozen=True, slots=True)

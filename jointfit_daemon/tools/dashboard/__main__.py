@@ -39,7 +39,7 @@ def main() -> None:
 
 
 async def _serve(server: DashboardServer, listen: ListenAddress, listener: socket.socket) -> None:
-    """Serve until a stop signal; print the URL, and a broker that cannot be reached."""
+    """Serve until a stop signal; print the URL, and why the broker cannot be reached."""
     with cancel_on_signal() as stop:
         try:
             async with server.listening(listen, listener) as url:

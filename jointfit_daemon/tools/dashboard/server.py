@@ -154,8 +154,8 @@ class DashboardServer:
     def _is_own_name(self, host: str) -> bool:
         """Return whether a Host header names this server.
 
-        A name of another site that resolves to this machine (DNS rebinding) would make its pages
-        pages of this origin.
+        A name of another site that resolves to this machine (DNS rebinding) would give the pages of
+        that site the origin of this server.
         """
         try:
             name = urlsplit(f"//{host}").hostname or ""

@@ -68,7 +68,7 @@ def driver_of(answers: Mapping[Key, Any], found: Found, sensor: str) -> ImuDrive
     if ("driver", sensor) not in answers and recognized in named:
         return named[str(recognized)]
 
-    # unanswered: most rigs have sensors of one family, so that of the sensor before
+    # unanswered: the driver of the sensor before, since most rigs have sensors of one family
     sensors = list(sensors_of(answers))
     known = [answers.get(("driver", name)) for name in sensors[: sensors.index(sensor) + 1]]
     return next((named[name] for name in reversed(known) if name in named), fitting[0])

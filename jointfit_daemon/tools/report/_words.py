@@ -6,7 +6,7 @@ from math import degrees, isfinite
 
 UNKNOWN = "–"
 _PERCENT_OF_NONE = 0.0005
-"""Share below which a share is written as a limit."""
+"""Smallest share that is written as a number; a smaller one is written as a limit."""
 
 
 def joint_angle(joint: str, angle: str) -> str:

@@ -53,7 +53,7 @@ class PrecisionTime:
         self._seen = 0
 
         self.absent = 0
-        """Consecutive frames without one."""
+        """Consecutive frames without a precision timestamp."""
 
     @property
     def decided(self) -> bool:

@@ -115,7 +115,7 @@ class SegmentPose(NamedTuple):
 
     segment: int
     position: tuple[float, float, float]
-    """mm."""
+    """Position, mm."""
     rotation: tuple[float, ...]
     """Nine numbers by rows."""
 
