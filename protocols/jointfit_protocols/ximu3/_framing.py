@@ -32,6 +32,11 @@ _NEVER = 1 << 62
 """Modulus that makes -1, the result of a search without a match, larger than every position."""
 _QUATERNION = (0xD1, 26)
 """First byte and size of a binary quaternion."""
+_SHORTEST_RUN = 4
+"""Messages of one kind in a row from which they are decoded together."""
+_LONGEST_RUN = 64
+"""Most messages decoded together; bounds the bytes that a failed attempt has read."""
+_TERMINATORS = bytes((TERMINATOR,)) * _LONGEST_RUN
 _new_data = tuple.__new__
 """Constructor of a message from all of its fields, in half of the time of its own."""
 _TOO_LONG = f"line longer than {MAX_LINE} bytes"
@@ -77,9 +82,20 @@ class XImu3Codec:
         # Most lines are binary messages of one kind: their layout is known, also after escapes.
         (first, size), (kind, layout) = self._usual, LAYOUTS[self._usual]
         size, unpack_from, find = 0 if self._too_long else size, layout.unpack_from, buffer.find
-        escape = find(ESCAPE) % _NEVER
+        escape, run_from = find(ESCAPE) % _NEVER, 0
         while (after := find(TERMINATOR, at) + 1) > 0:
             if after - at == size and buffer[at] == first and after <= escape:
+                # A run of such lines is decoded at once; a failed attempt is not repeated inside.
+                here = min((min(escape, len(buffer)) - at) // size, _LONGEST_RUN)
+                if here >= _SHORTEST_RUN and at >= run_from:
+                    run_from = at + here * size
+                    run = _decode_run(buffer[at:run_from], self._usual, base + at)
+                    if run:
+                        found += run
+                        count += here
+                        at = run_from
+                        continue
+
                 read = unpack_from(buffer, at)
                 fields = (kind, read[0], read[1:], b"", True, size, base + after, None)
                 append(_new_data(XImu3Data, fields))
@@ -153,3 +169,32 @@ class XImu3Codec:
         if count:
             self.discarded += count
             found.append(CorruptBytes(count, reason))
+
+
+def _decode_run(run: bytes, usual: tuple[int, int], end: int) -> list[XImu3Data]:
+    """Return the messages of a run without escapes; empty if not all of its lines are `usual`.
+
+    Parameters
+    ----------
+    run : bytes
+        Whole multiples of the usual size.
+    usual : tuple of int
+        First byte and size of each message.
+    end : int
+        Bytes fed before the run.
+    """
+    first, size = usual
+    count = len(run) // size
+    if (
+        run[size - 1 :: size] != _TERMINATORS[:count]
+        or run.count(TERMINATOR) != count
+        or run[::size].count(first) != count
+    ):
+        return []
+
+    kind, layout = LAYOUTS[usual]
+    new = _new_data
+    return [
+        new(XImu3Data, (kind, read[0], read[1:], b"", True, size, end := end + size, None))
+        for read in layout.iter_unpack(run)
+    ]

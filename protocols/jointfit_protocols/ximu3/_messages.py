@@ -198,9 +198,9 @@ def parse_rest(rest: bytes, end: int) -> XImu3Data | XImu3Reply | None:
 
 def unstuffed(line: bytes) -> bytes | None:
     """Return the bytes without escapes; None if an escape is malformed."""
-    if line.count(ESCAPE) != line.count(b"\xdb\xdc") + line.count(b"\xdb\xdd"):
-        return None
-    return line.replace(b"\xdb\xdc", b"\n").replace(b"\xdb\xdd", b"\xdb")
+    plain = line.replace(b"\xdb\xdc", b"\n").replace(b"\xdb\xdd", b"\xdb")
+    # each escape that is followed by its second byte makes the line one byte shorter
+    return plain if len(line) - len(plain) == line.count(ESCAPE) else None
 
 
 def _parse_data(plain: bytes, size: int, end: int, channel: int | None) -> Line:

@@ -114,6 +114,38 @@ def test_chunk_boundaries_do_not_change_the_messages(wire: bytes, cuts: list[int
     assert decode([bytes([byte]) for byte in wire])[0] == whole
 
 
+def changed(place: int, byte: int) -> bytes:
+    """Return a message of the usual kind with one other byte."""
+    usual = encode_data("Q", 1_000_000, (1.0, 0.0, 0.0, 0.0))
+    return usual[:place] + bytes([byte]) + usual[place + 1 :]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        pytest.param(b"", id="none"),
+        pytest.param(changed(0, 0xC9), id="another kind"),
+        pytest.param(changed(12, 0x0A), id="a terminator inside"),
+        pytest.param(changed(25, 0), id="no terminator"),
+        pytest.param(changed(12, 0x0A)[:-1] + b"\0", id="an early terminator"),
+        pytest.param(changed(12, 0xDB), id="malformed escape"),
+        pytest.param(encode_data("Q", 0xDB0A, (1.0, 0.0, 0.0, 0.0)), id="escapes"),
+        pytest.param(encode_data("I", 1_000_000, (0.5,) * 6), id="other layout"),
+        pytest.param(encode_command("ping"), id="command"),
+    ],
+)
+@pytest.mark.parametrize("before", [0, 1, 70, 140])
+def test_a_run_of_messages_equals_single_ones_up_to_another_line(before: int, other: bytes) -> None:
+    values = (0.5, -0.5, 0.5, -0.5)
+    run = [encode_data("Q", 1_000_000 + 3 * number, values) for number in range(before + 40)]
+    lines = [*run[:before], other, *run[before:]]
+    together, codec = decode([b"".join(lines)])
+    alone, single = decode(lines)
+    assert together == alone
+    assert (codec.messages, codec.discarded) == (single.messages, single.discarded)
+    assert together[-1].end == len(b"".join(lines))
+
+
 @given(st.lists(st.sampled_from([4095, 4096, 4097, 4351, 4352, 4353, 9000]), max_size=3), messages)
 @example([4352], encode_command("ping"))
 def test_lines_without_end_are_reported_in_bounded_runs_whatever_the_cut(
