@@ -141,6 +141,8 @@ class Corrupt:
 
     discarded: int
     reason: str
+    rejected: int = 0
+    """Well-formed messages among these bytes, whose content cannot be used."""
 
 
 DeviceEventKind = Literal[

@@ -26,10 +26,10 @@ class BusEvents:
         self._text = ""
         self._reported_ns = 0
 
-    def discard(self, count: int, reason: str) -> Corrupt:
-        """Count `count` corrupt bytes, and return them as an event."""
+    def discard(self, count: int, reason: str, rejected: int = 0) -> Corrupt:
+        """Count `count` corrupt bytes, `rejected` messages in them, and return them as an event."""
         self.discarded_bytes += count
-        return Corrupt(count, reason)
+        return Corrupt(count, reason, rejected)
 
     def add_error_frame(self, frame: can.CanFrame) -> list[Decoded]:
         """Return the events of an error frame of the controller, its driver or the host."""

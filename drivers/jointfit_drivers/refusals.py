@@ -21,7 +21,7 @@ class Refusals:
         """Count a message of `size` bytes that becomes no sample."""
         self.refused += 1
         self.refused_bytes += size
-        return Corrupt(size, reason)
+        return Corrupt(size, reason, rejected=1)
 
     def flush(self) -> list[Decoded]:
         """Refuse a sample that waits for confirmation; without such checks there is none."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
 from typing import TYPE_CHECKING, Annotated, Any
@@ -31,6 +32,12 @@ class CaptureSummary:
     """Counts of one capture."""
 
     corrupt: int = 0
+    """Runs of bytes that are no message."""
+    rejected: int = 0
+    """Messages whose content cannot be used."""
+    rejected_bytes: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+    """Rejected messages by reason."""
     quaternions: int = 0
     first_quaternion: tuple[float, ...] | None = None
     last_quaternion: tuple[float, ...] | None = None
@@ -49,7 +56,11 @@ class CaptureSummary:
                 if row[0] == row[0]:
                     self._quaternion(tuple(row.tolist()))
         elif isinstance(item, Corrupt):
-            self.corrupt += 1
+            self.corrupt += not item.rejected
+            if item.rejected:
+                self.rejected += item.rejected
+                self.rejected_bytes += item.discarded
+                self.reasons[item.reason] += item.rejected
         elif isinstance(item, DeviceEvent):
             self.time_resets += item.kind == "restart"
             self.counter_gaps += item.kind == "gap"
@@ -64,9 +75,10 @@ class CaptureSummary:
     def table(self, decoder: Decoder) -> dict[str, object]:
         """Return the counts of decoder and items by name."""
         found: dict[str, object] = {
-            "messages": decoder.messages,
+            "messages": decoder.messages + self.rejected,
+            "rejected": self.rejected,
             "corrupt": self.corrupt,
-            "discarded_bytes": decoder.discarded_bytes,
+            "discarded_bytes": decoder.discarded_bytes - self.rejected_bytes,
             "quaternions": self.quaternions,
             "first_quaternion": self.first_quaternion,
             "last_quaternion": self.last_quaternion,
@@ -116,14 +128,15 @@ def decode(
             sys.stdout.buffer.write(row + b"\n")
     if jsonl and not summary:
         return
-    if not decoder.messages and not summary:
+    if not (decoder.messages or counts.rejected or summary):
         raise ValueError(f"{file}: {_why_nothing_found(file, driver, protocol)}")
 
     found = counts.table(decoder)
     if summary:
         typer.echo(orjson.dumps(found))
     else:
-        _print_table(found, counts.warnings)
+        rejected = [f"{number} rejected: {text}" for text, number in counts.reasons.most_common()]
+        _print_table(found, rejected + counts.warnings)
 
 
 def _read(file: Path, wire: Wire) -> Iterator[Chunk]:
@@ -242,7 +255,8 @@ def _row(item: Decoded) -> dict[str, object]:
         }
 
     if isinstance(item, Corrupt):
-        return {"type": "corrupt", "discarded": item.discarded, "reason": item.reason}
+        kind = "rejected" if item.rejected else "corrupt"
+        return {"type": kind, "discarded": item.discarded, "reason": item.reason}
     if isinstance(item, ClockEcho):
         return {"type": "echo", "sent_ns": item.sent_ns, "ticks": item.ticks}
     if isinstance(item, SyncPulse):

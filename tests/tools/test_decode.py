@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 from jointfit_daemon.tools.__main__ import app
 from jointfit_protocols.xbus import XbusCodec, XbusMessage, encode
 from jointfit_protocols.xcdi import XcdiIds
+from jointfit_protocols.ximu3 import encode_data
 from jointfit_simulators.devices import XcdiDevice, XcdiDeviceOptions
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ def test_the_xsens_captures_hold_a_hundred_messages_each(
     found = summary("xbus", xsens(shared_data, number))
     assert found == {
         "messages": 100,
+        "rejected": 0,
         "corrupt": 0,
         "discarded_bytes": 0,
         "quaternions": quaternions,
@@ -120,6 +122,53 @@ def test_as_lines_every_item_is_one_json_object(shared_data: Path) -> None:
     assert [row["type"] for row in rows] == ["imu"] * 92
     assert (rows[0]["q_native"], rows[-1]["q_native"]) == (FIRST, LAST)
     assert (rows[0]["counter"], rows[0]["ticks"]) == (43800, 51747818)
+
+
+# --- MicroStrain, x-IMU3 ------------------------------------------------------------------------
+
+
+def test_the_mip_capture_holds_8384_packets_and_no_orientation(shared_data: Path) -> None:
+    found = summary("mip", shared_data / "imu" / "microstrain" / "mip_data.bin")
+    assert (found["messages"], found["quaternions"]) == (8384, 0)
+    assert found["rejected"] == found["corrupt"] == found["discarded_bytes"] == 0
+    assert found["time_resets"] == found["counter_gaps"] == 0
+
+
+@pytest.mark.parametrize(
+    ("damage", "counts"),
+    [
+        pytest.param(lambda wire: wire[5:], (8383, 5), id="first 5 bytes removed"),
+        pytest.param(lambda wire: wire[145_690:], (5158, 18), id="begun at the pair in a packet"),
+        pytest.param(lambda wire: wire[:-7], (8383, 47), id="last 7 bytes removed"),
+    ],
+)
+def test_a_damaged_mip_capture_loses_damaged_bytes_only(
+    tmp_path: Path,
+    shared_data: Path,
+    damage: Callable[[bytes], bytes],
+    counts: tuple[int, int],
+) -> None:
+    file = tmp_path / "damaged.bin"
+    file.write_bytes(damage((shared_data / "imu" / "microstrain" / "mip_data.bin").read_bytes()))
+    found = summary("mip", file)
+    assert (found["messages"], found["discarded_bytes"]) == counts
+
+
+def test_the_ximu3_file_holds_203_messages_of_which_one_has_no_unit_norm(shared_data: Path) -> None:
+    file = shared_data / "imu" / "ximu3" / "synthetic_quaternion.ximu3"
+    found = summary("ximu3", file)
+    assert (found["messages"], found["rejected"], found["quaternions"]) == (203, 1, 202)
+    assert found["corrupt"] == found["discarded_bytes"] == found["time_resets"] == 0
+    printed = run(app, ["decode", "ximu3", str(file)]).stderr
+    assert "1 rejected: quaternion norm is not 1" in printed
+
+
+def test_a_capture_whose_messages_are_all_rejected_states_the_reason(tmp_path: Path) -> None:
+    file = tmp_path / "half.bin"
+    file.write_bytes(b"".join(encode_data("Q", 2500 * n, (0.5, 0.0, 0.0, 0.0)) for n in range(20)))
+    result = run(app, ["decode", "ximu3", str(file)])
+    assert result.exit_code == 0
+    assert "20 rejected: quaternion norm is not 1" in result.stderr
 
 
 # --- NatNet -----------------------------------------------------------------------------------

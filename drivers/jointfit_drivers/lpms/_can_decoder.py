@@ -133,7 +133,7 @@ class LpmsCanDecoder:
                 frame = encode_frames(range(FRAMES), floats, "float32")[0]
                 if unit_of(decode_frame(frame.data, "int16") or ()) is not None:
                     self._orientation.remedy = 'the data fit precision = "int16"'
-            out.append(self._bus.discard(can.RECORD_BYTES, "quaternion norm is not 1"))
+            out.append(self._bus.discard(can.RECORD_BYTES, "quaternion norm is not 1", rejected=1))
             return
         native, q = converted
         out.append(ImuSample(quaternion.t_ns, q, native, None, None))
@@ -161,7 +161,9 @@ class LpmsCanDecoder:
             return
         self._refused += count
         out.append(
-            self._bus.discard(count * can.RECORD_BYTES, "frame without the others of its sample")
+            self._bus.discard(
+                count * can.RECORD_BYTES, "frame without the others of its sample", rejected=count
+            )
         )
 
         before, self._torn = self._torn, self._torn + count

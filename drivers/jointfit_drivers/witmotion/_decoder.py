@@ -211,7 +211,7 @@ class WitMotionDecoder:
 
     def _refuse(self, reason: str) -> Corrupt:
         self._refused += 1
-        return Corrupt(FRAME_BYTES, reason)
+        return Corrupt(FRAME_BYTES, reason, rejected=1)
 
     def _missing_kinds(self) -> list[Decoded]:
         """Return the warning about kinds that the settings require and the device does not send."""

@@ -318,7 +318,7 @@ class XbusDecoder:
     def _refuse(self, message: XbusMessage, reason: str) -> Corrupt:
         self._refused += 1
         self._refused_bytes += message.size
-        return Corrupt(message.size, reason)
+        return Corrupt(message.size, reason, rejected=1)
 
     def _device_events(self, message: XbusMessage) -> list[Decoded]:
         """Return the events of a message other than a measurement."""

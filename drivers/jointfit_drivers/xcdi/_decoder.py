@@ -222,7 +222,7 @@ class XcdiDecoder:
     def _refuse(self, reason: str, out: list[Decoded]) -> None:
         """Discard the quaternion frame that was just decoded."""
         self._refused += 1
-        out.append(self._bus.discard(can.RECORD_BYTES, reason))
+        out.append(self._bus.discard(can.RECORD_BYTES, reason, rejected=1))
 
 
 def _native(group: XcdiGroup) -> Quaternion:
