@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections import Counter
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,9 +17,9 @@ from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, Mo
 from jointfit_daemon.tools.completion import complete_driver
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
-    from jointfit_daemon.driver import Decoder, Driver, Wire
+    from jointfit_daemon.driver import Decoder, Driver
     from jointfit_daemon.model import Chunk, Decoded
 
 MOST_SHOWN = 8
@@ -113,11 +114,12 @@ def decode(
     from jointfit_daemon.driver import find_driver
 
     driver = find_driver(protocol)
-    decoder = driver(_settings(driver, protocol, setting or [])).decoder()
+    decoder_of = driver(_settings(driver, protocol, setting or [])).decoder
+    decoder = decoder_of()
     counts = CaptureSummary()
 
     def items() -> Iterator[Decoded]:
-        for chunk in _read(file, driver.wire):
+        for chunk in _read(file, driver, decoder_of):
             yield from decoder.feed(chunk)
         yield from decoder.flush()
 
@@ -137,20 +139,36 @@ def decode(
     else:
         rejected = [f"{number} rejected: {text}" for text, number in counts.reasons.most_common()]
         _print_table(found, rejected + counts.warnings)
+        if not found["quaternions"]:
+            typer.echo(_missing_orientations(driver, counts), err=True)
 
 
-def _read(file: Path, wire: Wire) -> Iterator[Chunk]:
-    """Return the chunks of a capture; an error of another wire lists the drivers for it."""
+def _read(
+    file: Path, driver: type[Driver], decoder_of: Callable[[], Decoder] | None = None
+) -> Iterator[Chunk]:
+    """Return the chunks of a capture; an error of another wire lists the drivers for it.
+
+    With `decoder_of` the connection in which its decoder finds most messages is chosen.
+    """
     from jointfit_daemon.files.captures import UnreadableCaptureError, read_capture
     from jointfit_daemon.tools.discovery import installed_drivers
 
+    split = getattr(driver, "packet_stream", None)
+    rate = None if decoder_of is None else partial(_count_messages, decoder_of)
     try:
-        return read_capture(file, wire)
+        return read_capture(file, driver.wire, split=split, rate=rate)
     except UnreadableCaptureError as error:
         fitting = [name for name, driver in installed_drivers() if driver.wire == error.recorded]
         if not fitting:
             raise
         raise ValueError(f"{error}: {', '.join(fitting)}") from None
+
+
+def _count_messages(decoder_of: Callable[[], Decoder], chunks: Iterable[Chunk]) -> int:
+    decoder = decoder_of()
+    for chunk in chunks:
+        decoder.feed(chunk)
+    return decoder.messages
 
 
 def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
@@ -160,7 +178,7 @@ def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
 
     if not file.stat().st_size:
         return "the file is empty: record again while the device sends"
-    chunks = list(_read(file, driver.wire))
+    chunks = list(_read(file, driver))
     text, others = f"no message of {name}", []
     if driver.wire == "can":
         sizes = frame_sizes(b"".join(chunk.data for chunk in chunks))
@@ -197,10 +215,21 @@ def _print_table(found: dict[str, object], warnings: list[str]) -> None:
         else:
             cell = "-" if value is None else str(value)
         typer.echo(f"{key:18} {cell}")
-    if not found["quaternions"]:
-        typer.echo("no orientation found: configure the device to send quaternions", err=True)
     for text in dict.fromkeys(warnings):
         typer.echo(f"warning: {text}", err=True)
+
+
+def _missing_orientations(driver: type[Driver], counts: CaptureSummary) -> str:
+    from jointfit_daemon.driver import MocapSettings
+
+    if not issubclass(driver.Settings, MocapSettings):
+        return "no orientation found: configure the device to send quaternions"
+    if counts.frames:
+        return "no rigid body found: the frames contain markers only, or no body was visible"
+    return (
+        "no frame found: a capture must contain frames and the server's reply with the names of "
+        "bodies and markers: start to record before jointfitd connects"
+    )
 
 
 def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:

@@ -23,12 +23,17 @@ from jointfit_daemon.files.orientations import (
     read_orientations_sto,
     read_sto,
 )
+from jointfit_protocols import qtm
 from jointfit_simulators.sample import write_sample
+from tests.files.captures.test_capture import pcap
+from tests.files.captures.test_tcp_streams import SYN, tcp
 from tests.fuzz.broker_targets import folder
 from tests.fuzz.target import Target
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
+
+    from jointfit_daemon.model import Chunk
 
 
 @cache
@@ -59,11 +64,18 @@ def reading(suffix: str, read: Callable[[Path], object]) -> Callable[[bytes], No
     return run
 
 
+def count(chunks: Iterable[Chunk]) -> int:
+    """Return the number of chunks."""
+    return sum(1 for _ in chunks)
+
+
 def read_captures(path: Path) -> None:
     """Read a file as a capture of every wire."""
     for wire in ("stream", "datagram", "can"):
         try:
             for _ in read_capture(path, wire):
+                pass
+            for _ in read_capture(path, wire, split=qtm.QtmStream, rate=count):
                 pass
         except ValueError:
             continue
@@ -112,7 +124,11 @@ def seeds_model_json() -> list[bytes]:
 
 def seeds_capture() -> list[bytes]:
     """Return the beginnings of captures of every kind."""
-    return [data[:1500] for name, data in samples().items() if name.endswith((".pcap", ".bin"))]
+    command = qtm.encode(qtm.Command("Version 1.25"))
+    segments = [tcp(b"", 99, flags=SYN), tcp(command[:9], 100), tcp(command[9:], 109)]
+    connection = pcap(list(enumerate(segments)), link=101)
+    files = [data for name, data in samples().items() if name.endswith((".pcap", ".bin"))]
+    return [data[:1500] for data in (*files, connection)]
 
 
 def run_candump(data: bytes) -> None:

@@ -14,6 +14,7 @@ from jointfit_drivers.qtm._diagnosis import diagnose
 from jointfit_drivers.qtm._server_search import find_servers
 from jointfit_drivers.qtm._session import QtmSession
 from jointfit_drivers.qtm._settings import QtmSettings
+from jointfit_protocols.qtm import QtmStream
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
@@ -25,6 +26,9 @@ class QtmMocap:
     Settings: ClassVar[type[QtmSettings]] = QtmSettings
     wire: ClassVar[Wire] = "datagram"
     """A chunk is one packet of the protocol, over TCP as over UDP."""
+
+    packet_stream = QtmStream
+    """Splits the bytes of a recorded connection into packets."""
 
     find_servers = staticmethod(find_servers)
     diagnose = staticmethod(diagnose)

@@ -13,6 +13,7 @@ from jointfit_drivers.vicon._decoder import ViconDecoder
 from jointfit_drivers.vicon._diagnosis import diagnose, find_servers
 from jointfit_drivers.vicon._session import ViconSession
 from jointfit_drivers.vicon._settings import ViconSettings
+from jointfit_protocols.vicon import ViconStream
 
 if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
@@ -24,6 +25,9 @@ class ViconMocap:
     Settings: ClassVar[type[ViconSettings]] = ViconSettings
     wire: ClassVar[Wire] = "datagram"
     """A chunk is one packet of the protocol."""
+
+    packet_stream = ViconStream
+    """Splits the bytes of a recorded connection into packets."""
 
     find_servers = staticmethod(find_servers)
     diagnose = staticmethod(diagnose)

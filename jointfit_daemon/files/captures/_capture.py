@@ -5,33 +5,54 @@ The file type is determined from the first bytes, not from the name:
 | file | wire | chunks |
 |---|---|---|
 | pcapng, pcap | datagram | one per UDP datagram, both directions, at the packet's own time |
+| pcapng, pcap | datagram, split | the same, and the packets of one direction of a TCP connection |
+| pcapng, pcap | stream | the segments of one direction of a TCP connection |
 | ``candump -L`` text | can | one per line, a record of `jointfit_protocols.can_frame` |
 | raw bytes | stream | pieces of 4096 bytes; the time is that of 921 600 baud |
+| raw bytes | datagram, split | packets |
 | raw bytes | datagram | messages ``u16 id, u16 length, …`` that fit exactly, else one datagram |
 | raw bytes | can | consecutive records of `jointfit_protocols.can_frame` |
+
+*Split* are the drivers with a `packet_stream`, whose chunks are packets of a connection.
 """
 
 from __future__ import annotations
 
+import heapq
 import struct
+from itertools import islice
 from typing import TYPE_CHECKING
 
 from jointfit_daemon.files.captures._candump import RECORD_BYTES, is_candump, read_candump
-from jointfit_daemon.files.captures._packet_capture import PCAP_MAGICS, PCAPNG_MAGIC, read_udp
+from jointfit_daemon.files.captures._packet_capture import (
+    PCAP_MAGICS,
+    PCAPNG_MAGIC,
+    TcpSegment,
+    UdpPacket,
+    read_packets,
+)
+from jointfit_daemon.files.captures._tcp_streams import Piece, directions, split_pieces
 from jointfit_daemon.files.text import reject_device
 from jointfit_daemon.model import Chunk
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     from jointfit_daemon.driver import Wire
+    from jointfit_daemon.files.captures._tcp_streams import Splitter
+
+    Rating = Callable[[Iterable[Chunk]], int]
+    """Number of messages that a decoder finds in some chunks."""
 
 PIECE = 4096
 """Bytes per chunk of a raw stream."""
 
 NS_PER_BYTE = 10 * 10**9 // 921_600
 """Assumed duration of a byte in a raw stream, ns: ten bits at 921 600 baud."""
+
+_RATED = 2000
+"""Chunks of each direction of TCP by which the best direction is chosen."""
 
 
 class UnreadableCaptureError(ValueError):
@@ -50,7 +71,14 @@ class UnreadableCaptureError(ValueError):
         self.recorded = recorded
 
 
-def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Chunk]:
+def read_capture(
+    path: Path,
+    wire: Wire,
+    port: int | None = None,
+    *,
+    split: Callable[[], Splitter] | None = None,
+    rate: Rating | None = None,
+) -> Iterator[Chunk]:
     """Yield the chunks recorded in a file, in file order.
 
     Parameters
@@ -61,6 +89,10 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
         Kind of the driver's chunks.
     port : int, optional
         Select UDP datagrams from or to this port.
+    split : callable, optional
+        Returns a new splitter of a connection into the driver's chunks.
+    rate : callable, optional
+        Rates the directions of TCP connections; without it, those are not read.
 
     Raises
     ------
@@ -72,18 +104,13 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
     reject_device(path)
     data = path.read_bytes()
     if data.startswith(PCAPNG_MAGIC) or data[:4] in PCAP_MAGICS:
-        _require_wire(path, "a network capture", "datagram", wire)
-        return (
-            Chunk(packet.t_ns, packet.payload)
-            for packet in read_udp(data)
-            if port is None or port in (packet.source_port, packet.target_port)
-        )
+        return _network(path, data, wire, port, split=split, rate=rate)
     if is_candump(data):
         _require_wire(path, "candump text", "can", wire)
         return read_candump(data)
 
     if wire == "datagram":
-        return _walk(data)
+        return _walk(data) if split is None else split_pieces([Piece(0, data, False)], split)
     if wire == "can" and len(data) % RECORD_BYTES:
         raise UnreadableCaptureError(
             f"{path}: neither `candump -L` text nor CAN records of {RECORD_BYTES} bytes: record"
@@ -91,6 +118,42 @@ def read_capture(path: Path, wire: Wire, port: int | None = None) -> Iterator[Ch
         )
     size = PIECE // RECORD_BYTES * RECORD_BYTES if wire == "can" else PIECE
     return (Chunk(at * NS_PER_BYTE, data[at : at + size]) for at in range(0, len(data), size))
+
+
+def _network(
+    path: Path,
+    data: bytes,
+    wire: Wire,
+    port: int | None,
+    *,
+    split: Callable[[], Splitter] | None,
+    rate: Rating | None,
+) -> Iterator[Chunk]:
+    """Return the chunks of a network capture; see `read_capture`."""
+    packets = list(read_packets(data))
+    by_tcp: list[Chunk] = []
+    if rate is not None and (wire == "stream" or split is not None):
+        found = directions(packet for packet in packets if isinstance(packet, TcpSegment))
+        rated = [_pieces_as_chunks(pieces, split) for pieces in found]
+        by_tcp = max(rated, key=lambda chunks: rate(islice(chunks, _RATED)), default=[])
+    if wire != "datagram" and not by_tcp:
+        _require_wire(path, "a network capture", "datagram", wire)
+    if wire == "stream":
+        return iter(by_tcp)
+
+    by_udp = (
+        Chunk(packet.t_ns, packet.payload)
+        for packet in packets
+        if isinstance(packet, UdpPacket)
+        and (port is None or port in (packet.source_port, packet.target_port))
+    )
+    return heapq.merge(by_udp, by_tcp, key=lambda chunk: chunk.t_ns) if by_tcp else by_udp
+
+
+def _pieces_as_chunks(pieces: Iterable[Piece], split: Callable[[], Splitter] | None) -> list[Chunk]:
+    if split is not None:
+        return list(split_pieces(pieces, split))
+    return [Chunk(piece.t_ns, piece.data) for piece in pieces]
 
 
 def _require_wire(path: Path, found: str, recorded: Wire, expected: Wire) -> None:

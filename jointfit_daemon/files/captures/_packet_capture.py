@@ -1,12 +1,13 @@
-"""Reader of UDP payloads in pcapng and pcap files.
+"""Reader of UDP datagrams and TCP segments in pcapng and pcap files.
 
 A truncated file yields the packets before the cut.
 
 Supported: little- and big-endian files, several sections and interfaces, microsecond to nanosecond
-timestamps, Ethernet (with VLAN tags), Linux cooked and raw IP links, IPv4 with reassembly of
-fragments. Everything else in the file is skipped. Time stamps are those of the file, ns since 1970.
+timestamps, Ethernet (with VLAN tags), Linux cooked, loopback and raw IP links, IPv4 with reassembly
+of fragments. Everything else in the file is skipped. Time stamps are those of the file, ns since
+1970.
 
-Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791.
+Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791; RFC 9293.
 """
 
 from __future__ import annotations
@@ -30,14 +31,23 @@ bytes of a pcap file."""
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
 _LITTLE_MAGIC = b"\x4d\x3c\x2b\x1a"
 _RESOLUTION, _OFFSET = 9, 14  # options if_tsresol, if_tsoffset
-_LINK_HEADS = {101: (0, None), 228: (0, None), 113: (16, 14), 276: (20, 0)}
+_LINK_HEADS = {
+    0: (4, None),
+    108: (4, None),
+    101: (0, None),
+    228: (0, None),
+    113: (16, 14),
+    276: (20, 0),
+}
 """Number of bytes before the IP header, and offset of the EtherType in them (None: the link has
 none), by link type."""
 _ETHERNET = 1
 _IPV4, _VLAN = 0x0800, (0x8100, 0x88A8)
-_UDP = 17
+_TCP, _UDP = 6, 17
 _IP_VERSION, _IP_HEAD = 4, 20
 _UDP_HEAD = struct.Struct(">HHHH")
+_TCP_HEAD = struct.Struct(">HHIIBB6x")
+_SYN = 0x02
 _BLOCK_EDGES, _INTERFACE_HEAD, _PACKET_HEAD, _OFFSET_BYTES = 12, 8, 20, 8
 _PCAP_HEAD = 24
 _MAX_PENDING = 64
@@ -53,17 +63,59 @@ class UdpPacket(NamedTuple):
     payload: bytes
 
 
+class TcpSegment(NamedTuple):
+    """One TCP segment of a capture."""
+
+    t_ns: int
+    source: tuple[bytes, int]
+    """Address and port of the sender."""
+    target: tuple[bytes, int]
+    sequence: int
+    """Number of the first byte of the payload."""
+    begins: bool
+    """Whether the segment begins a connection."""
+    payload: bytes
+
+
 def read_udp(data: bytes) -> Iterator[UdpPacket]:
     """Yield the UDP datagrams of a pcapng or pcap file in file order."""
+    return (packet for packet in read_packets(data) if isinstance(packet, UdpPacket))
+
+
+def read_packets(data: bytes) -> Iterator[UdpPacket | TcpSegment]:
+    """Yield the UDP datagrams and TCP segments of a pcapng or pcap file in file order."""
     packets = _read_pcapng(data) if data.startswith(PCAPNG_MAGIC) else _read_pcap(data)
     fragments = _Fragments()
     for t_ns, link, frame in packets:
         at = _ip_offset(frame, link)
-        segment = None if at is None else fragments.segment(frame[at:])
-        if segment is not None and len(segment) >= _UDP_HEAD.size:
+        packet = b"" if at is None else frame[at:]
+        segment = fragments.segment(packet)
+        if segment is None:
+            continue
+        if packet[9] == _TCP:
+            found = _tcp_segment(t_ns, packet[12:20], segment)
+            if found is not None:
+                yield found
+        elif len(segment) >= _UDP_HEAD.size:
             source, target, size, _ = _UDP_HEAD.unpack_from(segment)
             if _UDP_HEAD.size <= size <= len(segment):
                 yield UdpPacket(t_ns, source, target, segment[_UDP_HEAD.size : size])
+
+
+def _tcp_segment(t_ns: int, addresses: bytes, segment: bytes) -> TcpSegment | None:
+    """Return the TCP segment of an IP packet between two addresses; None if it is cut off."""
+    if len(segment) < _TCP_HEAD.size:
+        return None
+    source, target, sequence, _, size, flags = _TCP_HEAD.unpack_from(segment)
+    begins = bool(flags & _SYN)
+    return TcpSegment(
+        t_ns,
+        (addresses[:4], source),
+        (addresses[4:], target),
+        sequence + begins & 0xFFFFFFFF,  # a SYN takes one number
+        begins,
+        segment[max(size >> 4, 5) * 4 :],
+    )
 
 
 # --- files ------------------------------------------------------------------------------------
@@ -159,8 +211,10 @@ class _Fragments:
         self._pending: dict[tuple[bytes, int], _Parts] = {}
 
     def segment(self, packet: bytes) -> bytes | None:
-        """Return the UDP segment that `packet` contains or completes, if any."""
-        if len(packet) < _IP_HEAD or packet[0] >> 4 != _IP_VERSION or packet[9] != _UDP:
+        """Return the UDP or TCP segment that `packet` contains or completes, if any."""
+        if len(packet) < _IP_HEAD or packet[0] >> 4 != _IP_VERSION:
+            return None
+        if packet[9] not in {_TCP, _UDP}:
             return None
         total, number, flags = struct.unpack_from(">HHH", packet, 2)
         body = packet[(packet[0] & 15) * 4 : total or len(packet)]
@@ -168,7 +222,7 @@ class _Fragments:
         if not more and not offset:
             return body
 
-        key = (packet[12:20], number)
+        key = (packet[9:10] + packet[12:20], number)
         parts = self._pending.setdefault(key, _Parts())
         if len(self._pending) > _MAX_PENDING:
             del self._pending[next(iter(self._pending))]

@@ -23,6 +23,8 @@ HEADER = Struct("<II")
 """Size and type."""
 LARGEST_PACKET = 16 << 20
 """Largest accepted packet, bytes; a camera frame with thousands of markers has 100 kB."""
+_LARGEST_TYPE = 0xFF
+"""Largest plausible type of a packet; known ones are below 9."""
 _LARGEST_TEXT = 4 << 20
 """Largest accepted XML or text, bytes."""
 _FRAME_HEAD = Struct("<qII")
@@ -234,8 +236,8 @@ class QtmStream(PacketStream):
 
 
 def _packet_size(buffer: bytearray, at: int) -> int | None:
-    size: int = HEADER.unpack_from(buffer, at)[0]
-    return size if HEADER.size <= size <= LARGEST_PACKET else None
+    size, kind = HEADER.unpack_from(buffer, at)
+    return size if HEADER.size <= size <= LARGEST_PACKET and kind <= _LARGEST_TYPE else None
 
 
 def decode_announcement(datagram: bytes) -> ServerAnnouncement | CorruptBytes:
