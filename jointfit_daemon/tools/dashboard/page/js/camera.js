@@ -5,6 +5,7 @@ import { dot, mix, norm, rotate, scale, subtract } from "./geometry.js";
 const ELEVATION = 0.16;
 const FOLLOW_S = 0.9;
 const TURN_S = 3;
+const MIDDLE = 0.46; // height of the limb's centre in the window, from the top: the floor is below
 const JUMP = 0.5; // distance, in lengths of the limb, that the view does not follow smoothly
 
 /** Return a camera; `turn` is the angle of the view about the vertical, rad; null until it is set. */
@@ -59,7 +60,7 @@ export function createCamera() {
         const distance = dot(d, away);
         return {
           x: width / 2 + pixels * dot(d, across),
-          y: height / 2 - pixels * (d[2] * cosine + distance * sine),
+          y: height * MIDDLE - pixels * (d[2] * cosine + distance * sine),
           depth: distance * cosine - d[2] * sine,
         };
       };
