@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from jointfit_daemon.tools.output_files import check_output
+from jointfit_daemon.tools.text_output import echo_json
 
 
 def recover(
@@ -19,6 +20,7 @@ def recover(
             help="Clean file; default: NAME.mcap for NAME.mcap.part, else NAME-clean.mcap."
         ),
     ] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print the result as JSON.")] = False,
 ) -> None:
     """Copy the readable messages of a damaged recording to a clean file, and list what is missing.
 
@@ -36,6 +38,23 @@ def recover(
         raise ValueError(f"{out} exists: choose another name with --out, or delete it")
 
     result = repair_recording(file, out)
+    if json:
+        gaps = [
+            {
+                "first": gap.first_sequence,
+                "count": gap.count,
+                "s": gap.seconds,
+                "reason": gap.reason,
+            }
+            for gap in result.gaps
+        ]
+        echo_json(
+            {
+                "file": str(result.path), "messages": result.messages, "duration_s": result.seconds,
+                "gaps": gaps, "unreadable_bytes": result.unreadable_bytes, "closed": result.closed,
+            }
+        )  # fmt: skip
+        return
     for gap in result.gaps:
         typer.echo(gap.text())
     if not result.closed:

@@ -43,6 +43,23 @@ def test_help_paragraphs_are_wrapped_by_the_terminal_only() -> None:
     assert all("\n" not in paragraph for paragraph in shown.help.split("\n\n"))
 
 
+NO_JSON = {
+    "dashboard": "serves until it is stopped",
+    "decode": "--jsonl and --summary print JSON",
+    "demo": "--headless prints one JSON line",
+    "fuse": "its commands have the option",
+    "monitor": "is a screen",
+    "schema": "prints JSON only",
+}
+
+
+@pytest.mark.parametrize("command", sorted(get_command(app).commands))  # type: ignore[attr-defined]  # it is a group
+def test_every_command_with_a_result_prints_it_as_json_on_request(command: str) -> None:
+    found = get_command(app).get_command(None, command)  # type: ignore[attr-defined]
+    options = {option for parameter in found.params for option in parameter.opts}
+    assert ("--json" in options) != (command in NO_JSON)
+
+
 def completions(*words: str) -> list[str]:
     """Return what bash offers after Tab at the end of the words."""
     line = " ".join(map(shlex.quote, ("jointfit", *words)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import orjson
 import pytest
 from typer.testing import CliRunner
 
@@ -45,6 +46,19 @@ def test_a_damaged_chunk_is_listed(tmp_path: Path) -> None:
     assert "500 messages (0 to 499" in result.output
     assert "bytes" in result.output
     assert len(list(read_events(tmp_path / "new.mcap"))) == 500
+
+
+def test_a_program_gets_the_gaps_as_json(tmp_path: Path) -> None:
+    path = write_recording(tmp_path, map(Tick, range(1000)))
+    damaged = bytearray(path.read_bytes())
+    damaged[damaged.index(b"\x28\xb5\x2f\xfd") + 50] ^= 4
+    path.write_bytes(damaged)
+    found = orjson.loads(recover(path, "--json").stdout)
+    assert found["file"] == str(path.with_name(f"{path.stem}-clean.mcap"))
+    assert found["messages"] == 500
+    assert found["closed"]
+    assert found["unreadable_bytes"] > 0
+    assert [(gap["first"], gap["count"]) for gap in found["gaps"]] == [(0, 500)]
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x89MCAP0\r\n"])

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from dataclasses import asdict
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from jointfit_daemon.tools.command_group import EXIT_FAILED
-from jointfit_daemon.tools.text_output import check_choice
+from jointfit_daemon.tools.text_output import check_choice, echo_json
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -33,6 +34,9 @@ def batch(
         str | None,
         typer.Option("--scheduler", help="Dask cluster instead: tcp://HOST:8786."),
     ] = None,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the rows of the summary as JSON.")
+    ] = False,
 ) -> None:
     """Process every recording of a folder, and summarize them in a table.
 
@@ -66,8 +70,12 @@ def batch(
         text = f": {result.error}" if result.error else ""
         typer.echo(f"[{number}/{len(tasks)}] {result.recording}: {result.status}{text}", err=True)
         results.append(result)
-    for path in write_summary(results, output):
+    written = write_summary(results, output)
+    for path in written:
         typer.echo(f"wrote {path}", err=True)
+    if json:
+        rows = sorted(map(asdict, results), key=lambda row: row["recording"])
+        echo_json({"recordings": rows, "files": [str(path) for path in written]})
     if any(result.status != "done" for result in results):
         raise typer.Exit(EXIT_FAILED)
 

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from jointfit_daemon.tools.output_files import check_output
+from jointfit_daemon.tools.text_output import echo_json
 
 
 def report(
@@ -18,6 +19,9 @@ def report(
     out: Annotated[
         Path | None, typer.Option("--out", help="Page to write; default: beside the recording.")
     ] = None,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print the name of the page as JSON.")
+    ] = False,
 ) -> None:
     """Write a session as one HTML page: angles, gait, range of motion, differences, faults."""
     from jointfit_daemon.tools.report.writing import report_name, write_report
@@ -25,4 +29,7 @@ def report(
     page = report_name(recording) if out is None else out
     check_output("--out", page, (".html",))
     write_report(recording, page)
-    typer.echo(f"wrote {page}", err=True)
+    if json:
+        echo_json({"file": str(page)})
+    else:
+        typer.echo(f"wrote {page}", err=True)

@@ -13,6 +13,7 @@ from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from typing import TYPE_CHECKING
 
+import orjson
 import pytest
 from typer.testing import CliRunner
 
@@ -90,10 +91,13 @@ def test_calibration_and_replay_equal_the_single_commands(
 def test_one_bad_file_stops_only_itself(recordings: Recordings, tmp_path: Path) -> None:
     folder, out = recordings(2), tmp_path / "out"
     (folder / "trial-0000a.mcap").write_bytes(b"not a recording")
-    result = run(app, ["batch", str(folder), "--jobs", "1", "--out", str(out)])
+    result = run(app, ["batch", str(folder), "--jobs", "1", "--out", str(out), "--json"])
     assert result.exit_code == 1
     rows = rows_of(out)
     assert [row["status"] for row in rows] == ["done", "failed", "done"]
+    printed = orjson.loads(result.stdout)["recordings"]
+    assert [row["status"] for row in printed] == ["done", "failed", "done"]
+    assert printed[1]["error"] == rows[1]["error"]
     assert "trial-0000a.mcap" in rows[1]["error"]
     assert float(rows[0]["duration_s"]) > 0.0
     assert not (out / "trial-0000a").exists()

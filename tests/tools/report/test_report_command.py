@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import orjson
 from typer.testing import CliRunner
 
 from jointfit_daemon.tools.__main__ import app
@@ -23,6 +24,8 @@ def test_page_of_a_recording_is_written(recorded: Path, tmp_path: Path) -> None:
     assert "Joint angles" in text
     assert "first step" in text
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    again = run(app, ["report", str(recorded), "--out", str(page), "--json"])
+    assert orjson.loads(again.stdout) == {"file": str(page)}
 
 
 def test_a_file_that_is_no_recording_leaves_no_page(tmp_path: Path) -> None:
