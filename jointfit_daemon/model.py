@@ -313,6 +313,7 @@ class FrameFlag(StrEnum):
     LOST = "lost"
     UNTRAINED = "untrained"
     AXIS_VERTICAL = "axis_vertical"
+    AXIS_FROM_SHOULDER = "axis_from_shoulder"
 
     def of(self, name: str) -> str:
         """Return the flag of one sensor, segment or joint, as ``held:thigh``."""

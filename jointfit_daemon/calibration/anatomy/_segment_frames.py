@@ -168,9 +168,14 @@ def find_anatomy(
     ]
 
     q_static, lengths, sources = {}, {}, {}
+    shoulders = _shoulders(chain)
     for i, segment in enumerate(chain.segments):
         x = _direction(*ends[i]) if branched[i] else None
-        x = _right_axis(chain, i, axes) if x is None else x
+        if x is None:
+            used = _axis_joints(chain, i, axes)
+            x = _mean_axis([axes[joint] for joint in used])
+            if not chain.static_axes and shoulders.intersection(used):
+                flags.append(FrameFlag.AXIS_FROM_SHOULDER.of(segment))
         if x is None and _jointed(chain, tracks):
             raise CalibrationError(
                 f"{segment}: no adjacent joint flexed enough to determine its flexion axis; "
@@ -181,6 +186,7 @@ def find_anatomy(
             x = np.array([1.0, 0.0, 0.0])
         q_static[segment] = _STANDING.copy() if chain.static_axes else _frame(segment, x, z[i])
         lengths[segment], sources[segment] = _length(chain, i, *ends[i])
+    notes += _shoulder_note(chain, flags)
     flags = list(dict.fromkeys(flags))
     return Anatomy(joints, q_static, lengths, sources, axes, tuple(flags), tuple(notes))
 
@@ -413,8 +419,8 @@ def _shoulders(chain: Chain) -> set[str]:
     }
 
 
-def _right_axis(chain: Chain, i: int, axes: Mapping[str, FlexionAxis]) -> Array | None:
-    """Return the flexion axis of a segment: of inner joints if possible, else of outer ones.
+def _axis_joints(chain: Chain, i: int, axes: Mapping[str, FlexionAxis]) -> list[str]:
+    """Return the joints that determine the flexion axis of a segment: inner ones if possible.
 
     Beside a shoulder the axes of elbow and wrist are preferred, also for the thorax.
     """
@@ -422,13 +428,39 @@ def _right_axis(chain: Chain, i: int, axes: Mapping[str, FlexionAxis]) -> Array 
     ends = [chain.joints[k] for k in (i, *distal_joints(chain, i))]
     hinges = inner - shoulders
     beside = [j for j in ends if j in hinges]
-    farther = sorted(hinges) if shoulders.intersection(ends) else []
+    first = sorted(hinges) if shoulders.intersection(ends) else []
 
-    for wanted in (beside, farther, [j for j in ends if j in inner], ends, sorted(inner)):
-        if usable := [axes[j].axis * axes[j].rms for j in wanted if j in axes]:
-            mean = np.sum(usable, axis=0)
-            return np.asarray(mean / np.linalg.norm(mean))
-    return None
+    adjacent = [j for j in ends if j in inner]
+    for wanted in (beside, first, adjacent, ends, sorted(hinges), sorted(inner)):
+        if usable := [j for j in wanted if j in axes]:
+            return usable
+    return []
+
+
+def _mean_axis(axes: Sequence[FlexionAxis]) -> Array | None:
+    """Return the mean of axes, weighted by the rotation about each; None without an axis."""
+    if not axes:
+        return None
+    mean = np.sum([axis.axis * axis.rms for axis in axes], axis=0)
+    return np.asarray(mean / np.linalg.norm(mean))
+
+
+def _shoulder_note(chain: Chain, flags: Sequence[str]) -> list[str]:
+    """Return a note on the segments whose axis comes from a shoulder, with the remedy."""
+    prefix = FrameFlag.AXIS_FROM_SHOULDER.of("")
+    segments = [flag.removeprefix(prefix) for flag in flags if flag.startswith(prefix)]
+    if not segments:
+        return []
+    hinges = sorted({joint.name for joint in inner_joints(chain)} - _shoulders(chain))
+    remedy = (
+        f"bend {' or '.join(hinges)} in the functional phase"
+        if hinges
+        else "raise the arm mainly forward and back in the functional phase"
+    )
+    return [
+        f"{', '.join(segments)}: the flexion axis is that of the shoulder's main movement, which"
+        f" differs from the anatomical axis if the arm was not raised straight forward; {remedy}"
+    ]
 
 
 def _direction(end: JointCenter | None, begin: JointCenter | None) -> Array | None:

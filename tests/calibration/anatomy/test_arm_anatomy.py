@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -22,8 +24,11 @@ CHAIN = bench_rig(limb="arm").chain
 STAND_S, MOVE_S, HZ = 3.0, 8.0, 20.0
 
 
-def anatomy(*motions: str) -> Anatomy:
-    """Return the anatomy of a subject without soft-tissue artefact after some motions."""
+def anatomy(*motions: str, stiff: bool = False) -> Anatomy:
+    """Return the anatomy of a subject without soft-tissue artefact after some motions.
+
+    The forearm and hand of a stiff arm turn with the upper arm.
+    """
     steps = [Step("stand", STAND_S + 2.0), *(Step(name, MOVE_S) for name in motions)]
     subject = SimulatedSubject(perfect(Knobs()), steps, limb="arm")
     parts = [part for part in KIND.clusters if part != "plate"]
@@ -40,7 +45,11 @@ def anatomy(*motions: str) -> Anatomy:
     still = track(0.0, STAND_S)
     clusters = {part: static_cluster(still, part, settings) for part in parts}
     moved = track(STAND_S + 3.0, STAND_S + 2.0 + MOVE_S * len(motions))
-    return find_anatomy(CHAIN, track_clusters(moved, clusters))
+    tracks = dict(track_clusters(moved, clusters))
+    if stiff:
+        for part in ("forearm", "hand"):
+            tracks[part] = replace(tracks[part], q=tracks["upper_arm"].q)
+    return find_anatomy(CHAIN, tracks)
 
 
 @pytest.mark.parametrize("raising", ["arm_swings", "abduction", "reach"])
@@ -49,9 +58,19 @@ def test_the_frames_of_an_arm_do_not_depend_on_the_direction_of_the_shoulder(rai
     for segment in CHAIN.segments:  # every frame of an upright subject equals the world
         turn = Rotation.from_quat(found.q_static[segment], scalar_first=True)
         assert np.degrees(turn.magnitude()) < 6.0, segment
+    assert not [flag for flag in found.flags if flag.startswith("axis_from_shoulder")]
+    assert "shoulder's main movement" not in " ".join(found.notes)
 
 
-def test_without_a_movement_of_the_elbow_the_shoulder_determines_the_frames() -> None:
+def test_an_arm_that_is_only_swung_takes_its_frames_from_the_elbow_that_swings_along() -> None:
     found = anatomy("arm_swings")
     turn = Rotation.from_quat(found.q_static["thorax"], scalar_first=True)
     assert np.degrees(turn.magnitude()) < 10.0
+    assert not [flag for flag in found.flags if flag.startswith("axis_from_shoulder")]
+
+
+def test_a_stiff_arm_takes_its_frames_from_the_shoulder_and_has_a_flag() -> None:
+    found = anatomy("abduction", stiff=True)
+    assert {f"axis_from_shoulder:{segment}" for segment in CHAIN.segments} <= set(found.flags)
+    assert "thorax, upper_arm, forearm, hand: the flexion axis is that" in found.notes[-1]
+    assert "bend elbow or wrist in the functional phase" in found.notes[-1]
