@@ -58,6 +58,9 @@ class Movement:
     child_markers: Array | None = None
     """The child's own markers in its coordinates, m, shape (k, 3). None: the median of `points` in
     the child's coordinates, if `child` is given."""
+    residuals: Array | None = None
+    """Residual of the cameras for each of `points`, m, shape (n, k); NaN where unknown. Only their
+    ratios are used: of two frames, the one with the larger residual is noisier."""
     angles: Array | None = None
     """Angle of the child about the joint's axis relative to the parent, rad, shape (n,), from
     inertial sensors: for ``oriented``."""

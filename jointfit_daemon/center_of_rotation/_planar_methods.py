@@ -32,6 +32,8 @@ from jointfit_daemon.center_of_rotation.planar import (
 from jointfit_daemon.center_of_rotation.spatial import SphereLimits, fit_running
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from jointfit_daemon.center_of_rotation._result import CenterEstimate
     from jointfit_daemon.center_of_rotation.planar import CircleMethod
 
@@ -79,18 +81,35 @@ def grid(p: Array, _: Movement) -> CenterEstimate:
     return replace(about, center=node, covariance=about.covariance + rounding)
 
 
-def three_frames(p: Array, _: Movement) -> CenterEstimate:
-    """Use the first, middle and last frame of one marker, with noise estimated from all frames."""
+def three_frames(p: Array, movement: Movement) -> CenterEstimate:
+    """Use the first, middle and last frame of one marker, with noise estimated from all frames.
+
+    Where the cameras state a residual for every position, the noise of a frame is proportional to
+    it.
+    """
     whole = circle_estimate(p, limits=LIMITS)
     if whole.refused is not None:
         return replace(whole, method="three_frames")
-    seen = p[np.isfinite(p).all(axis=1)]
+    visible = np.asarray(np.isfinite(p).all(axis=1))
+    seen = p[visible]
     # along the arc, not along time: a movement may end where it began
     turn = np.unwrap(np.arctan2(*(seen - whole.center).T[::-1]))
     order = np.argsort(turn)
     middle = int(np.argmin(np.abs(turn - turn[order[[0, -1]]].mean())))
-    found = three_frame_estimate(seen[[order[0], middle, order[-1]]], whole.noise)
+    chosen = [order[0], middle, order[-1]]
+    noise = whole.noise * _relative_noise(movement.residuals, visible)[chosen]
+    found = three_frame_estimate(seen[chosen], noise[:, None])
     return replace(found, bound=whole.bound)  # of the movement, not of its three frames
+
+
+def _relative_noise(residuals: Array | None, visible: NDArray[np.bool_]) -> Array:
+    """Return the noise of every visible frame of one marker relative to the RMS of all of them."""
+    if residuals is None:
+        return np.ones(int(visible.sum()))
+    stated = residuals[visible, 0]
+    known = np.isfinite(stated)
+    typical = np.sqrt(np.mean(stated[known] ** 2)) if known.any() else 1.0
+    return np.where(known, stated, typical) / typical
 
 
 def geometric(points: Array, movement: Movement) -> CenterEstimate:
@@ -103,7 +122,14 @@ def each(fit: MarkerFit) -> MarkerFit:
     """Fit each marker alone and return the fused center."""
 
     def fit_all(points: Array, movement: Movement) -> CenterEstimate:
-        found = [fit(points[:, j], movement) for j in range(points.shape[1])]
+        stated = movement.residuals
+        found = [
+            fit(
+                points[:, j],
+                movement if stated is None else replace(movement, residuals=stated[:, j : j + 1]),
+            )
+            for j in range(points.shape[1])
+        ]
         return found[0] if len(found) == 1 else replace(fuse_centers(found), method=found[0].method)
 
     return fit_all

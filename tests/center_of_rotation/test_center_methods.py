@@ -200,3 +200,20 @@ def test_the_batch_spheres_ellipse_covers(arc: float) -> None:
         assert found.refused is None
         held += covers(found)
     assert held >= 70
+
+
+def test_three_frames_predict_their_error_from_the_residuals_of_the_cameras() -> None:
+    rng, angles = np.random.default_rng(5), np.linspace(0.0, np.radians(100.0), 60)
+    occluded = np.abs(np.abs(angles - angles.mean()) - np.radians(25.0)) < np.radians(12.0)
+    sd = np.where(occluded, 2e-3, 0.5e-3)  # the frames at the ends and in the middle are good
+    circle = 0.3 * np.stack((np.cos(angles), np.sin(angles)), axis=-1)[:, None]
+    errors, stated, unstated = [], [], []
+    for _ in range(200):
+        points = circle + sd[:, None, None] * rng.normal(size=circle.shape)
+        found = estimate_center(Movement(points, residuals=0.3 * sd[:, None]), "three_frames")
+        errors.append(found.center)
+        stated.append(found.sd**2)
+        unstated.append(estimate_center(Movement(points), "three_frames").sd ** 2)
+    actual = np.mean(np.sum(np.square(errors), axis=1))
+    assert np.sqrt(np.mean(stated) / actual) == pytest.approx(1.0, abs=0.1)
+    assert np.sqrt(np.mean(unstated) / actual) > 1.5

@@ -1,8 +1,8 @@
 """C3D files: marker trials, read with the optional package ``c3d``.
 
 Positions are returned in metres, in the file's own axes. A point with a negative residual is
-missing (NaN), whatever its coordinates. Times follow the frame numbers: frame 1 is at 0 s, as in a
-TRC file of the same trial.
+missing (NaN), whatever its coordinates; a positive one is that of the cameras. Times follow the
+frame numbers: frame 1 is at 0 s, as in a TRC file of the same trial.
 """
 
 from __future__ import annotations
@@ -103,6 +103,8 @@ def _read(path: Path, reader: Any) -> C3dTrial:
 
     positions = cells[..., :3].copy()
     positions[cells[..., 3] < 0.0] = np.nan
+    # the format defines a residual of 0 for points that were interpolated or filtered
+    residuals = np.where(cells[..., 3] > 0.0, cells[..., 3], np.nan) * METRES[unit]
     numbers = np.arange(first, first + len(cells), dtype=np.int64)
     trajectories = MarkerTrajectories(
         names,
@@ -113,6 +115,7 @@ def _read(path: Path, reader: Any) -> C3dTrial:
         ()
         if len(cells) == declared
         else (f"header declares {declared} frames, counted {len(cells)}",),
+        residuals if np.isfinite(residuals).any() else None,
     )
     screen = _text(reader, "POINT:Y_SCREEN").lstrip("+").lower()
     group = reader.get("JOINTFIT")

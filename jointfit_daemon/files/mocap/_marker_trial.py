@@ -67,6 +67,15 @@ class MarkerTrial:
         problems.append(f"there are: {', '.join(self.trajectories.names)}")
         raise UnknownMarkerError("; ".join(problems))
 
+    def residuals(self, names: Sequence[str]) -> NDArray[np.float64] | None:
+        """Return the residuals of the cameras by known names, m, shape (n, len(names)).
+
+        None if the file has none; NaN where it states none.
+        """
+        found = self.trajectories.residuals
+        wanted = [self._index(name) for name in names]
+        return None if found is None else found[:, [at for at in wanted if at is not None]]
+
     def direction(self, axis: Axis) -> NDArray[np.float64]:
         """Return an axis of the file in the world with z up, shape (3,)."""
         return to_z_up(np.eye(3)["xyz".index(axis)], self.up_axis)

@@ -63,6 +63,9 @@ class MarkerTrajectories:
     rate_hz: float
     warnings: tuple[str, ...] = ()
     """Contradictions between header and rows."""
+    residuals: NDArray[np.float64] | None = None
+    """Residual of the cameras for every position, m, shape (n, len(names)); NaN where the file
+    states none. None: the format has none."""
 
 
 _MOST_FRAMES = 2.0**53

@@ -130,7 +130,7 @@ def reduce(
         _check_planar_parent(seen @ basis, trial, parent, option)
         reduced = _reduce_planar(seen, child, basis, interval)
         _check_rigid(reduced.poses.q, parent, option)
-        return reduced
+        return _with_residuals(reduced, trial, markers)
 
     template = moving_template(seen)
     if is_line(template[:MIN_MARKERS]):
@@ -154,7 +154,15 @@ def reduce(
         other = None if is_line(shape) else _poses(moving_template(child), child)[0]
 
     movement = Movement(poses.to_body(child), poses, other, template, interval=interval)
-    return ParentFrameMotion(movement, rms, poses, np.eye(3), template)
+    reduced = ParentFrameMotion(movement, rms, poses, np.eye(3), template)
+    return _with_residuals(reduced, trial, markers)
+
+
+def _with_residuals(
+    reduced: ParentFrameMotion, trial: MarkerTrial, markers: Sequence[str]
+) -> ParentFrameMotion:
+    movement = replace(reduced.movement, residuals=trial.residuals(markers))
+    return replace(reduced, movement=movement)
 
 
 def _check_parent(trial: MarkerTrial, parent: Sequence[str], least: int, option: str) -> None:
@@ -280,6 +288,7 @@ def answers(
         window = replace(
             movement,
             points=points[part],
+            residuals=None if movement.residuals is None else movement.residuals[part],
             parent=within(movement.parent, part),
             child=within(movement.child, part),
         )

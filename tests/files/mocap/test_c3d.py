@@ -80,6 +80,25 @@ def test_an_independent_reader_sees_the_same_points_and_gaps(
     assert trial.warnings == ()
 
 
+def test_residuals_of_the_cameras_are_read_in_metres(
+    tmp_path: Path, positions: NDArray[np.float64]
+) -> None:
+    path = tmp_path / "a.c3d"
+    write_c3d(path, np.nan_to_num(positions))
+    assert read_marker_trial(path).residuals(["RASI"]) is None
+    residuals = np.random.default_rng(2).integers(1, 200, (40, 3)).astype(np.float32)
+    residuals[7, 2] = 0.0  # interpolated
+    content = bytearray(path.read_bytes())
+    begin = (int.from_bytes(content[16:18], "little") - 1) * 512
+    cells = np.frombuffer(content, "<f4", 40 * 3 * 4, begin).reshape(40, 3, 4)
+    cells[..., 3] = residuals + 256.0 * 0b101  # the high byte: two cameras saw the marker
+    path.write_bytes(content)
+    found = read_marker_trial(path).residuals(["RASI", "LKNE"])
+    assert found is not None
+    expected = np.where(residuals > 0.0, residuals / 1000.0, np.nan)[:, 1:]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
 def test_gaps_are_where_the_recording_has_them(shared_data: Path) -> None:
     path = shared_data / "mocap" / "c3d_trc_pyomeca" / "markers_gaps_frames119to218.c3d"
     trial = read_marker_trial(path)
