@@ -23,7 +23,11 @@ export function createAxesCheck(store, link) {
   let visible = false;
   let shownMs = 0;
 
-  const update = () => { if (visible && isFresh(store)) updateDrawings(store, drawings, cards); };
+  const update = () => {
+    if (!visible || !isFresh(store)) return;
+    updateDrawings(store, drawings, cards);
+    updateNote(); // together with the drawings, which it would move later
+  };
   store.on("sensors", update);
   setInterval(() => { if (visible) updateNote(); }, 500);
   const updateNote = () => {
