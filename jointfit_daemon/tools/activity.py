@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 
 @contextmanager
-def show_activity(label: str) -> Iterator[None]:
-    """Show a moving bar and the elapsed time on standard error if that is a terminal."""
+def show_activity(label: str) -> Iterator[Callable[[str], None]]:
+    """Show a moving bar and the elapsed time on standard error if that is a terminal.
+
+    Yields a function that prints a line on standard error, above the bar.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -20,4 +24,4 @@ def show_activity(label: str) -> Iterator[None]:
     disable = not console.is_terminal
     with Progress(*columns, console=console, transient=True, disable=disable) as bar:
         bar.add_task(label, total=None)
-        yield
+        yield partial(console.print, markup=False, highlight=False, soft_wrap=True)

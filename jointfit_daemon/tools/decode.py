@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections import Counter
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path  # noqa: TC003 - typer reads annotations at run time
@@ -14,6 +15,7 @@ import orjson
 import typer
 
 from jointfit_daemon.model import ClockEcho, Corrupt, DeviceEvent, ImuSample, MocapFrame, SyncPulse
+from jointfit_daemon.tools.activity import show_activity
 from jointfit_daemon.tools.completion import complete_driver
 
 if TYPE_CHECKING:
@@ -123,11 +125,12 @@ def decode(
             yield from decoder.feed(chunk)
         yield from decoder.flush()
 
-    for item in items():
-        counts.add(item)
-        if jsonl:
-            row = orjson.dumps(_row(item), default=str, option=orjson.OPT_SERIALIZE_NUMPY)
-            sys.stdout.buffer.write(row + b"\n")
+    with nullcontext() if jsonl else show_activity("decoding"):
+        for item in items():
+            counts.add(item)
+            if jsonl:
+                row = orjson.dumps(_row(item), default=str, option=orjson.OPT_SERIALIZE_NUMPY)
+                sys.stdout.buffer.write(row + b"\n")
     if jsonl and not summary:
         return
     if not (decoder.messages or counts.rejected or summary):

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from jointfit_daemon.tools.activity import show_activity
 from jointfit_daemon.tools.output_files import check_output
 from jointfit_daemon.tools.text_output import echo_json
 
@@ -37,7 +38,8 @@ def recover(
     if out.exists():
         raise ValueError(f"{out} exists: choose another name with --out, or delete it")
 
-    result = repair_recording(file, out)
+    with show_activity("copying"):
+        result = repair_recording(file, out)
     if json:
         gaps = [
             {

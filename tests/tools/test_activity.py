@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import subprocess
 import sys
 
@@ -14,8 +15,9 @@ from jointfit_daemon.tools.activity import show_activity
 PROGRAM = """
 import time
 from jointfit_daemon.tools.activity import show_activity
-with show_activity("fitting"):
+with show_activity("fitting") as print_line:
     time.sleep(0.3)
+    print_line("[1/2] a line")
 """
 
 
@@ -35,11 +37,13 @@ def test_a_terminal_shows_the_label_and_the_elapsed_time() -> None:
     assert process.returncode == 0
     assert b"fitting" in shown
     assert b"0:00:00" in shown
+    assert re.search(rb"\r\x1b\[2K\[1/2\] a line\r\n", shown)  # not behind the bar
 
 
-def test_a_pipe_receives_nothing() -> None:
+def test_a_pipe_receives_the_lines_only() -> None:
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, check=True)
-    assert done.stderr == done.stdout == b""
+    assert done.stdout == b""
+    assert done.stderr == b"[1/2] a line\n"
 
 
 def test_errors_pass_through() -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from jointfit_daemon.tools.activity import show_activity
 from jointfit_daemon.tools.command_group import EXIT_FAILED
 from jointfit_daemon.tools.text_output import check_choice, echo_json
 
@@ -66,10 +67,12 @@ def batch(
     else:
         running = run_in_pool(tasks, jobs or os.cpu_count() or 1)
     results = []
-    for number, result in enumerate(running, start=1):
-        text = f": {result.error}" if result.error else ""
-        typer.echo(f"[{number}/{len(tasks)}] {result.recording}: {result.status}{text}", err=True)
-        results.append(result)
+    with show_activity("processing") as print_line:
+        for number, result in enumerate(running, start=1):
+            text = f": {result.error}" if result.error else ""
+            count = f"[{number}/{len(tasks)}]"
+            print_line(f"{count} {result.recording}: {result.status}{text}")
+            results.append(result)
     written = write_summary(results, output)
     for path in written:
         typer.echo(f"wrote {path}", err=True)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
-import typer
-
+from jointfit_daemon.tools.activity import show_activity
 from jointfit_daemon.tools.output_files import check_output
 
 if TYPE_CHECKING:
@@ -46,12 +45,14 @@ def calibrate_offline(recording: Path, rig: Path | None, out: Path | None) -> di
     other = None if rig is None else load_rig(rig)
     last = ""
 
-    def report(seconds: float, status: CalibrationStatus) -> None:
-        nonlocal last
-        last = f"{status.phase}: {status.text}"
-        typer.echo(f"{seconds:9.3f} s  {last}", err=True)
+    with show_activity("calibrating") as print_line:
 
-    found = calibrate_recording(recording, other, report)
+        def report(seconds: float, status: CalibrationStatus) -> None:
+            nonlocal last
+            last = f"{status.phase}: {status.text}"
+            print_line(f"{seconds:9.3f} s  {last}")
+
+        found = calibrate_recording(recording, other, report)
     if found.calibration is None and found.rejected is None:
         raise ValueError(
             f"{recording}: no phase ended with a calibration; the last status is {last!r}"

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from jointfit_daemon.tools.activity import show_activity
 from jointfit_daemon.tools.command_group import EXIT_FAILED
 from jointfit_daemon.tools.output_files import check_output, check_plot
 from jointfit_daemon.tools.text_output import check_choice, echo_json
@@ -113,7 +114,8 @@ def center(
 
     asked = _names(parent), _names(markers)
     read = read_marker_trial(trial, vertical)
-    reduced, found = _one_joint(read, asked, normal, method, window)
+    with show_activity("estimating"):
+        reduced, found = _one_joint(read, asked, normal, method, window)
     _print(read, asked, reduced, found, as_table=window is not None, as_json=json)
     if plot is not None:
         from jointfit_daemon.tools.center._plot import draw_center

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import orjson
 import typer
 
+from jointfit_daemon.tools.activity import show_activity
 from jointfit_daemon.tools.command_group import EXIT_FAILED
 
 if TYPE_CHECKING:
@@ -141,7 +142,8 @@ def _verify(file: Path, *, json: bool) -> None:
     from jointfit_daemon.reprocessing import verify_recording
 
     began = time.monotonic()
-    found = verify_recording(file)
+    with show_activity("replaying"):
+        found = verify_recording(file)
     took_s = time.monotonic() - began
     if json:
         result = {

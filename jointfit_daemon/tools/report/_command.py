@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from jointfit_daemon.tools.activity import show_activity
 from jointfit_daemon.tools.output_files import check_output
 from jointfit_daemon.tools.text_output import echo_json
 
@@ -28,7 +29,8 @@ def report(
 
     page = report_name(recording) if out is None else out
     check_output("--out", page, (".html",))
-    write_report(recording, page)
+    with show_activity("computing"):
+        write_report(recording, page)
     if json:
         echo_json({"file": str(page)})
     else:
