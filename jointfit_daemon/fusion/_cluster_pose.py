@@ -1,30 +1,32 @@
 """Pose of a marker cluster, and of points fixed to it, in single mocap frames.
 
 The fit is that of ``limb_model.rigid_fit``, to rounding. Quantities that do not change
-from frame to frame are computed once for each set of visible markers, which takes a tenth of the
-time of the general fit (25 instead of 250 microseconds).
+from frame to frame are computed once for each set of visible markers. The fit of a frame uses plain
+floats: a matrix of NumPy costs more than its arithmetic here, and several times as much where the
+caches of the processor no longer contain the code of the library.
 """
 
 from __future__ import annotations
 
-from math import isfinite
+from math import isfinite, sqrt
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from jointfit_daemon.arrays import Array  # noqa: TC001 - mypyc evaluates the types of fields
+from jointfit_daemon.fusion._rotation_fit import fit_rotation
 from jointfit_daemon.kinematics.rotation_scalar import (
     as_quaternion,
     conjugate_one,
-    from_matrix_one,
     multiply_one,
     rotate_one,
 )
 from jointfit_daemon.limb_model import MAX_FIT_RMS_M, MIN_MARKERS, is_line
+from jointfit_daemon.model import Quaternion, Vector  # noqa: TC001 - as above
 
 if TYPE_CHECKING:
     from jointfit_daemon.limb_model import MarkerCluster
-    from jointfit_daemon.model import MocapFrame, MocapLayout, Quaternion, Vector
+    from jointfit_daemon.model import MocapFrame, MocapLayout
 
 
 class _MarkerSubset(NamedTuple):
@@ -32,10 +34,10 @@ class _MarkerSubset(NamedTuple):
 
     rows: list[int]
     """Rows of the cluster template."""
-    centered: Array
-    """Transposed template about the mean of these markers, m, shape (3, k)."""
-    offsets: Array
-    """Vectors from that mean to the points, static world, m, shape (n, 3)."""
+    centered: list[Vector]
+    """Template about the mean of these markers, m."""
+    offsets: list[Vector]
+    """Vectors from that mean to the points, static world, m."""
     moment: float
     """Sum of the squares of `centered`, m²."""
 
@@ -77,7 +79,7 @@ class ClusterPose:
         if columns is None:
             return None
         if self._cluster.body is None:
-            return self._fit_markers(frame.markers.take(columns, axis=0))
+            return self._fit_markers(frame.markers.take(columns, axis=0).tolist())
 
         column = columns[0]
         x, y, z = position = frame.body_positions[column].tolist()
@@ -88,37 +90,45 @@ class ClusterPose:
         turned = [rotate_one(q, (x, y, z)) for x, y, z in self._offsets.tolist()]
         return FittedPose(q, [(x + dx, y + dy, z + dz) for dx, dy, dz in turned])
 
-    def _fit_markers(self, seen: Array) -> FittedPose | None:
-        r"""Return the pose from the visible markers, by the rotation of Kabsch (1976).
+    def _fit_markers(self, seen: list[Vector]) -> FittedPose | None:
+        r"""Return the pose from the visible markers, by the rotation of Horn (1987).
 
-        With the singular values s of the cross moment and the sign d of the third axis, the sum of
-        squared residuals is :math:`\sum |a|^2 + \sum |y|^2 - 2 (s_1 + s_2 + d s_3)`.
+        With the largest sum :math:`\lambda` of ``y · R a``, the sum of squared residuals is
+        :math:`\sum |a|^2 + \sum |y|^2 - 2 \lambda`.
         """
-        subset, total = self._all, np.add.reduce(seen)  # NaN unless all markers are visible
-        if not all(map(isfinite, total.tolist())):
-            visible = np.isfinite(seen).all(axis=1).tobytes()  # one byte for each marker
+        subset = self._all
+        if not all(isfinite(x + y + z) for x, y, z in seen):
+            visible = bytes([isfinite(x + y + z) for x, y, z in seen])
             if visible not in self._subsets:
                 self._subsets[visible] = self._subset(visible)
             subset = self._subsets[visible]
-            if subset is not None:
-                seen = seen[subset.rows]
-                total = np.add.reduce(seen)
+            seen = [] if subset is None else [seen[row] for row in subset.rows]
         if subset is None:
             return None
 
         count = len(seen)
-        mean = total / count
-        y = seen - mean
-        u, s, vt = np.linalg.svd(subset.centered @ y)
-        sign = 1.0 if _determinant(u.tolist()) * _determinant(vt.tolist()) > 0.0 else -1.0
-        vt[2] *= sign
+        mx = sum([x for x, _, _ in seen]) / count
+        my = sum([y for _, y, _ in seen]) / count
+        mz = sum([z for _, _, z in seen]) / count
 
-        squares = float(np.add.reduce(y * y, axis=None))
-        residual = subset.moment + squares - 2.0 * float(s[0] + s[1] + sign * s[2])
-        if not residual <= MAX_FIT_RMS_M**2 * count:
+        # Cross moment of the template and the markers, and moment of the markers.
+        xx = xy = xz = yx = yy = yz = zx = zy = zz = squares = 0.0
+        for (ax, ay, az), (x, y, z) in zip(subset.centered, seen, strict=True):
+            dx, dy, dz = x - mx, y - my, z - mz
+            xx, xy, xz = xx + ax * dx, xy + ax * dy, xz + ax * dz
+            yx, yy, yz = yx + ay * dx, yy + ay * dy, yz + ay * dz
+            zx, zy, zz = zx + az * dx, zy + az * dy, zz + az * dz
+            squares += dx * dx + dy * dy + dz * dz
+
+        moment = ((xx, xy, xz), (yx, yy, yz), (zx, zy, zz))
+        try:
+            q, largest = fit_rotation(moment, sqrt(subset.moment * squares))
+        except ZeroDivisionError:  # the markers are in one point, or on a line
             return None
-        points = [((offset @ u) @ vt + mean).tolist() for offset in subset.offsets]
-        return FittedPose(from_matrix_one((u @ vt).T.tolist()), [(x, y, z) for x, y, z in points])
+        if not subset.moment + squares - 2.0 * largest <= MAX_FIT_RMS_M**2 * count:
+            return None
+        turned = [rotate_one(q, offset) for offset in subset.offsets]
+        return FittedPose(q, [(mx + x, my + y, mz + z) for x, y, z in turned])
 
     def _subset(self, visible: bytes) -> _MarkerSubset | None:
         rows = [row for row, seen in enumerate(visible) if seen]
@@ -126,8 +136,9 @@ class ClusterPose:
         if len(rows) < MIN_MARKERS or is_line(template):
             return None
         mean = template.mean(axis=0)
-        centered = (template - mean).T.copy()
-        return _MarkerSubset(rows, centered, self._offsets - mean, float((centered**2).sum()))
+        centered = template - mean
+        offsets = (self._offsets - mean).tolist()
+        return _MarkerSubset(rows, centered.tolist(), offsets, float((centered**2).sum()))
 
 
 def _columns(cluster: MarkerCluster, layout: MocapLayout) -> list[int] | None:
@@ -137,8 +148,3 @@ def _columns(cluster: MarkerCluster, layout: MocapLayout) -> list[int] | None:
     if any(marker not in layout.markers for marker in cluster.markers):
         return None
     return [layout.markers.index(marker) for marker in cluster.markers]
-
-
-def _determinant(m: list[list[float]]) -> float:
-    (a, b, c), (d, e, f), (g, h, i) = m
-    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
