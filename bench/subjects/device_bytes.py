@@ -22,9 +22,9 @@ from jointfit_simulators.devices import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
-    from jointfit_daemon.model import Quaternion
+    from jointfit_daemon.model import Quaternion, Vector
 
 NS = 1_000_000_000
 TICK_NS = 100_000
@@ -97,8 +97,19 @@ def natnet_opening() -> list[bytes]:
     return [encode(_SERVER), encode(model_definition(_bodies(), BITSTREAM), BITSTREAM)]
 
 
-def natnet_datagrams(count: int, period_ns: int) -> list[bytes]:
-    """Frames of a leg: every marker visible, every body tracked."""
+def natnet_datagrams(
+    count: int, period_ns: int, places: Mapping[str, Vector] | None = None
+) -> list[bytes]:
+    """Return the frames of a leg: every marker visible, every body tracked.
+
+    Parameters
+    ----------
+    count, period_ns : int
+        Number of frames, and their period, ns.
+    places : mapping of str to Vector, optional
+        Markers of a rigid leg, m, z up, which sways along all axes; by default, all markers are on
+        a line.
+    """
     stage = NatNetFrameBuilder(_bodies(), "y", "missing")
     found = []
     for k in range(count):
@@ -109,6 +120,8 @@ def natnet_datagrams(count: int, period_ns: int) -> list[bytes]:
             name: (sway + 0.03 * i, 0.2 * i, 0.4 + sway)
             for i, name in enumerate(name for names in CLUSTERS.values() for name in names)
         }
+        if places is not None:
+            markers = {name: (x + sway, y + sway, z + sway) for name, (x, y, z) in places.items()}
         turn = (math.cos(sway), math.sin(sway), 0.0, 0.0)
         bodies = {body.name: ((sway, 0.0, 1.0), turn) for body in _bodies()}
         found.append(encode(stage.frame(stamps, markers, bodies), BITSTREAM))

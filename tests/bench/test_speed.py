@@ -66,6 +66,16 @@ def test_fusion_and_core_keep_their_thresholds(tmp_path: Path) -> None:
 
 @pytest.mark.alone
 @pytest.mark.experiment
+@pytest.mark.timeout(90)
+def test_input_and_run_time_keep_their_thresholds(tmp_path: Path) -> None:
+    rows = measured(tmp_path, "can-input-time", "growth-run-time", "weak-gateway", timeout_s=85.0)
+    assert rows["SLCAN input, one frame: time ratio to python-can Notifier"]["value"] < 1.0
+    times = [row["value"] for row in rows.values() if row["unit"] == "ms/s"]
+    assert times[-1] < 0.5 * times[0]
+
+
+@pytest.mark.alone
+@pytest.mark.experiment
 @pytest.mark.system
 @pytest.mark.timeout(90)
 def test_daemon_is_measured_between_hardware_and_broker(tmp_path: Path) -> None:

@@ -35,7 +35,8 @@ def _mosquitto(folder: Path) -> Iterator[int]:
 Found = TypeVar("Found")
 
 
-def _played(broker: str, play: Callable[[Path, int], Coroutine[Any, Any, Found]]) -> Found | None:
+def played(broker: str, play: Callable[[Path, int], Coroutine[Any, Any, Found]]) -> Found | None:
+    """Return the result of `play` at ``mosquitto`` or ``iotcore``; None if it is missing."""
     needed = MosquittoBroker if broker == "mosquitto" else EmbeddedBroker
     if (reason := needed.missing()) is not None:
         print(f"not run: {reason}", file=sys.stderr)
@@ -92,7 +93,7 @@ def _honest(name: str, found: Figures) -> Result:
 def _through(rate_hz: float, goal_percent: float | None) -> Callable[[bool], list[Result]]:
     def measured(quick: bool) -> list[Result]:
         seconds = QUICK_S if quick else SECONDS
-        found = _played("mosquitto", lambda folder, port: run(folder, port, Load(rate_hz), seconds))
+        found = played("mosquitto", lambda folder, port: run(folder, port, Load(rate_hz), seconds))
         if found is None:
             return []
         name = f"4 × {rate_hz:g} Hz"
@@ -117,7 +118,7 @@ def _start(found: Figures) -> list[Result]:
 
 def embedded_rows(quick: bool) -> list[Result]:
     seconds, load = QUICK_S if quick else SECONDS, Load(100.0, 120.0)
-    found = _played("iotcore", lambda folder, port: run(folder, port, load, seconds))
+    found = played("iotcore", lambda folder, port: run(folder, port, load, seconds))
     name = "demo's broker, 4 × 100 Hz"
     return [] if found is None else _latency(name, found.latencies_ms, 60.0)
 
@@ -126,7 +127,7 @@ def flood_rows(quick: bool) -> list[Result]:
     """Measure one short run without requests and then under a flood of requests."""
     del quick
     load = Load(100.0)
-    found = _played("mosquitto", lambda folder, port: run_flooded(folder, port, load))
+    found = played("mosquitto", lambda folder, port: run_flooded(folder, port, load))
     if found is None:
         return []
     name = f"4 × 100 Hz, {found.requests} invalid requests in {found.seconds:.0f} s"

@@ -1,4 +1,4 @@
-"""Growth of the core's CPU time and memory with sensors, segments and markers.
+"""Growth of the core's CPU time and memory with sensors, segments, markers and run time.
 
 A rig of each size is fed the same way: all chunks of a frame, then the next frame. The sizes take
 turns, so that a busy machine slows all of them. The cost of a size is the median over the turns of
@@ -13,10 +13,12 @@ import time
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from bench.experiments.timing.memory import held
 from bench.framework.experiment import Result
-from bench.framework.exponents import growth_exponent
-from bench.framework.measurement import speed_experiment, timed_result
+from bench.framework.exponents import growth_exponent, log_slope
+from bench.framework.measurement import loop_s, speed_experiment, timed_result
 from bench.subjects.growing_rigs import BEGIN_NS, GrowingRig
 from jointfit_daemon.model import LimbState
 from jointfit_daemon.pipeline import Core
@@ -33,6 +35,10 @@ SETTLE = 300
 ROUNDS, QUICK_ROUNDS = 15, 3
 BLOCK = 100
 """Frames whose mean CPU time is one measurement."""
+FRAMES, QUICK_FRAMES = 100_000, 3_000
+"""Length of the run in which the cost of a frame must not grow; 17 minutes at 100 Hz."""
+DRIFT, SHORT_DRIFT, DRIFT_TARGET = 0.1, 0.5, 0.02
+"""Thresholds of a full and a short run, and target, of the exponent in run time, without sign."""
 LARGEST = 1.05
 """Threshold of the exponents in sensors, segments and markers."""
 
@@ -159,7 +165,45 @@ def marker_rows(quick: bool) -> list[Result]:
     return [*rows, timed_result(name, round(1e3 * took_s, 1), "ms", 100, 1000)]
 
 
+def run_time_rows(quick: bool) -> list[Result]:
+    """Return the exponent of the cost of a frame in the number of frames before it.
+
+    The cost of each block of frames is divided by that of a fixed loop just before it, so that the
+    load of the machine cancels. Each point of the regression is the median of a third of a decade.
+    """
+    core = LoadedCore(GrowingRig(1, 1))
+    frames = QUICK_FRAMES if quick else FRAMES
+    ages, costs = [], []
+    for number in range(frames // BLOCK):
+        loop = loop_s()
+        costs.append(core.cpu_s(BLOCK) / loop)
+        ages.append((number + 0.5) * BLOCK)
+    ladder = np.geomspace(BLOCK, frames, 1 + round(3 * np.log10(frames / BLOCK)))
+    place = np.digitize(ages, ladder[1:-1])
+    points = [
+        (
+            float(np.median(np.array(ages)[place == k])),
+            float(np.median(np.array(costs)[place == k])),
+        )
+        for k in range(1, len(ladder) - 1)  # in the first third of a decade clocks settle
+        if (place == k).any()
+    ]
+    found = log_slope(*map(list, zip(*points, strict=True)))
+    return [
+        timed_result(
+            "run time: exponent", round(abs(found.value), 3), "", DRIFT_TARGET,
+            SHORT_DRIFT if quick else DRIFT,
+            note=f"{found.value:+.3f} ± {found.half_width:.3f}, {BLOCK} to {frames} frames",
+        ),
+        *(
+            timed_result(f"run time: frame {age:.0f}", round(cost, 2), "loops a frame")
+            for age, cost in points
+        ),
+    ]  # fmt: skip
+
+
 EXPERIMENTS = (
+    speed_experiment("growth-run-time", "Growth with the frames of a run", run_time_rows),
     speed_experiment("growth-sensors", "Growth with the sensors of a segment", sensor_rows),
     speed_experiment("growth-segments", "Growth with the segments of a limb", segment_rows),
     speed_experiment("growth-markers", "Growth with the markers of a segment", marker_rows),

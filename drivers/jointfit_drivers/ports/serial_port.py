@@ -217,16 +217,23 @@ class SerialPort:
         self, take: Callable[[Chunk], None], ended: asyncio.Future[Any]
     ) -> Callable[[], None]:
         """Return a loop callback that reads and stamps a chunk; its errors go to `ended`."""
-        loop, fd = asyncio.get_running_loop(), self._fd
+        loop, fd, path = asyncio.get_running_loop(), self._fd, self.path
+        read, now_ns = os.read, time.monotonic_ns
 
         def readable() -> None:
             try:
-                data = self._read(fd)
+                try:
+                    data = read(fd, _READ_BYTES)
+                except BlockingIOError:
+                    return
+                except OSError as error:
+                    raise _unplugged(path, error.strerror) from error
+                if not data:  # end of file: the system has closed the port
+                    raise _unplugged(path, "hang-up")  # noqa: TRY301 - a call costs a tenth of all
+
                 # Stamp after the read: a stamp from before it would be too early for bytes that
                 # arrive while this process is delayed, and clocks are fitted to the earliest.
-                t_ns = time.monotonic_ns()
-                if data is not None:
-                    take(Chunk(t_ns, data))
+                take(Chunk(now_ns(), data))
             except Exception as error:  # noqa: BLE001 - a loop callback's error would only be logged
                 loop.remove_reader(fd)  # a hung-up tty stays readable: 100 % CPU
                 if not ended.done():
@@ -262,24 +269,6 @@ class SerialPort:
                     loop.remove_writer(fd)
             except OSError as error:
                 raise _unplugged(self.path, error.strerror) from error
-
-    def _read(self, fd: int) -> bytes | None:
-        """Return the available bytes; None if there are none.
-
-        Raises
-        ------
-        DeviceLostError
-            The port was closed by the system (end of file), or returned an error.
-        """
-        try:
-            data = os.read(fd, _READ_BYTES)
-        except BlockingIOError:
-            return None
-        except OSError as error:
-            raise _unplugged(self.path, error.strerror) from error
-        if not data:
-            raise _unplugged(self.path, "hang-up")
-        return data
 
 
 def _unplugged(path: str, found: object) -> DeviceAbsentError:

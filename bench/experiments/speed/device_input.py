@@ -1,0 +1,226 @@
+"""CPU time of one arrival from a pty on an event loop: the readers of the daemon, and peers.
+
+One message is in transit at a time, so that each wakes the loop once. The receiver writes the next
+one; the CPU time of writing is subtracted. The limit is a loop that only reads.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import pty
+import statistics
+import time
+import tty
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import can
+from typing_extensions import override
+
+from bench.framework.measurement import speed_experiment, timed_result
+from bench.subjects import device_bytes
+from bench.subjects.simulated_wearer import walking
+from jointfit_daemon.driver import CanBusSettings
+from jointfit_drivers.ports.can_bus import shared_bus
+from jointfit_drivers.ports.serial_port import SerialPort
+from jointfit_protocols.xcdi import XcdiIds
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable, Coroutine
+    from contextlib import AbstractAsyncContextManager
+
+    from bench.framework.experiment import Result
+
+MESSAGES = 400
+ROUNDS, QUICK_ROUNDS = 15, 3
+BAUD = 921_600
+PERIOD_NS = 10_000_000
+LONGEST_S = 60.0
+IDS = XcdiIds(5, 6, 33, status_word=None, error=None)
+
+Take: TypeAlias = "Callable[[], None]"
+Reader: TypeAlias = "Callable[[_Line, Take], AbstractAsyncContextManager[None]]"
+
+
+class _Line:
+    """A pty that sends one message whenever the one before was taken."""
+
+    def __init__(self, messages: list[bytes]) -> None:
+        self._far, self.near = pty.openpty()
+        tty.setraw(self.near)
+        self.path = os.ttyname(self.near)
+        self._messages = messages
+        self._left = 0
+        self._writing_s = 0.0
+        self._done: asyncio.Future[None] | None = None
+
+    async def cost_s(self) -> float:
+        """Return the CPU time of one arrival on the running loop, s."""
+        self._left, self._writing_s = len(self._messages), 0.0
+        self._done = asyncio.get_running_loop().create_future()
+        began = time.thread_time()
+        self._send()
+        async with asyncio.timeout(LONGEST_S):
+            await self._done
+        return (time.thread_time() - began - self._writing_s) / len(self._messages)
+
+    def take(self) -> None:
+        """Note that a message was received."""
+        if self._left:
+            self._send()
+        elif self._done is not None and not self._done.done():
+            self._done.set_result(None)
+
+    def _send(self) -> None:
+        self._left -= 1
+        began = time.thread_time()
+        os.write(self._far, self._messages[self._left])
+        self._writing_s += time.thread_time() - began
+
+    def close(self) -> None:
+        os.close(self._far)
+        os.close(self.near)
+
+
+@contextlib.asynccontextmanager
+async def _bare(line: _Line, take: Take) -> AsyncIterator[None]:
+    def readable() -> None:
+        os.read(line.near, 4096)
+        take()
+
+    loop = asyncio.get_running_loop()
+    loop.add_reader(line.near, readable)
+    try:
+        yield
+    finally:
+        loop.remove_reader(line.near)
+
+
+@contextlib.asynccontextmanager
+async def _running(work: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
+    task = asyncio.create_task(work)
+    await asyncio.sleep(0.05)  # the reader is in place
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.wait([task])
+
+
+@contextlib.asynccontextmanager
+async def _serial_port(line: _Line, take: Take) -> AsyncIterator[None]:
+    with SerialPort(line.path, BAUD) as port:
+        async with _running(port.pump(lambda _: take(), 5.0)):
+            yield
+
+
+@contextlib.asynccontextmanager
+async def _pyserial_asyncio_fast(line: _Line, take: Take) -> AsyncIterator[None]:
+    import serial_asyncio_fast  # noqa: PLC0415 - a peer, not always installed
+
+    class Receiver(asyncio.Protocol):
+        @override
+        def data_received(self, data: bytes) -> None:
+            del data
+            take()
+
+    transport, _ = await serial_asyncio_fast.create_serial_connection(
+        asyncio.get_running_loop(), Receiver, line.path, baudrate=BAUD
+    )
+    try:
+        yield
+    finally:
+        transport.close()
+        await asyncio.sleep(0.05)
+
+
+@contextlib.asynccontextmanager
+async def _shared_bus(line: _Line, take: Take) -> AsyncIterator[None]:
+    needed = (IDS.quaternion or 0, False)
+    settings = CanBusSettings(interface="slcan", channel=line.path, baud=115_200)
+    async with shared_bus(settings) as bus:
+        pumping = bus.pump("S1", {needed: "orientation"}, lambda _: take(), 5.0, needed=needed)
+        async with _running(pumping):
+            yield
+
+
+@contextlib.asynccontextmanager
+async def _notifier(line: _Line, take: Take) -> AsyncIterator[None]:
+    bus: Any = can.Bus(interface="slcan", channel=line.path, sleep_after_open=0)
+    notifier = can.Notifier(  # noqa: TID251 - the peer
+        bus, [lambda _: take()], loop=asyncio.get_running_loop()
+    )
+    try:
+        yield
+    finally:
+        notifier.stop()
+        bus.shutdown()
+
+
+async def _measure(
+    messages: list[bytes], readers: dict[str, Reader], rounds: int
+) -> dict[str, list[float]]:
+    """Return the CPU times of an arrival by reader, s; the readers take turns."""
+    times: dict[str, list[float]] = {name: [] for name in readers}
+    for _ in range(rounds):
+        for name, reader in readers.items():
+            line = _Line(messages)
+            try:
+                async with reader(line, line.take):
+                    times[name].append(await line.cost_s())
+            finally:
+                line.close()
+    return times
+
+
+def _rows(
+    name: str, messages: list[bytes], readers: dict[str, Reader], quick: bool
+) -> list[Result]:
+    """Return the times of all readers, and the ratios of the first, ours, to the others."""
+    times = asyncio.run(_measure(messages, readers, QUICK_ROUNDS if quick else ROUNDS))
+    rows = [
+        timed_result(f"{name}: {reader}", round(1e6 * statistics.median(found), 1), "µs")
+        for reader, found in times.items()
+    ]
+    ours, *others = readers
+    for other in others:
+        ratios = [a / b for a, b in zip(times[ours], times[other], strict=True)]
+        target = 1.3 if other == "bare loop" else 1.0
+        ratio = round(statistics.median(ratios), 3)
+        rows.append(timed_result(f"{name}: time ratio to {other}", ratio, "", target, 3.0))
+    return rows
+
+
+def serial_rows(quick: bool) -> list[Result]:
+    """Messages of an Xbus device."""
+    messages = device_bytes.xbus_messages(walking("S1", 100.0, MESSAGES / 100.0), PERIOD_NS)
+    readers: dict[str, Reader] = {
+        "jointfit": _serial_port,
+        "bare loop": _bare,
+        "pyserial-asyncio-fast": _pyserial_asyncio_fast,
+    }
+    return _rows("UART input, one message", messages, readers, quick)
+
+
+def can_rows(quick: bool) -> list[Result]:
+    """CAN frames of an SLCAN adapter, each with an orientation."""
+    orientations = walking("S1", 100.0, MESSAGES / 100.0)
+    groups = device_bytes.xcdi_frames(orientations, PERIOD_NS, IDS)
+    messages = device_bytes.slcan_lines([group[-1:] for group in groups])
+    readers: dict[str, Reader] = {
+        "jointfit": _shared_bus,
+        "bare loop": _bare,
+        "python-can Notifier": _notifier,
+    }
+    return _rows("SLCAN input, one frame", messages, readers, quick)
+
+
+EXPERIMENTS = (
+    replace(
+        speed_experiment("serial-input-time", "UART input on the event loop", serial_rows),
+        packages=("serial_asyncio_fast",),
+    ),
+    speed_experiment("can-input-time", "SLCAN input on the event loop", can_rows),
+)
