@@ -8,6 +8,7 @@ the mean CPU time of a frame.
 from __future__ import annotations
 
 import gc
+import itertools
 import statistics
 import time
 from functools import partial
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.experiments.speed.instruction_counts import count_instructions
 from bench.experiments.timing.memory import held
 from bench.framework.experiment import Result
 from bench.framework.exponents import growth_exponent, log_slope
@@ -26,6 +28,8 @@ from jointfit_daemon.pipeline.events import Configured, SourceOpened
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
+    from jointfit_daemon.pipeline.events import ChunkArrived
 
 SENSORS = (1, 2, 4, 8, 16, 32)
 SEGMENTS = (1, 2, 4, 8, 16)
@@ -61,10 +65,8 @@ class LoadedCore:
 
     def cpu_s(self, count: int) -> float:
         """Feed frames; return the mean CPU time of one, s."""
-        frames = [self._rig.frame(k) for k in range(self._next, self._next + count)]
-        self._next += count
         core, states, spent = self.core, 0, 0.0
-        for events in frames:
+        for events in self._frames(count):
             began = time.thread_time()
             for event in events:
                 outputs = core.feed(event)
@@ -73,6 +75,16 @@ class LoadedCore:
             spent += time.thread_time() - began
         assert abs(states - count) <= 3, f"{states} limb states of {count} frames"
         return spent / count
+
+    def instructions(self, count: int) -> float:
+        """Feed frames; return the interpreted instructions of one."""
+        frames, feed = self._frames(count), self.core.feed
+        return count_instructions(lambda: [feed(one) for each in frames for one in each]) / count
+
+    def _frames(self, count: int) -> list[list[ChunkArrived]]:
+        frames = [self._rig.frame(k) for k in range(self._next, self._next + count)]
+        self._next += count
+        return frames
 
 
 def frame_costs(rigs: Mapping[int, GrowingRig], rounds: int) -> dict[int, float]:
@@ -166,40 +178,37 @@ def marker_rows(quick: bool) -> list[Result]:
 
 
 def run_time_rows(quick: bool) -> list[Result]:
-    """Return the exponent of the cost of a frame in the number of frames before it.
+    """Return the exponents of time and instructions of a frame in the number of frames before it.
 
-    The cost of each block of frames is divided by that of a fixed loop just before it, so that the
-    load of the machine cancels. Each point of the regression is the median of a third of a decade.
+    The time of each block of frames is divided by that of a fixed loop just before it, so that the
+    load of the machine cancels. Each point of the regression is the median of a third of a decade,
+    at the end of which instructions are counted.
     """
     core = LoadedCore(GrowingRig(1, 1))
     frames = QUICK_FRAMES if quick else FRAMES
-    ages, costs = [], []
-    for number in range(frames // BLOCK):
-        loop = loop_s()
-        costs.append(core.cpu_s(BLOCK) / loop)
-        ages.append((number + 0.5) * BLOCK)
-    ladder = np.geomspace(BLOCK, frames, 1 + round(3 * np.log10(frames / BLOCK)))
-    place = np.digitize(ages, ladder[1:-1])
-    points = [
-        (
-            float(np.median(np.array(ages)[place == k])),
-            float(np.median(np.array(costs)[place == k])),
-        )
-        for k in range(1, len(ladder) - 1)  # in the first third of a decade clocks settle
-        if (place == k).any()
-    ]
-    found = log_slope(*map(list, zip(*points, strict=True)))
-    return [
-        timed_result(
-            "run time: exponent", round(abs(found.value), 3), "", DRIFT_TARGET,
-            SHORT_DRIFT if quick else DRIFT,
-            note=f"{found.value:+.3f} ± {found.half_width:.3f}, {BLOCK} to {frames} frames",
-        ),
-        *(
-            timed_result(f"run time: frame {age:.0f}", round(cost, 2), "loops a frame")
-            for age, cost in points
-        ),
-    ]  # fmt: skip
+    ages, costs, counts = [], [], []
+    ladder = np.geomspace(BLOCK, frames, 1 + round(3 * np.log10(frames / BLOCK))).round()
+    core.cpu_s(BLOCK)  # clocks settle
+    for begin, end in itertools.pairwise(ladder.astype(int).tolist()):
+        times = []
+        for _ in range(max(1, (end - begin) // BLOCK - 1)):
+            loop = loop_s()
+            times.append(core.cpu_s(BLOCK) / loop)
+        counts.append(core.instructions(BLOCK))
+        ages.append(0.5 * (begin + end))
+        costs.append(statistics.median(times))
+
+    rows = []
+    for name, values in (("time", costs), ("interpreted instructions", counts)):
+        found = log_slope(ages, values)
+        note = f"{found.value:+.4f} ± {found.half_width:.4f}, {BLOCK} to {frames} frames"
+        threshold = SHORT_DRIFT if quick else DRIFT
+        title = f"run time: exponent of {name}"
+        value = round(abs(found.value), 4)
+        rows.append(timed_result(title, value, "", DRIFT_TARGET, threshold, note=note))
+    for age, count in zip(ages, counts, strict=True):
+        rows.append(timed_result(f"run time: frame {age:.0f}", round(count, 1), "instructions"))
+    return rows
 
 
 EXPERIMENTS = (
