@@ -36,7 +36,7 @@ KNOWN = {
     "slcan: codec, one CAN frame": 213.0,
     "xcdi: 3 CAN frames to SI sample": 1213.2,
     "natnet: codec, one frame": 1967.0,
-    "natnet: bytes to MocapFrame": 3625.0,
+    "natnet: bytes to MocapFrame": 3362.5,
     "clock: one sample": 880.4,
     "aligner: one sample": 792.5,
     "core: 4 × 100 Hz, not calibrated, one frame": 14721.9,

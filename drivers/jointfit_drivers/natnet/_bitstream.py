@@ -47,6 +47,8 @@ class BitstreamTracker:
         self._confirmed: Version | None = None
         self._layouts: dict[tuple[Version, int], FrameLayout] = {}
         """Layout of the last frame with this version and length; a server sends few lengths."""
+        self._selected: frozenset[str] | None = None
+        """Marker sets that are read from frames of a known layout; None for all."""
 
     @property
     def known(self) -> bool:
@@ -62,6 +64,12 @@ class BitstreamTracker:
     def confirm(self, version: Version) -> None:
         """Add the version of a RESPONSE as a candidate."""
         self._confirmed = version
+
+    def select_sets(self, names: frozenset[str]) -> None:
+        """Leave out the other marker sets, and unlabeled markers, where it saves time."""
+        if names != self._selected:
+            self._selected = names
+            self._layouts.clear()
 
     def restart(self, version: Version) -> None:
         """Use the version of another server at the same address."""
@@ -79,7 +87,7 @@ class BitstreamTracker:
 
         message = decode(datagram, self.version)
         if isinstance(message, FrameOfData):
-            new = FrameLayout.of(datagram, message, self.version)
+            new = FrameLayout.of(datagram, message, self.version, self._selected)
             if new is not None:
                 if len(self._layouts) >= _MOST_LAYOUTS:  # the number of markers varies
                     self._layouts.clear()

@@ -188,6 +188,7 @@ class NatNetDecoder:
         columns, events = renew_columns(before, binding.columns, self.unpublished)
         out += events
         self._binding = binding = replace(binding, columns=columns)
+        self._bitstream.select_sets(binding.loose_sets)
         self._named_unknown.clear()
 
         if not model.complete:

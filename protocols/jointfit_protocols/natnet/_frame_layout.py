@@ -3,7 +3,8 @@
 A server repeats its model in every frame: the counts and names of one frame give the place of every
 number in the next one. A frame with any other count or name has another layout.
 
-Invariant: the result equals that of `decode_frame`, or is None.
+Invariant: the result equals that of `decode_frame`, or is None. A layout for selected marker sets
+leaves out the other sets and the unlabeled markers.
 """
 
 from __future__ import annotations
@@ -46,7 +47,12 @@ class _FramePlaces(NamedTuple):
     """Places of the numbers of a frame."""
 
     sets: tuple[tuple[str, _Span], ...]
+    """Marker sets that are read."""
+    unread: tuple[_Span, ...]
+    """Positions of the other marker sets."""
     others: _Span
+    all_read: bool
+    """Whether all marker sets and the unlabeled markers are read."""
     bodies: _Span
     markers: _Span
     stamps: int
@@ -72,7 +78,8 @@ class FrameLayout:
         fixed = bytearray(b"\xff" * len(example))
         number = (_HEADER_BYTES, _HEADER_BYTES + I32.size)
         tail = (places.stamps, places.end + 2)  # the flags of the frame, not its end tag
-        changing = (number, *(one for _, one in places.sets), places.others, places.bodies)
+        sets = (*(one for _, one in places.sets), *places.unread)
+        changing = (number, *sets, places.others, places.bodies)
         for start, stop in (*changing, places.markers, tail):
             fixed[start:stop] = bytes(stop - start)
 
@@ -81,8 +88,22 @@ class FrameLayout:
         self._fixed = int.from_bytes(example, "little") & self._mask
 
     @staticmethod
-    def of(datagram: bytes, frame: FrameOfData, version: Version) -> FrameLayout | None:
-        """Return the layout of a decoded frame; None if it contains items without fixed places."""
+    def of(
+        datagram: bytes,
+        frame: FrameOfData,
+        version: Version,
+        selected: frozenset[str] | None = None,
+    ) -> FrameLayout | None:
+        """Return the layout of a decoded frame; None if it contains items without fixed places.
+
+        Parameters
+        ----------
+        datagram, frame, version
+            The frame as received and as decoded, and its bitstream.
+        selected : frozenset of str, optional
+            Names of the marker sets that are read; by default everything is read. A server repeats
+            each marker in two sets, which takes as long as the rest of a frame.
+        """
         if frame.skeletons or frame.assets or frame.force_plates or frame.devices or frame.skipped:
             return None
         if version < TICKED:
@@ -90,11 +111,15 @@ class FrameLayout:
         head = 2 * I32.size if version >= SIZED else I32.size
         at = _HEADER_BYTES + I32.size + head
 
-        sets = []
+        sets, unread = [], []
         for marker_set in frame.marker_sets:
             at = datagram.index(0, at) + 1 + I32.size
-            sets.append((marker_set.name, _span(at, XYZ.size * len(marker_set.positions))))
-            at = sets[-1][1][1]
+            span = _span(at, XYZ.size * len(marker_set.positions))
+            at = span[1]
+            if selected is None or marker_set.name in selected:
+                sets.append((marker_set.name, span))
+            else:
+                unread.append(span)
         others = _span(at + head, XYZ.size * len(frame.other_markers))
         bodies = _span(others[1] + head, BODY_LAYOUT.size * len(frame.bodies))
         absent = 2 if version >= SIZED else 1  # skeletons, and assets where they exist
@@ -104,7 +129,10 @@ class FrameLayout:
 
         precision = frame.precision is not None
         end = stamps + STAMPS_LAYOUT.size + (PRECISION_LAYOUT.size if precision else 0)
-        places = _FramePlaces(tuple(sets), others, bodies, markers, stamps, precision, end)
+        places = _FramePlaces(
+            tuple(sets), tuple(unread), others, selected is None, bodies, markers, stamps,
+            precision, end,
+        )  # fmt: skip
         return FrameLayout(places, datagram) if end + END_LAYOUT.size == len(datagram) else None
 
     def read(self, datagram: bytes) -> FrameOfData | None:
@@ -114,7 +142,7 @@ class FrameLayout:
         if int.from_bytes(datagram, "little") & self._mask != self._fixed:
             return None
 
-        sets, others, bodies, markers, at, precise, end = self._places
+        sets, _, others, all_read, bodies, markers, at, precise, end = self._places
         number: int = I32.unpack_from(datagram, _HEADER_BYTES)[0]
         stamps = STAMPS_LAYOUT.unpack_from(datagram, at)
         timecode, subframe, timestamp, exposure, received, transmit = stamps
@@ -124,7 +152,7 @@ class FrameLayout:
             tuple(map(_body, BODY_LAYOUT.iter_unpack(datagram[bodies[0] : bodies[1]]))),
             tuple(map(_marker, MARKER_LAYOUT.iter_unpack(datagram[markers[0] : markers[1]]))),
             tuple([MarkerSet(name, _positions(datagram, span)) for name, span in sets]),
-            _positions(datagram, others),
+            _positions(datagram, others) if all_read else (),
             timecode=timecode, subframe=subframe,
             precision=_precision(datagram, end) if precise else None,
         )  # fmt: skip

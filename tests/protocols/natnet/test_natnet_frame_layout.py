@@ -28,6 +28,31 @@ def test_frame_by_layout_equals_the_decoded_one_for_any_changed_byte(
     assert found is None or repr(found) == repr(decode(bytes(changed), version))
 
 
+@given(pair=frames(), data=st.data())
+def test_a_layout_for_selected_sets_leaves_out_the_others_and_nothing_else(
+    pair: tuple[FrameOfData, tuple[int, int]], data: st.DataObject
+) -> None:
+    frame, version = pair
+    datagram = encode(frame._replace(skeletons=(), assets=(), force_plates=(), devices=()), version)
+    decoded = decode(datagram, version)
+    assert isinstance(decoded, FrameOfData)
+    names = sorted({each.name for each in decoded.marker_sets})
+    selected = frozenset(data.draw(st.lists(st.sampled_from(names)) if names else st.just([])))
+    layout = FrameLayout.of(datagram, decoded, version, selected)
+    assert layout is not None
+    sets = tuple(each for each in decoded.marker_sets if each.name in selected)
+    assert layout.read(datagram) == decoded._replace(marker_sets=sets, other_markers=())
+
+    changed = bytearray(datagram)
+    changed[data.draw(st.integers(0, len(datagram) - 1))] ^= data.draw(st.integers(1, 255))
+    found = layout.read(bytes(changed))
+    if found is not None:  # unread numbers may have changed, and nothing else
+        whole = decode(bytes(changed), version)
+        assert isinstance(whole, FrameOfData)
+        sets = tuple(each for each in whole.marker_sets if each.name in selected)
+        assert repr(found) == repr(whole._replace(marker_sets=sets, other_markers=()))
+
+
 @given(pair=frames())
 def test_frame_with_items_of_variable_size_has_no_layout(
     pair: tuple[FrameOfData, tuple[int, int]],
