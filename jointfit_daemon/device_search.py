@@ -23,7 +23,8 @@ class Finding:
     """One result of a diagnosis."""
 
     check: str
-    """Its subject: ``serial``, ``can``, ``mocap``, ``broker``, ``clock``, ``disk`` and so on."""
+    """Subject of the check: ``serial``, ``can``, ``mocap``, ``broker``, ``clock``, ``disk`` and so
+    on."""
     id: str
     """Name of the device, interface or file; empty if the subject is the host."""
     level: Level
@@ -40,7 +41,7 @@ class FoundServer:
     driver: str
     """Driver that uses it."""
     server: str
-    """Numeric address."""
+    """Numeric address of the server."""
     port: int
     interface: str
     """Address of this host's network card at which the answer arrived."""

@@ -103,9 +103,9 @@ class MocapFrame:
     body_orientations: NDArray[np.float64]
     """q_world_body, shape (len(layout.bodies), 4)."""
     live: bool = True
-    """False if the server plays back a recording."""
+    """Whether the frame is measured; False if the server plays back a recording."""
     counted: bool = True
-    """False if the server sends no frame numbers: `number` then shows no loss."""
+    """Whether the server numbers its frames; if not, `number` shows no loss."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -361,7 +361,7 @@ class OpticalSegment(NamedTuple):
 
     name: str
     q_world_segment: Quaternion | None
-    """None while fewer than three of its markers are visible."""
+    """Orientation by the cameras; None while fewer than three of its markers are visible."""
     residual: float | None
     """Angle between the orientations from the IMUs and from the cameras, rad."""
     residual_rms: float | None
@@ -451,7 +451,7 @@ class ModelCoordinate(NamedTuple):
     is_angle: bool
     """Angle, rad, or else translation, m."""
     value: float | None
-    """None if the visible markers do not determine it."""
+    """Value of the coordinate; None if the visible markers do not determine it."""
     sd: float | None
 
 
@@ -480,7 +480,7 @@ class ChainModelState(NamedTuple):
     fit: MarkerFitErrors | None
     """Errors of the markers in use; None if fewer than three are visible."""
     recent: MarkerFitErrors | None
-    """The same over the last seconds."""
+    """Errors over the last seconds."""
     flags: tuple[str, ...]
     """`MarkerFlag` with the names of markers."""
 
@@ -504,7 +504,8 @@ class Stick(NamedTuple):
 
     segment: str
     ends: tuple[Vector | None, ...]
-    """From proximal to distal, m: two joints, or a marker and a joint; None if unknown."""
+    """Ends of the segment from proximal to distal, m: two joints, or a marker and a joint; None if
+    unknown."""
 
 
 class StickFigure(NamedTuple):

@@ -32,7 +32,7 @@ class NewestKnown:
     """Newest version of a family that the codec supports, and the program that installs it."""
 
     version: tuple[int, ...]
-    """Its leading numbers; the vendor changes further ones without changing contents."""
+    """Leading numbers of the version; the vendor changes further ones without changing contents."""
     tool: str
     """Program of the vendor that selects outputs and installs firmware."""
     part: str = "firmware"

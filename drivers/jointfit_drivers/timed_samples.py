@@ -48,7 +48,7 @@ class TimedReading(NamedTuple):
     q_world_sensor: Quaternion | None = None
     """Sensor to ENU, any norm."""
     q_native: Quaternion | None = None
-    """As sent."""
+    """Quaternion as sent."""
     status: int | None = None
     raw: RawVectors | None = None
 

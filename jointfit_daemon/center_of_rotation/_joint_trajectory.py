@@ -50,7 +50,7 @@ class JointTrajectory:
     """Position of a joint in the world over time."""
 
     positions: Array
-    """m, shape (n, 3); NaN where neither segment has a pose."""
+    """Position of the joint, m, shape (n, 3); NaN where neither segment has a pose."""
     error: Array
     """Predicted RMS error of the position, m, shape (n,), along the directions in which the center
     was observed; NaN where the position is unknown."""

@@ -451,7 +451,11 @@ def binding_warning(sources: Sequence[Source]) -> str | None:
         settings = source.settings
         if source.kind != "mocap" or any(settings.markers.values()) or settings.rigid_body:
             continue
-        only = "the plate alone is used, in the align phase" if settings.plate else "no use of it"
+        only = (
+            "only its plate is used, in the align phase"
+            if settings.plate
+            else "its data are unused"
+        )
         return (
             f"[mocap] measures no segment ({only}): add markers.SEGMENT = [names] or "
             "rigid_body.SEGMENT = name, with the names in the stream (`jointfit probe --mocap HOST`"

@@ -133,7 +133,7 @@ class _RigReader:
         self.imus_read: list[Source] = []
         """All IMUs whose tables could be read, even with faults."""
         self.imus_with_load: list[Source] = []
-        """IMUs of `imus_read` whose load is known: their faults concern names only."""
+        """IMUs of `imus_read` whose bit rate is known: their faults concern names only."""
         for key in table:
             if key not in SECTIONS:
                 known = f"unknown table; known: {', '.join(SECTIONS)}"
@@ -157,7 +157,8 @@ class _RigReader:
         # Checks across tables, even if some of them have faults.
         self.faults += _checks.check_ports(self.imus_read, buses)
         self.faults += _checks.check_can_ids(with_known_ids(self.imus_read, self.faults))
-        reported = {fault.key for fault in self.faults}  # a wrong bit rate has no load
+        # A load that was computed from a faulty key says nothing.
+        reported = {fault.key for fault in self.faults}
         loads = [
             *_bandwidth.check_serial_lines(self.imus_with_load),
             *_bandwidth.check_can_buses(self.imus_with_load, buses),
@@ -322,7 +323,7 @@ class _RigReader:
     def _check_bus_keys(
         self, key: str, table: dict[str, Any], in_use: Sequence[str]
     ) -> dict[str, Any]:
-        """Report the keys of a bus that its interface refuses; return a table with a valid one."""
+        """Report the keys that the interface refuses; return the table with a valid interface."""
         unusable = unusable_keys(table, in_use)
         usable = table
         if "interface" in unusable:
@@ -387,7 +388,8 @@ class _RigReader:
         elif isinstance(named, dict) and name not in named:
             text = f"no table [can.{name}]; known: {', '.join(named) or 'none'}"
             self.faults.append(Fault(f"{key}.can", text, name, nearest_name(name, named)))
-        # The fault is already reported: a valid bus of its own replaces it.
+        # The fault is already reported: the sensor gets a virtual bus, so that its other keys are
+        # checked.
         bus = CanBusSettings(interface="virtual", channel=f"unknown {name}")
         return imu | {"can": bus.model_dump()}
 

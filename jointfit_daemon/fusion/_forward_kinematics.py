@@ -35,8 +35,8 @@ class JointPlace(NamedTuple):
     segment: int
     """Number of the proximal segment."""
     share: float = 0.0
-    """0 at the distal end of the segment; otherwise the part of its length to the right (+) or left
-    (-) of its origin."""
+    """Place of the joint on the segment: 0 at the distal end, otherwise the part of the segment's
+    length to the right (+) or left (-) of its origin."""
 
 
 def joint_places(chain: Chain) -> list[JointPlace]:

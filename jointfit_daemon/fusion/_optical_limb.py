@@ -33,7 +33,7 @@ class OpticalReading(NamedTuple):
     """A limb in one mocap frame, in the order of the chain. Unknown values are None."""
 
     segments: list[Quaternion | None]
-    """q_optical_segment."""
+    """Orientation q_optical_segment of each segment."""
     positions: list[Vector | None]
     """Joint centers, m: mean of the two centers fixed in the adjacent body parts."""
     gaps: list[float | None]

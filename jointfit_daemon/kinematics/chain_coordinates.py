@@ -116,7 +116,7 @@ class CoordinateTable:
     names: tuple[str, ...]
     is_angle: tuple[bool, ...]
     values: Array
-    """rad and m, shape (T, K); angles are continuous over time."""
+    """Value of each coordinate, rad and m, shape (T, K); angles are continuous over time."""
     sd: Array
     """Standard deviations, rad and m, shape (T, K)."""
     misfit: dict[str, float]

@@ -45,7 +45,8 @@ class SensorCalibration:
     """Calibration of one sensor on its segment."""
 
     q_optical_world: Quaternion
-    """From the world of the sensor to the optical world (to the static world without cameras)."""
+    """Rotation from the world of the sensor to the optical world (to the static world without
+    cameras)."""
     q_sensor_segment: Quaternion
     """Sensor-to-segment alignment from the static pose."""
     lag_ns: int = 0
@@ -127,13 +128,14 @@ class Calibration:
     """Training frames, encoded by ``calibration.soft_tissue.pack``; the basis of online
     learning."""
     procedure: Procedure = "corrected"
-    """With ``patent``, every segment has one model, for all of its sensors."""
+    """Procedure of the calibration. With ``patent``, every segment has one model, for all of its
+    sensors."""
     chain: RefinedChain | None = None
     """Refined markers of the chain model; None if there are none."""
     parents: tuple[int | None, ...] = ()
-    """As in `Chain`: segment proximal of each joint; empty for a limb without branches."""
+    """Segment proximal of each joint, as in `Chain`; empty for a limb without branches."""
     left_joints: tuple[bool, ...] = ()
-    """As in `Chain`: sides of the joints of a branched limb."""
+    """Sides of the joints of a branched limb, as in `Chain`."""
 
     @property
     def lag_ns(self) -> dict[str, int]:

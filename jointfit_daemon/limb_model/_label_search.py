@@ -125,7 +125,7 @@ class _Frame(NamedTuple):
     """Markers of one frame; the last row belongs to no marker."""
 
     points: Array
-    """m, shape (M + 1, 3)."""
+    """Positions of the markers, m, shape (M + 1, 3)."""
     seen: NDArray[np.bool_]
     distances: Array
     """Distances of all pairs, m, shape (M + 1, M + 1)."""
@@ -144,9 +144,9 @@ class _Fits(NamedTuple):
     """Rigid fits of n sets of markers."""
 
     rms: Array
-    """m, shape (n,)."""
+    """RMS residual of each fit, m, shape (n,)."""
     rotation: Array
-    """From the template to the frame, shape (n, 3, 3)."""
+    """Rotation from the template to the frame, shape (n, 3, 3)."""
     template_mean: Array
     mean: Array
     """Means of the markers in template and frame, m, shape (n, 3)."""

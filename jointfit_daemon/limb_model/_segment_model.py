@@ -36,7 +36,7 @@ class Prediction(NamedTuple):
     """Estimate of one segment in one frame."""
 
     q: Quaternion
-    """q_world_segment."""
+    """Estimated orientation q_world_segment."""
     sd: float
     """Standard deviation of the orientation, rad (root mean variance per axis)."""
     extrapolating: bool

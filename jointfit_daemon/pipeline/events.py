@@ -147,7 +147,7 @@ class JobProgress:
     t_ns: int
     job: int
     progress: float
-    """0 to 1."""
+    """Share of the job that is done, 0 to 1."""
     text: str
 
 
@@ -294,7 +294,7 @@ class CalibrationProgress:
     t_ns: int
     phase: CalibrationPhase
     progress: float
-    """0 to 1."""
+    """Share of the phase that is done, 0 to 1."""
     text: str
     data: Mapping[str, object] = field(default_factory=dict)
 
@@ -304,7 +304,7 @@ class FitJob:
     """A job for the worker process."""
 
     job: int
-    """Its number, never reused."""
+    """Number of the job, which is never reused."""
     work: CalibrationJob
 
 

@@ -27,7 +27,7 @@ class WireCounts:
     """Counts since the daemon started; they continue when a reconnect replaces the decoder."""
 
     received: int = 0
-    """Samples decoded."""
+    """Number of decoded samples."""
     corrupt: int = 0
     """Runs of discarded bytes."""
     discarded_bytes: int = 0

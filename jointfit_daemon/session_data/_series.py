@@ -36,11 +36,11 @@ class SensorSeries:
     orientation: Array
     """q_world_sensor, shape (n, 4); NaN where unknown."""
     angular_velocity: Array | None = None
-    """In sensor axes, rad/s, shape (n, 3)."""
+    """Angular rate in sensor axes, rad/s, shape (n, 3)."""
     acceleration: Array | None = None
     """Specific force in sensor axes, m/s^2, shape (n, 3); at rest +9.81 upward."""
     magnetic_field: Array | None = None
-    """In sensor axes, as the sensor outputs it, shape (n, 3)."""
+    """Magnetic field in sensor axes, in the unit of the sensor, shape (n, 3)."""
 
     def __post_init__(self) -> None:
         owner = f"sensor {self.id!r}"
@@ -58,7 +58,8 @@ class MarkerSeries:
     t_s: Array
     """Instants since the start of the session, s, shape (n,)."""
     positions: Array
-    """In the optical world, z up, m, shape (n, len(labels), 3); NaN where occluded."""
+    """Positions of the markers in the optical world, z up, m, shape (n, len(labels), 3); NaN where
+    occluded."""
 
     def __post_init__(self) -> None:
         owner = "markers"

@@ -35,15 +35,15 @@ class SessionData:
     sensors: tuple[SensorSeries, ...] = ()
     markers: MarkerSeries | None = None
     segments: tuple[SegmentSeries, ...] = ()
-    """From the sensors."""
+    """Orientations of segments from the sensors."""
     joints: tuple[JointSeries, ...] = ()
-    """From the sensors."""
+    """Joints from the sensors."""
     optical_segments: tuple[SegmentSeries, ...] = ()
-    """From the markers: the reference."""
+    """Orientations of segments from the markers: the reference."""
     optical_joints: tuple[JointSeries, ...] = ()
-    """From the markers: the reference."""
+    """Joints from the markers: the reference."""
     events: tuple[TimelineEvent, ...] = ()
-    """In the order of their instants."""
+    """Events in the order of their instants."""
     description: Mapping[str, str] = field(default_factory=dict)
     """Where the data come from: rig, software, calibration, file."""
 

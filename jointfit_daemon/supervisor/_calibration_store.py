@@ -37,9 +37,9 @@ class LoadedCalibration(NamedTuple):
     """The stored calibration of a rig."""
 
     calibration: Calibration | None
-    """None if the store has none that can be used."""
+    """Newest stored calibration; None if the store has none that can be used."""
     version: int | None
-    """Its number in the store."""
+    """Number of the calibration in the store."""
     warnings: tuple[str, ...]
     """Faults of the stored files, for the log and ``bridge/event``."""
 

@@ -147,7 +147,7 @@ class Daemon:
         self._health_due_s = 0.0
         self._reload_requested = asyncio.Event()
         self._changes = asyncio.Lock()
-        """Held by a change of the configuration or of a source: one at a time."""
+        """Lock that a change of the configuration or of a source holds: one at a time."""
         self._tasks: asyncio.TaskGroup
         self._sources: SourceTasks
         self._requests: RequestDispatcher

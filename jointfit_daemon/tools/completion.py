@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 def complete_rig_or_command(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return second words of commands that begin with this one, and TOML files beside them.
+    """Return rig files and second words of a command that begin with `incomplete`.
 
-    Without such a word the result is empty, and the shell completes paths itself.
+    If no command has such a second word, the result is empty: the shell completes paths itself.
     """
     group = getattr(ctx.parent, "command", None)
     names = [name.split(" ") for name in getattr(group, "commands", {}) if " " in name]

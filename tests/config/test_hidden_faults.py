@@ -269,8 +269,8 @@ def test_a_missing_file_is_a_warning_of_the_check(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("keys", "words"),
     [
-        ("", "no use of it"),
-        ('plate = "Plate"\n', "the plate alone"),
+        ("", "its data are unused"),
+        ('plate = "Plate"\n', "only its plate"),
         ('rigid_body.thigh = "T"\n', None),
         ('markers.thigh = ["A", "B", "C"]\n', None),
     ],

@@ -1,7 +1,7 @@
 """Driver of Bosch / CEVA BNO085 and BNO086 on a serial port.
 
 `RvcDecoder` and `ShtpDecoder` are the pure part. `Bno085Imu.run` opens the port, makes the device
-send and reads until cancelled. Nothing but chunks passes from one to the other. The mode of the
+send and reads until cancelled. `run` passes nothing but chunks to the decoder. The mode of the
 device determines the speed of the port.
 """
 

@@ -39,7 +39,7 @@ class DbcSignal(NamedTuple):
     place: TableField
     """Place in the frame, with scale and zero of the file."""
     unit: str | None
-    """Its unit if we know it."""
+    """Unit of the signal, if rig.toml has it."""
 
 
 def read_signals(path: str, names: Sequence[str]) -> list[DbcSignal]:

@@ -114,9 +114,8 @@ class FilterStep(NamedTuple):
     """Result of one reading."""
 
     oriented: tuple[FilterOutput, ...]
-    """Empty while the filter settles, then one per reading. Without a settling time, the first
-    reading waits for the second, which returns both.
-    """
+    """Orientations: none while the filter settles, then one per reading. Without a settling time,
+    the first reading waits for the second, which returns both."""
     missing: int = 0
     """Readings missing before this one."""
     restarted: bool = False

@@ -1,7 +1,7 @@
 """Driver of LP-Research LPMS sensors that use LP-BUS on a serial port or USB.
 
 `LpmsDecoder` is the pure part. `LpmsImu.run` opens the port, brings the sensor into stream mode and
-reads until cancelled. Nothing but chunks passes from one to the other.
+reads until cancelled. `run` passes nothing but chunks to the decoder.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ class LslSession:
         self._loop = asyncio.get_running_loop()
         self._ended: asyncio.Future[None] = self._loop.create_future()
         self._finished = asyncio.Event()
-        """Set when the threads have ended."""
+        """Event that is set when the threads have ended."""
         self._stop = threading.Event()
         self._last_ns = 0
 

@@ -1,7 +1,7 @@
 """Driver of MicroStrain IMUs that use MIP on a serial port or USB.
 
 `MipDecoder` is the pure part. `MipImu.run` opens the port, makes the device stream and reads until
-cancelled. Nothing but chunks passes from one to the other.
+cancelled. `run` passes nothing but chunks to the decoder.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ class ModelEntry(NamedTuple):
     key: ColumnKey
     """Identity in the frames of the server."""
     owner: str
-    """Its model or set; empty for a rigid body."""
+    """Model or set of the entry; empty for a rigid body."""
     name: str
     member: int
     """Number in its owner, from 1."""

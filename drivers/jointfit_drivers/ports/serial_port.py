@@ -290,7 +290,8 @@ def _device_error(
             f"{path}: cannot run at {baud} baud: set `baud` to a speed that port and device share"
         )
     return DeviceMisconfiguredError(
-        f"{path}: not a serial port ({error}): set `{key}` to a tty, best one of /dev/serial/by-id"
+        f"{path}: not a serial port ({error}): set `{key}` to a tty, preferably one in "
+        "/dev/serial/by-id"
     )
 
 

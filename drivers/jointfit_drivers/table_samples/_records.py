@@ -40,7 +40,8 @@ class SampleForm(NamedTuple):
     rate_unit: float = 1.0
     """SI value of the configured unit of angular rates."""
     make_raw: Callable[[], RawSamples] | None = None
-    """For orientations of the gateway: returns a new filter of raw measurements."""
+    """Function that returns a new filter of raw measurements; None if the device sends
+    orientations."""
 
 
 class TableRecord(NamedTuple):
@@ -50,7 +51,7 @@ class TableRecord(NamedTuple):
     values: tuple[float | None, ...]
     """Numbers as sent, in the order of the slots; None if a frame is missing."""
     size: int
-    """Its bytes on the wire, or in the chunks of a CAN bus."""
+    """Bytes of the record on the wire, or in the chunks of a CAN bus."""
     data: tuple[bytes, ...]
     """Data of its frames."""
 

@@ -1,7 +1,7 @@
 """Driver of VectorNav IMUs on a serial port or USB.
 
 `VectorNavDecoder` is the pure part. `VectorNavImu.run` opens the port, makes the device stream and
-reads until cancelled. Nothing but chunks passes from one to the other.
+reads until cancelled. `run` passes nothing but chunks to the decoder.
 """
 
 from __future__ import annotations

@@ -139,7 +139,7 @@ class VectorNavHandshake:
         left = await self._read_output(register)
         if not _is_sufficient(left, wanted):
             raise DeviceMisconfiguredError(
-                f"{self._path}: {self._model} does not keep register {register} = "
+                f"{self._path}: {self._model} does not accept register {register} = "
                 f"{encode_output(wanted)}: correct `rate_hz`, or update the firmware of the device"
             )
         return True

@@ -124,7 +124,7 @@ class VrpnDecoder:
                     version = f"{message.major:02d}.{message.minor:02d}"
                     out.append(DeviceEvent("info", f"VRPN {version}", {"vrpn": version}))
                     if message.major != vrpn.MAJOR:
-                        text = f"the server speaks VRPN {version}, expected {vrpn.MAJOR:02d}.xx"
+                        text = f"the server uses VRPN {version}, expected {vrpn.MAJOR:02d}.xx"
                         out.append(DeviceEvent("error", text, {"vrpn": version}))
                     else:
                         out += self._newer.take_version(version)

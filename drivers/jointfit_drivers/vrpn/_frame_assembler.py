@@ -22,7 +22,7 @@ _AWAITED_PERIODS = 3
 _SAME_FRAME = 0.5
 """Largest difference of the times in one frame, periods."""
 _FIRST_SPREAD_US = 2_000.0
-"""The same before the period is known, µs."""
+"""Largest difference of the times in one frame before the period is known, µs."""
 _LONGEST_US = 500_000
 """Longest time between two reports of one body that is a period, µs."""
 _REORDERED_US = 100_000

@@ -157,7 +157,7 @@ class VrpnSession:
         major, minor, _ = self._cookie
         if major != vrpn.MAJOR:
             raise DeviceMisconfiguredError(
-                f"{self._name}: speaks VRPN {major:02d}.{minor:02d}, expected "
+                f"{self._name}: uses VRPN {major:02d}.{minor:02d}, expected "
                 f"{vrpn.MAJOR:02d}.xx: install a server of version {vrpn.MAJOR}"
             )
 
@@ -208,7 +208,7 @@ class VrpnSession:
         """Return the error of a server without poses, with its probable cause."""
         self._output.silent = True
         if self._pong_ns > self._pose_ns:
-            cause = "it answers, but sees no body: bring the bodies into view, or start streaming"
+            cause = "it answers, but sends no body: bring the bodies into view, or start streaming"
         elif not self._codec.senders:
             cause = "it has described no body: create rigid bodies and start streaming"
         else:

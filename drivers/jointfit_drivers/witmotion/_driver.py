@@ -1,7 +1,7 @@
 """Driver of WitMotion IMUs (WT901, JY901, HWT905 and relatives) on a serial port.
 
 `WitMotionDecoder` is the pure part. `WitMotionImu.run` opens the port, makes the device send the
-required frames and reads until cancelled. Nothing but chunks passes from one to the other.
+required frames and reads until cancelled. `run` passes nothing but chunks to the decoder.
 """
 
 from __future__ import annotations

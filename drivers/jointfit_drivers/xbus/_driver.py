@@ -1,7 +1,7 @@
 """Driver of Xsens / Movella IMUs that use Xbus on a serial port or USB.
 
 `XbusDecoder` is the pure part. `XbusImu.run` opens the port, brings the device into measurement
-mode and reads until cancelled. Nothing but chunks passes from one to the other.
+mode and reads until cancelled. `run` passes nothing but chunks to the decoder.
 """
 
 from __future__ import annotations

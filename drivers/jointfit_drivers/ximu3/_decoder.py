@@ -61,7 +61,7 @@ class _Measurement(NamedTuple):
     arrived_ns: int
     native: Quaternion | None
     q: Quaternion | None
-    """None for raw measurements."""
+    """Orientation of the message; None for raw measurements."""
 
 
 class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):

@@ -1,7 +1,7 @@
 """Driver of x-io x-IMU3 on a serial port or USB, and of boards that send its messages.
 
 `XImu3Decoder` is the pure part. `XImu3Imu.run` opens the port, checks the settings of the device
-and reads until cancelled. Nothing but chunks passes from one to the other.
+and reads until cancelled. `run` passes nothing but chunks to the decoder.
 """
 
 from __future__ import annotations

@@ -9,8 +9,10 @@ through the leverage
           \frac{\mathrm{Cov}(v_j)}{R_j^2} \Big]^{-1} + \sigma_s^2 I
 
 with :math:`v_j` marker j in coordinates of the proximal part at distance :math:`R_j` from the
-center. The constants are those of the final fit, so that the predicted soft-tissue error matches.
-The final fit compares both body parts instead of spheres, and has a smaller random error.
+center, :math:`n_j` its number of frames and :math:`\sigma_r, \sigma_s` the standard deviations of
+the soft-tissue artefact, which are those of `calibration.anatomy`. So the final fit predicts the
+same soft-tissue error. It compares both body parts instead of spheres, and has a smaller random
+error.
 """
 
 from __future__ import annotations
@@ -45,7 +47,8 @@ if TYPE_CHECKING:
 _ROUNDED_M2 = 1e-12
 """Lower bound of squared radii, m², against division by zero."""
 _ALONG = 0.7
-"""Cosine above which a direction counts as unobserved by the estimator."""
+"""Cosine of the angle to an unobserved direction of the estimator above which a direction counts as
+unobserved, too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +152,7 @@ class LiveJointCenters:
                 sphere.feed(v[k, : self._sizes[k]])
 
     def estimate_next(self) -> tuple[LiveJointCenter, CenterEstimate | None]:
-        """Estimate the next joint in turn; without an observed plane there is no estimate."""
+        """Estimate the next joint in turn; with None if fewer than two directions were observed."""
         k = self._turn = (self._turn + 1) % len(self.joints)
         with np.errstate(all="ignore"):  # markers at rest leave zeros
             estimate = self._spheres[k].estimate()

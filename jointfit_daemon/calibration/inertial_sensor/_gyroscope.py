@@ -41,7 +41,7 @@ class GyroscopeEstimate:
     bias: Array
     """Bias, rad/s, shape (3,)."""
     covariance: Array
-    """Its covariance, rad^2/s^2, shape (3, 3)."""
+    """Covariance of the bias, rad^2/s^2, shape (3, 3)."""
     degrees_of_freedom: int
     """Degrees of freedom of the covariance."""
     rest_s: float

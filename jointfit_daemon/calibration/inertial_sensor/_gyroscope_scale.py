@@ -71,7 +71,7 @@ class GyroscopeScaleEstimate:
     spread_before: float
     """RMS of the differences between the directions of gravity, uncorrected, rad."""
     residual: float
-    """The same, corrected, rad."""
+    """RMS of the differences between the directions of gravity, corrected, rad."""
 
 
 def fit_gyroscope_scale(

@@ -106,10 +106,7 @@ def find_trial_faults(
     if (whole.sum(axis=1) >= 3).sum() < fewest_frames:
         few = f"fewer than {fewest_frames} frames show"
         least = "no frame shows" if fewest_frames == 1 else few
-        return [
-            f"{trial.name}: {least} three or more of the model's markers: are the names the"
-            " model's?"
-        ]
+        return [f"{trial.name}: {least} three or more of the model's markers: check their names"]
 
     stretch = _stretch(model, trial)
     if not np.isfinite(stretch):
@@ -190,7 +187,11 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
     """Return the trial without frames of exchanged labels, notes, and faults."""
     found = solve_frames(model, trial.targets, options=_ROBUST)
     if not (trial.targets.shape[0] and np.isfinite(found.residuals).any()):
-        return trial, [], [f"{trial.name}: the model follows none of its frames"]
+        return (
+            trial,
+            [],
+            [f"{trial.name}: the model fits none of its frames: check marker names, unit and axes"],
+        )
     faults, notes, targets = [], [], trial.targets.copy()
     for group, frames in exchanged_markers(found.residuals, trial.targets).items():
         text = f"{trial.name}: {exchange_text(model, group)}"

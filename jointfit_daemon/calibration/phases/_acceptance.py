@@ -35,22 +35,22 @@ def compare_calibrations(new: Calibration, old: Calibration | None) -> Calibrati
     (5 mm).
     """
     if old is None:
-        return CalibrationComparison(True, "there was no calibration")
+        return CalibrationComparison(True, "no calibration was in force")
     chains = [(one.joints, one.segments, one.chain_sensors) for one in (new, old)]
     if chains[0] != chains[1]:
-        return CalibrationComparison(True, "the old one belongs to another chain or other sensors")
+        return CalibrationComparison(
+            True, "the stored one belongs to another chain or other sensors"
+        )
 
     had, has = "holdout" in old.quality, "holdout" in new.quality
     if had != has:
-        return CalibrationComparison(
-            has, "only the new one used cameras" if has else "the old one used cameras"
-        )
+        return CalibrationComparison(has, f"only the {'new' if has else 'stored'} one used cameras")
 
     assumed = FrameFlag.HEADINGS_FROM_STATIC
     if (assumed in old.flags) != (assumed in new.flags):
         aligned = assumed in old.flags
         return CalibrationComparison(
-            aligned, "its worlds are aligned" if aligned else "the old one's worlds were aligned"
+            aligned, f"only the {'new' if aligned else 'stored'} one has an align phase"
         )
 
     worse = [*_worse_angles(new, old), *_worse_joints(new, old)] if has else []
@@ -80,7 +80,9 @@ def _worse_joints(new: Calibration, old: Calibration) -> list[str]:
     for name, was in old.joint.items():
         now = new.joint[name]
         if was.source == "fit" and now.source != "fit":
-            found.append(f"{name}: its center was fitted, now it is {now.source}")
+            found.append(
+                f"{name}: its center was estimated from the movement, now it is {now.source}"
+            )
         elif (now.gap_rms or 0.0) > (was.gap_rms or np.inf) + SLACK_M:
             found.append(
                 f"{name}: center gap {1000 * (now.gap_rms or 0.0):.0f} mm, "

@@ -59,9 +59,9 @@ class ChainOutcome:
     """Result of the refinement of a chain model."""
 
     chain: RefinedChain | None = None
-    """None if the positions of the model remain in use."""
+    """Refined markers; None if the positions of the model remain in use."""
     figures: ChainQuality | None = None
-    """None without a chain model."""
+    """Figures of the refinement; None without a chain model."""
     notes: tuple[str, ...] = ()
 
 

@@ -51,7 +51,7 @@ class RefinedClusters:
 
     clusters: Mapping[str, MarkerCluster]
     figures: MarkerQuality | None
-    """None if nothing was refined."""
+    """Figures of the refinement; None if nothing was refined."""
     notes: tuple[str, ...] = ()
 
 

@@ -115,7 +115,9 @@ def _functional(job: FunctionalJob, control: JobControl) -> FitResult:
 def _refit(job: RefitJob) -> FitResult:
     previous = _previous(job)
     if previous is None:
-        raise CalibrationError("no calibration of this limb to go on from")
+        raise CalibrationError(
+            "no calibration of this limb is in force: repeat the functional phase"
+        )
     return refit_models(previous, job.fresh, job.chain, software=__version__)
 
 

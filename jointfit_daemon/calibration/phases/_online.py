@@ -70,7 +70,8 @@ MOST_LEFT_OUT = 0.3
 CONTRADICTED = np.deg2rad(8.0)
 """Median angle between cameras and models in force above which either is wrong, rad."""
 SHIFTED = np.deg2rad(5.0)
-"""The same limit for the mean rotation: a displaced marker cluster, rad."""
+"""Largest mean rotation between cameras and models in force, rad; a larger one is due to a
+displaced marker cluster."""
 TURN_FRAMES = 150
 """Number of frames over which heading drift is taken as constant: 15 s."""
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 BLOCKS = 3
-"""Held-out blocks of a single trial: few and long, so that each contains movement absent
+"""Number of held-out blocks of a single trial: few and long, so that each contains movement absent
 elsewhere."""
 
 

@@ -34,7 +34,7 @@ PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
 RATIOS = (1.0, 0.1, 10.0)
 """Penalty of bumps over that of smooth terms."""
 PASSES = 3
-"""Reweighting iterations."""
+"""Number of reweighting iterations."""
 SMALLEST_SCALE = 1e-3
 """Constant added to the RMS of each regressor, rad, so that a nearly constant regressor is not
 amplified."""

@@ -43,7 +43,8 @@ if TYPE_CHECKING:
 METHODS: tuple[Method, ...] = get_args(Method)
 """All fusion methods."""
 MAX_SUBSET_SENSORS = 3
-"""With more sensors on a segment, only all sensors, all but one, and each alone get a model."""
+"""Largest number of sensors on a segment for which every subset gets a model. With more sensors,
+only all of them, all but one, and each alone get one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 PASSES = 5
-"""Reweighting iterations."""
+"""Number of reweighting iterations."""
 _SMALLEST_SCALE = 1e-9
 
 

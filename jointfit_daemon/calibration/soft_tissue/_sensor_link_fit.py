@@ -47,10 +47,10 @@ if TYPE_CHECKING:
 
 
 RIDGE = 1e-3
-"""Ridge penalty."""
+"""Penalty of the ridge regression."""
 
 BLOCKS = 5
-"""Held-out blocks, contiguous in time."""
+"""Number of held-out blocks, which are contiguous in time."""
 
 FEWEST_FRAMES = 100
 """Smallest number of complete frames."""

@@ -43,7 +43,7 @@ class CircleLimits:
     """Acceptance limits of a planar center."""
 
     gate: float = GATE
-    """Least T."""
+    """Least T, the radius over the largest standard error of the center."""
     reach: tuple[float, float] = (0.02, 1.0)
     """Distance of a marker from the center, m."""
     arc: float = radians(10.0)

@@ -36,7 +36,7 @@ class Circles(NamedTuple):
     center: Array
     """Center, m, shape (..., 2); NaN where `valid` is False."""
     radius: Array
-    """Radius, m."""
+    """Radius of the circle, m."""
     covariance: Array
     """Covariance of the center, m², shape (..., 2, 2)."""
     noise: Array

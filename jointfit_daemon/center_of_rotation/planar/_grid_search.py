@@ -1,7 +1,7 @@
 """Grid search for the center with the smallest variance of distances.
 
-This is the published baseline of the planar method. Its accuracy is limited by the box on short
-arcs and by the step on long ones.
+This is the published baseline of the planar method. Its accuracy is limited by the extent of the
+grid on short arcs and by its step on long ones.
 """
 
 from __future__ import annotations

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 Number = TypeVar("Number", float, Array)
 
 GATE = 6.0
-"""Smallest T of a published center; there the error is within 15 % of the bound."""
+"""Smallest T, curvature over its standard error, of a published center: the error is then within 15
+% of the bound."""
 LOG_20 = log(20.0)
 FARTHEST_M = 1e4
 """Coordinates beyond this, m, are treated as missing, like NaN."""
@@ -106,7 +107,7 @@ def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMom
 
 
 def moments_of_one(points: Array, weights: Array | None = None) -> CircleMoments[float]:
-    """Return `moments_of` one set of points, shape (n, 2), without NaN; several times faster.
+    """Return the moments of one set of points, shape (n, 2), without NaN, faster than `moments_of`.
 
     Weights, shape (n,), are not negative and not all zero.
     """

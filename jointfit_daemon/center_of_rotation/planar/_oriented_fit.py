@@ -80,7 +80,7 @@ def oriented_estimate(
     contribution of marker noise to aᵀMa, which decreases with distance and would bias c outward.
 
     The guard is a limited translation (Efron and Morris 1971). With Δ = aided - circle, E its
-    covariance if the angles are as good as stated, and s² = ΔᵀE⁻¹Δ, the result is
+    covariance if the errors of the angles are as stated, and s² = ΔᵀE⁻¹Δ, the result is
 
     .. math:: c = c_{circle} + \Delta \min(1, \lambda/s), \qquad
               \lambda = 0.7 \left( 1 + (6/T)^2/2 \right)
@@ -164,7 +164,7 @@ def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, flo
     center : ndarray, shape (2,)
         Estimated with the angles, m.
     C : ndarray, shape (2, 2)
-        Its covariance if the angles are as good as stated, m².
+        Its covariance, m², if the errors of the angles are as stated.
     circle : Circles
         Fit of the path alone; where it is not valid the center is returned unchanged.
 

@@ -106,7 +106,7 @@ class RunningCircle:
                 self._squares *= mu * mu
             self._before = (0.0, 0.0, 0.0)
             if self._window is not None and self._kept and self._kept[-1][2] > 0.0:
-                self._kept.append((0.0, 0.0, 0.0))  # separates the frames before and after
+                self._kept.append((0.0, 0.0, 0.0))  # a gap separates the frames before and after it
             return
 
         if self._origin is None:
@@ -122,7 +122,7 @@ class RunningCircle:
         if self._window is not None:
             self._slide((x, y, weight))
         if self._robust and self.frames >= _SETTLED_FRAMES:
-            # Circle and noise weight the next frame.
+            # The weight of the next frame follows from this circle and its noise.
             found = self.circle()
             if found is not None:
                 m = self.moments()

@@ -68,7 +68,7 @@ def _sides(p: Array) -> tuple[Array, Array, Array]:
 
 
 def _offset(u: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the center from the first point, in the sides' unit, and a mask of missing centers."""
+    """Return the center from the first point, over the largest side, and a mask of missing ones."""
     D = u[..., 0] * v[..., 1] - v[..., 0] * u[..., 1]
     s2, s3 = (u**2).sum(axis=-1), (v**2).sum(axis=-1)
     longest = np.maximum(np.maximum(s2, s3), ((u - v) ** 2).sum(axis=-1))
@@ -87,8 +87,8 @@ def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
     points : array_like, shape (3, 2)
         One marker in three frames, m.
     noise : array_like, broadcast to (3, 2)
-        Standard deviations of x and y in each frame, m; three points do not determine them. One
-        value for all, (3, 1) for one a frame, (2,) for one an axis, or six.
+        Standard deviations of x and y in each frame, m; three points do not determine them. Six
+        values; or one for each frame, shape (3, 1), one for each axis, shape (2,), or one for all.
 
     Returns
     -------

@@ -8,8 +8,8 @@ radial residual. Therefore
 
 weights all markers as a geometric fit does. E_j, the contribution of unit noise to var F_j, removes
 the bias of short arcs. For one marker in a plane the center equals that of the hyper fit
-(Al-Sharadqah and Chernov 2009; Kanatani and Rangarajan 2011; for spheres, Halvorsen 2003 solved
-instead of iterated).
+(Al-Sharadqah and Chernov 2009; Kanatani and Rangarajan 2011; for spheres it is the limit of the
+iteration of Halvorsen 2003).
 """
 
 from __future__ import annotations

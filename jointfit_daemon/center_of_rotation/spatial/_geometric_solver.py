@@ -1,6 +1,7 @@
 """Robust geometric fit of concentric spheres.
 
-Unobservable directions keep the start value. Acceptance is decided by `judge_sphere`.
+The center keeps its start value along unobservable directions. `judge_sphere` decides on
+acceptance.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class SphereOptions:
     """Settings of a geometric sphere fit."""
 
     huber: float = HUBER
-    """Residual in scales above which the weight is reduced; inf: plain least squares."""
+    """Residual, in robust standard deviations, above which the weight is reduced; inf: plain least
+    squares."""
     smallest_scale: float = _ROUNDED
     """Smallest residual scale, m; 0.1 mm with soft-tissue artefact, so that a few good
     frames do not dominate."""
@@ -88,15 +90,15 @@ class SphereFit:
 def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
     """Fit spheres about one center by Gauss-Newton with Huber weights; radii are eliminated.
 
-    Unobserved directions keep the start value: noise would move the center to the plane of the
-    markers with a covariance that is too small. Halvorsen 2003; Chang and Pollard 2007.
+    The center keeps its start value along unobserved directions: noise would move it to the plane
+    of the markers, with a covariance that is too small. Halvorsen 2003; Chang and Pollard 2007.
 
     Parameters
     ----------
     points : ndarray, shape (n, k, 3)
         m; NaN where missing; every marker is visible at least twice.
     options : SphereOptions
-        Start, robustness.
+        Start value of the center, Huber's bound and the limits of observability.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1))
     v = np.where(seen[..., None], points, 0.0)
@@ -122,7 +124,7 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
             break
 
         g = np.einsum("tj,tja,tj->a", w, Jb, e)
-        # far from the answer the radii are wrong and full steps overshoot
+        # far from the solution the radii are wrong, and full steps overshoot
         step = basis @ np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(len(H)), -g)
         step *= min(1.0, _LONGEST_STEP_M / max(float(np.linalg.norm(step)), 1e-12))
         m = start + basis @ (basis.T @ (m + step - start))
@@ -146,7 +148,7 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
 
 
 def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
-    """Return Gamage and Lasenby's center, at `start` in directions where noise `hold` dominates."""
+    """Return Gamage and Lasenby's center; it stays at `start` where the noise `hold` dominates."""
     total = np.maximum(w.sum(axis=0), 1e-12)
     d = v - start
     d = d - (w[..., None] * d).sum(axis=0) / total[:, None]
@@ -163,8 +165,8 @@ def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
 def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions) -> Array:
     """Return an orthonormal basis (3, r) of the observed directions.
 
-    Noise changes the direction of a marker only across its line to the center, so the threshold of
-    each direction b is scaled by the mean of 1 - (b·u)².
+    Noise changes the direction u from the center to a marker only across u. So the threshold along
+    each axis b of the basis is scaled by the mean of 1 - (b·u)² over all markers.
     """
     _, J = radial_residuals(v, m, w)
     total = w.sum()
@@ -174,7 +176,7 @@ def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions
     along = np.einsum("tj,tja,tjb->ab", w / u2, d, d) / total
     across = np.maximum(1.0 - np.einsum("ai,ab,bi->i", axes, along, axes), 0.0)
     noise = scale**2 * float((w / u2).sum() / total)
-    if options.keep_one:  # soft-tissue artefact: a fixed multiple of its motion
+    if options.keep_one:  # soft-tissue artefact: a fixed multiple of the noise
         keep = spread >= max(options.min_direction**2, NOISE_FACTOR * noise) * across
         keep[-1] = True
         return np.asarray(axes[:, keep])
@@ -196,7 +198,7 @@ def judge_sphere(
     .. math:: C = \frac{\sum ψ^2 / (N - k - r)}{p^2} \Big(\sum J J^T - \text{noise's part}
               \Big)^{-1} \frac{1+\rho}{1-\rho}
 
-    ψ with ψ the residuals limited to Huber's bound, p the share that is not limited, and ρ the
+    with ψ the residuals limited to Huber's bound, p the share that is not limited, and ρ the
     correlation of the residuals from one frame to the next (Huber 1964). With a smooth disturbance
     only ρ prevents an underestimate of the covariance at a high frame rate.
     """

@@ -48,8 +48,8 @@ NO_TURN = "the child did not rotate against the parent: move the joint, at least
 MIN_TURN_RAD = 0.02
 """RMS rotation, rad, about the second axis of the movement below which there was no rotation."""
 LEVER_M = 0.24
-"""Replaces the radius in T, m, since poses carry no marker positions: the center must be known to
-40 mm."""
+"""Length, m, that replaces the radius in the conditioning T, since poses carry no marker positions:
+the center must be known to 40 mm."""
 HIDDEN = (
     "noise of the markers rotates both bodies as much as the joint does: move the joint further, "
     "or put the markers of each body further apart"
@@ -104,7 +104,7 @@ def two_sided_estimate(
         origin.
     hinge : bool
         Solve for an axis, without the sixth singular value. False: only if the ratio of the last
-        two is below `HINGE_RATIO`.
+        two singular values is below `HINGE_RATIO`.
     robust : bool
         Huber weights on the gap, which reduce the influence of marker swaps.
     markers : tuple of ndarray, shapes (m, 3) and (k, 3), or None

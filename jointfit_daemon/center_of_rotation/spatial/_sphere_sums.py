@@ -34,7 +34,7 @@ class SphereSums:
     origin: Array
     """The fixed point of each marker, m, shape (k, d)."""
     M: Array
-    """Shape (k, e, k, e)."""
+    """Sums of the products of φ of two markers, shape (k, e, k, e)."""
     L: Array
     """Lagged sums for each of `LAGS`, shape (2, k, e, e)."""
     squares: Array

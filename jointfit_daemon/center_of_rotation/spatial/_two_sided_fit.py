@@ -46,7 +46,7 @@ class ClusterNoise:
     turning: Array
     """G⁻¹, 1/m², shape (3, 3)."""
     shift: float
-    """1/k."""
+    """Variance of the mean of the markers, 1/k."""
 
     @classmethod
     def of(cls, markers: Array) -> ClusterNoise:

@@ -35,7 +35,7 @@ class C3dTrial:
     up_axis: str | None
     """Vertical screen axis "x", "y" or "z", if declared."""
     events: tuple[C3dEvent, ...] = ()
-    """In the order of the file."""
+    """Events in the order of the file."""
     own_texts: Mapping[str, str] = field(default_factory=dict)
     """Parameters of the group JOINTFIT."""
 

@@ -37,7 +37,7 @@ class MarkerTrial:
     """Positions rotated to z up, m; NaN where missing."""
     up_axis: Axis
     """Vertical axis of the file, which became z."""
-    up_said_by: Literal["file", "caller", "custom of the format"]
+    up_said_by: Literal["file", "caller", "convention of the format"]
 
     def points(self, names: Sequence[str]) -> NDArray[np.float64]:
         """Return the trajectories of markers by name, m, shape (n, len(names), 3).
@@ -128,5 +128,5 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
     return MarkerTrial(
         replace(trajectories, positions=turned),
         up,
-        "caller" if up_axis else "file" if declared else "custom of the format",
+        "caller" if up_axis else "file" if declared else "convention of the format",
     )

@@ -35,7 +35,7 @@ class WrittenTable:
 
     path: Path
     frames: int
-    """Written frames; 0: no file was written."""
+    """Number of written frames; 0: no file was written."""
     notes: tuple[str, ...] = ()
     """Omitted columns and frames."""
 

@@ -54,7 +54,7 @@ class TimeTable:
     t_s: NDArray[np.float64]
     """Times, s, shape (n,)."""
     values: NDArray[np.float64]
-    """As written, shape (n, len(columns)); NaN where missing."""
+    """Numbers as written, shape (n, len(columns)); NaN where missing."""
     in_degrees: bool
     name: str = ""
     """First header line."""

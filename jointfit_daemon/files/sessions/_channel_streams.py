@@ -83,7 +83,7 @@ class ChannelStream:
     """Instants since the start of the session, s, shape (n,)."""
     channels: tuple[StreamColumn, ...]
     values: Array
-    """Shape (n, len(channels)); NaN where unknown."""
+    """Samples of the channels, shape (n, len(channels)); NaN where unknown."""
 
 
 def streams_of(session: SessionData) -> list[ChannelStream]:

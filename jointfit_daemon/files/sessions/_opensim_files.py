@@ -52,7 +52,8 @@ def write_sto_session(
     Parameters
     ----------
     session, folder
-        Groups without series are left out, and up to 1 s before the last series of a group starts.
+        A group without series gets no file. If the series of a group start within 1 s, frames
+        before the last start are left out.
     names
         Column names of sensors and segments, ``{"S1": "femur_r_imu"}`` for example. OpenSense finds
         the body of a column by its name.
@@ -154,8 +155,8 @@ def write_mot_session(session: SessionData, folder: Path) -> WrittenSession:
 def read_mot_session(path: Path) -> SessionData:
     """Return the joints of a MOT or STO file with one number in each cell.
 
-    In a foreign file every column is a joint of its own with the angle ``angle``, but for positions
-    ``NAME_tx``, ``NAME_ty`` and ``NAME_tz`` in m, y up.
+    Every column of a foreign file becomes a joint with one angle, called ``angle``. The exception
+    are positions, ``NAME_tx``, ``NAME_ty`` and ``NAME_tz``, in m with y up.
     """
     table = read_sto(path)
     facts = header_facts(table.header)

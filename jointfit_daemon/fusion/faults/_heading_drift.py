@@ -55,7 +55,7 @@ class HeadingDriftFilter:
         self.heading = 0.0
         """Estimated heading error, rad."""
         self.sd = START_SD
-        """Its standard deviation, rad."""
+        """Standard deviation of the estimated heading error, rad."""
         self.observed_sd = max(START_SD, 0.6 * spread)
         """Standard deviation that is reached with regular measurements, rad. The calibration
         residuals contain it already."""

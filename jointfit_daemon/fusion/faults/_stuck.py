@@ -41,7 +41,8 @@ NATURAL_LIMIT_NS = 150_000_000
 PARTNER_ROTATION = radians(1.0)
 """Rotation of a sensor on the same segment that a healthy sensor always follows, rad."""
 OTHER_ROTATION = radians(10.0)
-"""The same for a sensor on another segment, rad: joints allow segments to move alone."""
+"""Rotation of a sensor on another segment that a healthy sensor always follows, rad. It is larger,
+because joints allow segments to move alone."""
 OTHER_REPEAT_NS = 300_000_000
 """Shortest repetition that the rotation of another segment can confirm, ns."""
 WINDOW_NS = 150_000_000

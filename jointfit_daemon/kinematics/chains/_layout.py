@@ -31,7 +31,7 @@ class ChainLayout:
     levels: tuple[tuple[Index | slice, Index | slice], ...]
     """Segments with a parent, grouped by depth, and their parents."""
     free: Index | slice
-    """Free segments."""
+    """Numbers of the free segments."""
     corners: Array
     """Transforms to the parent without rotations and own centers, shape (S, 4, 4)."""
     has_own_centers: bool
@@ -53,15 +53,14 @@ class ChainLayout:
     spread: Array
     """Maps a step to the rotation vectors of all segments; shape (nq, 3 S)."""
     below: Array
-    """1 where segment j is i or a descendant of it, shape (S, S)."""
+    """Matrix with 1 where segment j is i or a descendant of it, shape (S, S)."""
     moves: Array
-    """1 where a degree of freedom moves a segment, shape (S, nq)."""
+    """Matrix with 1 where a degree of freedom moves a segment, shape (S, nq)."""
     lower: Array
-    """1 where the column's segment is the row's or an ancestor of it, and the column is not after
-    the row; shape (nq, nq).
-    """
+    """Matrix with 1 where the column's segment is the row's or an ancestor of it, and the column is
+    not after the row; shape (nq, nq)."""
     strictly_lower: Array
-    """The same without the diagonal."""
+    """Matrix `lower` without its diagonal."""
     coupled: tuple[tuple[int, int, CoupledCurve], ...]
     """Segment, column and curve of each coupled joint."""
 

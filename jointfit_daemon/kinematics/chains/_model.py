@@ -49,7 +49,7 @@ class Joint:
     center_in_parent: Vector = _ORIGIN
     """Joint center in the parent's axes (the world's without a parent), m; unused when free."""
     center: Vector = _ORIGIN
-    """The same point in the segment's own axes, m; unused when free."""
+    """Joint center in the segment's own axes, m; unused when free."""
     axis: Vector = (1.0, 0.0, 0.0)
     """Unit axis of a hinge in own axes; positive rotations are right-handed about it."""
     rest: Quaternion = (1.0, 0.0, 0.0, 0.0)

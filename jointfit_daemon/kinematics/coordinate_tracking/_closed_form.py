@@ -45,7 +45,8 @@ class ClosedForm:
     angles: tuple[int, ...]
     """Indices of the angles among the coordinates of the joint, in the order of the rotations."""
     signs: tuple[float, ...]
-    """1, or -1 where a positive angle is a negative rotation about the column of B."""
+    """Sign of each angle: -1 where a positive angle is a negative rotation about the column of
+    B."""
     left: Array
     """B^T A_0^T, shape (3, 3)."""
     basis: Array

@@ -43,7 +43,7 @@ _SMALLEST_STEP = 1e-10
 _QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
 """Angles from which an inversion begins without an instant before, rad."""
 _STEEP = 0.87
-"""The same for the second of three rotations: 50 degrees."""
+"""Angle of the second of three rotations from which an inversion begins: 50 degrees."""
 _MOST_ANGLES = 3
 
 

@@ -171,9 +171,9 @@ class _Rotations(NamedTuple):
     """Joints of three rotations in closed form, in arrays over J joints."""
 
     rows: NDArray[np.intp]
-    """Coordinates of the rotations, shape (J, 3)."""
+    """Indices of the rotation angles among the coordinates, shape (J, 3)."""
     signs: Array
-    """Shape (J, 3)."""
+    """Sign of each angle, shape (J, 3)."""
     basis: Array
     """B^T, shape (J, 3, 3)."""
     cells: NDArray[np.intp]
@@ -206,15 +206,15 @@ class _Shift(NamedTuple):
 
     segment: int
     number: int
-    """Among the free segments."""
+    """Number of the joint's segment among the free segments."""
     rows: NDArray[np.intp]
-    """Coordinates."""
+    """Indices of the translations among the coordinates."""
     column: int
     """First column of the segment."""
     inverse: Array
     start: Array
     center: Array | None
-    """None: zero."""
+    """Joint center; None: zero."""
 
     @classmethod
     def of(

@@ -89,11 +89,11 @@ class LivePose:
     """Chain at one instant."""
 
     state: ChainState
-    """Quaternion, unit norm."""
+    """Joint positions, one instant."""
     rotations: Array
     """R_world_segment, shape (S, 3, 3)."""
     origins: Array
-    """World, m, shape (S, 3)."""
+    """Origins of the segments in the world, m, shape (S, 3)."""
     residuals: Array
     """Marker of the model minus measured, m, shape (M, 3); NaN where missing."""
     covariance: Array
@@ -211,8 +211,8 @@ class LiveInverseKinematics:
     ) -> _Place:
         """Take the steps of one instant, starting from the last state extrapolated by `lead`.
 
-        `limits` are those of the steps, and of all evaluations in the instant.
-        The returned Cholesky factor is that of the start of the last step. The difference to the
+        `limits` are those of the steps, and of all evaluations in the instant. The returned
+        Cholesky factor was computed at the start of the last step. Its difference from that at the
         final state is far below the accuracy of a covariance.
         """
         steps, most = limits

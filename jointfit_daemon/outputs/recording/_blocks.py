@@ -54,7 +54,7 @@ class ChunkBlock(NamedTuple):
     """Position in the file, bytes."""
     end: int
     content: bytes
-    """Its records."""
+    """Records of the chunk."""
 
 
 class MetadataBlock(NamedTuple):

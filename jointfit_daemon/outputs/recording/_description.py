@@ -29,7 +29,7 @@ class RecordingInfo:
     part: int
     """Number of the file within its session, from 1."""
     rig: str
-    """``[rig] name``."""
+    """Name of the rig, ``[rig] name``."""
     began_with_daemon: bool
     """Whether the session contains every event since the start of the daemon."""
     unix_offset_ns: int

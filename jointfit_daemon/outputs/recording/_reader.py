@@ -66,7 +66,7 @@ class RecordedMessage(NamedTuple):
     """One message of a recording."""
 
     sequence: int
-    """Its number in the session; of a snapshot, that of the message after it."""
+    """Number of the message in the session; of a snapshot, that of the message after it."""
     channel: str
     t_ns: int
     """Arrival, CLOCK_MONOTONIC ns."""

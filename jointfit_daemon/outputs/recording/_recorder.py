@@ -100,9 +100,9 @@ class Recorder:
         self._limits = limits or RecordingLimits()
         self._report = report
         self._writing = asyncio.Lock()
-        """Held while the thread writes: one call at a time."""
+        """Lock that is held while the thread writes: one call at a time."""
         self._changing = asyncio.Lock()
-        """Held by a start or stop: each is answered with the state that it leaves."""
+        """Lock that is held by a start or stop: each is answered with the state that it leaves."""
         self._writer: SessionWriter | None = None
         self._snapshot = self._before = Snapshot()
         self._t_ns = time.monotonic_ns()

@@ -47,7 +47,7 @@ class RepairResult:
     """The clean file."""
     messages: int
     seconds: float
-    """From the first to the last message, s."""
+    """Time from the first to the last message, s."""
     gaps: tuple[RecordingGap, ...]
     """Missing messages before the end."""
     unreadable_bytes: int

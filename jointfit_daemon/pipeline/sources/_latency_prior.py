@@ -15,11 +15,11 @@ _NS_PER_MS = 1e6
 CAN_MS = (0.1, 0.1)
 """Mean and standard deviation on a CAN bus, ms: one CAN frame at 1 Mbit/s."""
 UART_MS = (0.2, 0.2)
-"""The same on a UART, ms."""
+"""Mean and standard deviation on a UART, ms."""
 USB_MS = (1.0, 0.7)
-"""The same on USB, ms: polled once a millisecond."""
+"""Mean and standard deviation on USB, ms: the host polls once a millisecond."""
 DATAGRAM_MS = (0.5, 0.5)
-"""The same for datagrams on a local network, ms."""
+"""Mean and standard deviation for datagrams on a local network, ms."""
 _USB_NAMES = ("usb", "acm")
 
 

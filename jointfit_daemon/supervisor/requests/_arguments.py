@@ -132,9 +132,9 @@ class RequestKind(NamedTuple):
     """One request that the daemon accepts."""
 
     model: type[RequestArguments]
-    """Its arguments."""
+    """Model of the arguments."""
     effect: str
-    """Its effect, in one sentence."""
+    """Effect of the request, in one sentence."""
 
 
 REQUESTS: dict[str, RequestKind] = {

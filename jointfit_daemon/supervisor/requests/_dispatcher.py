@@ -39,7 +39,7 @@ class _Transaction:
 
     request: Request
     reply: Reply | None = None
-    """None until the request is answered."""
+    """Answer to the request; None until it is answered."""
     repeated: list[ReplyAddress] = field(default_factory=list)
     """Addresses of repetitions that wait for the answer."""
 

@@ -113,7 +113,7 @@ class LagEstimate:
     sigma_ns: float
     """Standard deviation, ns, valid for correlated residuals and slowly varying stamp errors."""
     r2: float
-    """1 - sum |residual|² / sum |omega|²."""
+    """Coefficient of determination R², 1 - sum |residual|² / sum |omega|²."""
     refused: str | None
     """Reason for the rejection; None if the estimate is valid."""
     q_imu_ref: Quaternion = IDENTITY_ONE

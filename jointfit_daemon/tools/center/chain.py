@@ -52,7 +52,7 @@ class ChainJoint:
     name: str
     sides: Sequence[ChainSide]
     trajectory: JointTrajectory
-    """In the axes of the file."""
+    """Positions of the joint in the axes of the file."""
     faults: Sequence[str]
     """Segments without a frame that were expected to have one, each with the reason."""
 

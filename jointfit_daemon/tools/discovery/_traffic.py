@@ -63,9 +63,9 @@ class DecodedDevice:
     settings: dict[str, Any]
     """Keys of its table in rig.toml, without those of the connection."""
     messages: int
-    """Well-formed messages."""
+    """Number of well-formed messages."""
     samples: int
-    """Orientations."""
+    """Number of orientations."""
     rate_hz: float | None
     """Measured rate of the orientations, Hz; None if fewer than two arrived."""
     discarded_bytes: int

@@ -58,7 +58,7 @@ class FusedAngles:
     patent: Array
     """`PATENT_ANGLES` of `read_patent`, shape (n, 4)."""
     patent_gimbal: Array
-    """1 in gimbal lock of the patent's angles, else 0, shape (n,)."""
+    """Gimbal lock of the patent's angles, 1 or 0, shape (n,)."""
     convention: AngleConvention
     """Definition of `anatomical`."""
 

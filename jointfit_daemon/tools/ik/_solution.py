@@ -80,7 +80,7 @@ class TrialSolution:
     names: tuple[str, ...]
     is_angle: tuple[bool, ...]
     values: Array
-    """rad and m, shape (T, K); NaN where unknown."""
+    """Value of each coordinate, rad and m, shape (T, K); NaN where unknown."""
     sd: Array
     """Standard deviations, rad and m, shape (T, K); NaN where unknown."""
     marker_names: tuple[str, ...]

@@ -19,7 +19,7 @@ class KeyChoice:
     key: str
     values: tuple[Any, ...]
     help: str
-    """Its description."""
+    """Description of the key."""
 
     def meaning(self, value: Any) -> str:
         """Return the part of the description that begins with `value`; empty without one."""

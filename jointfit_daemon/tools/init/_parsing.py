@@ -106,7 +106,7 @@ def _device(given: Any, choices: Sequence[str]) -> str:
 
 
 def _choice(given: Any, choices: Sequence[str]) -> str:
-    if str(given) in choices:  # a value that is a number is not a number of the list
+    if str(given) in choices:  # before its position in the list, if it is a number
         return str(given)
     chosen = _device(given, choices)
     if chosen not in choices:

@@ -77,7 +77,7 @@ class RigView:
     last_events: dict[str, EventMessage] = field(default_factory=dict)
     """Newest event of each id."""
     events: deque[EventMessage] = field(default_factory=lambda: deque(maxlen=_MOST_EVENTS))
-    """Newest first."""
+    """Events, the newest first."""
     poses: deque[AngleSample] = field(default_factory=lambda: deque(maxlen=_MOST_SAMPLES))
     opticals: deque[AngleSample] = field(default_factory=lambda: deque(maxlen=_MOST_SAMPLES))
     faults: dict[str, str] = field(default_factory=dict)

@@ -101,7 +101,7 @@ class HubReport(NamedTuple):
     delay: int
     """Time from the base to the measurement, 100 us."""
     values: tuple[float, ...]
-    """In SI units, in the order of the table above."""
+    """Measured values in SI units, in the order of the table above."""
 
 
 def split_reports(payload: bytes) -> list[bytes] | None:

@@ -46,9 +46,9 @@ class CanFrame(NamedTuple):
     can_id: int
     """Identifier; the error classes of an error frame."""
     data: bytes
-    """At most 8 bytes."""
+    """Data bytes, at most 8."""
     extended: bool = False
-    """29-bit identifier."""
+    """Whether the identifier has 29 bits."""
     error: bool = False
     """An error frame of the controller or a note of the host, not a frame from the wire."""
     remote: bool = False

@@ -63,7 +63,7 @@ class SlcanLine(NamedTuple):
     """A line without a frame: an answer or a command."""
 
     letter: str
-    """Its first letter; ``""`` for a bare CR (done), ``"\\a"`` for BELL (refused)."""
+    """First letter of the line; ``""`` for a bare CR (done), ``"\\a"`` for BELL (refused)."""
     argument: str = ""
 
 

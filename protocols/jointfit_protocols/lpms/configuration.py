@@ -69,7 +69,7 @@ class CommandTable:
     generation: Generation
     models: str
     outputs: tuple[LpmsOutput, ...]
-    """In the order of a data packet."""
+    """Outputs in the order of a data packet."""
     rates_hz: tuple[int, ...]
     tick_hz: int
     """Usual unit of the device time, 1/s."""

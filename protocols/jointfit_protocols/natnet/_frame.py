@@ -27,9 +27,9 @@ SectionReader = Callable[[Cursor, int], tuple[Any, ...]]
 
 OLDEST: Version = (2, 5)
 TICKED: Version = (3, 0)
-"""From this bitstream on, frames contain server ticks; older ones are read by `_frame_2x`."""
+"""First bitstream whose frames contain server ticks; older frames are read by `_frame_2x`."""
 SIZED: Version = (4, 1)
-"""From this bitstream on, sections contain their size in bytes."""
+"""First bitstream whose sections contain their size in bytes."""
 
 BODY_TRACKED = 0x01
 MARKER_OCCLUDED = 0x01

@@ -63,7 +63,8 @@ class ServerInfo(NamedTuple):
     application: str
     application_version: Version4
     natnet_version: Version4
-    """Its first two numbers are the bitstream in use unless changed."""
+    """NatNet version of the server; its first two numbers are the bitstream in use unless
+    changed."""
     clock_hz: int | None
     """Ticks per second of the stamps in frames; None from a 2.x server."""
     data_port: int = 1511

@@ -152,7 +152,8 @@ class ModelDefinition(NamedTuple):
 
     descriptions: tuple[Description, ...]
     complete: bool = True
-    """False if an unknown type ended the decoding (below 4.1)."""
+    """Whether all descriptions were read; False if an unknown type ended the decoding (below
+    4.1)."""
 
 
 def decode_model(datagram: bytes, version: Version) -> ModelDefinition | CorruptBytes:

@@ -42,7 +42,7 @@ class CanSample(NamedTuple):
     t_ns: int
     """Stamp of its first frame."""
     values: tuple[float | None, ...]
-    """Its record; None for numbers of a missing frame."""
+    """Record of the sample; None for numbers of a missing frame."""
     data: tuple[bytes, ...]
     """Data of its frames; empty for a missing one."""
 

@@ -55,7 +55,7 @@ class Checksum(NamedTuple):
     """Whether bits are taken from the least significant one on."""
     xor_out: int = 0
     modulus: int = 256
-    """Of fletcher16: 256 or 255."""
+    """Modulus of fletcher16, 256 or 255."""
 
     @property
     def width(self) -> int:

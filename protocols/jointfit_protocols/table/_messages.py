@@ -11,9 +11,9 @@ class TableMessage(NamedTuple):
     """One sample as sent."""
 
     values: tuple[float, ...]
-    """Its record: counts of binary frames, numbers of text lines."""
+    """Record of the sample: counts of binary frames, numbers of text lines."""
     data: bytes
-    """Its bytes on the wire."""
+    """Bytes of the message on the wire."""
     end: int
     """Bytes fed to the codec up to and including its last one, for back-dating."""
 

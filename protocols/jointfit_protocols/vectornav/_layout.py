@@ -32,13 +32,13 @@ class Field(IntEnum):
     """Fields that are decoded, each ``group << 4 | bit``."""
 
     TIME_STARTUP = 0x00
-    """ns since power-up."""
+    """Time since power-up, ns."""
     YAW_PITCH_ROLL = 0x03
-    """Degrees."""
+    """Yaw, pitch and roll, degrees."""
     QUATERNION = 0x04
     """x, y, z, w: the scalar is the last one. Sensor to north-east-down."""
     ANGULAR_RATE = 0x05
-    """Compensated, rad/s."""
+    """Compensated angular rate, rad/s."""
     ACCELERATION = 0x08
     """Compensated specific force, m/s^2."""
     MAGNETIC_AND_PRESSURE = 0x0A

@@ -50,7 +50,7 @@ class TextMessage(NamedTuple):
     """One ASCII message with a valid checksum."""
 
     command: str
-    """Such as ``VNRRG``."""
+    """Name of the command, such as ``VNRRG``."""
     values: tuple[str, ...]
     """Values behind the command."""
     size: int

@@ -158,7 +158,8 @@ class StreamTimecode(NamedTuple):
     subframes: int
     subframes_per_frame: int
     standard: int
-    """0 PAL, 1 NTSC, 2 drop frame, 3 film, 4 NTSC film, 5 ATSC; 0xFFFFFFFF: none."""
+    """Video standard: 0 PAL, 1 NTSC, 2 drop frame, 3 film, 4 NTSC film, 5 ATSC; 0xFFFFFFFF:
+    none."""
     user_bits: int = 0
     field: int = 0
 

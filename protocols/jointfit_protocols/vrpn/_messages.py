@@ -74,7 +74,8 @@ class Cookie(NamedTuple):
     major: int = MAJOR
     minor: int = 38
     log_mode: int = 0
-    """0 to 3: whether the peer writes incoming (1) and outgoing (2) messages to a file."""
+    """Logging by the peer, 0 to 3: bit 0, it writes incoming messages to a file; bit 1, outgoing
+    ones."""
 
 
 class SenderDescription(NamedTuple):

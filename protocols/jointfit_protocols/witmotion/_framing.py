@@ -57,7 +57,7 @@ class WitMotionFrame(NamedTuple):
 
     kind: int
     data: bytes
-    """Eight bytes."""
+    """Eight bytes of data."""
     end: int = 0
     """Bytes fed to the codec up to and including the checksum, for back-dating."""
 

@@ -30,15 +30,16 @@ class WitMotionRegister(IntEnum):
     RATE = 0x03
     BAUD = 0x04
     MOUNTING = 0x23
-    """0 horizontal, 1 vertical."""
+    """Mounting: 0 horizontal, 1 vertical."""
     ALGORITHM = 0x24
-    """0 with magnetometer (nine axes), 1 without (six axes)."""
+    """Algorithm: 0 with magnetometer (nine axes), 1 without (six axes)."""
     READ = 0x27
-    """Written with the number of a register: request to read it and the next three."""
+    """Register of the read command: a register number written to it requests this register and the
+    next three."""
     VERSION = 0x2E
     """Firmware version."""
     KEY = 0x69
-    """Written with `_UNLOCKED`: writing is allowed for 10 s."""
+    """Register of the unlock command: `_UNLOCKED` written to it allows writing for 10 s."""
 
 
 _UNLOCKED = 0xB588

@@ -49,24 +49,25 @@ class Output(NamedTuple):
 
     data_id: int
     rate: int
-    """Hz; 0 or 0xFFFF is the highest possible rate."""
+    """Output rate, Hz; 0 or 0xFFFF is the highest possible rate."""
 
 
 class SyncSetting(NamedTuple):
     """One entry of the synchronisation settings; a list that is sent replaces the old one."""
 
     function: int
-    """3 trigger indication, 4 SyncOut, 8 send latest, 9 clock bias, 11 start sampling, 14 1PPS."""
+    """Function of the line: 3 trigger indication, 4 SyncOut, 8 send latest, 9 clock bias, 11 start
+    sampling, 14 1PPS."""
     line: int
     polarity: int
-    """1 rising, 2 falling, 3 both, 0 off."""
+    """Polarity: 1 rising, 2 falling, 3 both, 0 off."""
     once: int = 0
     skip_first: int = 0
     skip_factor: int = 0
     pulse_width: int = 0
-    """100 us, outputs only."""
+    """Width of the pulses of an output, 100 us."""
     delay: int = 0
-    """100 us; for clock bias estimation the reference period, ms."""
+    """Delay, 100 us; for clock bias estimation the reference period, ms."""
 
 
 class Firmware(NamedTuple):
@@ -83,7 +84,7 @@ class AlignmentRotation(NamedTuple):
     """A rotation that the device applies to its output."""
 
     frame: int
-    """0 sensor, 1 local (world)."""
+    """Frame of the rotation: 0 sensor, 1 local (world)."""
     q: tuple[float, float, float, float]
 
 

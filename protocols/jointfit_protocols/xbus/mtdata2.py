@@ -37,7 +37,7 @@ class Item(IntEnum):
     SAMPLE_TIME_FINE = 0x1060
     """U4, 100 us ticks."""
     SAMPLE_TIME_COARSE = 0x1070
-    """U4, s."""
+    """Time of the sample, U4, s."""
     QUATERNION = 0x2010
     """w x y z, sensor to world."""
     ROTATION_MATRIX = 0x2020
@@ -45,18 +45,18 @@ class Item(IntEnum):
     EULER_ANGLES = 0x2030
     """Roll, pitch, yaw, deg."""
     DELTA_V = 0x4010
-    """m/s."""
+    """Velocity increment of the interval, m/s."""
     ACCELERATION = 0x4020
     """Specific force, m/s^2."""
     FREE_ACCELERATION = 0x4030
-    """m/s^2, gravity removed, world coordinates."""
+    """Acceleration without gravity, world coordinates, m/s^2."""
     TRIGGER_IN1 = 0x4810
     """An edge on a sync input; only in the next message after it."""
     TRIGGER_IN2 = 0x4820
     GNSS_PVT = 0x7010
-    """94 bytes, not decoded."""
+    """Position, velocity and time of a GNSS receiver: 94 bytes, not decoded."""
     RATE_OF_TURN = 0x8020
-    """rad/s."""
+    """Angular rate, rad/s."""
     DELTA_Q = 0x8030
     """w x y z."""
     MAGNETIC_FIELD = 0xC020
@@ -94,7 +94,7 @@ class UtcTime(NamedTuple):
     minute: int
     second: int
     flags: int
-    """1 time of week valid, 2 week valid, 4 UTC valid."""
+    """Validity: 1 time of week valid, 2 week valid, 4 UTC valid."""
 
 
 class Trigger(NamedTuple):

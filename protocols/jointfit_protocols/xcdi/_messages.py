@@ -121,7 +121,7 @@ class XcdiIds(NamedTuple):
     status_word: int | None = int(DataId.STATUS_WORD)
     error: int | None = int(DataId.ERROR)
     extended: bool = False
-    """29-bit identifiers even where the numbers would fit 11 bits."""
+    """Whether identifiers have 29 bits even where the numbers would fit 11 bits."""
 
     def by_id(self) -> dict[tuple[int, bool], DataId]:
         """Return the content of each (identifier, is 29-bit)."""
@@ -162,7 +162,7 @@ class XcdiError(NamedTuple):
 
     t_ns: int
     code: int
-    """1: its output buffer overflowed, at least one frame is lost."""
+    """Error code; 1: its output buffer overflowed, at least one frame is lost."""
 
 
 XcdiMessage = XcdiGroup | XcdiError | CorruptBytes

@@ -68,7 +68,7 @@ class DataKind(StrEnum):
     RSSI = "W"
     """Signal strength of Wi-Fi, percent; power, dBm."""
     BUTTON = "O"
-    """1 pressed, 0 released."""
+    """State of the button: 1 pressed, 0 released."""
     STATUS = "U"
     """State of the orientation filter, as text."""
     NOTIFICATION = "N"

@@ -36,7 +36,7 @@ class RigChain(NamedTuple):
     """The limb as rig.toml describes it, from proximal to distal."""
 
     joints: tuple[str, ...]
-    """Empty for a branched limb."""
+    """Joints from proximal to distal; empty for a branched limb."""
     segments: tuple[str, ...]
     proximal: str | None = None
     distal: str | None = None

@@ -71,7 +71,8 @@ class RecordedSubject:
     """
 
     templates: Mapping[str, Array] = {}
-    """Empty: the reference of a recording is its bones."""
+    """Marker templates of rigid bodies; empty, because the reference of a recording is its
+    bones."""
     chain = LEG_CHAIN
     """Recordings are of legs."""
 

@@ -56,7 +56,7 @@ class SimulatedSubject:
     """
 
     visible_bones: tuple[str, ...] = ()
-    """Empty, because the cameras measure markers only."""
+    """Bones that the cameras stream; empty, because they measure markers only."""
 
     def __init__(
         self,

@@ -19,7 +19,7 @@ class VectorErrors:
     """Errors of one vector: measured = `matrix` true + `bias` + noise, limited to the range."""
 
     bias: Vector = (0.0, 0.0, 0.0)
-    """In the unit of the vector."""
+    """Bias in the unit of the vector."""
     matrix: Matrix = IDENTITY
     """Scale factors, non-orthogonality and soft iron."""
     noise_sd: float = 0.0

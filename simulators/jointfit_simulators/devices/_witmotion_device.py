@@ -71,7 +71,7 @@ class WitMotionDeviceOptions:
     """Settings in flash, and faults of a device."""
 
     content: int = FACTORY_CONTENT
-    """Register CONTENT."""
+    """Value of the register CONTENT."""
     rate_hz: int = 10
     baud: int | None = None
     """Speed of the device, bit/s; at another speed both sides receive garbage. None: any."""

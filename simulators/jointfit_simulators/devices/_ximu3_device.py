@@ -67,7 +67,7 @@ _MOST = {
     "ahrs_message_rate_divisor": 400, "inertial_message_rate_divisor": 400,
     "magnetometer_message_rate_divisor": 20, "serial_baud_rate": 12_000_000,
 }  # fmt: skip
-"""Largest values of numbers."""
+"""Largest value of each numeric setting."""
 _ACTIONS = ("apply", "save", "strobe", "heading")
 _ACCESSORY = 2
 """Serial mode in which an accessory occupies the serial interface."""
@@ -150,7 +150,7 @@ class XImu3Device(SerialDevice):
 
     @property
     def counter(self) -> int:
-        """Number of the next sample; it is not on the wire."""
+        """Number of the next sample; no message contains it."""
         return self._pushes
 
     @property

@@ -104,7 +104,7 @@ class ConnectedImu:
     keys: list[str]
     """Lines of its ``[[imu]]`` table, without id, segment, driver and rate_hz."""
     label: str
-    """Its port, or its bus and identifier."""
+    """Port of the sensor, or its bus and identifier."""
 
 
 @dataclass(frozen=True, slots=True)

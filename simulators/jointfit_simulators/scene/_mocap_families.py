@@ -38,7 +38,7 @@ class MocapServer(Protocol):
     """Virtual motion-capture server on loopback, whose port is open from the start."""
 
     ready: asyncio.Event
-    """Set while `run` answers."""
+    """Event that is set while `run` answers."""
     number: int
     """Number of the next frame."""
     command_port: int

@@ -145,7 +145,7 @@ def test_refinement_without_free_markers_is_rejected() -> None:
 
 def test_names_that_are_not_the_models_are_refused() -> None:
     nothing = replace(trial(), targets=np.full_like(trial().targets, np.nan))
-    assert "are the names the model's?" in refused(nothing)
+    assert "of the model's markers: check their names" in refused(nothing)
 
 
 def test_all_input_faults_are_reported_together() -> None:

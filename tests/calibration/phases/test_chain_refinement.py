@@ -182,7 +182,7 @@ def test_models_that_do_not_fit_are_refused_by_name() -> None:
 
     renamed = tuple(replace(m, name=f"X{m.name}") for m in true_model().markers)
     found = refine_chain(trials()[1], wanted(replace(true_model(), markers=renamed)), JobControl())
-    assert "are the names the model's" in found.notes[0]
+    assert "of the model's markers: check their names" in found.notes[0]
 
 
 def test_time_limit_ends_the_iteration_with_the_reason() -> None:

@@ -142,7 +142,7 @@ def test_a_marker_in_the_origin_of_a_trc_is_missing(tmp_path: Path) -> None:
     write_trc(tmp_path / "a.trc", MarkerTrajectories(("M",), frames / 100, frames, points, 100.0))
     found = read_marker_trial(tmp_path / "a.trc")
     assert np.isnan(found.points(["M"])[:, 0, 0]).tolist() == [False, True, False]
-    assert (found.up_axis, found.up_said_by) == ("y", "custom of the format")
+    assert (found.up_axis, found.up_said_by) == ("y", "convention of the format")
 
 
 def test_a_subjects_prefix_may_be_left_out_and_misspellings_are_met_halfway(
