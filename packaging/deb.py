@@ -62,6 +62,7 @@ SYSTEM_FILES = {
     "systemd/jointfitd@.service": "usr/lib/systemd/system",
     "systemd/70-jointfitd.rules": "usr/lib/udev/rules.d",
     "packaging/completions/jointfit.bash": "usr/share/bash-completion/completions",
+    "systemd/jointfitd-can.conf": "usr/share/jointfitd/systemd",
     "systemd/80-jointfit-can0.network": "usr/share/jointfitd/networkd",
     "systemd/mosquitto/jointfitd.conf": "usr/share/jointfitd/mosquitto",
     "systemd/mosquitto/jointfitd.acl": "usr/share/jointfitd/mosquitto",

@@ -18,6 +18,9 @@ echo force-unsafe-io > /etc/dpkg/dpkg.cfg.d/unsafe-io  # the disk is thrown away
 printf '[NetDev]\nName=can0\nKind=vcan\n' > /etc/systemd/network/80-can0.netdev
 dpkg -i jointfitd.deb
 cp /usr/share/jointfitd/networkd/80-jointfit-can0.network /etc/systemd/network/
+for unit in jointfitd jointfitd@; do
+    install -D -m 644 -t /etc/systemd/system/$unit.service.d /usr/share/jointfitd/systemd/jointfitd-can.conf
+done
 
 # A broker as docs/security.md sets it up: TLS with a CA of our own, passwords, the shipped rights.
 certs=/etc/mosquitto/certs

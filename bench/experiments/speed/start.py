@@ -79,7 +79,7 @@ def exposure_rows(quick: bool) -> list[Result]:
         words = [tool, "security", "--offline=yes", "--no-pager", str(unit)]
         said = subprocess.run(words, check=True, capture_output=True, text=True).stdout  # noqa: S603 - systemd's
         figure = float(said.partition("level for")[2].partition(":")[2].split()[0])
-        rows.append(timed_result(f"exposure of {unit.name}", figure, "of 10", 1.4, 1.4))
+        rows.append(timed_result(f"exposure of {unit.name}", figure, "of 10", 1.2, 1.2))
     return rows
 
 
