@@ -8,7 +8,7 @@ STAMP  := $(VENV)/.installed
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root faults endurance load fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom release vendor audit lock clean
+.PHONY: help install compiled demo test test-compiled test-experiments test-cameras test-cpu test-root faults endurance load fuzz test-vm lint types imports bench bench-full docs pictures wheel deb sbom release vendor audit lock mutation clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-12s %s\n", $$1, $$2}'
@@ -73,6 +73,13 @@ $(VENV)/.fuzz: $(STAMP)
 
 fuzz: $(VENV)/.fuzz  ## coverage-guided fuzzing of every input, 10^7 cases (an hour); ARGS="xbus-bytes --seconds 60"
 	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.fuzz $(ARGS)
+
+$(VENV)/.mutation: $(STAMP)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --group mutation
+	@touch $@
+
+mutation: $(VENV)/.mutation  ## do tests notice small changes of protocols, timing, fusion and calibration record: 300 mutants (hours); ARGS="--mutants 20"
+	@OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.mutation $(ARGS)
 
 lint: $(STAMP)  ## ruff: rules and format
 	@$(BIN)/ruff check .

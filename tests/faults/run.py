@@ -16,6 +16,8 @@ from tests.endurance.slopes import table_of
 from tests.faults.gateway import running_gateway
 from tests.load.table import RESULTS as LOAD
 from tests.load.table import table_of as load_table_of
+from tests.mutation.score import RESULTS as MUTATION
+from tests.mutation.score import table_of as mutation_table_of
 
 if TYPE_CHECKING:
     from tests.broker_fixture import Broker
@@ -138,7 +140,15 @@ def render(results: dict[str, Any]) -> str:
     load = json.loads(LOAD.read_text("utf-8"))
     page = page.replace("{minutes}", f"{load['seconds'] / 60.0:g}")
     page = page.replace("{load}", load_table_of(load))
+    page = page.replace("{mutation}", _mutation())
     return page.replace("{slopes}", table_of(endurance))
+
+
+def _mutation() -> str:
+    """Return the table of the stored mutants, if there are any."""
+    if not MUTATION.exists():
+        return "No complete run is stored yet."
+    return mutation_table_of(json.loads(MUTATION.read_text("utf-8")))
 
 
 def stored() -> dict[str, Any]:
