@@ -23,7 +23,8 @@ from typing_extensions import override  # typing has it from Python 3.12
 if TYPE_CHECKING:
     from pathlib import Path
 
-HOST = "127.0.0.1"
+HOST = os.environ.get("JOINTFIT_TEST_HOST", "127.0.0.1")
+"""Address of the loopback; a machine without IPv4 has ``::1`` only."""
 MOSQUITTO_MISSING = "mosquitto is not installed (Debian: apt install mosquitto)"
 CHOICE = "JOINTFIT_TEST_BROKER"
 """Environment variable with the broker for tests that need no particular one."""
@@ -31,10 +32,15 @@ CHOICE = "JOINTFIT_TEST_BROKER"
 
 def free_port() -> int:
     """Return a TCP port of the loopback that nobody listens on just now."""
-    with socket.socket() as probe:
+    with socket.socket(socket.AF_INET6 if ":" in HOST else socket.AF_INET) as probe:
         probe.bind((HOST, 0))
         port: int = probe.getsockname()[1]
         return port
+
+
+def address(port: int) -> str:
+    """Return a port of the loopback as ``host:port``."""
+    return f"[{HOST}]:{port}" if ":" in HOST else f"{HOST}:{port}"
 
 
 def wait_for_listener(port: int, within_s: float = 5.0) -> None:
@@ -176,7 +182,7 @@ max_segment_count = 10
         listener = """
 [{section}.1]
 name = "{section}"
-listen = "127.0.0.1:{port}"
+listen = "{address}"
 next_connection_delay_ms = 1
 [{section}.1.connections]
 connection_timeout_ms = 60000
@@ -186,8 +192,8 @@ dynamic_filters = true
 """
         return (
             router
-            + listener.format(section="v4", port=self._port_of_3_1_1)
-            + listener.format(section="v5", port=self.port)
+            + listener.format(section="v4", address=address(self._port_of_3_1_1))
+            + listener.format(section="v5", address=address(self.port))
         )
 
 

@@ -26,7 +26,7 @@ from jointfit_daemon.calibration.record import CalibrationStore
 from jointfit_daemon.config import load_rig
 from jointfit_daemon.tools.child_processes import ChildProcess, daemon
 from jointfit_simulators.devices import XbusDevice
-from tests.broker_fixture import free_port
+from tests.broker_fixture import HOST, address, free_port
 from tests.faults.hardware import Cameras, CanSensor
 from tests.limb_model.plain_calibration import plain_calibration
 from tests.system.station import Listener, broker, sensors_in
@@ -59,12 +59,12 @@ segment = "thigh"
 driver = "xbus"
 port = "{folder}/S2"
 [mqtt]
-host = "127.0.0.1"
+host = "{host}"
 port = {port}
 base = "{base}"
 health_s = 0.2
 [metrics]
-listen = "127.0.0.1:{metrics}"
+listen = "{metrics}"
 [recording]
 directory = "{folder}/recordings"
 """
@@ -274,7 +274,7 @@ class Gateway:
         self.broker.stop()
         port = self.broker.port
         try:
-            async with await asyncio.start_server(serve, "127.0.0.1", port, reuse_address=True):
+            async with await asyncio.start_server(serve, HOST, port, reuse_address=True):
                 yield
         finally:
             self.broker.start()
@@ -368,7 +368,7 @@ class Gateway:
         assert answer["status"] == "ok", answer
 
     async def _metrics(self) -> bytes:
-        reader, writer = await asyncio.open_connection("127.0.0.1", self.metrics_port)
+        reader, writer = await asyncio.open_connection(HOST, self.metrics_port)
         try:
             writer.write(b"GET /metrics HTTP/1.0\r\n\r\n")
             return await reader.read()
@@ -412,7 +412,9 @@ async def running_gateway(
 ) -> AsyncIterator[Gateway]:
     """Yield a gateway whose sensors contribute to poses."""
     metrics, cameras = free_port(), Cameras() if kind == "all" else None
-    text = RIG.format(folder=folder, port=chosen.port, base=BASE, metrics=metrics)
+    text = RIG.format(
+        folder=folder, host=HOST, port=chosen.port, base=BASE, metrics=address(metrics)
+    )
     if cameras is not None:
         text += MORE.format(folder=folder, mocap=cameras.server.command_port)
     (folder / "rig.toml").write_text(text, encoding="utf-8")

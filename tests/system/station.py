@@ -27,6 +27,7 @@ from jointfit_daemon.tools.calibrate import PhaseTracker
 from jointfit_daemon.tools.child_processes import ChildProcess, Simulator
 from jointfit_daemon.tools.child_processes import daemon as daemon_child
 from jointfit_daemon.tools.child_processes import simulator as simulator_child
+from tests.broker_fixture import HOST
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Collection
@@ -51,7 +52,7 @@ FIT_PATIENCE_S = 150.0
 
 def broker(port: int, base: str = BASE) -> MqttSettings:
     """Return the settings of a client of the test's broker."""
-    return MqttSettings(host="127.0.0.1", port=port, base=base)
+    return MqttSettings(host=HOST, port=port, base=base)
 
 
 def load_factor() -> float:
