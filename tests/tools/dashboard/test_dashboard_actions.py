@@ -126,6 +126,17 @@ async def test_the_check_of_axes_names_the_axis_and_the_angle_of_a_turned_sensor
         await page.page.wait_for_function("() => !document.querySelector('.card.turned')")
 
 
+async def test_the_check_of_axes_continues_after_a_loss_of_the_broker(broker: Broker) -> None:
+    async with shown(broker, PublishedRig()) as page:
+        await page.show("sensors")
+        await page.until_text("#view-sensors .lead", "Up in the drawing")
+        broker.stop()
+        await page.until_text("#main-action", "Reconnect")
+        await page.until_text("#view-sensors .lead", "Waiting for the orientations")
+        broker.start()
+        await page.until_text("#view-sensors .lead", "Up in the drawing")
+
+
 STEPS = [
     "Lay S1 flat, its z axis up, and let go.",
     "Turn it on the table by a quarter turn, counter-clockwise seen from above, and let go.",

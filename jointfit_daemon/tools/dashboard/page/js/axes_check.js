@@ -31,7 +31,7 @@ export function createAxesCheck(store, link) {
   store.on("sensors", update);
   setInterval(() => { if (visible) updateNote(); }, 500);
   const updateNote = () => {
-    setText(note, noteOf(store, shownMs));
+    setText(note, noteOf(store, link, shownMs));
     zero.hidden = !isFresh(store);
   };
   return {
@@ -52,11 +52,11 @@ function isFresh(store) {
   return store.sensorsReceivedMs !== null && performance.now() - store.sensorsReceivedMs < STALE_MS;
 }
 
-function noteOf(store, shownMs) {
+function noteOf(store, link, shownMs) {
   if (isFresh(store)) {
     return "Turn one sensor by hand about one of the axes printed on its housing, for example by 90° about x. The drawing must turn the same way, and the line below it must name the same axis, sign and angle. Up in the drawing is up in the room.";
   }
-  if (performance.now() - shownMs < STALE_MS) return "Waiting for the orientations of the sensors.";
+  if (link.state !== "connected" || performance.now() - Math.max(shownMs, link.sinceMs) < STALE_MS) return "Waiting for the orientations of the sensors.";
   return "Orientations of single sensors are not published. To see their axes, set sensors_hz = 10 under [mqtt] in rig.toml and reload the daemon.";
 }
 

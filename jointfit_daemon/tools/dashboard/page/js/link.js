@@ -40,6 +40,8 @@ export function createLink(configuration, handlers) {
     client: null,
     /** Topics that the broker refused to pass on, from the answer to the subscription. */
     refused: new Set(),
+    /** Topics that a view asked for, beside those of every page. */
+    wanted: new Set(),
     closeCode: 0,
     closeReason: "",
     opened: false,
@@ -62,12 +64,18 @@ export function createLink(configuration, handlers) {
     link.connect();
   };
   link.choose = (base) => {
-    if (link.base !== null) link.client?.unsubscribe(TOPICS.map((topic) => `${link.base}/${topic}`));
+    if (link.base !== null) link.client?.unsubscribe(topicsOf(link));
     link.base = base;
     if (link.client?.connected) subscribe(link);
   };
-  link.subscribe = (topic) => link.client?.connected && link.client.subscribe(`${link.base}/${topic}`);
-  link.unsubscribe = (topic) => link.client?.connected && link.client.unsubscribe(`${link.base}/${topic}`);
+  link.subscribe = (topic) => {
+    link.wanted.add(topic); // again after each connection
+    if (link.client?.connected && link.base !== null) link.client.subscribe(`${link.base}/${topic}`);
+  };
+  link.unsubscribe = (topic) => {
+    link.wanted.delete(topic);
+    if (link.client?.connected && link.base !== null) link.client.unsubscribe(`${link.base}/${topic}`);
+  };
   link.publish = (topic, text, options) => link.client.publishAsync(`${link.base}/${topic}`, text, options);
 
   addEventListener("offline", () => change("lost", lossReason(link, configuration) ?? INTERRUPTED));
@@ -167,9 +175,11 @@ function addressFault(websocket) {
   return `Pages of https:// cannot connect to ${websocket}. Start the dashboard with --broker wss://HOST/PATH or mqtt://HOST:PORT.`;
 }
 
+const topicsOf = (link) => [...TOPICS, ...link.wanted].map((topic) => `${link.base}/${topic}`);
+
 function subscribe(link) {
   link.refused.clear();
-  const topics = link.base === null ? DISCOVERY : TOPICS.map((topic) => `${link.base}/${topic}`);
+  const topics = link.base === null ? DISCOVERY : topicsOf(link);
   link.client.subscribe(topics, { qos: 0 }, (error, granted, packet) => {
     const codes = (packet ?? error?.packet)?.granted ?? [];
     topics.forEach((topic, i) => { if (codes[i] >= 128 && link.base !== null) link.refused.add(topic); });
