@@ -79,7 +79,7 @@ class ClusterPose:
         if columns is None:
             return None
         if self._cluster.body is None:
-            return self._fit_markers(frame.markers.take(columns, axis=0).tolist())
+            return self._fit_markers(_vectors(frame.markers.take(columns, axis=0)))
 
         column = columns[0]
         x, y, z = position = frame.body_positions[column].tolist()
@@ -137,8 +137,13 @@ class ClusterPose:
             return None
         mean = template.mean(axis=0)
         centered = template - mean
-        offsets = (self._offsets - mean).tolist()
-        return _MarkerSubset(rows, centered.tolist(), offsets, float((centered**2).sum()))
+        offsets = _vectors(self._offsets - mean)
+        return _MarkerSubset(rows, _vectors(centered), offsets, float((centered**2).sum()))
+
+
+def _vectors(rows: Array) -> list[Vector]:
+    """Return the rows of an array as tuples, which compiled code requires."""
+    return [(x, y, z) for x, y, z in rows.tolist()]
 
 
 def _columns(cluster: MarkerCluster, layout: MocapLayout) -> list[int] | None:

@@ -56,6 +56,13 @@ def test_pose_agrees_with_the_fit_of_a_trial(
         np.testing.assert_allclose(rotation.to_matrix(found.q), rotation.to_matrix(q), atol=1e-6)
 
 
+def test_markers_are_tuples_as_compiled_code_requires() -> None:
+    pose = ClusterPose(cluster(np.eye(5, 3)), POINT[None], LAYOUT)
+    subset = pose._all
+    assert subset is not None
+    assert {type(row) for row in (*subset.centered, *subset.offsets)} == {tuple}
+
+
 def test_rigid_body_moves_the_points() -> None:
     part = cluster(np.eye(3), body="Pelvis")
     frame = seen(np.zeros((5, 3)))
