@@ -187,6 +187,13 @@ def test_newer_messages_of_the_other_servers_are_named() -> None:
     (text,) = [text for text in vicon_seen.texts("warning") if UPDATE in text]
     assert "sends objects 77, 78," in text
 
+    older = vicon_feeder.ready()
+    latency = vicon.OpaqueObject(vicon.ObjectId.LATENCY_INFO, b"\1\0\0\0")
+    (frame,) = older.frames(vicon_feeder.frame(1, latency, vicon_feeder.segments(1, 100, 200, 300)))
+    assert frame.body_positions[0].tolist() == [0.1, 0.2, 0.3]
+    (text,) = [text for text in older.texts("warning") if UPDATE in text]
+    assert "object 26 in a shorter layout" in text
+
 
 def test_corrupt_messages_that_pass_a_checksum_are_not_reported() -> None:
     newer = NewerFirmwareDetector(NewestKnown((1,), "MT Manager"))

@@ -110,6 +110,9 @@ class ViconDecoder:
                 if newer := sorted(item.ids - _KNOWN_IDS):
                     content = f"objects {list_names(list(map(str, newer)))}"
                     out += self._newer.take_unknown(content, chunk.t_ns)
+            elif isinstance(item, vicon.OpaqueObject) and item.id in vicon.OPTIONAL:
+                content = f"object {item.id} in a shorter layout"
+                out += self._newer.take_unknown(content, chunk.t_ns)
         self._take_static(packet.objects, out)
         number = _first(packet.objects, vicon.FrameInfo)
         if number is not None:

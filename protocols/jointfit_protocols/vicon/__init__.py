@@ -34,12 +34,14 @@ from jointfit_protocols.vicon._messages import (
     SubjectInfo,
     ViconPing,
 )
+from jointfit_protocols.vicon._objects import OPTIONAL
 from jointfit_protocols.vicon._packets import Packet, ViconStream, decode, encode
 
 __all__ = [
     "DYNAMIC",
     "HEADER",
     "LARGEST_PACKET",
+    "OPTIONAL",
     "PACKET",
     "REQUESTS",
     "STATIC",

@@ -58,6 +58,12 @@ _NO_COVARIANCE = (0.0,) * 9
 _EMPTY_STRING = 4
 """Bytes of a string without text."""
 
+OPTIONAL = frozenset((
+    ObjectId.STREAM_INFO, ObjectId.TIMECODE, ObjectId.LATENCY_INFO, ObjectId.HARDWARE_FRAME,
+    ObjectId.APPLICATION_INFO, ObjectId.FRAME_RATES, ObjectId.OBJECT_QUALITY, ObjectId.PING,
+))  # fmt: skip
+"""Objects without which poses and markers are known: servers of other versions may lack a part."""
+
 
 class _BodyError(Exception):
     """A body ends before its content; does not leave this module."""
@@ -108,13 +114,18 @@ class _Cursor:
 
 
 def decode_object(kind: int, data: memoryview) -> Object | str:
-    """Return the object with an id, or the reason for which its body is corrupt."""
+    """Return the object with an id, or the reason for which its body is corrupt.
+
+    An optional object with a shorter body than known is opaque.
+    """
     read = _READERS.get(kind)
     if read is None:
         return OpaqueObject(kind, bytes(data))
     try:
         return read(_Cursor(data))
     except _BodyError as error:
+        if kind in OPTIONAL:
+            return OpaqueObject(kind, bytes(data))
         return f"object {kind}: {error}"
 
 
