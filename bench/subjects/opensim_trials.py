@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 GAIT, OPENCAP = "opensim_gait2354", "opencap_subject4"
 _WALK_S = (0.4, 1.6)
+_LEGS = ("pelvis", "femur", "tibia", "talus", "calcn", "toes")
+_STATIC, _STATIC_STEP = "static1", 10
 _STEPS = {"walking1": 1, "squats1": 10, "DJ1": 2, "STS1": 10}
 """Interval of the training frames; evaluation uses fewer."""
 
@@ -74,6 +76,23 @@ def gait2354(data: Path) -> OpensimSubject:
         positions=whole.positions[some],
     )
     return OpensimSubject(model, names, {"walk1": walk}, {"walk1": walk})
+
+
+def opencap_legs(data: Path) -> OpensimSubject:
+    """Return OpenCap subject 4 with the 30 markers of pelvis and legs, and with a static pose."""
+    whole = opencap(data)
+    keep = [i for i, m in enumerate(whole.chain().markers) if m.segment.startswith(_LEGS)]
+    names = tuple(whole.names[i] for i in keep)
+    static = data / OPENCAP / "trc" / f"{_STATIC}.trc"
+
+    def of_legs(trials: Mapping[str, MarkerTrajectories]) -> dict[str, MarkerTrajectories]:
+        return {
+            name: replace(trial, names=names, positions=trial.positions[:, keep])
+            for name, trial in trials.items()
+        }
+
+    training = {**of_legs(whole.trials), _STATIC: trial_frames(static, names, _STATIC_STEP)}
+    return OpensimSubject(whole.model, names, training, of_legs(whole.judged))
 
 
 def opencap(data: Path, coarser: int = 2, *, computed: bool = False) -> OpensimSubject:
