@@ -63,8 +63,8 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     movement : Movement or ndarray
         An array, shape (n, k, d) or (n, d), stands for `Movement` with these points only.
     method : str
-        A key of `METHODS`, or ``auto``: in a plane ``geometric``; ``score`` if the markers and the
-        poses of both bodies are known, or no points but both poses; otherwise ``sphere``.
+        A key of `METHODS`, or ``auto``: ``geometric`` in a plane; ``score`` if the poses of both
+        bodies are known, with the markers of both or without `points`; otherwise ``sphere``.
 
     Returns
     -------

@@ -61,8 +61,7 @@ class RefinementSettings:
     limit_m2: float = 1.0
     """Weight, m^2/rad^2, of a hinge's excess over its limits, where the model has limits."""
     holdout_share: float = 0.0
-    """Last share of every training trial that only decides when to stop; 0: all frames are
-    fitted."""
+    """Share of every training trial, at its end, that is not fitted but decides when to stop."""
     tolerance: float | None = None
     """Relative decrease of F that ends the iteration; None: the default of the method."""
     search: SearchSettings = field(default_factory=SearchSettings)

@@ -55,7 +55,8 @@ class MarkerTrial:
         if not unknown:
             return self.trajectories.positions[:, [at for at in wanted if at is not None]]
 
-        # Name the nearest markers of each, and all once. Requested markers are not candidates.
+        # Propose markers similar to each unknown name, then list all. None that was requested is
+        # proposed.
         taken = set(names)
         free = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
         spellings = [*free, *map(_bare, free)]
@@ -70,7 +71,7 @@ class MarkerTrial:
     def residuals(self, names: Sequence[str]) -> NDArray[np.float64] | None:
         """Return the residuals of the cameras by known names, m, shape (n, len(names)).
 
-        None if the file has none; NaN where it states none.
+        None if the file contains no residuals; NaN where one is missing.
         """
         found = self.trajectories.residuals
         wanted = [self._index(name) for name in names]

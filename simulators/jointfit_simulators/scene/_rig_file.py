@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.body import RigChain
 
 _SHORTEST_S = 45.0
-"""Shortest functional phase, s, unless the longest is shorter: the default of the daemon."""
+"""Default of ``functional_min_s`` in the daemon, s; limited to the duration of the phase."""
 
 
 @dataclass(frozen=True, slots=True)
