@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration
     from jointfit_daemon.model import Quaternion
+    from jointfit_simulators.body import LegGeometry
 
 NS = 1_000_000_000
 MOVES = {
@@ -56,11 +57,15 @@ class Phases:
 @cache
 def phases(seed: int = 1, rate_hz: float = 100.0, limb: str = "leg") -> Phases:
     """Return the trials of one wearer: 22 s of plate, 7 s of standing, 60 s of movement."""
-    knobs = Knobs(seed=seed, rate_hz=rate_hz)
-    moves = MOVES[limb]
+    return phases_of(Knobs(seed=seed, rate_hz=rate_hz), limb)
+
+
+def phases_of(knobs: Knobs, limb: str = "leg", geometry: LegGeometry | None = None) -> Phases:
+    """Return the trials of a wearer with other magnitudes of errors or other bones."""
+    rate_hz, moves = knobs.rate_hz, MOVES[limb]
     steps = [Step("plate", PLATE_S), Step("stand", STAND_S)]
     steps += [Step(name, FUNCTIONAL_S / len(moves)) for name in moves]
-    wearer = SimulatedSubject(knobs, steps, limb=limb)
+    wearer = SimulatedSubject(knobs, steps, limb=limb, geometry=geometry)
     end_s = PLATE_S + STAND_S + FUNCTIONAL_S
     imu_s = np.arange(0.0, end_s, 1 / rate_hz)
     camera_s = np.arange(0.0, end_s, 1 / knobs.mocap_hz)

@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Rig
     from jointfit_daemon.limb_model import Calibration, Method
     from jointfit_daemon.model import LimbState, Quaternion
+    from jointfit_simulators.body import LegGeometry
 
 SEEDS = tuple(range(1, 9))
 """The first one is the subject of the demo."""
@@ -80,11 +81,16 @@ class Errors:
 
 
 def wear_live(seed: int) -> Live:
-    knobs = Knobs(seed=seed)
-    still = SimulatedSubject(knobs, [Step("stand", 9.0)]).observe(
+    return live_of(Knobs(seed=seed))
+
+
+def live_of(knobs: Knobs, geometry: LegGeometry | None = None) -> Live:
+    """Return the live part of a subject with these magnitudes of errors and bones."""
+    still = SimulatedSubject(knobs, [Step("stand", 9.0)], geometry=geometry).observe(
         [np.empty(0)] * 4, np.empty(0), _STILL_S
     )
-    wearer = SimulatedSubject(knobs, [Step("stand", BEGIN_S), *(Step(*motion) for motion in LIVE)])
+    steps = [Step("stand", BEGIN_S), *(Step(*motion) for motion in LIVE)]
+    wearer = SimulatedSubject(knobs, steps, geometry=geometry)
     end_s = BEGIN_S + sum(seconds for _, seconds in LIVE)
     t_s = np.arange(BEGIN_S, end_s, 1 / RATE_HZ)
     seen = wearer.observe([t_s] * len(SENSORS), np.empty(0), t_s)
@@ -201,7 +207,7 @@ def _row(method: Method) -> Callable[[Path], list[Result]]:
             Result("knee, subject of the demo", errors[0].knee, goal),
         ]
         for name in ("knee", "thigh", "shank"):
-            figures += _spread(name, [getattr(each, name) for each in errors])
+            figures += spread(name, [getattr(each, name) for each in errors])
         for name, ideal in (("within_1_sd", 0.68), ("within_2_sd", 0.95)):
             share = float(np.mean([getattr(each, name) for each in errors]))
             label = f"knee {name.replace('_', ' ')} (ideal {ideal})"
@@ -216,11 +222,11 @@ def centers(_: Path) -> list[Result]:
     errors = people()["anchored"]
     figures: list[Result] = []
     for joint in ("hip", "knee", "ankle"):
-        figures += _spread(joint, [each.centers_mm[joint] for each in errors], "mm")
+        figures += spread(joint, [each.centers_mm[joint] for each in errors], "mm")
     return figures
 
 
-def _spread(name: str, values: list[float], unit: str = "deg") -> list[Result]:
+def spread(name: str, values: list[float], unit: str = "deg") -> list[Result]:
     nothing = float("inf")
     return [
         Result(f"{name}, median", float(np.median(values)), nothing, unit=unit),
