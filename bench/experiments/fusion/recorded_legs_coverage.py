@@ -114,8 +114,9 @@ LONG_AXIS = (
 )
 SHORT = "the first 60 % of this movement do not show the error of the rest"
 APART = (
-    "the variance grows with the distance from the training range alone; a term for the difference "
-    "of the two corrections widens it here, but its form must not be chosen on these recordings"
+    "the variance grows with the distance from the training range alone; growth with the sensor "
+    "disagreement, selected on simulated subjects, widens it here, and makes the share of "
+    "flexion-coverage-recorded within 1 sd too large"
 )
 MISSES = {
     "later parts, fitted, walking1: thigh": SHORT,
