@@ -59,6 +59,7 @@ def main() -> int:
     known = _reviewed()
     end_s = time.monotonic() + 60 * options.minutes
     found: list[dict[str, Any]] = []
+    results = {"seed": options.seed, "mutants": found}
     unchanged: set[tuple[str, ...]] = set()
     for package, mutant in sample(options.mutants, options.seed):
         tests = tests_of(mutant.path, package)
@@ -81,7 +82,6 @@ def main() -> int:
         print(
             f"{len(found):4} {outcome:10} {name}:{mutant.line}: {before}  ->  {after}", flush=True
         )
-        results = {"seed": options.seed, "mutants": found}
         if options.store:
             RESULTS.write_text(json.dumps(results, indent=1) + "\n", "utf-8")
         if time.monotonic() > end_s:
@@ -147,7 +147,7 @@ def run_tests(tests: tuple[str, ...], mutant: Mutant | None = None) -> int:
 
 def _wait(child: int) -> int:
     """Wait for the tests, and kill them with their processes when their time is over."""
-    end_s = time.monotonic() + WALL_S
+    end_s, status = time.monotonic() + WALL_S, 0
     while time.monotonic() < end_s:
         ended, status = os.waitpid(child, os.WNOHANG)
         if ended:
@@ -168,7 +168,7 @@ def _replace(path: Path, source: str) -> None:
             return compile(source, str(path), "exec", dont_inherit=True)
         return original(self, fullname)
 
-    importlib.machinery.SourceFileLoader.get_code = get_code  # type: ignore[method-assign]
+    importlib.machinery.SourceFileLoader.get_code = get_code  # type: ignore[method-assign,assignment]  # of its own loader only
 
 
 sys.exit(main())
