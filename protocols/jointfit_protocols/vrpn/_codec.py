@@ -44,7 +44,8 @@ from jointfit_protocols.vrpn._messages import (
 COOKIE_BYTES = 24
 HEADER_BYTES = HEADER.size
 _MAGIC = b"vrpn: ver. "
-_COOKIE = re.compile(rb"vrpn: ver\. (\d\d)\.(\d\d)  ([0-3])\0{5}", re.DOTALL)
+_COOKIE = re.compile(rb"vrpn: ver\. (\d\d)\.(\d\d)  ([0-3])\0.{4}", re.DOTALL)
+"""The reference implementation does not initialize the last four bytes."""
 _FIRST = int.from_bytes(_MAGIC[:4], "big")
 """Length field that the first bytes of a cookie look like."""
 _US = 1_000_000

@@ -168,6 +168,10 @@ def test_the_number_of_a_type_belongs_to_the_peer() -> None:
     assert decoded(described, encode(SAMPLE, types))[1] == SAMPLE
 
 
+def test_a_cookie_may_end_with_memory_that_the_server_did_not_initialize() -> None:
+    assert decoded(COOKIE[:20] + b"\x7f\x0a\xfe.", DESCRIBED)[0] == Cookie(7, 38, 0)
+
+
 def test_a_cookie_forgets_the_peer_before() -> None:
     codec = VrpnCodec()
     codec.feed(COOKIE + DESCRIBED + THIGH)
