@@ -61,8 +61,10 @@ _EMPTY_STRING = 4
 OPTIONAL = frozenset((
     ObjectId.STREAM_INFO, ObjectId.TIMECODE, ObjectId.LATENCY_INFO, ObjectId.HARDWARE_FRAME,
     ObjectId.APPLICATION_INFO, ObjectId.FRAME_RATES, ObjectId.OBJECT_QUALITY, ObjectId.PING,
+    ObjectId.SUBJECT_INFO,
 ))  # fmt: skip
-"""Objects without which poses and markers are known: servers of other versions may lack a part."""
+"""Objects without which poses or markers of other subjects are known: servers of other versions may
+lack a part."""
 
 
 class _BodyError(Exception):
@@ -109,6 +111,11 @@ class _Cursor:
         return raw.split(b"\0", 1)[0].decode("utf-8", "replace")
 
     @property
+    def ended(self) -> bool:
+        """Whether the whole body has been read."""
+        return not self._left
+
+    @property
     def _left(self) -> int:
         return len(self._data) - self._at
 
@@ -138,11 +145,13 @@ def _subject(cursor: _Cursor) -> SubjectInfo:
     for _ in range(cursor.count(_SEGMENT_INFO.size + _EMPTY_STRING)):
         parent, segment = cursor.take(_SEGMENT_INFO)
         segments.append(SegmentInfo(int(parent), int(segment), cursor.text()))
+    # Servers of other versions end the object before the markers or before their attachments.
     markers = [
         MarkerInfo(cursor.integer(), cursor.text())
-        for _ in range(cursor.count(_U32.size + _EMPTY_STRING))
+        for _ in range(0 if cursor.ended else cursor.count(_U32.size + _EMPTY_STRING))
     ]
-    attached = tuple((int(marker), int(segment)) for marker, segment in cursor.items(_PAIR))
+    pairs = () if cursor.ended else cursor.items(_PAIR)
+    attached = tuple((int(marker), int(segment)) for marker, segment in pairs)
     return SubjectInfo(number, name, tuple(segments), tuple(markers), attached)
 
 

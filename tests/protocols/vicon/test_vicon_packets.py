@@ -121,6 +121,14 @@ def test_an_optional_object_of_another_server_version_leaves_the_others_readable
     assert decoded == vicon.Packet((vicon.ApplicationInfo(1) if known else short, frame))
 
 
+def test_a_subject_without_attachments_or_markers_is_read() -> None:
+    subject = vicon.SubjectInfo(1, "Leg", (vicon.SegmentInfo(0, 1, "Thigh"),), (), ())
+    body = struct.pack("<II3sI2I24xI5s", 1, 3, b"Leg", 1, 0, 1, 5, b"Thigh")
+    assert vicon.decode(vicon.encode(vicon.OpaqueObject(ObjectId.SUBJECT_INFO, body))) == (
+        vicon.Packet((subject,))
+    )
+
+
 def test_fields_that_newer_servers_append_are_ignored() -> None:
     body = struct.pack("<I", 7) + b"more"
     packet = vicon.encode(vicon.OpaqueObject(ObjectId.FRAME_INFO, body))
