@@ -3,11 +3,11 @@
 A truncated file yields the packets before the cut.
 
 Supported: little- and big-endian files, several sections and interfaces, microsecond to nanosecond
-timestamps, Ethernet (with VLAN tags), Linux cooked, loopback and raw IP links, IPv4 with reassembly
-of fragments. Everything else in the file is skipped. Time stamps are those of the file, ns since
-1970.
+timestamps, Ethernet (with VLAN tags), Linux cooked, loopback and raw IP links, IPv4 and IPv6 with
+reassembly of fragments. Everything else in the file is skipped. Time stamps are those of the file,
+ns since 1970.
 
-Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791; RFC 9293.
+Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791; RFC 8200; RFC 9293.
 """
 
 from __future__ import annotations
@@ -36,15 +36,19 @@ _LINK_HEADS = {
     108: (4, None),
     101: (0, None),
     228: (0, None),
+    229: (0, None),
     113: (16, 14),
     276: (20, 0),
 }
 """Number of bytes before the IP header, and offset of the EtherType in them (None: the link has
 none), by link type."""
 _ETHERNET = 1
-_IPV4, _VLAN = 0x0800, (0x8100, 0x88A8)
+_IP, _VLAN = (b"\x08\x00", b"\x86\xdd"), (0x8100, 0x88A8)
 _TCP, _UDP = 6, 17
-_IP_VERSION, _IP_HEAD = 4, 20
+_IPV4_HEAD, _IPV6_HEAD = 20, 40
+_HOP_OPTIONS, _ROUTING, _FRAGMENT, _TARGET_OPTIONS = 0, 43, 44, 60
+_EXTENSIONS = frozenset((_HOP_OPTIONS, _ROUTING, _FRAGMENT, _TARGET_OPTIONS))
+"""Headers of IPv6 between its own and that of the segment."""
 _UDP_HEAD = struct.Struct(">HHHH")
 _TCP_HEAD = struct.Struct(">HHIIBB6x")
 _SYN = 0x02
@@ -88,12 +92,12 @@ def read_packets(data: bytes) -> Iterator[UdpPacket | TcpSegment]:
     fragments = _Fragments()
     for t_ns, link, frame in packets:
         at = _ip_offset(frame, link)
-        packet = b"" if at is None else frame[at:]
-        segment = fragments.segment(packet)
-        if segment is None:
+        packet = None if at is None else _ip_packet(frame[at:])
+        segment = None if packet is None else fragments.segment(packet)
+        if packet is None or segment is None:
             continue
-        if packet[9] == _TCP:
-            found = _tcp_segment(t_ns, packet[12:20], segment)
+        if packet.protocol == _TCP:
+            found = _tcp_segment(t_ns, packet.addresses, segment)
             if found is not None:
                 yield found
         elif len(segment) >= _UDP_HEAD.size:
@@ -107,11 +111,12 @@ def _tcp_segment(t_ns: int, addresses: bytes, segment: bytes) -> TcpSegment | No
     if len(segment) < _TCP_HEAD.size:
         return None
     source, target, sequence, _, size, flags = _TCP_HEAD.unpack_from(segment)
+    half = len(addresses) // 2
     begins = bool(flags & _SYN)
     return TcpSegment(
         t_ns,
-        (addresses[:4], source),
-        (addresses[4:], target),
+        (addresses[:half], source),
+        (addresses[half:], target),
         sequence + begins & 0xFFFFFFFF,  # a SYN takes one number
         begins,
         segment[max(size >> 4, 5) * 4 :],
@@ -187,7 +192,7 @@ def _read_pcap(data: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _ip_offset(frame: bytes, link: int) -> int | None:
-    """Return the offset of the IPv4 header, or None."""
+    """Return the offset of the IP header, or None."""
     if link == _ETHERNET:
         at = 12
         while frame[at : at + 2] in {kind.to_bytes(2, "big") for kind in _VLAN}:
@@ -199,30 +204,71 @@ def _ip_offset(frame: bytes, link: int) -> int | None:
             return head
         kind_at = place
 
-    if kind_at < 0 or frame[kind_at : kind_at + 2] != _IPV4.to_bytes(2, "big"):
+    if kind_at < 0 or frame[kind_at : kind_at + 2] not in _IP:
         return None
     return head
 
 
-class _Fragments:
-    """Reassembly of IPv4 fragments; incomplete datagrams are dropped."""
+class _IpPacket(NamedTuple):
+    """One IP packet with a whole UDP or TCP segment, or a fragment of it."""
 
-    def __init__(self) -> None:
-        self._pending: dict[tuple[bytes, int], _Parts] = {}
+    protocol: int
+    addresses: bytes
+    """Source and target."""
+    number: int
+    """Identification of its fragments."""
+    more: bool
+    """Whether fragments follow this one."""
+    offset: int
+    """Place in the segment, bytes."""
+    body: bytes
 
-    def segment(self, packet: bytes) -> bytes | None:
-        """Return the UDP or TCP segment that `packet` contains or completes, if any."""
-        if len(packet) < _IP_HEAD or packet[0] >> 4 != _IP_VERSION:
-            return None
-        if packet[9] not in {_TCP, _UDP}:
-            return None
+
+def _ip_packet(packet: bytes) -> _IpPacket | None:
+    """Return a packet of UDP or TCP; None for others, and if the header is cut off."""
+    version = packet[0] >> 4 if packet else 0
+    found = None
+    if version == 4 and len(packet) >= _IPV4_HEAD:  # noqa: PLR2004 - IPv4
         total, number, flags = struct.unpack_from(">HHH", packet, 2)
         body = packet[(packet[0] & 15) * 4 : total or len(packet)]
         more, offset = bool(flags & 0x2000), (flags & 0x1FFF) * 8
+        found = _IpPacket(packet[9], packet[12:20], number, more, offset, body)
+    elif version == 6 and len(packet) >= _IPV6_HEAD:  # noqa: PLR2004 - IPv6
+        found = _ipv6_packet(packet)
+    return found if found is not None and found.protocol in {_TCP, _UDP} else None
+
+
+def _ipv6_packet(packet: bytes) -> _IpPacket | None:
+    """Return an IPv6 packet without its extension headers; None if one of them is cut off."""
+    size, kind = struct.unpack_from(">HB", packet, 4)
+    at, end = _IPV6_HEAD, _IPV6_HEAD + size if size else len(packet)
+    number = fields = 0
+    while kind in _EXTENSIONS:
+        if at + 8 > len(packet):
+            return None
+        following, units = packet[at], packet[at + 1]
+        if kind == _FRAGMENT:
+            fields, number = struct.unpack_from(">HI", packet, at + 2)
+            units = 0
+        kind, at = following, at + 8 * (units + 1)
+        if fields & 0xFFF8:
+            break  # extension headers behind the first fragment are in its body
+    return _IpPacket(kind, packet[8:40], number, bool(fields & 1), fields & 0xFFF8, packet[at:end])
+
+
+class _Fragments:
+    """Reassembly of fragments; incomplete datagrams are dropped."""
+
+    def __init__(self) -> None:
+        self._pending: dict[tuple[int, bytes, int], _Parts] = {}
+
+    def segment(self, packet: _IpPacket) -> bytes | None:
+        """Return the UDP or TCP segment that `packet` contains or completes, if any."""
+        protocol, addresses, number, more, offset, body = packet
         if not more and not offset:
             return body
 
-        key = (packet[9:10] + packet[12:20], number)
+        key = (protocol, addresses, number)
         parts = self._pending.setdefault(key, _Parts())
         if len(self._pending) > _MAX_PENDING:
             del self._pending[next(iter(self._pending))]

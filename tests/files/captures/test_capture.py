@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.files.captures._candump import read_candump
 from jointfit_daemon.files.captures._capture import UnreadableCaptureError
-from jointfit_daemon.files.captures._packet_capture import read_udp
+from jointfit_daemon.files.captures._packet_capture import read_packets, read_udp
 from jointfit_protocols.can import host_count, unpack_frames
 from jointfit_protocols.corrupt import CorruptBytes
 from tests.protocols.can.candump_oracle import parse_candump
@@ -32,8 +32,13 @@ def ip(body: bytes, number: int = 1, flags: int = 0) -> bytes:
     return head + body
 
 
+def ipv6(body: bytes, next_header: int = 17) -> bytes:
+    return struct.pack(">IHBB", 6 << 28, len(body), next_header, 64) + bytes(range(32)) + body
+
+
 def ethernet(packet: bytes, vlan: bool = False) -> bytes:
-    return bytes(12) + (b"\x81\x00\x00\x05" if vlan else b"") + b"\x08\x00" + packet
+    kind = b"\x86\xdd" if packet[0] >> 4 == 6 else b"\x08\x00"
+    return bytes(12) + (b"\x81\x00\x00\x05" if vlan else b"") + kind + packet
 
 
 def pcap(frames: list[tuple[int, bytes]], order: str = "<", link: int = 1) -> bytes:
@@ -80,6 +85,38 @@ def test_a_pcapng_file_keeps_the_time_of_its_interface(
     file = pcapng([(7000, ethernet(ip(udp(b"x"))))], order, resolution)
     (packet,) = read_udp(file)
     assert packet.t_ns == 5 * 10**9 + t_ns
+
+
+@pytest.mark.parametrize("vlan", [False, True])
+def test_udp_payloads_over_ipv6_are_read_behind_extension_headers(vlan: bool) -> None:
+    options = b"\x3c\0" + bytes(6) + b"\x11\x01" + bytes(14)  # hop by hop, then destination
+    packets = [ipv6(udp(b"plain")), ipv6(options + udp(b"behind"), 0), ipv6(udp(b"x"), 58)]
+    frames = [(0, ethernet(packet, vlan)) for packet in packets]
+    assert [packet.payload for packet in read_udp(pcap(frames))] == [b"plain", b"behind"]
+    raw = pcap([(0, packet) for packet in packets], link=101)
+    assert [packet.payload for packet in read_udp(raw)] == [b"plain", b"behind"]
+
+
+def test_tcp_segments_over_ipv6_have_both_addresses() -> None:
+    body = struct.pack(">HHIIBB6x", 801, 40_000, 7, 0, 0x50, 0) + b"bytes"
+    (segment,) = read_packets(pcap([(0, ethernet(ipv6(body, 6)))]))
+    source, target = (bytes(range(16)), 801), (bytes(range(16, 32)), 40_000)
+    assert segment == (0, source, target, 7, False, b"bytes")
+
+
+def test_ipv6_fragments_are_put_together() -> None:
+    whole = udp(bytes(range(256)) * 10)
+    frames = [
+        (n, ethernet(ipv6(struct.pack(">BxHI", 17, at | more, 9) + whole[at:end], 44)))
+        for n, (at, end, more) in enumerate([(1448, len(whole), 0), (0, 1448, 1)])
+    ]
+    (packet,) = read_udp(pcap(frames))
+    assert packet.payload == whole[8:]
+
+
+@given(st.binary(max_size=100), st.sampled_from([0, 6, 17, 43, 44, 51, 60]))
+def test_any_ipv6_packet_ends_quietly(data: bytes, next_header: int) -> None:
+    list(read_udp(pcap([(0, ethernet(ipv6(data, next_header)[: 20 + len(data)]))])))
 
 
 def test_fragments_are_put_together_in_any_order() -> None:
