@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 _CLOCK = TickClock(1, None)
 _TIME = int(SharedField.REFERENCE_TIME)
+_TIME_OF_WEEK = int(SharedField.GPS_TIME)
 _RATE, _FORCE = int(SensorField.ANGULAR_RATE), int(SensorField.ACCELERATION)
 _FIELD = int(SensorField.MAGNETIC_FIELD)
 _DATA = 0x80
@@ -77,7 +78,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         self._quaternion = int(QUATERNIONS[required.data_set])
         self._gps_time = int(GPS_TIMES[required.data_set])
         raw_fields = {_RATE, _FORCE, _FIELD} if self._is_raw else {self._quaternion}
-        self._wanted = {_TIME, self._gps_time, *raw_fields}
+        self._wanted = {_TIME, _TIME_OF_WEEK, self._gps_time, *raw_fields}
         self._needed = frozenset({_RATE, _FORCE} if self._is_raw else {self._quaternion})
         self._other = {int(one): int(field) for one, field in QUATERNIONS.items()}
         del self._other[self._set]
@@ -141,8 +142,8 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         ticks: int | None = None
         if _TIME in values:
             ticks = int(values[_TIME][0])
-        elif self._gps_time in values:
-            time_of_week_s, week, _ = values[self._gps_time]
+        elif week_time := values.get(_TIME_OF_WEEK) or values.get(self._gps_time):
+            time_of_week_s, week, _ = week_time
             ticks = gps_ns(week, time_of_week_s)
         if self._is_raw:
             x, y, z = values[_FORCE]

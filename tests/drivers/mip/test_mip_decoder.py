@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from jointfit_daemon.model import Decoded
+    from jointfit_protocols.mip import MipField
 
 
 def samples(events: list[Decoded]) -> list[ImuSample]:
@@ -94,6 +95,17 @@ def test_legacy_time_counts_weeks_and_seconds() -> None:
     ticks = [one.ticks for one in samples(decoded([packet(604_799.99), packet(604_799.995)]))]
     assert ticks == [2300 * WEEK_NS + 604_799_990_000_000, 2300 * WEEK_NS + 604_799_995_000_000]
     assert samples(decoded([packet(float("nan"))]))[0].ticks is None
+
+
+def test_the_shared_time_of_week_is_the_device_time_of_packets_without_reference_time() -> None:
+    def packet(time_s: float, *more: MipField) -> bytes:
+        week = encode_field(0x82, 0xD3, time_s, 0, 0)
+        return encode(0x82, (*more, encode_field(0x82, 3, 1, 0, 0, 0, 1), week))
+
+    ticks = [one.ticks for one in samples(decoded([packet(12.5), packet(12.51)]))]
+    assert ticks == [12_500_000_000, 12_510_000_000]
+    both = decoded([packet(12.5, encode_field(0x82, 0xD5, 7_000_000))])
+    assert samples(both)[0].ticks == 7_000_000
 
 
 def test_lost_packets_are_counted() -> None:
