@@ -52,16 +52,17 @@ class Field(IntEnum):
     ATTITUDE_QUATERNION = 0x42
 
 
-_GNSS = ("8s", "Q", "H", "B", "B", "3d", "3d", "3f", "3f", "3f", "f", "I")
+_GNSS = ("8s", "Q", "H", "B", "B", "3d", "3d", "3f", "3f", "3f", "f", "I", "2s", "28s")
 _FORMATS: tuple[tuple[str, ...], ...] = (
     ("Q", "Q", "Q", "3f", "4f", "3f", "3d", "3f", "3f", "6f", "5f", "7f", "H", "I", "Q"),
     ("Q", "Q", "Q", "H", "Q", "Q", "8s", "I", "I", "B"),
-    ("H", "3f", "3f", "3f", "f", "f", "4f", "3f", "3f", "3f", "3f"),
+    ("H", "3f", "3f", "3f", "f", "f", "4f", "3f", "3f", "3f", "3f", "2s",
+     "40s"),
     _GNSS,
-    ("H", "3f", "4f", "9f", "3f", "3f", "3f", "3f", "3f"),
-    ("H", "3d", "3d", "3f", "3f", "3f", "3f", "3f", "3f", "f", "f"),
+    ("H", "3f", "4f", "9f", "3f", "3f", "3f", "3f", "3f", "12s", "28s", "24s"),
+    ("H", "3d", "3d", "3f", "3f", "3f", "3f", "3f", "3f", "f", "f", "68s", "64s"),
     _GNSS,
-)
+)  # fmt: skip
 """Struct codes of the fields of each group: common, time, IMU, GNSS, attitude, INS, GNSS 2."""
 GROUPS = len(_FORMATS)
 MAX_PAYLOAD = sum(struct.calcsize("<" + code) for group in _FORMATS for code in group)

@@ -106,14 +106,14 @@ def test_an_output_has_the_documented_bytes() -> None:
 
 @pytest.mark.parametrize("group", range(7))
 def test_field_sizes_equal_those_of_the_vendors_library(group: int) -> None:
-    gnss = [8, 8, 2, 1, 1, 24, 24, 12, 12, 12, 4, 4]
+    gnss = [8, 8, 2, 1, 1, 24, 24, 12, 12, 12, 4, 4, 2, 28]
     sizes = [
         [8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8],
         [8, 8, 8, 2, 8, 8, 8, 4, 4, 1],
-        [2, 12, 12, 12, 4, 4, 16, 12, 12, 12, 12],
+        [2, 12, 12, 12, 4, 4, 16, 12, 12, 12, 12, 2, 40],
         gnss,
-        [2, 12, 16, 36, 12, 12, 12, 12, 12],
-        [2, 24, 24, 12, 12, 12, 12, 12, 12, 4, 4],
+        [2, 12, 16, 36, 12, 12, 12, 12, 12, 12, 28, 24],
+        [2, 24, 24, 12, 12, 12, 12, 12, 12, 4, 4, 68, 64],
         gnss,
     ]
     assert [struct.calcsize("<" + code) for code in _FORMATS[group]] == sizes[group]
