@@ -11,7 +11,7 @@ is refused.
 | 0x00000002      | UTC time, 12 bytes                                             |
 | 0x0000000C      | orientation: 0 quaternion, 4 Euler angles, 8 matrix            |
 | 0x00000070      | leaves out accelerometer (1), gyroscope (2), magnetometer (4)  |
-| 0x00000300      | reals: 0 float32, 1 12.20, 2 16.32                             |
+| 0x00000300      | reals: 0 float32, 1 12.20, 2 16.32, 3 float64                  |
 | 0x00000C00      | leaves out the auxiliary inputs                                |
 | 0x80000000      | the world is NED                                               |
 
@@ -68,7 +68,7 @@ NED = 0x8000_0000
 _ORIENTATION_MASK, _FORMAT_MASK = 0xC, 0x3
 _KNOWN_MODES = sum(OutputMode)
 _RAW_BYTES, _GNSS_BYTES, _UTC_BYTES, _INPUT_BYTES = 20, 44, 12, 2
-_REAL_BYTES = {Precision.FLOAT32: 4, Precision.FIXED_12_20: 4, Precision.FIXED_16_32: 6}
+_REAL_BYTES = dict(zip(Precision, (4, 4, 6, 8), strict=True))
 
 
 class LegacyField(NamedTuple):
@@ -95,12 +95,12 @@ class MTDataLayout:
     Raises
     ------
     ValueError
-        The mode or the format of the reals is unknown.
+        The mode is unknown.
     """
 
     def __init__(self, mode: int, settings: int) -> None:
         precision = settings >> FORMAT_SHIFT & _FORMAT_MASK
-        if mode & ~_KNOWN_MODES or precision not in _REAL_BYTES:
+        if mode & ~_KNOWN_MODES:
             raise ValueError(f"output mode 0x{mode:04X} with settings 0x{settings:08X} is unknown")
         self.mode, self.settings = mode, settings
         self.precision = Precision(precision)
