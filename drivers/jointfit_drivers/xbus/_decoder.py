@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from jointfit_daemon.model import Corrupt, DeviceEvent, ImuSample, SyncPulse, TickClock
 from jointfit_drivers.gateway_orientation import RawStamp
 from jointfit_drivers.newer_firmware import NewerFirmwareDetector, NewestKnown
+from jointfit_drivers.xbus._bus_ids import BusIdSelection
 from jointfit_drivers.xbus._continuity import XbusContinuity, XbusStep
 from jointfit_drivers.xbus._raw_orientation import RAW
 from jointfit_drivers.xbus._sync_lines import describe_entry
@@ -60,6 +61,7 @@ _WANTED = {_COUNTER, _TIME, _QUATERNION, _STATUS_BYTE, _STATUS_WORD}
 """Items that are decoded."""
 _ALIGNED = ("sensor", "local")
 _MESSAGES = frozenset(map(int, XbusMessageId))
+_MEASUREMENTS = (XbusMessageId.MT_DATA2, XbusMessageId.MT_DATA)
 _NEWEST = NewestKnown((1,), "MT Manager")
 """Firmware of all MTi series since 2012."""
 
@@ -107,6 +109,7 @@ class XbusDecoder:
         self._layouts: dict[int, MTData2Layout | None] = {}
         """MTData2Layout of the first message of each length; a device sends one or two lengths."""
         self._xbus = XbusCodec()
+        self._bus_ids = BusIdSelection()
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
         self._continuity = XbusContinuity(rate_hz)
@@ -159,12 +162,14 @@ class XbusDecoder:
         for event in found:
             if not isinstance(event, XbusMessage):
                 out.append(Corrupt(event.discarded, event.reason))
+            elif event.mid not in _MEASUREMENTS:
+                out += self._device_events(event)
+            elif not self._bus_ids.admits(event.bid):
+                out += self._bus_ids.report(event.bid)
             elif event.mid == XbusMessageId.MT_DATA2:
                 out += self._decode_measurement(event)
-            elif event.mid == XbusMessageId.MT_DATA:
-                out += self._decode_legacy(event)
             else:
-                out += self._device_events(event)
+                out += self._decode_legacy(event)
         return out
 
     def _arrival_of(self, message: XbusMessage) -> int:

@@ -294,7 +294,7 @@ def test_any_counters_and_times_are_accepted(steps: list[tuple[int | None, int |
 def test_a_quaternion_of_another_norm_is_refused() -> None:
     events = decoder()
     found = fed(events, message(1, 100, (0.5, 0.0, 0.0, 0.0)))
-    assert found == [Corrupt(36, "quaternion norm is not 1")]
+    assert found == [Corrupt(36, "quaternion norm is not 1", rejected=1)]
     assert (events.messages, events.discarded_bytes) == (0, 36)
 
 
@@ -358,3 +358,25 @@ def test_an_error_of_the_device_is_an_event_in_words() -> None:
     assert isinstance(event, DeviceEvent)
     assert (event.kind, dict(event.data)) == ("error", {"code": 0x1E})
     assert "baud" in event.text
+
+
+@pytest.mark.parametrize("bus_ids", [(1, 2), (0xFF, 3, 1)])
+def test_measurements_of_several_devices_on_one_line_are_not_mixed(
+    bus_ids: tuple[int, ...],
+) -> None:
+    def wire(k: int, bus_id: int) -> bytes:
+        data = message(k, 100 * k)[4:-1]
+        return encode(XbusMessageId.MT_DATA2, data, bus_id)
+
+    events = fed(decoder(), *(wire(k, bus_id) for k in range(40) for bus_id in bus_ids))
+    assert [one.counter for one in samples(events)] == list(range(40))
+    (warning,) = [one for one in events if isinstance(one, DeviceEvent)]
+    assert warning.kind == "warning"
+    assert f"of bus id {bus_ids[0]} are used" in warning.text
+    assert set(bus_ids[:1]) < set(warning.data["bus_ids"]) <= set(bus_ids)  # type: ignore[call-overload]
+
+
+def test_one_measurement_with_another_bus_id_does_not_stop_the_device() -> None:
+    stray = encode(XbusMessageId.MT_DATA2, message(0, 0)[4:-1], 9)
+    events = fed(decoder(), stray, *(message(k, 100 * k) for k in range(200)))
+    assert len(samples(events)) > 130

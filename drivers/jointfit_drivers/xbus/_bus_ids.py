@@ -1,0 +1,48 @@
+"""Selection of one device on a line with several.
+
+Devices on one line differ in the bus id of their messages. Their orientations belong to different
+segments, so that only those of one device are used.
+
+Invariant: the result depends only on the bus ids fed.
+"""
+
+from __future__ import annotations
+
+from jointfit_daemon.model import DeviceEvent
+
+_MOST_OTHERS = 64
+"""Consecutive messages of other devices after which the selected one counts as absent: more than a
+line has devices."""
+_SIGHTINGS = 10
+"""Messages of other devices after which they are reported; a corrupt one may pass the checksum."""
+
+
+class BusIdSelection:
+    """Selects the device whose measurements are used: the first one that sends."""
+
+    def __init__(self) -> None:
+        self._selected: int | None = None
+        self._others = self._sightings = 0
+
+    def admits(self, bus_id: int) -> bool:
+        """Return whether a measurement with `bus_id` belongs to the selected device."""
+        if bus_id == self._selected:
+            self._others = 0
+            return True
+        self._others += 1
+        if self._selected is None or self._others > _MOST_OTHERS:
+            self._selected, self._others = bus_id, 0
+            return True
+        return False
+
+    def report(self, bus_id: int) -> list[DeviceEvent]:
+        """Return a warning, once, about measurements with a `bus_id` that is not admitted."""
+        self._sightings += 1
+        if self._sightings != _SIGHTINGS or self._selected is None:
+            return []
+        text = (
+            f"measurements with bus id {bus_id} arrive, too: several devices send on this line. "
+            f"Only those of bus id {self._selected} are used: connect each device to a port of its "
+            "own, without an Xbus master"
+        )
+        return [DeviceEvent("warning", text, {"bus_ids": sorted((self._selected, bus_id))})]
