@@ -15,7 +15,6 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import hypothesis  # noqa: F401 - the forks share what is imported here
 import numpy  # noqa: F401 - as above
 import pytest
 import scipy.optimize  # noqa: F401 - as above
