@@ -142,6 +142,12 @@ def test_base_times_have_the_sign_of_the_vendors_library() -> None:
     assert base_time(bytes.fromhex("f900")) is None
 
 
+@pytest.mark.parametrize(("kind", "size"), [(0x2C, 24), (0x2D, 60), (0x2E, 12)])
+def test_reports_of_the_bno086_are_skipped_by_their_length(kind: int, size: int) -> None:
+    other, base = bytes((kind,)).ljust(size, b"\0"), encode_base_time(3)
+    assert split_reports(base + other + base) == [base, other, base]
+
+
 def test_packets_of_unknown_or_cut_off_reports_are_refused() -> None:
     assert split_reports(encode_base_time(3) + b"\x99") is None
     assert split_reports(encode_base_time(3)[:-1]) is None
