@@ -16,6 +16,7 @@ from jointfit_protocols.xbus import XbusMessageId
 from jointfit_protocols.xbus.mtdata import (
     NED,
     MTDataLayout,
+    decode_device_configuration,
     decode_output_mode,
     decode_output_settings,
 )
@@ -54,11 +55,16 @@ class LegacyMeasurements:
         return real_id(Item.QUATERNION, world="NED" if ned else self._world)
 
     def reply(self, mid: int, data: bytes) -> None:
-        """Take the output mode or the output settings from a reply of the device."""
+        """Take the output mode, the output settings or both from a reply of the device."""
         if mid == XbusMessageId.OUTPUT_MODE_ACK:
             self._mode = decode_output_mode(data) if data else self._mode
         elif mid == XbusMessageId.OUTPUT_SETTINGS_ACK:
             self._settings = decode_output_settings(data) if data else self._settings
+        elif mid == XbusMessageId.CONFIGURATION:
+            self._mode, self._settings = decode_device_configuration(data) or (
+                self._mode,
+                self._settings,
+            )
         else:
             return
         self._update()

@@ -65,6 +65,8 @@ NO_ACCELERATION, NO_RATE, NO_MAGNETIC = 0x10, 0x20, 0x40
 FORMAT_SHIFT = 8
 NO_INPUT_1, NO_INPUT_2 = 0x400, 0x800
 NED = 0x8000_0000
+_CONFIGURATION = struct.Struct(">96xH6xHI8x")
+"""Number of devices; output mode and settings of the only one."""
 _ORIENTATION_MASK, _FORMAT_MASK = 0xC, 0x3
 _KNOWN_MODES = sum(OutputMode)
 _RAW_BYTES, _GNSS_BYTES, _UTC_BYTES, _INPUT_BYTES = 20, 44, 12, 2
@@ -191,6 +193,14 @@ def decode_output_mode(data: bytes) -> int | None:
 def decode_output_settings(data: bytes) -> int | None:
     """Return the output settings of a reply; None if it is malformed."""
     return int.from_bytes(data, "big") if len(data) == 4 else None  # noqa: PLR2004 - U4
+
+
+def decode_device_configuration(data: bytes) -> tuple[int, int] | None:
+    """Return output mode and settings of a Configuration; None unless it is of one device."""
+    if len(data) != _CONFIGURATION.size:
+        return None
+    devices, mode, settings = _CONFIGURATION.unpack(data)
+    return (mode, settings) if devices == 1 else None
 
 
 def rate_hz(period: bytes, skip: bytes) -> float | None:

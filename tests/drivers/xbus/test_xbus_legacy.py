@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import struct
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import pytest
@@ -169,3 +170,18 @@ def test_a_matrix_that_is_no_rotation_is_refused_by_its_norm() -> None:
     (item,) = decoded(encode(XbusMessageId.MT_DATA, wire), **keys)
     assert isinstance(item, Corrupt)
     assert item.reason == "quaternion norm is not 1"
+
+
+def test_the_configuration_message_of_a_capture_defines_the_fields() -> None:
+    layout = MTDataLayout(MODE, SAMPLE_COUNTER | MATRIX)
+    body = struct.pack(">IHHHHI80xH", 1, 1152, 0, 0, 0, 0, 1)
+    body += struct.pack(">IHHI8x", 1, layout.size, layout.mode, layout.settings)
+    assert len(body) == 118
+    wires = list(messages(layout, "NWU", range(5)))
+    found = decoded(encode(XbusMessageId.CONFIGURATION, body), *wires)
+    assert sum(isinstance(item, ImuSample) for item in found) == 5
+
+    several = body[:96] + b"\0\2" + body[98:] + body[98:]
+    for other in (several, body[:-1], b""):
+        found = decoded(encode(XbusMessageId.CONFIGURATION, other), *wires)
+        assert not any(isinstance(item, ImuSample) for item in found)
