@@ -59,7 +59,9 @@ def radial_residuals(v: Array, m: Array, w: Array) -> tuple[Array, Array]:
 
 
 def arc_of_spread(spread: float) -> float:
-    r"""Return the evenly covered arc, rad, on which the points have variance `spread` R².
+    r"""Return the angle, rad, of an arc whose evenly spaced points have variance `spread` R².
+
+    R is the radius of the arc.
 
     .. math:: 1 - \left( \frac{\sin(\varphi/2)}{\varphi/2} \right)^2 = \text{spread}
     """

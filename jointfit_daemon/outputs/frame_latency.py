@@ -32,7 +32,7 @@ class LatencyHistogram:
         self.longest_ns = 0
 
     def add(self, ns: int) -> None:
-        """Count one time, ns; a negative one as zero."""
+        """Count one time, ns; a negative time counts as zero."""
         units = max(0, ns) >> _UNIT_BITS
         shift = max(0, units.bit_length() - _OCTAVE_BITS - 1)
         bucket = (shift << _OCTAVE_BITS) + (units >> shift)
@@ -41,9 +41,9 @@ class LatencyHistogram:
         self.longest_ns = max(self.longest_ns, ns)
 
     def quantile_ns(self, share: float) -> int | None:
-        """Return a time that at least `share` of the times do not exceed; None without times.
+        """Return the quantile `share` of the times, ns, rounded up; None without times.
 
-        It is the upper limit of a bucket, and never more than the longest time.
+        The result is the upper limit of a bucket, but never more than the longest time.
         """
         left = share * self.total
         for bucket, count in enumerate(self.counts):
@@ -80,8 +80,9 @@ class LatencyHealth:
 
 
 STAGES = ("decoded", "aligned", "fused", "encoded", "written", "total")
-"""Stages of a frame. Each latency is the time since the stage before; the first one's is the time
-since the arrival, as is that of ``total``, which ends with ``written``."""
+"""Stages of a frame. The latency of a stage is the time since the end of the stage before. The
+latency of ``decoded`` is the time since the arrival. ``total`` is the time from the arrival to the
+end of ``written``."""
 
 
 class FrameLatency:
@@ -98,7 +99,7 @@ class FrameLatency:
         self._histograms = {stage: LatencyHistogram() for stage in STAGES}
         self._arrival_ns = self._decoded_ns = self._aligned_ns = 0
         self._fused: deque[tuple[int, int]] = deque()
-        """Beginning and fusion of the frames that are not encoded yet, ns."""
+        """Instants of the beginning and the fusion of each frame that is not encoded yet, ns."""
         self.end_interval()
 
     def end_interval(self) -> None:
@@ -120,7 +121,7 @@ class FrameLatency:
     def mark_aligned(self) -> None:
         """Note that one or more frames were released."""
         self._aligned_ns = self._clock()
-        self._fused.clear()  # states of the event before, if nobody encoded them
+        self._fused.clear()  # states of the previous event that no output encoded
 
     def mark_fused(self, deadline_ns: int | None) -> None:
         """Count the stages of a frame up to its limb state."""

@@ -52,12 +52,12 @@ def viewer_results(quick: bool) -> list[Result]:
     error = statistics.stdev(differences) / len(differences) ** 0.5
     without = statistics.fmean(found.daemon_pct[0])
     note = (
-        f"ten viewers minus none {mean:.1f} ± {error:.1f}, mean and standard error of {rounds}"
+        f"ten viewers minus none: mean {mean:.1f}, standard error {error:.1f}, {rounds}"
         f" pairs of rounds of {seconds:g} s; {without:.1f} without viewers"
     )
     # Other work on the machine changes the CPU time of a round by more than any viewer could.
     certain = round(max(0.0, mean - 2.0 * error), 2)
-    name = "daemon: cost of ten viewers beyond two standard errors"
+    name = "daemon: extra CPU with ten viewers, mean minus two standard errors, at least 0"
     results = [timed_result(name, certain, "% of a core", 0.5, 3.0, note=note)]
     for count, words, target in (
         (0, "no viewer", None),

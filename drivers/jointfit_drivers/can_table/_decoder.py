@@ -1,7 +1,8 @@
 """Decoder of the can-table driver: records of CAN frames in, samples in SI units out.
 
 A sample is stamped with the first of its frames, because arbitration delays the later ones. Every
-record of 24 bytes is a frame of this device, a foreign one, a note of the host, or discarded.
+record of 24 bytes is one of four: a frame of this device, a frame of another device, a note of the
+host, or a rejected record.
 
 Invariant: the output depends only on the chunks fed; the decoder reads no clock and no bus.
 """
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded, TickClock
 
 _HALVED = 20
-"""Incomplete samples without a complete one after which their order is reported."""
+"""Number of incomplete samples before the first complete one at which a warning is given."""
 
 
 class CanTableDecoder:
@@ -88,6 +89,6 @@ class CanTableDecoder:
 
 
 _INCOMPLETE = (
-    f"{_HALVED} samples, and none with all its frames: correct `sequence` if the device sends them "
-    "in another order, and `rate_hz`; frames of a sample arrive within half a period"
+    f"no complete sample after {_HALVED} incomplete ones: correct `sequence` if the device sends "
+    "the frames in another order; correct `rate_hz` if a sample takes longer than half a period"
 )

@@ -7,7 +7,7 @@ The direction a of the specific force, constant in the world, changes in sensor 
 with k = 1 if the rate is in rad/s. k is the slope of a regression over the first rotations. Linear
 acceleration scatters the differences, and does not bias the slope.
 
-Invariant: a function of the readings fed, without a clock of its own.
+Invariant: the result depends only on the readings fed; the check reads no clock.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _STEPS = 300
 _MOST_STEPS = 6000
 """Steps after which a sensor that hardly rotated is no longer checked."""
 _EXPLAINED = 0.5
-"""Least share of the differences that the regression explains."""
+"""Smallest share of the squared differences that the regression must explain."""
 _LOW, _HIGH = 0.6, 1.7
 """Range of k with a correct unit."""
 _FREE = 0.3
@@ -42,7 +42,7 @@ class RateUnitCheck:
         self._cross = self._predicted = self._observed = 0.0
         self._steps = 0
         self.slope: float | None = None
-        """k if it is wrong and certain; None otherwise."""
+        """k if the check has found that it is certain and out of range; None otherwise."""
         self.done = False
         """Whether the check ended."""
 
@@ -57,7 +57,7 @@ class RateUnitCheck:
         if last is None or not 0 < t_ns - last[0] <= _LONGEST_S * 1e9:
             return
 
-        # The mean of two readings: a device sends the rate at, or before, its instant.
+        # Use the mean rate of two readings: a rate may refer to its stamp or to the time before.
         step_s = 0.5e-9 * (t_ns - last[0])
         wx, wy, wz = ((now + then) * step_s for now, then in zip(rate, last[1], strict=True))
         bx, by, bz = last[2]
@@ -80,7 +80,7 @@ class RateUnitCheck:
                 self.slope = slope
 
     def fitting_unit(self, configured: float) -> str | None:
-        """Return the unit with which k is 1; `configured` is the SI value of the present one."""
+        """Return the unit with which k is about 1; `configured` is the present unit in rad/s."""
         if self.slope is None:
             return None
         for unit, si in UNITS["rate"].items():

@@ -59,7 +59,7 @@ def judge_trial(
     trained: bool,
     options: IkOptions | None = None,
 ) -> TrialOutcome:
-    """Return tracking errors and joint-angle changes of one trial; both models are solved again.
+    """Return tracking errors and joint-angle changes of one trial, solved with both models.
 
     Frames in a local minimum of inverse kinematics are solved again from other poses.
     """

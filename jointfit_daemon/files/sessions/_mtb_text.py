@@ -1,8 +1,8 @@
 """Text files that Xsens programs (MT Manager, MTw) export: one sensor in each file.
 
-Lines beginning with ``//`` are comments, of which ``// Update Rate: 100.0Hz`` is read; then follow
-column names and rows, separated by tabs. The packet counter (16 bit) or the sample time (32 bit,
-0.1 ms) number the rows, so lost packets are gaps in time.
+Lines beginning with ``//`` are comments; only ``// Update Rate: 100.0Hz`` is used. The next lines
+contain column names and rows, separated by tabs. The packet counter (16 bit) or the sample time
+(32 bit, 0.1 ms) number the rows, so lost packets are gaps in time.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def read_mtb_session(files: Sequence[Path], name: str) -> SessionData:
 
 
 def _read_sensor(path: Path) -> tuple[float, SensorSeries]:
-    """Return the first instant on the counter of the recording, s, and the sensor from 0 s."""
+    """Return the first time on the recording's counter, s, and the sensor with times from 0 s."""
     lines = read_lines(path)
     at = next((k for k, line in enumerate(lines) if not line.startswith("//")), None)
     if at is None or (_COUNTER not in lines[at] and _SAMPLE_TIME not in lines[at]):
@@ -94,7 +94,7 @@ def _read_sensor(path: Path) -> tuple[float, SensorSeries]:
 
 
 def _times(path: Path, columns: Mapping[str, Array], rate_hz: float | None) -> tuple[float, Array]:
-    """Return the first instant on its counter, s, and the instants of the rows since then, s."""
+    """Return the counter's time at the first row, s, and the time of each row since then, s."""
     ticks = columns.get(_SAMPLE_TIME)
     if ticks is not None and len(ticks) and np.isfinite(ticks).all():
         return float(ticks[0]) * _TICK_S, unwrapped(ticks, _SAMPLE_TIME_TURN) * _TICK_S

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 _BLOCK_ROWS = 1 << 15
 """Rows that are converted to text at a time, which bounds the memory."""
 MOST_VALUES = 1 << 27
-"""Values that are read from a file: 1 GiB."""
+"""Largest number of values that are read from a file; they take 1 GiB."""
 _NEEDS_QUOTES = frozenset(',"\n\r')
 
 
@@ -143,7 +143,7 @@ def read_parquet_session(path: Path) -> SessionData:
 
     def read(file: Path, columns: Sequence[str]) -> Table:
         try:
-            # Texts remain dictionaries: a long one that is repeated takes its memory once.
+            # Texts remain dictionaries, so a repeated long text is stored only once.
             texts = [name for name in columns if name in TEXT_COLUMNS]
             with parquet.ParquetFile(file, read_dictionary=texts) as opened:
                 _check_parquet(file, opened.schema_arrow.names, opened.metadata, columns)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _MM = 1000.0
 _WORST = 3
-"""Markers named in the line of the worst ones."""
+"""Number of markers in the line ``worst``."""
 _MARKER_HEAD = ("marker", "segment", "frames", "RMS, mm", "max, mm", "at, s")
 _COORDINATE_HEAD = ("coordinate", "unit", "min", "max", "sd")
 
@@ -75,7 +75,7 @@ def _coordinates(found: TrialSolution) -> list[tuple[str, ...]]:
 
 
 def _errors(found: TrialSolution) -> tuple[Array, NDArray[np.bool_]]:
-    """Return squared errors of frames with a solution, m^2, zero where missing; and presence."""
+    """Return squared errors, m^2, zero where unknown, and a mask of the known errors."""
     seen: NDArray[np.bool_] = np.isfinite(found.distances) & found.solved[:, None]
     return np.where(seen, found.distances, 0.0) ** 2, seen
 

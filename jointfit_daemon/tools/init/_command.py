@@ -1,4 +1,4 @@
-"""Command `jointfit init`: asks, and writes a checked rig.toml."""
+"""Command `jointfit init`: asks questions, then writes and checks rig.toml."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def init(
     ] = None,
     answers: Annotated[
         Path | None,
-        typer.Option("--answers", help="TOML file with answers; others take their proposal."),
+        typer.Option("--answers", help="TOML file with answers; a missing answer is the proposal."),
     ] = None,
     port: Annotated[
         list[Path] | None,

@@ -109,7 +109,7 @@ def _summary(found: Refinement) -> list[str]:
         )
 
     if gauge.weak:
-        lines.append(f"weak      {gauge.weak} more hardly change it")
+        lines.append(f"weak      further motions that hardly change the error: {gauge.weak}")
 
     return lines
 

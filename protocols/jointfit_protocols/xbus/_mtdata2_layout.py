@@ -30,7 +30,7 @@ class MTData2Layout:
     Parameters
     ----------
     items : sequence of (int, bytes)
-        Result of `split` for a message whose requested items `decode_item` could decode.
+        Items of a message from `split`. `decode_item` must be able to decode the requested ones.
     wanted : container of int
         Identifiers to decode, precision and world bits zero.
     """
@@ -42,7 +42,7 @@ class MTData2Layout:
         self._one: list[tuple[int, int]] = []
         self._many: list[tuple[int, slice]] = []
         self.world_id = 0
-        """Identifier of the last quaternion, which gives its world."""
+        """Identifier of the last quaternion; two of its bits encode the world frame."""
         at = 0
 
         for data_id, raw in items:
@@ -65,7 +65,7 @@ class MTData2Layout:
 
     @staticmethod
     def of(items: Sequence[tuple[int, bytes]], wanted: Container[int]) -> MTData2Layout | None:
-        """Return the layout of such a message; None if an item has no single code."""
+        """Return the layout of the items; None without items or a code for a requested one."""
         plain = all(
             data_id & 0xFFF0 not in wanted or _form(data_id, raw)[0] for data_id, raw in items
         )
