@@ -81,7 +81,7 @@ class BoardImu:
                     speeds=self.usual_bauds,
                     family="the frames of the board",
                 )
-            await port.pump(emit, settings.silence_s)
+            await port.pump(emit, settings.lost_after_s)
 
 
 def _is_frame(_: BoardFrame) -> bool:
