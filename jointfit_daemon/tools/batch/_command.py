@@ -14,7 +14,9 @@ from jointfit_daemon.tools.command_group import EXIT_FAILED
 from jointfit_daemon.tools.text_output import check_choice, echo_json
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
+
+    from jointfit_daemon.tools.batch.recording_task import RecordingResult
 
 
 def batch(
@@ -32,8 +34,7 @@ def batch(
         int | None, typer.Option("--jobs", min=1, help="Processes; default: one per processor.")
     ] = None,
     scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", help="Dask cluster instead: tcp://HOST:8786."),
+        str | None, typer.Option("--scheduler", help="Dask cluster instead: tcp://HOST:8786.")
     ] = None,
     json: Annotated[
         bool, typer.Option("--json", help="Print the rows of the summary as JSON.")
@@ -66,13 +67,7 @@ def batch(
         running = run_on_cluster(tasks, scheduler)
     else:
         running = run_in_pool(tasks, jobs or os.cpu_count() or 1)
-    results = []
-    with show_activity("processing") as print_line:
-        for number, result in enumerate(running, start=1):
-            text = f": {result.error}" if result.error else ""
-            count = f"[{number}/{len(tasks)}]"
-            print_line(f"{count} {result.recording}: {result.status}{text}")
-            results.append(result)
+    results = _report_progress(running, len(tasks))
     written = write_summary(results, output)
     for path in written:
         typer.echo(f"wrote {path}", err=True)
@@ -81,6 +76,17 @@ def batch(
         echo_json({"recordings": rows, "files": [str(path) for path in written]})
     if any(result.status != "done" for result in results):
         raise typer.Exit(EXIT_FAILED)
+
+
+def _report_progress(running: Iterator[RecordingResult], total: int) -> list[RecordingResult]:
+    """Print a line for every processed recording; return the results."""
+    results = []
+    with show_activity("processing") as print_line:
+        for number, result in enumerate(running, start=1):
+            text = f": {result.error}" if result.error else ""
+            print_line(f"[{number}/{total}] {result.recording}: {result.status}{text}")
+            results.append(result)
+    return results
 
 
 def _words(option: str, text: str, choices: Sequence[str]) -> tuple[str, ...]:

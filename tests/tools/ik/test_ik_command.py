@@ -303,7 +303,7 @@ def test_a_trial_with_other_markers_is_refused_with_both_lists(folder: Path) -> 
     [
         (lambda y: y * 1000.0, "length unit"),
         (lambda y: 1.5 * y, "scale the model"),
-        (lambda y: np.where(np.arange(12)[:, None] < 2, y, np.nan), "are the names"),
+        (lambda y: np.where(np.arange(12)[:, None] < 2, y, np.nan), "check their names"),
         (lambda y: y[:, [8, 9, 10, 11, 4, 5, 6, 7, 0, 1, 2, 3]], "check labels"),
     ],
 )
