@@ -243,8 +243,8 @@ class PythonCanBus:
         if number == errno.EAFNOSUPPORT:
             return DeviceMisconfiguredError(
                 f"{channel}: no CAN in this kernel, or not permitted for this service: load the "
-                "modules can and can_raw, allow AF_CAN, or use an adapter with "
-                'interface = "slcan"'
+                "modules can and can_raw, copy the drop-in jointfitd-can.conf of the service, or "
+                'use an adapter with interface = "slcan"'
             )
 
         if number in {errno.ENODEV, errno.ENXIO}:
