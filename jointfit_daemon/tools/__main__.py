@@ -80,8 +80,8 @@ def _shared_options(
 def main() -> None:
     """Run the command line with one OpenBLAS thread unless the environment sets a number.
 
-    The matrices of all commands are small: with more threads, waiting costs `jointfit fuse fit` ten
-    times the CPU time.
+    The matrices of all commands are small: with more threads, `jointfit fuse fit` takes ten times
+    the CPU time, spent on waiting.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app()

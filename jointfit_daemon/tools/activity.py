@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def show_activity(label: str) -> Iterator[Callable[[str], None]]:
     """Show a moving bar and the elapsed time on standard error if that is a terminal.
 
-    Yields a function that prints a line on standard error, above the bar.
+    The context manager yields a function that prints a line on standard error, above the bar.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn

@@ -87,7 +87,7 @@ def _calibration_lines(sources: Iterable[Source]) -> Iterator[str]:
 
 
 def _rate(source: Source) -> str:
-    """Return the rate that is set; cameras send at their own, unless their driver has a key."""
+    """Return the configured rate; cameras without a rate key send at their own rate."""
     if source.kind == "mocap" and not hasattr(source.settings, "rate_hz"):
         return "its own"
     return f"{source.rate_hz:g} Hz"

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 READY_S = 30.0
 """Time limit for a process to become ready, s; a Raspberry Pi needs 10 s to import SciPy."""
 STOP_S = 10.0
-"""Time limit for a process to end after SIGTERM, s; then it is killed."""
+"""Time limit for a process to end after SIGTERM, s. A process that exceeds the limit is killed."""
 
 
 class ProcessExitedError(Exception):
@@ -31,7 +31,7 @@ class DemoTimeoutError(Exception):
 
 @contextlib.asynccontextmanager
 async def time_limit(seconds: float, step: str) -> AsyncIterator[None]:
-    """Limit the time of a step.
+    """Raise `DemoTimeoutError` if a step of the demo exceeds its time limit.
 
     Raises
     ------

@@ -51,11 +51,11 @@ ON_DEMAND_ERRORS = (
     (EXIT_MISUSE, "jointfit_daemon.tools.embedded_broker", "BrokerMissingError"),
     (EXIT_MISUSE, "jointfit_daemon.tools.monitor", "MonitorUnavailableError"),
 )
-"""Exit code, module and class of errors whose modules are imported on demand."""
+"""Exit code, module and class name of each error whose module is imported on demand."""
 
 
 def join_lines(text: str) -> str:
-    """Join the lines of each paragraph; lists and indented examples stay as they are."""
+    """Join the lines of each paragraph; lists and indented examples are unchanged."""
     paragraphs = inspect.cleandoc(text).split("\n\n")
     return "\n\n".join(
         paragraph if any(line[:1] in " -*\b" for line in paragraph.split("\n") if line)
@@ -77,7 +77,7 @@ class CommandGroup(TyperGroup):
 
     @override
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command; the terminal wraps the paragraphs of its help, not the docstring."""
+        """Return a command whose help paragraphs are wrapped to the width of the terminal."""
         command = super().get_command(ctx, cmd_name)
         if command is not None and command.help:
             command.help = join_lines(command.help)
@@ -85,7 +85,7 @@ class CommandGroup(TyperGroup):
 
     @override
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Return the completions of one word; a shell would split a name of two."""
+        """Return the completions that are one word; a shell would split a name of two words."""
         found = super().shell_complete(ctx, incomplete)
         return [item for item in found if " " not in item.value]
 
@@ -121,7 +121,7 @@ class CommandGroup(TyperGroup):
 
 def _known_error(error: Exception) -> tuple[int, str] | None:
     """Return exit code and message of an error that is not a bug."""
-    if isinstance(error, BrokenPipeError):  # as in `jointfit schema | head`; typer is silent
+    if isinstance(error, BrokenPipeError):  # as in `jointfit schema | head`; typer prints nothing
         return None
     if isinstance(error, OSError) and error.filename is not None:
         return EXIT_MISUSE, os_error_text(error)

@@ -1,6 +1,7 @@
 """Words that a shell offers after Tab, by argument.
 
-Each list is imported only when a shell asks for it, because most need the packages of the daemon.
+The module of a list is imported only on request of a shell, because most lists need the packages of
+the daemon.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 def complete_rig_or_command(ctx: typer.Context, incomplete: str) -> list[str]:
     """Return rig files and second words of a command that begin with `incomplete`.
 
-    If no command has such a second word, the result is empty: the shell completes paths itself.
+    If no second word matches, the result is empty and the shell completes paths.
     """
     group = getattr(ctx.parent, "command", None)
     names = [name.split(" ") for name in getattr(group, "commands", {}) if " " in name]
@@ -27,7 +28,7 @@ def complete_rig_or_command(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def complete_sensor(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return the sensors of the rig that begin with `incomplete`; none if it cannot be read."""
+    """Return the sensors that begin with `incomplete`; none if the rig cannot be read."""
     from jointfit_daemon.files.text import parse_toml
 
     try:
@@ -45,7 +46,7 @@ def complete_driver(incomplete: str) -> list[str]:
 
 
 def complete_request(incomplete: str) -> list[str]:
-    """Return the requests that begin with `incomplete`."""
+    """Return the names of requests that begin with `incomplete`."""
     from jointfit_daemon.supervisor.requests import REQUESTS
 
     return _beginning_with(incomplete, REQUESTS)

@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded
 
 MOST_SHOWN = 8
-"""Most identifiers in a message."""
+"""Maximum number of identifiers that a message lists."""
 SHOWN = 60
 """Maximum number of characters of a setting quoted in a message."""
 
 
 @dataclass(slots=True)
 class CaptureSummary:
-    """Counts of one capture."""
+    """Counts of decoded and rejected items of one capture."""
 
     corrupt: int = 0
-    """Runs of bytes that are no message."""
+    """Number of runs of bytes that belong to no message."""
     rejected: int = 0
-    """Messages whose content cannot be used."""
+    """Number of messages with unusable content."""
     rejected_bytes: int = 0
     reasons: Counter[str] = field(default_factory=Counter)
     """Rejected messages by reason."""
@@ -206,7 +206,7 @@ def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
 
 
 def _toml(key: str, value: Any) -> str:
-    from jointfit_daemon.files.text import toml_value  # it loads numpy, a quarter of the start
+    from jointfit_daemon.files.text import toml_value  # numpy takes a quarter of the start
 
     return toml_value(value, hexadecimal=key == "ids")
 
@@ -251,7 +251,7 @@ def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
             raise ValueError(
                 f"--set {key[:SHOWN]}: nested more than {MAX_NESTING} levels deep"
             ) from None
-        except ValueError:  # a bare word is text
+        except ValueError:  # a word without quotes is text
             table = {key: value}
         if fault := find_structure_fault(table):
             raise ValueError(f"--set {fault}")

@@ -1,4 +1,4 @@
-"""Settings of a driver that only decodes: keys of the connection get placeholders."""
+"""Driver settings for decoding without a device: keys of the connection get placeholders."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def decoder_settings(driver: type[Driver], name: str, given: Mapping[str, Any]) 
             if CanBusSettings in models:
                 table[key] = {"interface": "virtual", "channel": "file"}
             elif get_origin(info.annotation) is Literal and 1 not in get_args(info.annotation):
-                continue  # a choice without a stand-in is missing
+                continue  # a required choice without a placeholder is missing
             elif not models and get_origin(info.annotation) is not dict:  # no description of data
                 table[key] = "file" if str in kinds else 1
     try:

@@ -1,6 +1,7 @@
 """MQTT 5 broker for the demo and for tests, listening on the loopback interface.
 
-Invariant: no other module imports iotcore. It is not meant for installations; see docs/mqtt.md.
+Invariant: no other module imports iotcore. The broker is not meant for installations; see
+docs/mqtt.md.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class BrokerMissingError(ImportError):
 
 
 def free_port() -> int:
-    """Return a TCP port of the loopback interface that is free now."""
+    """Return a TCP port of the loopback interface that is free at the moment."""
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])

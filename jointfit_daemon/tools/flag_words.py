@@ -1,6 +1,7 @@
-"""Flags of poses in words.
+"""Sentences that describe the flags of poses.
 
-The dashboard's page has the same sentences (``page/js/words.js``). Invariant: every flag has one.
+The dashboard's page has the same sentences (``page/js/words.js``). Invariant: every flag has a
+sentence.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _MINOR = {"extrapolating", "headings_from_static", "origin_fixed", "uncorrected"
 
 
 def flag_sentence(flag: str) -> str:
-    """Return the sentence of a flag of a pose; an unknown flag is its own text."""
+    """Return the sentence of a flag of a pose; an unknown flag is returned unchanged."""
     kind, _, name = flag.partition(":")
     return _FLAGS.get(kind, flag).replace("%", name.replace("_", " "))
 

@@ -1,6 +1,6 @@
 """Trials in a model's marker order, for the commands on marker trials.
 
-Markers that a trial lacks are NaN there.
+Positions of markers that are missing in a trial are NaN.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Outcome of tables written for OpenSim, as the commands report it."""
+"""Report of the outcome of tables written for OpenSim, for all commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Checks of output paths before a command starts its computation; files written as a whole."""
+"""Checks of output paths before a computation starts, and atomic writing of text files."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def check_plot(path: Path | None) -> None:
 
 
 def replace_file(path: Path, text: str) -> None:
-    """Write a text file as a whole, or leave the old one."""
+    """Write a text file as a whole; after an error the old file is unchanged."""
     partial = path.with_name(f"{path.name}.part")
     try:
         with partial.open("w", encoding="utf-8", newline="") as file:

@@ -109,7 +109,7 @@ def send_request(
 
 
 def exit_if_refused(answer: Mapping[str, Any]) -> None:
-    """Print the faults of an answer, one a line, and exit; return if it has none."""
+    """Print the faults of an answer, one per line, and exit; return without faults."""
     if answer.get("status") != "error":
         return
     error: Mapping[str, Any] = answer.get("error") or {}
@@ -122,7 +122,7 @@ def exit_if_refused(answer: Mapping[str, Any]) -> None:
 
 
 def _lines(answer: Mapping[str, Any]) -> list[str]:
-    """Return the data of an answer as text: one line for a value, or for an entry of a list."""
+    """Return the data of an answer as text, with one line for each value or list entry."""
     data: Mapping[str, Any] = answer.get("data") or {}
     lines = []
     if "checks" in data:

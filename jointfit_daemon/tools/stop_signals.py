@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Sent by Ctrl-C, by a service manager or `kill`, and by a closed terminal."""
+"""Signals that Ctrl-C, a service manager or `kill`, and a closed terminal send."""
 _EXIT_BASE = 128
 """Exit code of a process stopped by signal N is 128 + N, the convention of shells."""
 

@@ -1,4 +1,4 @@
-"""Output that the commands share: tables in text, JSON on standard output, checks of choices."""
+"""Shared output functions of the commands: text tables, JSON on standard output, choices."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def echo_json(data: Any) -> None:
 
 
 def echo_wrapped(text: str, *, err: bool = False) -> None:
-    """Print lines; on a terminal, long ones continue below their text, broken at blanks."""
+    """Print lines; on a terminal, long lines are broken at blanks and indented."""
     if not (sys.stderr if err else sys.stdout).isatty():
         typer.echo(text, err=err)
         return
@@ -35,7 +35,7 @@ def echo_wrapped(text: str, *, err: bool = False) -> None:
 
 
 def align_columns(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> str:
-    """Return rows as text columns; those whose numbers are in `right` are right-aligned."""
+    """Return rows as text columns; columns whose numbers are in `right` are right-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
 
     def line(row: Iterable[str]) -> str:

@@ -90,7 +90,7 @@ def _report_progress(running: Iterator[RecordingResult], total: int) -> list[Rec
 
 
 def _words(option: str, text: str, choices: Sequence[str]) -> tuple[str, ...]:
-    """Return the words of a list in the order of `choices`."""
+    """Return the words of a comma-separated list, in the order of `choices`."""
     words = [word.strip() for word in text.split(",") if word.strip()]
     for word in words or [""]:
         check_choice(option, word, choices)

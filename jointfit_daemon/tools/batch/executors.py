@@ -1,7 +1,7 @@
 """Execution of tasks: in a pool of processes, or on an existing Dask cluster.
 
-Invariant: every task yields exactly one result; a process that dies fails only the task that ended
-it.
+Invariant: every task yields exactly one result; if a process dies, only the task that ended the
+process fails.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
 _AHEAD = 2
-"""Tasks submitted per process, so that none of them waits."""
+"""Number of submitted tasks for each process, so that no process waits for a task."""
 _DIED = (
     "the process that read this recording was ended, probably by the system for lack of memory:"
     " process it on a computer with more memory"
@@ -41,8 +41,8 @@ class SchedulerUnavailableError(ImportError):
 def run_in_pool(tasks: Sequence[RecordingTask], jobs: int) -> Iterator[RecordingResult]:
     """Yield results in the order of their completion; a single job runs in this process.
 
-    A pool whose process dies loses all of its tasks. They run again one at a time, which names the
-    task that ends its process.
+    If a process of the pool dies, the pool loses all tasks. The lost tasks run again one at a time,
+    which identifies the task that ends its process.
     """
     if jobs == 1:
         yield from map(process_recording, tasks)
@@ -58,8 +58,8 @@ def run_in_pool(tasks: Sequence[RecordingTask], jobs: int) -> Iterator[Recording
 def _run_pool(
     tasks: Sequence[RecordingTask], jobs: int
 ) -> Generator[RecordingResult, None, list[RecordingTask]]:
-    """Yield results; return the tasks without one, because a process died."""
-    context = multiprocessing.get_context("spawn")  # a fork would copy threads of numpy
+    """Yield results; return the tasks without a result if a process died."""
+    context = multiprocessing.get_context("spawn")  # a forked process would copy numpy's threads
     waiting = deque(tasks)
     running: dict[Future[RecordingResult], RecordingTask] = {}
     with ProcessPoolExecutor(jobs, context) as pool:
@@ -86,7 +86,7 @@ def _run_pool(
 def run_on_cluster(tasks: Sequence[RecordingTask], address: str) -> Iterator[RecordingResult]:
     """Yield results of the workers of a Dask scheduler, in the order of their completion.
 
-    Tasks of a worker that dies run on another one. The workers must see the recordings and the
+    If a worker dies, another worker runs its tasks. The workers must see the recordings and the
     output folder under the same paths.
 
     Raises
@@ -97,7 +97,7 @@ def run_on_cluster(tasks: Sequence[RecordingTask], address: str) -> Iterator[Rec
         There is no scheduler at `address`.
     """
     try:
-        dask: Any = import_module("distributed")  # some of its functions have no types
+        dask: Any = import_module("distributed")  # some functions of Dask have no types
     except ModuleNotFoundError as missing:
         raise SchedulerUnavailableError from missing
 

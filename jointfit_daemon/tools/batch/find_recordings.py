@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _PART = re.compile(r"(?P<session>.+-\d{8}T\d{6})-(?P<number>\d{4,})\.mcap(\.part)?")
-"""Name of a part of a recorded session."""
+"""Pattern of the file name of one part of a recorded session."""
 _ENDINGS = (".mcap", ".mcap.part", ".jsonl")
-"""Endings of files that are recordings."""
+"""File-name extensions of recordings."""
 
 
 def find_recordings(

@@ -1,4 +1,4 @@
-"""Processing of one recording of a batch, in whatever process runs it.
+"""Processing of one recording of a batch, in any process.
 
 Invariant: the files of a recording depend on its bytes, the steps and the software version alone;
 they become visible together, and only when all steps succeeded.
@@ -25,19 +25,22 @@ STEPS = ("calibrate", "replay", "export", "report")
 """Steps in the order in which they run."""
 REPORT_FILE, CALIBRATION_FILE = "report.html", "calibration.json"
 _NAMED_GAPS = 5
-"""Gaps that a row of the summary names; the others are counted."""
+"""Number of gaps that a row of the summary names; further gaps are only counted."""
 MARKS = ".done"
-"""Folder of the marks of processed recordings, in the output folder."""
+"""Folder, in the output folder, of the files that mark processed recordings."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingTask:
-    """One recording, and what to do with it. Paths are the same on all computers of a cluster."""
+    """One recording and the steps to run on it.
+
+    Paths are the same on all computers of a cluster.
+    """
 
     name: str
-    """Name of the recording in the summary, and of its output folder."""
+    """Name of the recording in the summary, and name of the output folder of the recording."""
     parts: tuple[str, ...]
-    """Files of the recording in order."""
+    """Files of the recording, in the order of their parts."""
     out: str
     """Output folder of the batch."""
     steps: tuple[str, ...]
@@ -51,17 +54,17 @@ class RecordingResult:
 
     recording: str
     status: str
-    """``done``, ``differs`` (the replay is not the recorded run) or ``failed``."""
+    """``done``, ``failed``, or ``differs`` if the replay differs from the recorded run."""
     duration_s: float | None = None
     angle: str = ""
-    """Joint angle of `rms_deg`."""
+    """Name of the joint angle to which `rms_deg` refers."""
     rms_deg: float | None = None
-    """RMS difference of the sensors from the cameras, degrees."""
+    """RMS difference between the angle from the sensors and from the cameras, degrees."""
     range_deg: float | None = None
-    """Largest range of an angle, degrees."""
+    """Largest range of motion of all angles, degrees."""
     gait_cycles: int | None = None
     lost_percent: float | None = None
-    """Largest loss of a source, percent."""
+    """Share of lost samples of the source with the largest loss, percent."""
     faults: int | None = None
     verified: str = ""
     """Result of the step ``replay``."""
@@ -96,7 +99,7 @@ def finished_result(task: RecordingTask, digest: str) -> RecordingResult | None:
             return None
         return RecordingResult(**stored)
     except (OSError, ValueError, TypeError, KeyError):
-        return None  # no mark, or one of another version
+        return None  # no mark, or the mark of another version
 
 
 def process_recording(task: RecordingTask) -> RecordingResult:
@@ -195,7 +198,7 @@ def _measured(task: RecordingTask, session: SessionData, notes: str) -> Recordin
     known = [share for share in losses if math.isfinite(share)]
     extents = [found.extent for found in results.ranges]
 
-    # The first missing parts of the recording with their times, and the number of the others.
+    # List the first missing parts of the recording with their times, and count the others.
     missing = [event for event in session.events if event.kind == "gap"]
     gaps = [f"at {gap.t_s:.3f} s: {gap.text}" for gap in missing[:_NAMED_GAPS]]
     if len(missing) > _NAMED_GAPS:

@@ -1,4 +1,4 @@
-"""Summary of a batch: one row a recording, as CSV and as HTML page."""
+"""Summary of a batch as CSV and as HTML page, with one row for each recording."""
 
 from __future__ import annotations
 

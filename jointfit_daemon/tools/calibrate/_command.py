@@ -227,7 +227,7 @@ async def _run_phase(
 
     name = str(arguments["phase"])
     tracker.begin()
-    # The request runs in its own task: its answer is needed even if a signal cancels this one.
+    # The request runs in its own task: the answer is needed even if a signal cancels this one.
     request = asyncio.create_task(client.request("calibrate", arguments), name="calibrate request")
     try:
         answer = await _await_answer(client, tracker, request, name)
@@ -246,7 +246,7 @@ async def _run_phase(
 async def _await_answer(
     client: MqttClient, tracker: PhaseTracker, request: asyncio.Task[dict[str, Any]], name: str
 ) -> dict[str, Any]:
-    """Return the answer to `request`; an empty one if only status messages show its success.
+    """Return the answer to `request`, or an empty answer if only status messages show success.
 
     Raises
     ------
@@ -291,7 +291,7 @@ async def _abort_phase(
     ending = asyncio.create_task(client.request("calibrate", {"phase": "abort"}), name="abort")
     await asyncio.wait([ending], timeout=ABORT_S)
     if ending.done() and not ending.cancelled() and ending.exception() is None:
-        # The answer does not say whether a phase was running: the status does.
+        # The answer does not contain whether a phase was running; the status does.
         final = asyncio.create_task(tracker.wait_for_final(name), name="final status")
         await asyncio.wait([final], timeout=ABORT_S)
         status: Mapping[str, Any] = {}

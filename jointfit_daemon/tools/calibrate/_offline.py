@@ -1,4 +1,4 @@
-"""Option ``--recording`` of `jointfit calibrate`: the calibration of a recorded session again."""
+"""Option ``--recording`` of `jointfit calibrate`: repeats the calibration of a recorded session."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def calibrate_offline(recording: Path, rig: Path | None, out: Path | None) -> di
 
 
 def store_offline_calibration(found: OfflineCalibration, out: Path | None = None) -> str:
-    """Write the calibration to `out`, or to the store of its rig; return a sentence about it.
+    """Write the calibration to `out` or to the rig's store; return a sentence with the place.
 
     Raises
     ------

@@ -18,7 +18,7 @@ STORING_S = 1.5
 RETAINED_S = 1.0
 """Longest wait for the retained status after a subscription, s."""
 OFFLINE_S = 60.0
-"""Longest wait for a daemon that is offline, s: more than a restart takes on a Raspberry Pi."""
+"""Longest wait for an offline daemon, s. A restart on a Raspberry Pi takes less."""
 
 
 def is_not_stored(status: Mapping[str, Any]) -> bool:
@@ -51,14 +51,15 @@ class PhaseTracker:
     status: Mapping[str, Any] = field(default_factory=dict)
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
     _unread: list[Mapping[str, Any]] = field(default_factory=list)
-    """Status messages to process; one without a phase marks an interruption."""
+    """Status messages to process; a status without a phase marks an interruption."""
     _failure: Exception | None = None
     _waiting: bool = False
     """Whether a task waits for the end of a phase."""
     _offline_until: float | None = None
-    """End of the wait for the daemon, s of the event loop; None while it is online."""
+    """Time at which the wait for the daemon ends, s of the event loop; None while the daemon is
+    online."""
     _requested: bool = False
-    """Whether the phase was requested; earlier messages are retained or of other phases."""
+    """Whether the phase was requested; earlier messages are retained or belong to other phases."""
     _phase_before: object = None
     """Phase of the last status before the request."""
     _status_before: object = None
@@ -77,7 +78,7 @@ class PhaseTracker:
         return self._requested
 
     def has_begun(self, phase: str) -> bool:
-        """Return whether a status since the request shows that `phase` was started by it."""
+        """Return whether a status since the request shows that the request started `phase`."""
         began = any(status.get("phase") == phase for status in self._unread)
         return began and self._phase_before != phase
 
@@ -148,7 +149,8 @@ class PhaseTracker:
                     why = status.get("text", "no reason given")
                     raise PhaseAbortedError(f"{phase} was aborted: {why}")
                 elif began and current != "fitting":
-                    # A completed phase changes the version, or gives a reason why it does not.
+                    # The status of a completed phase has a new version, or the reason why the
+                    # version is unchanged.
                     restored = current == "calibrated" and status.get("version") == version
                     if interrupted and (
                         current == "uncalibrated"
@@ -169,7 +171,7 @@ class PhaseTracker:
         return ended if ended.get("phase") == "aborted" else await self.wait_for_store(ended)
 
     async def wait_for_store(self, ended: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the status with the stored version or a failure; `ended` if none comes in time."""
+        """Return the status with the stored version or a failure; `ended` if both are late."""
         with suppress(TimeoutError):
             async with asyncio.timeout(STORING_S):
                 while self.status.get("version") == ended.get("version"):

@@ -10,7 +10,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 MOVED_M = 0.008
-"""Displacement, m, above which a marker was probably knocked; soft tissue moves markers 5 mm."""
+"""Displacement, m, above which a marker was probably knocked. Soft tissue moves markers by about 5
+mm."""
 
 
 def report(quality: Mapping[str, Any]) -> list[str]:
@@ -71,8 +72,8 @@ def report(quality: Mapping[str, Any]) -> list[str]:
 def movement_lines(data: Mapping[str, Any]) -> list[str]:
     """Return one line for each joint in ``data`` of topic ``calibration/progress``.
 
-    The first number is the predicted error with soft-tissue artefact. The second is its random
-    part, which decreases with more movement.
+    The first number is the predicted error with soft-tissue artefact. The second number is the
+    random part of this error, which decreases with more movement.
     """
     lines = []
     for name, joint in (data.get("joints") or {}).items():
@@ -101,7 +102,7 @@ class ProgressLines:
     _next_s: float = 0.0
 
     def update(self, phase: str, share: float, text: str) -> None:
-        """Store the newest progress, `share` from 0 to 1; a new phase is due at once."""
+        """Store the newest progress, `share` from 0 to 1; a new phase is reported at once."""
         if phase != self._run_phase:
             self._run_phase, self._next_s = phase, float("-inf")
         self._line = f"{phase}: {100 * share:.0f} %" + (f", {text}" if text else "")

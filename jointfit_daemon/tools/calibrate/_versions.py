@@ -46,7 +46,7 @@ def list_versions(config: Path, *, json: bool) -> None:
 
 
 def use_version(config: Path, version: int | None, *, json: bool) -> None:
-    """Use a stored version again; None: the one before the version in force."""
+    """Use a stored version again; None selects the version before the one in force."""
     arguments = {"revert": True} if version is None else {"version": version}
     answer = send_request(config, "use-calibration", arguments)
     exit_if_refused(answer)

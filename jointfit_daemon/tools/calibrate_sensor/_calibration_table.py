@@ -39,7 +39,7 @@ def make_calibration(
 ) -> SensorCalibrationSettings:
     """Return the calibration of a sensor; parts without an estimate are taken from `before`.
 
-    Parts of another sensor, by its serial number, are not taken.
+    If the serial number shows that `before` belongs to another sensor, none of its parts are taken.
     """
     values: dict[str, Any] = {}
     if before is not None and before.serial in {None, serial}:
@@ -58,7 +58,7 @@ def make_calibration(
 
 
 def table_lines(calibration: SensorCalibrationSettings) -> list[str]:
-    """Return the lines of the table."""
+    """Return the lines of the table ``[imu.sensor_calibration]``."""
     lines = [f"[imu.{KEY}]"]
     for key, value in calibration.model_dump(exclude_none=True).items():
         text = f'"{value}"' if isinstance(value, str) else str(_lists(value))
@@ -85,7 +85,7 @@ def insert_table(text: str, name: str, calibration: SensorCalibrationSettings) -
     if len(numbers) != 1 or len(begins) != len(wanted["imu"]):
         return None
 
-    # the table of the sensor ends at the next header that is no part of it
+    # The table of the sensor ends at the next header outside of this table.
     begin = begins[numbers[0]]
     end = begin + 1
     while end < len(lines) and not (
@@ -105,7 +105,7 @@ def insert_table(text: str, name: str, calibration: SensorCalibrationSettings) -
 
 
 def _without_own(lines: list[str]) -> list[str]:
-    """Return the lines of a sensor without those of its older calibration."""
+    """Return the lines of a sensor without the lines of the older calibration."""
     out: list[str] = []
     inside = False
     for line in lines:
@@ -117,7 +117,7 @@ def _without_own(lines: list[str]) -> list[str]:
 
 
 def _trailing(lines: list[str]) -> int:
-    """Return the number of empty lines and comments at the end."""
+    """Return the number of empty lines and comments at the end of `lines`."""
     count = 0
     while count < len(lines) and (
         not lines[-1 - count].strip() or lines[-1 - count].lstrip().startswith("#")

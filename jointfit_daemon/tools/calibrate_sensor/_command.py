@@ -1,4 +1,4 @@
-"""Command `jointfit calibrate sensor`: guides through the movements, and writes the result.
+"""Command `jointfit calibrate sensor`: guides through the movements and writes the result.
 
 Invariant: rig.toml is replaced as a whole after the last step, or not at all.
 """
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def _complete_steps(incomplete: str) -> list[str]:
-    """Return lists of steps that begin with `incomplete`."""
+    """Return the completions of a list of steps that begin with `incomplete`."""
     from jointfit_daemon.tools.calibrate_sensor._guided_steps import STEPS
 
     given = incomplete.split(",")[:-1]
@@ -131,7 +131,7 @@ def _sensor(rig: Rig, name: str) -> Source:
 
 
 def _calibratable(rig: Rig, name: str, configured: Source) -> Source:
-    """Return the sensor whose readings are taken, if its orientation comes from the gateway."""
+    """Return the sensor to calibrate, if the gateway computes the orientation of this sensor."""
     from jointfit_daemon.sensor_calibration import CalibratableSettings
 
     for source in (configured, _sensor(rig, name)):
@@ -164,7 +164,7 @@ def _named_steps(steps: str | None) -> list[str] | None:
 
 
 def _possible_steps(named: list[str] | None, source: Source) -> list[str]:
-    """Return the steps for a sensor: those of the option, or all that it can use."""
+    """Return the steps of the option, or else all steps that the sensor supports."""
     from jointfit_daemon.tools.calibrate_sensor._guided_steps import STEPS
 
     magnetic = bool(source.settings.magnetometer)

@@ -47,7 +47,7 @@ INSTRUCTIONS = {
     "each of its sides has pointed in every direction.",
 }
 GYROSCOPE_SCALE = "gyroscope_scale"
-"""Name of the estimate that the turns between the poses of the accelerometer yield."""
+"""Name of the estimate from the turns between the poses of the accelerometer."""
 _SHOW_S = 0.25
 """Interval between two displays of the progress, s."""
 
@@ -58,7 +58,7 @@ class SensorFindings:
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
-    """Reason why a step has no result."""
+    """Reasons of steps without a result."""
     not_estimated: dict[str, str] = field(default_factory=dict)
     """Reason why the additional quantity of a step is not estimated."""
     serial: str | None = None
@@ -67,7 +67,7 @@ class SensorFindings:
     """Warnings of the device."""
 
     def finish(self, name: str, step: Step) -> None:
-        """Add the result of a step, or the reason for its absence."""
+        """Add the result of a step, or the reason why the step has no result."""
         try:
             estimate = step.finish()
         except SensorCalibrationError as error:
@@ -107,7 +107,7 @@ class ReadingStream:
         self._decoder: Decoder = source.driver_class(source.settings.for_readings()).decoder()
         self._findings = findings
         self.samples_without_rate = 0
-        """Samples that contain an orientation only."""
+        """Number of samples that contain an orientation only."""
 
     def feed(self, chunk: Chunk) -> list[SensorReading]:
         """Return the readings that a chunk completes."""

@@ -95,6 +95,6 @@ def _numbers(values: Array, digits: int) -> str:
 
 
 def _axes(matrix: Array) -> str:
-    """Return the largest angle by which two axes are not at right angles."""
+    """Return the largest deviation from a right angle between two axes."""
     skew = np.rad2deg(np.abs(np.array((matrix[0, 1], matrix[0, 2], matrix[1, 2]))).max() * 2.0)
     return f"{skew:.2f} deg from perpendicular"

@@ -1,4 +1,4 @@
-"""Display of the steps: a progress bar on a terminal, lines elsewhere."""
+"""Display of the calibration steps: a progress bar on a terminal, lines elsewhere."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def reconstruct_chain(
     """
     asked = [marker for segment in options.segments for marker in segment]
     for read in filter(None, (trial, source)):
-        read.points(asked)  # reports all unknown names at once
+        read.points(asked)  # report all unknown names at once
 
     names = joint_names(len(options.segments) - 1, options.joints)
     found = chain_joints(

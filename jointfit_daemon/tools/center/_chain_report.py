@@ -27,7 +27,7 @@ _TRAJECTORIES = ("joint", "known", "longest gap, s", "error, mm", "sides apart, 
 
 
 def text(trial: MarkerTrial, joints: Sequence[ChainJoint]) -> str:
-    """Return the centres and a summary of the trajectories as two tables."""
+    """Return the joint centres as a table, and the summary of the trajectories as another."""
     data = trial.trajectories
     centers = [_CENTERS]
     for joint in joints:

@@ -23,7 +23,7 @@ _MM = 1000.0
 _MOST_POINTS = 600
 """Most plotted samples of a marker, to keep vector graphics small."""
 _END_ON = 0.1
-"""Length of a projected unit direction below which the direction is seen end-on."""
+"""Length of a projected unit vector below which the view is treated as along this vector."""
 
 
 def draw_center(

@@ -1,7 +1,8 @@
 """Joints of a chain of segments from one marker trial: centres, and their trajectories.
 
-Each joint is measured in the coordinates of its two segments, where their markers define a frame. A
-segment at an end of the chain needs no frame: in a plane, one marker anywhere on it suffices.
+Each joint centre is estimated in the coordinates of the adjacent segments whose markers define a
+frame. A segment at an end of the chain needs no frame: in a plane, one marker on this segment
+suffices.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 
 _LEAST_SEGMENTS = 2
-"""Fewest segments of a chain: a joint is between two."""
+"""Smallest number of segments of a chain; a joint connects two segments."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,18 +53,18 @@ class ChainJoint:
     name: str
     sides: Sequence[ChainSide]
     trajectory: JointTrajectory
-    """Positions of the joint in the axes of the file."""
+    """Positions of the joint in the axes of the trial file."""
     faults: Sequence[str]
-    """Segments without a frame that were expected to have one, each with the reason."""
+    """Segments that lack an expected frame, each with the reason."""
 
     @property
     def refused(self) -> bool:
-        """Return whether no side has a usable centre."""
+        """Return whether neither segment has a usable centre."""
         return all(side.answer.estimate.refused is not None for side in self.sides)
 
 
 def joint_names(count: int, names: Sequence[str]) -> list[str]:
-    """Return the names of the joints of a chain; ``joint1``, ``joint2``, ... if none are given.
+    """Return the names of the joints of a chain; by default ``joint1``, ``joint2``, ...
 
     Raises
     ------
@@ -111,7 +112,7 @@ def chain_joints(
     Raises
     ------
     UnsuitableTrialError
-        Markers that are too few or named twice, or a joint of which no segment has a frame.
+        Too few markers, a marker named twice, or a joint whose segments both lack a frame.
     """
     least = MIN_MARKERS if plane is None else LEAST_PLANAR
     _check_segments(segments, names, least)
@@ -173,7 +174,7 @@ def _check_segments(segments: Sequence[Sequence[str]], names: Sequence[str], lea
 
 
 def _refuse_other_segment(answer: WindowEstimate, child: Sequence[str]) -> WindowEstimate:
-    """Refuse a centre about which the child's markers do not move on circles or spheres."""
+    """Refuse a centre if the child's markers do not move on circles or spheres about it."""
     e = answer.estimate
     if not MAX_FIT_RMS_M < e.residual < inf:
         return answer

@@ -1,8 +1,8 @@
 """Centres of rotation from a marker trial: parent frame, estimates over windows, world position.
 
 The parent frame is defined by its markers: origin at their mean, x from the first to the second, z
-normal to the plane of the first three (planar movement: y normal to x). It is therefore the same in
-all trials with one marker placement.
+normal to the plane of the first three (planar movement: y normal to x). The parent frame is
+therefore the same in all trials with the same marker placement.
 """
 
 from __future__ import annotations
@@ -29,19 +29,20 @@ if TYPE_CHECKING:
 
 
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
-"""95 % quantile of chi-squared by degrees of freedom: squared semi-axis over variance."""
+"""95 % quantile of the chi-squared distribution, by degrees of freedom: the ratio of the squared
+semi-axis to the variance."""
 STILL_M = 0.005
 """RMS movement of the child markers, m, below which the centre is unobservable."""
 _SEGMENT_M = (0.005, 2.0)
 """Plausible extent of the markers of one segment, m; other values indicate a wrong unit."""
 LEAST_PLANAR = 2
-"""Parent markers needed in a plane."""
+"""Number of parent markers that an estimate in a plane needs."""
 _FEWEST_FRAMES = 3
-"""Fewest frames of a window: three points define a circle."""
+"""Smallest number of frames of a window: three points define a circle."""
 _EXCHANGE_RAD = 2.5
-"""Rotation of a planar parent between two frames, rad, above which names were exchanged."""
+"""Rotation of a planar parent between two frames, rad, above which marker names were exchanged."""
 _EXCHANGE_S = 0.1
-"""Longest time between these two frames, s."""
+"""Longest time between two frames that are checked for exchanged names, s."""
 
 
 class UnsuitableTrialError(ValueError):
@@ -57,11 +58,13 @@ class ParentFrameMotion:
     rms: float
     """RMS residual of the rigid fit to the parent markers, m."""
     poses: BodyPoses
-    """Parent poses in the world (z up); in a plane, the rotation about the normal of the plane."""
+    """Parent poses in the world (z up). In a plane, only the rotation about the normal of the
+    plane."""
     basis: Array
-    """Maps parent coordinates (d,) to those of `poses` (3,): identity, or basis of the plane."""
+    """Matrix from parent coordinates (d,) to the coordinates of `poses` (3,), with d the number of
+    dimensions: the identity, or the basis of the plane."""
     template: Array
-    """The parent's markers in its coordinates, m, shape (m, d)."""
+    """Parent markers in the parent frame, m, shape (number of markers, d)."""
 
     def to_world(self, center: Array) -> Array:
         """Return the world position of a parent point at the mean parent pose, m, shape (3,)."""
@@ -74,7 +77,7 @@ class ParentFrameMotion:
 
 @dataclass(frozen=True, slots=True)
 class WindowEstimate:
-    """Estimate over one window of the trial."""
+    """Estimate of the centre from one window of the trial."""
 
     start_s: float
     end_s: float
@@ -84,7 +87,10 @@ class WindowEstimate:
 
     @property
     def semi_axes(self) -> Array:
-        """Return the semi-axes of the 95 % ellipsoid, m, shape (d,), longest first; inf: unseen."""
+        """Return the semi-axes of the 95 % ellipsoid, m, shape (d,), longest first.
+
+        A semi-axis along an unobservable direction is infinite.
+        """
         unseen = len(self.estimate.unseen)
         variances = np.linalg.eigvalsh(self.estimate.covariance)[unseen:]
         within95 = self.estimate.within95
@@ -198,7 +204,7 @@ def _check_parent(trial: MarkerTrial, parent: Sequence[str], least: int, option:
 def _check_planar_parent(
     flat: Array, trial: MarkerTrial, parent: Sequence[str], option: str
 ) -> None:
-    """Raise an error if the names of the first two markers are exchanged within the trial."""
+    """Raise an error if the trial exchanges the names of the first two parent markers."""
     along = flat[:, 1] - flat[:, 0]
     whole = np.flatnonzero(np.isfinite(flat).all(axis=(1, 2)))
     step = np.angle(np.exp(1j * np.diff(np.arctan2(along[whole, 1], along[whole, 0]))))
@@ -228,7 +234,7 @@ def _poses(template: Array, seen: Array) -> tuple[BodyPoses, float]:
 
 
 def _reduce_planar(seen: Array, child: Array, basis: Array, interval: float) -> ParentFrameMotion:
-    """Transform to the parent frame in the plane spanned by `basis`, shape (3, 2)."""
+    """Transform child markers to the parent frame in the plane with `basis`, shape (3, 2)."""
     flat = seen @ basis
     z = flat[..., 0] + 1j * flat[..., 1]
     whole = np.flatnonzero(np.isfinite(z).all(axis=1))
@@ -284,7 +290,7 @@ def answers(
     for first in range(0, len(points), size):
         part = slice(first, min(first + size, len(points)))
         if part.stop - first < min(size, len(points)) // 2:
-            return  # less than half a window is not estimated
+            return  # a rest shorter than half a window has no estimate
         window = replace(
             movement,
             points=points[part],
@@ -298,7 +304,7 @@ def answers(
 
 
 def _refuse_small_motion(found: CenterEstimate, points: Array) -> CenterEstimate:
-    """Refuse an estimate from motion that rotational noise of the parent could explain."""
+    """Refuse an estimate if rotational noise of the parent could explain the motion."""
     seen = visible(points)
     if not seen.any():
         return found

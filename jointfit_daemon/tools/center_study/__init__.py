@@ -1,4 +1,4 @@
-"""`jointfit center-study`: a published experiment repeated, as tables and figures."""
+"""`jointfit center-study`: repeats a published experiment and writes tables and figures."""
 
 from jointfit_daemon.tools.center_study._command import center_study
 

@@ -35,7 +35,7 @@ def center_study(
 
     if json is not None:
         check_output("--json", json, (json.suffix.lower(),))
-    if out is not None:  # before the computation: it may be impossible
+    if out is not None:  # Check the output before the computation: writing may be impossible.
         out.mkdir(parents=True, exist_ok=True)
 
     plain = StudySetup()

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation.study import PairMaps, StudyExtension, StudySetup
 
 NEAREST = {"α–σ": 0.3, "r–σ": None, "r–α": 0.15}
-"""Clipping limit, m, with the correlations nearest to the printed table, by pair."""
+"""Clipping limit, m, that gives the correlations nearest to the published table, by pair of
+quantities."""
 CAVEATS = (
     "Three noisy points can be collinear, so the error of the analytic solution has no finite"
     " mean square: single outliers determine the raw correlation, which changes with the seed."
@@ -133,7 +134,7 @@ def _correlations(study: Sequence[PairMaps], grid: str) -> list[tuple[str, ...]]
 
 
 def correlations(pair: PairMaps, grid: str, clip: float | None) -> tuple[float, float]:
-    """Return the correlations prediction–analytic and analytic–grid of one pair of quantities."""
+    """Return two correlations of a pair of quantities: prediction–analytic and analytic–grid."""
     analytic = pair.maps["three frames"]
     return (
         correlation(pair.maps["predicted"], analytic, clip),

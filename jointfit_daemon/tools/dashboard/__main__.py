@@ -1,4 +1,4 @@
-"""The server of `jointfit dashboard`, which starts it with its settings as JSON."""
+"""Server process of `jointfit dashboard`; the command passes the settings as JSON."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 async def _serve(server: DashboardServer, listen: ListenAddress, listener: socket.socket) -> None:
-    """Serve until a stop signal; print the URL, and why the broker cannot be reached."""
+    """Serve until a stop signal; print the URL, and the reason for an unreachable broker."""
     with cancel_on_signal() as stop:
         try:
             async with server.listening(listen, listener) as url:
@@ -63,7 +63,7 @@ async def _serve(server: DashboardServer, listen: ListenAddress, listener: socke
 
 
 def exposure(*, encrypted: bool) -> str:
-    """Return the warning of a page that other devices can open."""
+    """Return the warning that other devices can open the page."""
     text = (
         "Every device that can open this page can also use the broker: protect the broker with"
         " accounts (docs/security.md)."

@@ -1,6 +1,6 @@
-"""TLS of the dashboard: towards browsers, and towards the broker.
+"""TLS settings of the dashboard for the connections to browsers and to the broker.
 
-Invariant: the certificate of the broker is always verified, and the version is at least TLS 1.2.
+Invariant: the certificate of the broker is always verified, and the TLS version is at least 1.2.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.tools.dashboard.addresses import BrokerAddress
 
-# Numbers of OpenSSL, X509_V_ERR_… in x509_vfy.h.
+# Error numbers of OpenSSL, X509_V_ERR_… in x509_vfy.h.
 _NOT_YET_VALID, _EXPIRED = 9, 10
 _OTHER_NAMES = (62, 64)
 
 
 def broker_context(broker: BrokerAddress, authority: Path | None) -> ssl.SSLContext | None:
-    """Return the context that verifies the broker, or None for plain TCP.
+    """Return the TLS context that verifies the broker, or None for plain TCP.
 
     Raises
     ------
@@ -43,14 +43,14 @@ def broker_context(broker: BrokerAddress, authority: Path | None) -> ssl.SSLCont
 
 
 def page_context(certificate: Path | None, key: Path | None) -> ssl.SSLContext | None:
-    """Return the context with which the page is served by HTTPS, or None for HTTP.
+    """Return the TLS context that serves the page by HTTPS, or None for HTTP.
 
     Parameters
     ----------
     certificate
         Certificate of this machine in PEM, with intermediate certificates if there are any.
     key
-        Its private key; None if the file of the certificate contains it.
+        Private key of the certificate; None if the certificate file contains the key.
 
     Raises
     ------

@@ -80,7 +80,7 @@ def dashboard(
 
 
 def _new_rig(folder: Path, address: ListenAddress) -> Path:
-    """Return the path of the rig that the page writes; it is offered to this machine only."""
+    """Return the path of the rig that the page writes; only this machine can use this page."""
     from jointfit_daemon.tools.init import rig_path
 
     if not address.is_local:

@@ -1,4 +1,4 @@
-"""Files of the page, read and compressed once.
+"""Files of the web page, which are read and compressed once.
 
 Invariant: a request selects a file by an exact name, so no path can leave the folder of the page.
 """
@@ -24,12 +24,12 @@ _TYPES = {
 
 @dataclass(frozen=True, slots=True)
 class PageFile:
-    """One file of the page."""
+    """One file of the web page."""
 
     content_type: str
     etag: str
     compressed: bytes
-    """Content, compressed by gzip."""
+    """Content of the file, compressed by gzip."""
 
     @property
     def content(self) -> bytes:
@@ -38,14 +38,14 @@ class PageFile:
 
 
 def read_page_files(folder: Path = PAGE) -> dict[str, PageFile]:
-    """Return the files below `folder` by their path in a URL; ``/`` is ``index.html``."""
+    """Return the files below `folder`, by URL path; the path ``/`` is ``index.html``."""
     files = {}
     for path in sorted(folder.rglob("*")):
         if path.suffix not in _TYPES:
             continue
         content = path.read_bytes()
         digest = hashlib.sha256(content).hexdigest()[:20]
-        # A weak tag, because compressed and plain content share it.
+        # The tag is weak, because compressed and plain content share the same tag.
         files[f"/{path.relative_to(folder).as_posix()}"] = PageFile(
             _TYPES[path.suffix], f'W/"{digest}"', gzip.compress(content, 9, mtime=0)
         )

@@ -1,7 +1,7 @@
 """Tunnel from a WebSocket of the page to the TCP or TLS port of the broker.
 
-Invariant: the tunnel passes bytes on unread. The page sends its own CONNECT packet, so the accounts
-and access lists of the broker decide, and the tunnel holds no password.
+Invariant: the tunnel passes bytes on without decoding them. The page sends its own CONNECT packet,
+so the accounts and access lists of the broker decide, and the tunnel holds no password.
 """
 
 from __future__ import annotations
@@ -76,10 +76,10 @@ async def _upload(websocket: ServerConnection, writer: asyncio.StreamWriter) -> 
 async def _download(
     reader: asyncio.StreamReader, websocket: ServerConnection, answered: asyncio.Event
 ) -> None:
-    """Pass the bytes of the broker to the page; set `answered` at the first of them.
+    """Pass the bytes of the broker to the page; set `answered` at the first byte.
 
-    A page that reads slowly fills the buffers of reader and WebSocket. Then nothing is read until
-    it continues, and the broker queues or drops its messages.
+    A page that reads slowly fills the buffers of reader and WebSocket. The tunnel then stops
+    reading until the page continues, and the broker queues or drops messages.
     """
     with contextlib.suppress(OSError, ConnectionClosed):
         while chunk := await reader.read(_CHUNK_BYTES):
@@ -91,7 +91,8 @@ def _closure(broker: BrokerAddress, answered: asyncio.Event) -> str:
     """Return why the broker closed the connection, as far as the tunnel can observe it."""
     if answered.is_set():
         return "the broker closed the connection"
-    # TLS 1.3 checks the certificate of the client after the client's side of the handshake.
+    # With TLS 1.3 the broker checks the client certificate after the client has completed the
+    # handshake.
     cause = (
         "it may require a client certificate" if broker.tls else "a port with TLS needs mqtts://"
     )
@@ -99,7 +100,7 @@ def _closure(broker: BrokerAddress, answered: asyncio.Event) -> str:
 
 
 async def broker_fault(broker: BrokerAddress, context: ssl.SSLContext | None) -> str | None:
-    """Return the reason why the broker cannot be reached now; None if it can."""
+    """Return the reason why the broker cannot be reached now; None if it is reachable."""
     try:
         async with asyncio.timeout(CONNECT_S):
             _, writer = await asyncio.open_connection(broker.host, broker.port, ssl=context)
@@ -112,10 +113,10 @@ async def broker_fault(broker: BrokerAddress, context: ssl.SSLContext | None) ->
 
 
 def connection_fault(error: BaseException) -> str:
-    """Return the cause of a failed connection in words."""
+    """Return the cause of a failed connection as text."""
     if isinstance(error, ssl.SSLCertVerificationError):
         return verification_fault(error)
-    if isinstance(error, ssl.SSLError | ConnectionResetError):  # reset in the handshake of TLS
+    if isinstance(error, ssl.SSLError | ConnectionResetError):  # reset during the TLS handshake
         return "the port does not answer to TLS: check the port, or use mqtt://"
     words: dict[type[BaseException], str] = {
         TimeoutError: "the host does not answer: check its address and the network",
@@ -124,7 +125,7 @@ def connection_fault(error: BaseException) -> str:
     if type(error) in words:
         return words[type(error)]
 
-    # asyncio reports one error for several addresses of a name, with their texts only.
+    # If a name has several addresses, asyncio reports one error that contains only the error texts.
     if isinstance(error, ConnectionRefusedError) or "Connect call failed" in str(error):
         return "connection refused: start the broker, or correct --broker"
     if isinstance(error, OSError) and error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH):

@@ -1,4 +1,4 @@
-"""Addresses that the dashboard accepts: where it listens, and its broker."""
+"""Addresses in the options of the dashboard: of the web server and of the broker."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 LISTEN = "127.0.0.1:8080"
-"""Default address of the page: this machine only."""
+"""Default address of the page, which only this machine can open."""
 PLAIN_PORT, TLS_PORT = 1883, 8883
 """Registered TCP ports of MQTT without and with TLS."""
 _SCHEMES = ("mqtt", "mqtts", "ws", "wss")
@@ -19,7 +19,7 @@ class ListenAddress:
 
     host: str
     port: int
-    """TCP port; 0 selects a free one."""
+    """TCP port; 0 selects a free port."""
 
     @property
     def is_local(self) -> bool:
@@ -51,7 +51,7 @@ class BrokerAddress:
 
 
 def bracketed(host: str) -> str:
-    """Return `host` as in a URL: IPv6 addresses in brackets."""
+    """Return `host` in the form of URLs, with IPv6 addresses in brackets."""
     return f"[{host}]" if ":" in host else host
 
 
@@ -61,7 +61,7 @@ def parse_listen(text: str) -> ListenAddress:
     Raises
     ------
     ValueError
-        `text` is none of them.
+        `text` has none of these forms.
     """
     expected = f"--listen {text}: expected HOST:PORT, such as 127.0.0.1:8080"
     try:
@@ -77,12 +77,12 @@ def parse_listen(text: str) -> ListenAddress:
 def parse_broker(text: str, account: str = "the page asks for them") -> BrokerAddress:
     """Return the address of ``mqtt://HOST:PORT``, ``mqtts://…``, ``wss://…`` or ``HOST:PORT``.
 
-    `account` is the end of the message about a user name in the address: where it belongs.
+    `account` ends the message about a user name in the address: the place for the user name.
 
     Raises
     ------
     ValueError
-        `text` is none of them, or contains a password.
+        `text` has none of these forms, or contains a password.
     """
     expected = (
         f"--broker {text}: expected mqtt://HOST:PORT, mqtts://HOST:PORT (TLS), or wss://HOST/PATH"

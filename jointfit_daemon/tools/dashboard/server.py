@@ -41,7 +41,7 @@ MOST_VIEWERS = 64
 _PACKET_BYTES = 64 * 1024
 """Longest WebSocket message of a page; requests have at most 32 KiB."""
 _PING_S = 20.0
-"""Interval of WebSocket pings, s: a page that disappeared is closed within two intervals."""
+"""Interval of WebSocket pings, s. The connection of a lost page is closed within two intervals."""
 
 
 @dataclass(slots=True)
@@ -51,7 +51,7 @@ class DashboardServer:
     broker: BrokerAddress
     context: ssl.SSLContext | None = None
     base: str | None = None
-    """Base topic that the page shows; None: the page searches."""
+    """Base topic that the page shows; with None, the page searches for rigs."""
     names: tuple[str, ...] = ()
     """Further host names under which browsers may open the page."""
     page_context: ssl.SSLContext | None = None
@@ -70,7 +70,7 @@ class DashboardServer:
         listen
             Address of the page.
         listener
-            Its socket; None opens it.
+            Listening socket of the address; None opens a socket.
 
         Raises
         ------
@@ -85,7 +85,7 @@ class DashboardServer:
             process_request=self.respond,
             subprotocols=[Subprotocol("mqtt"), Subprotocol("jointfit-set-up")],
             server_header=None,
-            compression=None,  # costs more CPU time and memory than it saves on a local network
+            compression=None,  # compression costs more than it saves on a local network
             max_size=_PACKET_BYTES,
             ping_interval=_PING_S,
             ping_timeout=_PING_S,
@@ -106,11 +106,11 @@ class DashboardServer:
         method = getattr(request, "method", "GET")  # old versions of websockets parse GET only
         response = self._refusal(request, method) or self._answer(request, method)
         if method == "HEAD" and response is not None:
-            response.body = b""  # the headers remain, with the length of the content
+            response.body = b""  # HEAD: the headers remain, with the length
         return response
 
     def _refusal(self, request: Request, method: str) -> Response | None:
-        """Return the refusal of a request that no path accepts, if there is one."""
+        """Return the error response to a request that is invalid on every path; None if valid."""
         host = request.headers.get_all("Host")
         if _path(request.path) is None or len(host) != 1:
             return self._text(HTTPStatus.BAD_REQUEST, "Expected a path and one Host header.")
@@ -171,7 +171,7 @@ class DashboardServer:
         return True
 
     def _configuration(self) -> bytes:
-        """Return the settings that the page reads at its start."""
+        """Return the settings that the page requests when it starts."""
         return json.dumps(
             {
                 "version": __version__,
@@ -205,7 +205,7 @@ class DashboardServer:
                 "Content-Type": kind,
                 "Content-Length": str(len(body)),
                 "Connection": "close",
-                "Cache-Control": "no-cache",  # stored, and revalidated by its tag
+                "Cache-Control": "no-cache",  # browsers revalidate stored files by the tag
                 "Content-Security-Policy": self.security_policy,
                 "X-Content-Type-Options": "nosniff",
                 "Referrer-Policy": "no-referrer",
@@ -231,7 +231,7 @@ class DashboardServer:
 
 
 def _path(target: str) -> str | None:
-    """Return the path of a request target; None if there is none."""
+    """Return the path of a request target; None if the target has no path."""
     try:
         return urlsplit(target).path or None
     except ValueError:
@@ -247,14 +247,14 @@ def _authority(origin: str) -> str | None:
 
 
 def _tokens(headers: Headers, name: str) -> set[str]:
-    """Return the elements of all headers of a name, in lower case; without those of weight 0."""
+    """Return the elements of all headers `name` in lower case, without elements of weight 0."""
     elements = ",".join(headers.get_all(name)).lower().split(",")
     parts = [element.replace(" ", "").split(";") for element in elements]
     return {token for token, *weight in parts if weight not in (["q=0"], ["q=0.0"], ["q=0.000"])}
 
 
 def open_listener(listen: ListenAddress) -> socket.socket:
-    """Return a listening socket; it belongs to the first address of a host name.
+    """Return a socket that listens on the first address of a host name.
 
     Raises
     ------
@@ -289,7 +289,7 @@ def own_address() -> str:
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect(("192.0.2.1", 9))  # reserved for documentation (RFC 5737)
+            probe.connect(("192.0.2.1", 9))  # an address reserved for documentation (RFC 5737)
         except OSError:
             return "127.0.0.1"
         return str(probe.getsockname()[0])

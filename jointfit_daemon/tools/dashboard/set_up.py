@@ -1,7 +1,7 @@
 """The set-up page of the dashboard: the dialogue of `jointfit init` in a browser.
 
-Invariant: it is served on the loopback interface only, and writes only into the folder that the
-command names.
+Invariant: the page is served on the loopback interface only, and writes only into the folder that
+the command names.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PAGE = "set-up.html"
 
 @dataclass(slots=True)
 class SetUpServer(DashboardServer):
-    """The dashboard with the set-up page."""
+    """Dashboard server with the additional set-up page."""
 
     session: SetUpSession | None = None
     _turn: asyncio.Lock = field(default_factory=asyncio.Lock)
@@ -49,7 +49,10 @@ class SetUpServer(DashboardServer):
             await websocket.send(json.dumps(await self._reply(websocket, text)))
 
     async def _reply(self, websocket: ServerConnection, text: str | bytes) -> dict[str, Any]:
-        """Return the state after a message; searches take seconds, so they run in a thread."""
+        """Return the dialogue state after a message.
+
+        The message is processed in a thread, because a search takes seconds.
+        """
         try:
             message = json.loads(text)
         except (ValueError, RecursionError):
@@ -68,7 +71,7 @@ class SetUpServer(DashboardServer):
 
 
 def set_up_server(server: DashboardServer, path: Path) -> SetUpServer:
-    """Return a server as `server` that also sets up the rig at `path`."""
+    """Return a server with the settings of `server` that also sets up the rig at `path`."""
     return SetUpServer(
         server.broker,
         server.context,

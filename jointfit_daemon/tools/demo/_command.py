@@ -26,7 +26,7 @@ TARGETS = {"unaccounted": 0, "latency_p99_ms": 60.0}
 """Largest other accepted values; docs/simulator.md lists the simulated imperfections."""
 _LIMBS = "Simulated limb: leg, legs (with pelvis), arm (thorax to hand) or trunk."
 _ERROR_KEY = "_flexion_rmse_deg"
-"""End of the key of the flexion error; the name of the joint comes first."""
+"""End of the result's key for the flexion error; the key begins with the name of the joint."""
 BASE = "jointfit/demo"
 """Topic prefix of the demo."""
 
@@ -124,7 +124,7 @@ def result_line(outcome: str, figures: Mapping[str, Any]) -> str:
 
 
 def _compared_joint(figures: Mapping[str, Any]) -> str:
-    """Return the joint whose flexion error a result contains; the knee without one."""
+    """Return the joint whose flexion error a result contains; by default the knee."""
     return next((name for name in FLEXION_RMSE_DEG if f"{name}{_ERROR_KEY}" in figures), "knee")
 
 
@@ -132,7 +132,7 @@ HINTS = {"latency_p99_ms": ": check the load of this machine"}
 
 
 def missed_targets(figures: dict[str, Any]) -> list[str]:
-    """Return one line for each target that the result misses."""
+    """Return one line for each target that the result does not meet."""
     values = {**figures, "latency_p99_ms": figures.get("latency_ms", {}).get("p99")}
     joint = _compared_joint(figures)
     targets = {f"{joint}{_ERROR_KEY}": FLEXION_RMSE_DEG[joint]} | TARGETS

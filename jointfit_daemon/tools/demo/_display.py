@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.demo._score import TrueLimbState
 
 LONGEST_CURVE = 200
-"""Stored points of each curve; a terminal shows as many of the newest as fit."""
+"""Number of stored points of each curve; a terminal shows as many of the newest points as fit."""
 SPARSE = 10
-"""Frames per column of the curves: 7 s at 100 Hz fill 70 columns."""
+"""Number of frames per column of the curves: 7 s at 100 Hz fill 70 columns."""
 _WIDE = 76
-"""Inner width, columns, from which the steps have a progress bar."""
+"""Smallest inner width, columns, at which the steps have a progress bar."""
 _STEP_COLUMNS = 12
 """Width of the step names, columns."""
 _BARS = "▁▂▃▄▅▆▇█"
@@ -98,7 +98,7 @@ class DemoDisplay:
     def live(
         self, pose: Mapping[str, Any], truth: TrueLimbState | None, figures: Mapping[str, object]
     ) -> None:
-        """Show a pose with the ground truth at the same time."""
+        """Show a pose and the ground truth at the time of the pose."""
         self._pose, self._truth, self._figures = pose, truth, figures
         self._frame += 1
         flexion = _main_joint(pose)[1].get("flexion_deg")
@@ -188,7 +188,7 @@ class _FittedSteps:
 
 @dataclass(frozen=True, slots=True)
 class _Curve:
-    """Labelled line of block characters for the newest values that fit."""
+    """Labelled line of block characters that shows as many of the newest values as fit."""
 
     name: str
     values: Iterable[float]

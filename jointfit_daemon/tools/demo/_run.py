@@ -34,7 +34,7 @@ SETTLE_S = 3.0
 
 
 class DemoLimb(NamedTuple):
-    """Movements of the simulated subject, and the joint that is compared with ground truth."""
+    """Movements of the simulated subject for one limb, and the joint compared with ground truth."""
 
     joint: str
     functional: tuple[tuple[str, float], ...]
@@ -71,7 +71,7 @@ MOTION_S = 8.0
 TRUTH_S = 0.1
 """Interval between readings of the ground truth, s."""
 MATURE_NS = 300_000_000
-"""Age, ns, at which the ground truth of a pose is written and the pose is evaluated."""
+"""Age of a pose, ns, at which the pose is evaluated, because the ground truth is then written."""
 CALIBRATIONS = "state/calibrations"
 """Calibration store of the demo, relative to its folder."""
 OUTCOMES = ("used", "decimated", "idle", "late", "duplicate", "dropped")
@@ -251,7 +251,7 @@ class DemoRun:
         }
         counts["dropped"] += counts.pop("pending")
 
-        # Samples without an outcome, or sent but not received, or the reverse.
+        # Samples without an outcome, and the difference between sent and received samples.
         sent, unaccounted = self._sent or {}, dict[str, int]()
         for name, device in devices.items():
             received = int(device.get("received") or 0)

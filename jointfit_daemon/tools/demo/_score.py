@@ -22,7 +22,7 @@ class TrueLimbState:
     t_ns: int
     motion: str
     orientations: Mapping[str, Quaternion]
-    """q_world_segment in the optical world."""
+    """Segment orientations q_world_segment in the optical world."""
     centers: Mapping[str, Vector]
     """Joint centres in the optical world, m."""
     flexion: float
@@ -90,13 +90,13 @@ class RmsAccumulator:
 
 @dataclass(slots=True)
 class DemoScore:
-    """Errors of published poses against ground truth."""
+    """Statistics of the errors of published poses against ground truth."""
 
     flexion: RmsAccumulator = field(default_factory=RmsAccumulator)
     segments: dict[str, RmsAccumulator] = field(default_factory=dict)
     frames: int = 0
     covered: int = 0
-    """Frames with a flexion error within two published standard deviations."""
+    """Number of frames whose flexion error is within two published standard deviations."""
 
     def add(self, pose: Mapping[str, object], truth: TrueLimbState, joint: str) -> None:
         """Compare one ``pose`` payload with the ground truth at its time."""

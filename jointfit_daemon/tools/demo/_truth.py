@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class TruthReader:
-    """Reads new complete lines of ``truth.jsonl``; a partial line is read with its rest."""
+    """Reads new complete lines of ``truth.jsonl``; a partial line is read when it is complete."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -33,7 +33,7 @@ class TruthReader:
         *lines, self._rest = (self._rest + self._file.read()).split(b"\n")
         for line in lines:
             row = orjson.loads(line)
-            if "truth" in row:  # the header
+            if "truth" in row:  # the first line is the header
                 self._joint = row.get("joint", self._joint)
                 continue
 

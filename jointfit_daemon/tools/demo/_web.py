@@ -39,7 +39,8 @@ PHASES = (("align", 20.0), ("static", 5.0), ("functional", 47.0))
 """Phases of the calibration and their durations, s."""
 TOPICS = ("calibration", "calibration/progress", "device/+/availability")
 ATTEMPTS = 3
-"""Attempts at each phase: a busy computer pauses the simulated sensors, which ends a phase."""
+"""Number of attempts at each phase. A busy computer pauses the simulated sensors, which aborts the
+phase."""
 STOPPED_BY_USER = "abort requested"
 """End of the reason of a phase that a user stopped in the page."""
 LIVE = "The limb is live. Calibrate again in the page; Ctrl-C stops."
@@ -72,7 +73,7 @@ async def run_web_demo(
                     async with simulator(folder, port, base, [*options, *more]) as simulated:
                         rig_file = Path((await simulated.ready())["rig"])
                         async with daemon(folder, rig_file) as process:
-                            from jointfit_daemon.config import load_rig  # slow: after the URL
+                            from jointfit_daemon.config import load_rig  # slow; the URL comes first
 
                             typer.echo(await _calibrate(load_rig(rig_file), process))
                             while True:
@@ -85,7 +86,10 @@ async def run_web_demo(
 
 
 def print_address(url: str, listen: ListenAddress) -> None:
-    """Print the URL; as a QR code too if other devices can open it and segno is installed."""
+    """Print the URL.
+
+    A QR code follows if other devices can open the page and segno is installed.
+    """
     typer.echo(f"dashboard: {url}  (Ctrl-C stops)")
     if listen.is_local:
         typer.echo("For a phone in the same network: --listen 0.0.0.0:8080")
@@ -99,7 +103,7 @@ def print_address(url: str, listen: ListenAddress) -> None:
 
 
 async def _calibrate(rig: Rig, process: ChildProcess) -> str:
-    """Run all phases unless the user takes over in the page; return the sentence of the result."""
+    """Run all phases unless the user takes over in the page; return the result as text."""
     from jointfit_daemon.outputs.mqtt import MqttClient
 
     online: set[str] = set()

@@ -1,4 +1,4 @@
-"""CAN interfaces of this host: network interfaces, and those in the files of python-can.
+"""CAN interfaces of this host: network interfaces, and interfaces configured in python-can.
 
 Invariant: no interface is opened, and none is changed.
 """
@@ -19,13 +19,13 @@ import orjson
 from jointfit_daemon.tools.discovery._sysfs import read_attribute, read_number
 
 RunCommand = Callable[[Sequence[str]], str | None]
-"""Returns the output of a command; None if it is absent or fails."""
+"""Function that returns the output of a command; None if the command is absent or fails."""
 _ARPHRD_CAN = 280
 """Hardware type of CAN interfaces in the kernel."""
 _IFF_UP = 1
 _IP_TIMEOUT_S = 5.0
 _PYTHON_CAN_FILES = ("/etc/can.conf", "~/.can", "~/.canrc", "can.ini")
-"""Configuration files of python-can; a later one wins."""
+"""Configuration files of python-can; values of a later file take precedence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class CanChannel:
 
 
 def run_command(command: Sequence[str]) -> str | None:
-    """Return the output of a command; None if it is absent, fails, or takes too long."""
+    """Return the output of a command; None if the command is absent, fails or is too slow."""
     if shutil.which(command[0]) is None:
         return None
     try:
@@ -77,7 +77,8 @@ def find_can_interfaces(
 ) -> list[CanInterface]:
     """Return the CAN interfaces of this host, ordered by name.
 
-    State and bit rate are in netlink only, so they come from ``ip``; without it they are None.
+    Only netlink gives state and bit rate, so both come from the command ``ip``. They are None
+    without this command.
 
     Parameters
     ----------
@@ -113,11 +114,11 @@ def find_can_interfaces(
 
 
 def _link_details(run: RunCommand, name: str) -> dict[str, Any]:
-    """Return the description of an interface by ``ip``; empty without it."""
+    """Return the description of an interface by the command ``ip``; empty without ``ip``."""
     text = run(["ip", "-details", "-json", "link", "show", "dev", name])
     try:
         links = orjson.loads(text or "[]")
-    except orjson.JSONDecodeError:  # an ip of busybox has no JSON
+    except orjson.JSONDecodeError:  # the ip of busybox has no JSON
         return {}
     first = links[0] if isinstance(links, list) and links else {}
     return first if isinstance(first, dict) else {}
@@ -131,7 +132,7 @@ def configured_can_channels(root: Path = Path("/"), home: Path | None = None) ->
     root
         Folder that contains ``etc``.
     home
-        Home folder; default: that of the user.
+        Home folder; by default the user's home folder.
     """
     found = []
     for name in _PYTHON_CAN_FILES:
@@ -143,7 +144,7 @@ def configured_can_channels(root: Path = Path("/"), home: Path | None = None) ->
         try:
             parser.read(path, encoding="utf-8")
         except (configparser.Error, UnicodeDecodeError, OSError):
-            continue  # python-can reports its own files
+            continue  # python-can reports errors in these files
         for section in parser.sections():
             table = parser[section]
             kind, channel = table.get("interface", table.get("bustype")), table.get("channel")

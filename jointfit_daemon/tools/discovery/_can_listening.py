@@ -1,7 +1,7 @@
-"""Reception on one CAN network interface, and the sensors that the drivers decode there.
+"""Reception on one CAN network interface, and the sensors that the drivers recognize.
 
-Invariant: nothing is sent, and nothing is set. A controller in normal mode acknowledges frames of
-others, as it does for every program.
+Invariant: nothing is sent and no setting is changed. A controller in normal mode acknowledges
+received frames, with this program as with any other.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ _FAULTS = {
 
 @dataclass(frozen=True, slots=True)
 class CanIdentifier:
-    """One identifier that was received."""
+    """One received CAN identifier."""
 
     id: int
     extended: bool
-    """Whether it has 29 bits."""
+    """Whether the identifier has 29 bits."""
     data_bytes: int
-    """Number of data bytes of the last frame."""
+    """Number of data bytes of the last received frame."""
     frames: int
     rate_hz: float | None
-    """Frames a second; None if fewer than two arrived."""
+    """Frames per second; None if fewer than two frames arrived."""
     driver: str | None = None
-    """Driver of the sensor that uses it; None if unknown."""
+    """Driver of the sensor that uses this identifier; None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +65,11 @@ class CanTraffic:
 
     interface: str
     fault: str | None
-    """Reason why it cannot be opened, with its remedy; None if it was opened."""
+    """Reason why the interface cannot be opened, with a remedy; None if it was opened."""
     identifiers: tuple[CanIdentifier, ...] = ()
     devices: tuple[DecodedDevice, ...] = ()
     error_frames: int = 0
-    """Error frames of the controller."""
+    """Number of error frames of the controller."""
 
 
 def listen_can(
@@ -130,7 +130,7 @@ def _receive(
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as receiver:
         try:
             socket.if_nametoindex(interface)
-        except OSError as error:  # CPython sets no error number here
+        except OSError as error:  # CPython sets no errno for this error
             raise OSError(errno.ENODEV, os.strerror(errno.ENODEV)) from error
         receiver.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, _EXTENDED_MASK)
         receiver.bind((interface,))

@@ -1,4 +1,4 @@
-"""Servers of motion capture, found by the drivers that use them."""
+"""Motion-capture servers that the installed drivers find."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ async def find_mocap_servers(
     port: int | None = None,
     wait_s: float = 1.0,
 ) -> list[FoundServer]:
-    """Return the servers of motion capture that answer to one of the installed drivers.
+    """Return the motion-capture servers that answer one of the installed drivers.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ async def find_mocap_servers(
     broadcast
         Whether to ask all hosts in the networks of this host, by one datagram for each network.
     port
-        Command port; default: the usual one of each system.
+        Command port; by default the usual port of each system.
     wait_s
         Time to wait for answers, s.
 
@@ -63,7 +63,7 @@ async def find_mocap_servers(
         except OSError as error:  # the other searches continue
             return error
 
-    # At the same time, so that their waits do not add up.
+    # Search with all drivers at the same time, so that the waiting times do not add up.
     async with asyncio.TaskGroup() as group:
         asked = [
             group.create_task(ask(cast("ServerSearch", cast("Any", driver))))

@@ -44,13 +44,13 @@ class SerialTraffic:
 
     port: str
     fault: str | None
-    """Reason why it cannot be opened, with its remedy; None if it was opened."""
+    """Reason why the port cannot be opened, with a remedy; None if it was opened."""
     received_bytes: dict[int, int]
     """Number of received bytes by speed."""
     baud: int | None = None
     """Speed at which a driver decodes the data, baud."""
     devices: tuple[DecodedDevice, ...] = ()
-    """The driver that decodes the data; several only if their formats are alike."""
+    """Driver that decodes the data. There are several drivers only if their formats are alike."""
 
 
 def usual_bauds() -> tuple[int, ...]:
@@ -79,8 +79,8 @@ def listen_serial(
 ) -> SerialTraffic:
     """Receive on a port at one speed after the other until a driver decodes the data.
 
-    A port that is silent at one speed is not tried at others, because at a wrong speed bytes
-    arrive, too.
+    A port that is silent at one speed is not tried at other speeds, because bytes arrive even at a
+    wrong speed.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def listen_serial(
 
 @contextlib.contextmanager
 def _open(port: str) -> Iterator[int]:
-    """Open for reading, exclusively; restore the settings of the port at the end."""
+    """Open a port exclusively for reading; restore its settings at the end."""
     descriptor = os.open(port, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         if not os.isatty(descriptor):
@@ -128,7 +128,7 @@ def _open(port: str) -> Iterator[int]:
         try:
             yield descriptor
         finally:
-            with contextlib.suppress(termios.error, OSError):  # unplugged
+            with contextlib.suppress(termios.error, OSError):  # the adapter was unplugged
                 termios.tcsetattr(descriptor, termios.TCSANOW, before)
                 fcntl.ioctl(descriptor, termios.TIOCNXCL)
     finally:

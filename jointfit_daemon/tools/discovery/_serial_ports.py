@@ -1,6 +1,7 @@
 """Serial ports of this host, from sysfs and ``/dev/serial``.
 
-Invariant: no port is opened. Opening one resets some boards, and takes it from other programs.
+Invariant: no port is opened. Opening a port resets some boards and takes the port from other
+programs.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ class SerialPortInfo:
 
     @property
     def path(self) -> str:
-        """The path for rig.toml: the most stable of the three."""
+        """Path for rig.toml: the most stable of device file and links."""
         return self.by_id or self.by_path or self.device
 
     @property
     def description(self) -> str:
-        """Maker, product, and USB ids; of a port without them its driver."""
+        """Maker, product and USB ids; the name of the driver for a port without them."""
         words = [word for word in (self.manufacturer, self.product) if word]
         if self.vendor_id is not None and self.product_id is not None:
             words.append(f"({self.vendor_id:04x}:{self.product_id:04x})")
@@ -68,7 +69,7 @@ def find_serial_ports(root: Path = Path("/")) -> list[SerialPortInfo]:
         if not (tty / "device").exists() or read_number(tty / "type") == 0:
             continue
         hardware = (tty / "device").resolve()
-        # The USB device that contains the port; None for other buses.
+        # Find the USB device that contains the port; None for other buses.
         usb = next((up for up in (hardware, *hardware.parents) if (up / "idVendor").exists()), None)
         driver = hardware / "driver"
         found.append(

@@ -1,6 +1,6 @@
-"""Recognition of received bytes or frames: every driver decodes them with its own decoder.
+"""Recognition of received bytes or frames by the decoders of all installed drivers.
 
-Invariant: pure, apart from the import of drivers.
+Invariant: all functions are pure, apart from the import of drivers.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk
 
 LEAST_SAMPLES = 3
-"""Samples that identify a driver: noise may pass one checksum."""
+"""Number of samples that identify a driver; noise may pass the checksum of one sample."""
 LEAST_MESSAGES = 5
-"""Messages that identify a driver whose device sends no orientation."""
+"""Number of messages that identify a driver if the device sends no orientation."""
 MOST_FOREIGN = 0.1
-"""Largest share of bytes outside of messages for a device that sends no orientation."""
+"""Largest share of bytes outside of messages at which a device without orientations is
+recognized."""
 _USUAL_RATES = (
     1,
     5,
@@ -46,13 +47,14 @@ _USUAL_RATES = (
     500,
     1000,
 )
-"""Rates of devices, Hz. A short reception measures the rate with an error of a few percent."""
+"""Usual rates of devices, Hz. A short reception measures the rate with an error of a few
+percent."""
 _NEAR = 0.06
 """Largest relative difference between a measured and a usual rate."""
 
 
 Layouts: TypeAlias = "Mapping[str, Sequence[Mapping[str, Any]]]"
-"""Tables that describe the data of a device, by driver."""
+"""Tables of rig.toml that describe the data of a device, by driver."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,15 +63,15 @@ class DecodedDevice:
 
     driver: str
     settings: dict[str, Any]
-    """Keys of its table in rig.toml, without those of the connection."""
+    """Keys of the device's table in rig.toml, without the keys of the connection."""
     messages: int
     """Number of well-formed messages."""
     samples: int
     """Number of orientations."""
     rate_hz: float | None
-    """Measured rate of the orientations, Hz; None if fewer than two arrived."""
+    """Measured rate of the orientations, Hz; None if fewer than two orientations arrived."""
     discarded_bytes: int
-    """Bytes that belong to no message; after the start, the rest of one is usual."""
+    """Number of bytes that belong to no message. A rest of a message at the start is usual."""
     properties: dict[str, Any] = field(default_factory=dict)
     """Properties that the device sent, such as its model."""
     warnings: tuple[str, ...] = ()
@@ -92,7 +94,7 @@ def decode_stream(
     other_than: str = "",
     layouts: Layouts | None = None,
 ) -> tuple[DecodedDevice, ...]:
-    """Return the device of every installed driver that decodes a byte stream; most samples first.
+    """Return one device for each driver that decodes a byte stream; most samples first.
 
     Parameters
     ----------
@@ -103,7 +105,7 @@ def decode_stream(
     other_than
         Driver that is left out.
     layouts
-        Tables to try in addition to that of each driver.
+        Tables to try in addition to the table of each driver.
     """
     found = []
     for name, driver in installed_drivers():
@@ -129,7 +131,8 @@ def decode_frames(
     Parameters
     ----------
     sizes
-        Number of data bytes of each identifier, by number and whether it has 29 bits.
+        Number of data bytes of each identifier, by identifier and whether the identifier has 29
+        bits.
     chunks
         Records of the frames.
     layouts
@@ -158,7 +161,7 @@ def _candidate_tables(
 
 
 def used_identifiers(table: Mapping[str, Any]) -> set[tuple[int, bool]]:
-    """Return the identifiers in the key ``ids`` of a table, each with whether it has 29 bits."""
+    """Return the identifiers in the key ``ids`` of a table, each with a flag for 29 bits."""
     extended = bool(table.get("extended_ids"))
     return {(number, extended) for number in (table.get("ids") or {}).values()}
 
@@ -181,7 +184,7 @@ def decode_traffic(
 
     try:
         decoder = driver(decoder_settings(driver, name, table)).decoder()
-    except ValueError:  # a candidate that its own settings exclude
+    except ValueError:  # the settings of this candidate are invalid
         return None
     items = [item for chunk in chunks for item in decoder.feed(chunk)] + decoder.flush()
 

@@ -1,4 +1,4 @@
-"""Checks of the broker: address, TLS, credentials, rights, and other clients with our id."""
+"""Checks of the broker: address, TLS, credentials, rights, and other clients with the same id."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ async def check_broker(settings: MqttSettings) -> list[Finding]:
 
 
 async def _state(client: MqttClient) -> str | None:
-    """Return the stored state of the daemon with this base topic; None without one."""
+    """Return the stored state of the daemon with this base topic; None if there is none."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(_STORED_S):
             async for topic, payload in client.messages():
@@ -56,7 +56,7 @@ async def _state(client: MqttClient) -> str | None:
 
 
 def _remedy(error: BrokerLostError, settings: MqttSettings) -> str:
-    """Return the command that helps with an error of the connection."""
+    """Return the command that helps to correct a connection error."""
     text = str(error).casefold()
     host, port = settings.host, settings.tcp_port
     if "refused: no server" in text:

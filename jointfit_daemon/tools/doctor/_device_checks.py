@@ -1,4 +1,4 @@
-"""Checks of the sensors behind serial ports: their family, speed and outputs, by listening only.
+"""Checks of the sensors behind serial ports: family, speed and outputs, found by listening only.
 
 Invariant: nothing is sent to a device.
 """
@@ -31,9 +31,9 @@ _SILENT = (
 
 
 def check_devices(host: Host, sources: Iterable[Source]) -> Iterator[Finding]:
-    """Yield what arrives on the serial ports of sensors, compared with their drivers.
+    """Yield findings from the data on serial ports, compared with the configured drivers.
 
-    Ports that are absent, forbidden or in use are the subject of the checks of ports.
+    Absent, forbidden and used ports are reported by the checks of serial ports.
 
     Parameters
     ----------
@@ -57,7 +57,8 @@ def _is_free(host: Host, source: Source) -> bool:
     node = host.at(source.settings.port)
     if not node.is_char_device() or not host.may_open(node):
         return False
-    # The simulator is one process at a pseudo-terminal; a daemon would be another.
+    # The simulator is one process that has the pseudo-terminal open; a daemon would be a second
+    # one.
     is_pseudo = node.resolve().is_relative_to(host.at("/dev/pts"))
     return len(host.holders(node)) <= is_pseudo
 
@@ -91,7 +92,7 @@ def _compare(  # noqa: PLR0911 - one for each finding
         )
         return Finding(CHECK, name, "error", f"{text}, expected {expected}", remedy)
 
-    # The driver decodes with its defaults, too: those of rig.toml count.
+    # The driver also decodes the data with its defaults, but the keys of rig.toml decide.
     same = [device for device in heard.devices if device.driver == source.driver]
     own = [device for device in same if table.items() <= device.settings.items()] or same
     others = [device for device in heard.devices if device.driver != source.driver]

@@ -1,4 +1,4 @@
-"""The result of `jointfit doctor`, and its text."""
+"""Result of `jointfit doctor`, and the conversion to text."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def report_of(findings: list[Finding]) -> DoctorReport:
 
 
 def finding_lines(finding: Finding) -> Iterator[str]:
-    """Yield a finding as text, its remedy in a line of its own."""
+    """Yield the lines of a finding; the remedy has its own line."""
     subject = f"{finding.check} {finding.id}".strip()
     yield f"{finding.level:8} {subject}: {finding.text}"
     if finding.remedy:

@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 _TIMEX_BYTES = 256
-"""At least the size of ``struct timex``; modes = 0 reads only."""
+"""Buffer size, at least the size of ``struct timex``; modes = 0 only reads."""
 _STATUS_OFFSET = 40
-"""Place of the field ``status`` on 64-bit systems: after modes and four more."""
+"""Position of the field ``status`` on 64-bit systems: after ``modes`` and four more fields."""
 _STA_UNSYNC = 0x40
 
 
 def clock_is_synchronized() -> bool | None:
     """Return whether a service disciplines the system clock (adjtimex); None if unknown."""
     if ctypes.sizeof(ctypes.c_long) != ctypes.sizeof(ctypes.c_int64):
-        return None  # another layout
+        return None  # this system has another layout
     buffer = ctypes.create_string_buffer(_TIMEX_BYTES)
     try:
         if ctypes.CDLL(None, use_errno=True).adjtimex(buffer) < 0:
@@ -80,7 +80,7 @@ def free_bytes(folder: Path) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Host:
-    """The host to check; tests replace single facts.
+    """The host to check; tests replace single methods.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class Host:
         return self.root / path.lstrip("/") if path.startswith("/") else Path(path)
 
     def processes(self) -> Iterator[tuple[int, str, Path]]:
-        """Yield number, name and folder of the running processes."""
+        """Yield number, name and ``/proc`` folder of each running process."""
         for folder in (self.root / "proc").glob("[0-9]*"):
             name = read_attribute(folder / "comm")
             if name is not None and folder.name.isdigit():
@@ -114,7 +114,7 @@ class Host:
         return any(found == name[:15] for _, found, _ in self.processes())
 
     def holders(self, device: Path) -> list[tuple[int, str]]:
-        """Return the processes, of those that this user may inspect, that have `device` open."""
+        """Return the processes that have `device` open, if this user may inspect them."""
         wanted = device.resolve()
         found = []
         for number, name, folder in self.processes():
@@ -122,6 +122,6 @@ class Host:
                 links = list((folder / "fd").iterdir())
                 if any(self.at(str(link.readlink())) == wanted for link in links):
                     found.append((number, name))
-            except OSError:  # of another user, or ended
+            except OSError:  # process of another user, or ended
                 continue
         return found

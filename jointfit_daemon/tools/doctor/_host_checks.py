@@ -15,16 +15,17 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.doctor._host import Host
 
 LOW_DISK_BYTES, LEAST_DISK_BYTES = 1_000_000_000, 50_000_000
-"""Free space that is a warning and an error, bytes: an hour of recording takes about 0.3 GB."""
+"""Free space below which a warning and an error are reported, bytes. An hour of recording takes
+about 0.3 GB."""
 LOW_MEMORY_KB = 200_000
 """Available memory below which a fit may fail, kB."""
 _HARDWARE_GOVERNORS = ("intel_pstate", "amd-pstate-epp")
-"""Drivers whose governor ``powersave`` scales with the load."""
+"""Processor drivers whose governor ``powersave`` scales the frequency with the load."""
 _SERVICE_STATE = "/var/lib/jointfitd"
 
 
 def check_clock(host: Host, *, needed: bool) -> Iterator[Finding]:
-    """Yield whether the system clock is synchronized; `needed`: cameras are stamped by PTP."""
+    """Yield the finding about clock synchronization; `needed` if cameras use PTP stamps."""
     synchronized = host.clock_is_synchronized()
     if synchronized is None:
         text = "the state of the clock cannot be read here"
@@ -40,7 +41,7 @@ def check_clock(host: Host, *, needed: bool) -> Iterator[Finding]:
 
 
 def check_disk(host: Host) -> Iterator[Finding]:
-    """Yield whether the state directory can be written, and the free space."""
+    """Yield findings about write access to the state directory and about free space."""
     folders = [state_directory().absolute()]
     if host.at(_SERVICE_STATE).is_dir():
         folders.append(host.at(_SERVICE_STATE))
@@ -62,7 +63,7 @@ def check_disk(host: Host) -> Iterator[Finding]:
 
 
 def check_memory(host: Host) -> Iterator[Finding]:
-    """Yield whether enough memory is available."""
+    """Yield the finding about the available memory."""
     found = re.search(r"MemAvailable:\s+(\d+)", read_attribute(host.root / "proc/meminfo") or "")
     if found is None:
         yield Finding("memory", "", "unknown", "/proc/meminfo cannot be read", "free -m")
@@ -77,7 +78,7 @@ def check_memory(host: Host) -> Iterator[Finding]:
 
 
 def check_processor(host: Host) -> Iterator[Finding]:
-    """Yield a governor that keeps the processor at its lowest frequency."""
+    """Yield a warning if the governor keeps the processor at its lowest frequency."""
     for folder in sorted((host.root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq")):
         governor = read_attribute(folder / "scaling_governor")
         driver = read_attribute(folder / "scaling_driver")
@@ -92,7 +93,7 @@ def check_processor(host: Host) -> Iterator[Finding]:
 
 
 def check_firewall(host: Host, server: str) -> Iterator[Finding]:
-    """Yield what is known about the firewall of this host, for a server without data."""
+    """Yield the finding about the host's firewall, if a camera server sends no data."""
     settings = read_attribute(host.root / "etc/ufw/ufw.conf") or ""
     if re.search(r"^\s*ENABLED\s*=\s*yes", settings, re.MULTILINE | re.IGNORECASE):
         yield Finding(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.fuse._trial import LimbDescription
 
 METHODS_WITHOUT_MOTION = ("mean", "single")
-"""Methods that are fitted without movement."""
+"""Methods whose fit needs no movement."""
 
 app = typer.Typer(
     name="fuse",
@@ -236,7 +236,7 @@ def apply(
 
 
 def _read_model(path: Path) -> Calibration:
-    """Return the calibration of a model file; ValueError if it is none."""
+    """Return the calibration in a model file; raise ValueError for any other file."""
     from jointfit_daemon.calibration.record import MOST_BYTES, calibration_of
     from jointfit_daemon.files.text import read_json
 

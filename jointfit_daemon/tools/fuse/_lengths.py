@@ -27,7 +27,7 @@ LONGEST_M = 3.0
 """Upper limit of a segment length, m; larger numbers are probably millimetres."""
 _COORDINATES = 3
 _MAD_TO_SD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
 
 
 class MeasuredLength(NamedTuple):
@@ -88,7 +88,7 @@ def parse_origin(text: str | None) -> Vector | None:
 def segment_lengths(
     texts: Sequence[str], trials: Iterable[tuple[Path, Path | None]], limb: LimbDescription
 ) -> dict[str, MeasuredLength]:
-    """Return the segment lengths of ``--length`` options, else those of the reference files.
+    """Return segment lengths from ``--length`` options, or else from the reference files.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def segment_lengths(
     Raises
     ------
     UnusableInputError
-        As `parse_lengths`, or the bone origins are not the ends of a segment in metres.
+        As `parse_lengths`, or the distances of the bone origins are no segment lengths in metres.
     """
     given = parse_lengths(texts, limb.chain.segments)
     references = (reference or sensors for sensors, reference in trials)
@@ -116,8 +116,9 @@ def _measured_lengths(
     """Return the lengths of segments whose two joint centers are in the reference files.
 
     The origin of a bone (``p_BONE``) is its proximal joint center. The length of a segment is the
-    median distance of its origin from that of the next segment, over the instants of all files; its
-    standard deviation is robust (median absolute deviation). The last segment has no next one.
+    median distance from its origin to the origin of the next segment, over all files. The standard
+    deviation of the length is robust (median absolute deviation). The last segment has no next
+    segment, so its length remains unknown.
     """
     arrays = [path for path in references if path.suffix.lower() == ".npz"]
     recordings = [read_recording(path, limb.up) for path in arrays]
@@ -149,7 +150,8 @@ def _measured_lengths(
 def placed_joints(chain: Chain, lengths: Sequence[float | None]) -> dict[int, str]:
     """Return number and name of every joint whose position follows from the known lengths.
 
-    If that is the first joint alone, which is the origin, there is none.
+    If only the first joint has a known position, the result is empty, because this joint is the
+    origin.
     """
     placed = {0: chain.joints[0]}
     for joint in range(1, len(chain.joints)):
@@ -160,7 +162,7 @@ def placed_joints(chain: Chain, lengths: Sequence[float | None]) -> dict[int, st
 
 
 def left_out_positions(chain: Chain, lengths: Sequence[float | None]) -> str | None:
-    """Return a note on the joints without position, with the remedy; None if all are known."""
+    """Return a note on joints without position, with the remedy; None if all are known."""
     known = dict(zip(chain.segments, lengths, strict=True))
     unknown = [segment for segment, length in known.items() if length is None]
     if not unknown:
@@ -175,7 +177,7 @@ def left_out_positions(chain: Chain, lengths: Sequence[float | None]) -> str | N
 
 
 def _number(text: str) -> float | None:
-    """Return a finite number, or None."""
+    """Return the number in a text; None if it is no finite number."""
     try:
         number = float(text)
     except ValueError:

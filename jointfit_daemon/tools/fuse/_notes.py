@@ -1,4 +1,4 @@
-"""Notes on what `jointfit fuse apply` does not take from a calibration: lags, and the side."""
+"""Notes on the parts of a calibration that `jointfit fuse apply` ignores: lags and the side."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
 
 LARGEST_LAG_DIFFERENCE_NS = 1_000_000
-"""Differences up to 1 ms are not noted: at 360 deg/s they amount to 0.4 deg."""
+"""Largest lag difference without a note: at 360 deg/s, 1 ms amounts to 0.4 deg."""
 
 
 def calibration_notes(
@@ -25,7 +25,7 @@ def calibration_notes(
     sensors
         Fused sensors.
     left
-        The limb is a left one, as given by the option ``--left``.
+        Whether the limb is a left limb, from the option ``--left``.
     """
     notes = []
     lags = {name: ns for name, ns in calibration.lag_ns.items() if name in sensors}
@@ -38,7 +38,8 @@ def calibration_notes(
             " interpolate each sensor at t + lag first"
         )
 
-    # a model of `jointfit fuse fit` has no side either, but its user chose the signs
+    # A model of `jointfit fuse fit` has no side either, but the user of this command chose the
+    # signs.
     known = left or bool(calibration.left_joints) or "offline" in calibration.quality
     if not known:
         notes.append(

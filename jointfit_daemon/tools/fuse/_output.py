@@ -56,15 +56,15 @@ class FusedAngles:
     inner: Array
     """Angle between the two segments, shape (n,)."""
     patent: Array
-    """`PATENT_ANGLES` of `read_patent`, shape (n, 4)."""
+    """The angles `PATENT_ANGLES` from `read_patent`, shape (n, 4)."""
     patent_gimbal: Array
-    """Gimbal lock of the patent's angles, 1 or 0, shape (n,)."""
+    """Whether the angles in `patent` are in gimbal lock, 1 or 0, shape (n,)."""
     convention: AngleConvention
-    """Definition of `anatomical`."""
+    """Definition of the angles in `anatomical`."""
 
     @property
     def main_angle(self) -> str:
-        """Name of the angle of `main_sd`."""
+        """Name of the angle to which `main_sd` belongs."""
         return "elevation" if self.convention is AngleConvention.ELEVATION else "flexion"
 
 
@@ -84,13 +84,14 @@ class FusedTrial:
 
     t_s: Array
     segments: Mapping[str, Array]
-    """q_world_segment, z up, shape (n, 4); NaN where unknown."""
+    """Segment orientations q_world_segment, z up, shape (n, 4); NaN where unknown."""
     sd: Mapping[str, Array]
     """Standard deviation of each segment, rad, shape (n,)."""
     angles: Mapping[str, FusedAngles]
     """Joints between two segments."""
     positions: Mapping[str, FusedPosition]
-    """Joints from proximal to distal as far as lengths are known; empty if the first is not."""
+    """Joints from proximal to distal as far as lengths are known; empty if the first length is
+    unknown."""
     flags: Mapping[str, float]
     """Share of frames with each flag, 0 to 1."""
     notes: tuple[str, ...] = ()
@@ -132,7 +133,7 @@ def fuse_trial(calibration: Calibration, table: OrientationRecording, chain: Cha
     table : OrientationRecording
         Sensors of the trial.
     chain : Chain
-        The chain of the calibration, see `chain_of`.
+        Kinematic chain of the calibration, see `chain_of`.
     """
     fuser = LimbFuser(chain, calibration)
     columns = {name: q.tolist() for name, q in table.q.items()}
@@ -143,7 +144,8 @@ def fuse_trial(calibration: Calibration, table: OrientationRecording, chain: Cha
         t_ns = round(t_s * 1e9)
         states.append(fuser.fuse(t_ns, t_ns, k, alive))
 
-    # The lengths of the segments up to a joint are needed; the first joint alone is the origin.
+    # A joint position needs the lengths of all segments up to the joint. If only the first joint is
+    # known, it is the origin and needs no column.
     configured = [configured_length(chain, i) for i in range(len(chain.segments))]
     lengths = [
         calibration.segment[name].length if length is None else length
@@ -254,7 +256,7 @@ def _angle_columns(found: FusedTrial) -> dict[str, Array]:
 
 
 def _position_columns(found: FusedTrial, up: Axis) -> dict[str, Array]:
-    """Return joint positions and their standard deviations as columns, m, in the axes of `up`."""
+    """Return joint positions and their standard deviations as columns, m; `up` is vertical."""
     columns: dict[str, Array] = {}
     for joint, place in found.positions.items():
         columns |= zip(

@@ -16,9 +16,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.fuse._output import FusedTrial
 
 BASELINE = "mean"
-"""Method that the others are compared with."""
+"""Method with which the other methods are compared."""
 _DIGITS = 2
-"""Decimals of displayed degrees; errors that are equal at this precision count as equal."""
+"""Number of decimals of displayed degrees. Errors that are equal at this precision count as
+equal."""
 
 
 def evaluation_table(found: MethodEvaluation) -> str:

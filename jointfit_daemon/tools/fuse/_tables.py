@@ -29,11 +29,12 @@ if TYPE_CHECKING:
 
 
 SLOWEST_HZ, FASTEST_HZ = 5.0, 20_000.0
-"""Plausible sampling rates; others indicate times in another unit than seconds."""
+"""Range of plausible sampling rates, Hz; other rates indicate times in another unit than
+seconds."""
 NORM_SLACK = 0.05
 """Largest deviation of the median quaternion norm from 1."""
 FEWEST = 30
-"""Least number of common samples of sensors and reference."""
+"""Smallest number of common samples of sensors and reference."""
 
 
 class UnusableInputError(ValueError):
@@ -46,9 +47,10 @@ class OrientationRecording:
 
     t_s: Array
     q: Mapping[str, Array]
-    """q_world_sensor by sensor, shape (n, 4) each; NaN where missing."""
+    """Sensor orientations q_world_sensor by sensor, shape (n, 4) each; NaN where missing."""
     bones: Mapping[str, Array]
-    """q_world_segment by bone, shape (n, 4) each; equal to `q` for an STO file."""
+    """Segment orientations q_world_segment by bone, shape (n, 4) each; equal to `q` for an STO
+    file."""
     origins: Mapping[str, Array] = field(default_factory=dict)
     """Proximal joint center of each bone, m, shape (n, 3); NaN where missing."""
 
@@ -64,7 +66,7 @@ def read_recording(path: Path, up: Axis) -> OrientationRecording:
     kind = path.suffix.lower()
     if kind == ".npz":
         trial = read_orientations_npz(path)
-        for name, array in read_arrays(path).items():  # as written: the trial is normalized
+        for name, array in read_arrays(path).items():  # `_trial.py` normalizes them
             if name.endswith("_quat") or name.startswith("q_"):
                 check_unit_norm(path, name, np.asarray(array, dtype=np.float64))
         table = OrientationRecording(trial.t_s, trial.sensors, trial.bones, trial.origins)

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 MARKER_FILES = (".trc", ".c3d")
 SMALLEST_M, LARGEST_M = 0.01, 2.0
-"""Plausible extent of the markers of one segment, m; others indicate wrong units."""
+"""Plausible extent of the markers of one segment, m; other values indicate wrong units."""
 STILL = np.deg2rad(3.0)
 """Largest robust standard deviation of orientation in a static trial, rad."""
 
@@ -65,7 +65,10 @@ class LimbDescription:
 
 @dataclass(frozen=True, slots=True)
 class StaticMarkers:
-    """Marker positions on each segment from a static trial; segment axes equal world axes there."""
+    """Marker positions on each segment from a static trial.
+
+    Segment axes equal world axes in the static pose.
+    """
 
     clusters: Mapping[str, MarkerCluster]
 
@@ -121,7 +124,7 @@ def _markers(texts: Sequence[str], segments: Sequence[str]) -> dict[str, tuple[s
 def read_trial(
     sensors: Path, reference: Path | None, limb: LimbDescription, static: StaticMarkers | None
 ) -> OfflineTrial:
-    """Read one trial: sensors from one file, the reference from the same or another file.
+    """Read one trial: sensors from one file, reference from the same or another file.
 
     Raises
     ------
@@ -187,7 +190,7 @@ def name_trials(trials: Sequence[OfflineTrial], paths: Sequence[Path]) -> list[O
 def read_available_sensors(
     path: Path, chain: Chain, up: Axis, without: Sequence[str]
 ) -> OrientationRecording:
-    """Read the sensors of a chain except those in `without`.
+    """Read the sensors of a chain except the sensors in `without`.
 
     Raises
     ------
@@ -300,7 +303,7 @@ def _optical(path: Path, limb: LimbDescription) -> tuple[OpticalTrack, Calibrati
 
     trial = read_marker_trial(path)
     names = tuple(dict.fromkeys(name for group in limb.markers.values() for name in group))
-    positions = trial.points(names)  # reports all unknown names at once
+    positions = trial.points(names)  # report all unknown names at once
     for segment in limb.chain.segments:
         seen = positions[:, [names.index(name) for name in limb.markers[segment]]]
         seen = seen[visible(seen).all(axis=1)]

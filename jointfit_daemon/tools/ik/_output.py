@@ -32,7 +32,7 @@ def write_tables(
     with_sd: bool,
     in_degrees: bool,
 ) -> list[WrittenTable]:
-    """Write coordinates and marker errors to the files asked for; return an outcome for each."""
+    """Write coordinates and marker errors to the requested files; return an outcome per file."""
     tables = [
         write_coordinates(path, found, with_sd=with_sd, in_degrees=in_degrees)
         for path in coordinates
@@ -43,9 +43,9 @@ def write_tables(
 def write_coordinates(
     path: Path, found: TrialSolution, *, with_sd: bool, in_degrees: bool
 ) -> WrittenTable:
-    """Write the coordinates, angles in degrees or rad, translations in m.
+    """Write the coordinates: angles in degrees or rad, translations in m.
 
-    With `with_sd` a column ``NAME_sd`` follows the coordinates for each of them.
+    With `with_sd`, a column ``NAME_sd`` for each coordinate follows the coordinates.
     """
     unit = np.where(found.is_angle, np.degrees(1.0) if in_degrees else 1.0, 1.0)
     names, values = found.names, found.values * unit

@@ -1,7 +1,6 @@
 """Inverse kinematics of one trial: input checks, solution, and coordinates with uncertainty.
 
-Unknown coordinates are NaN: those of frames without a solution, and those that the visible markers
-do not determine.
+A coordinate is NaN if its frame has no solution, or if the visible markers do not determine it.
 """
 
 from __future__ import annotations
@@ -48,11 +47,12 @@ if TYPE_CHECKING:
 _LIMIT_M2 = 1.0
 """Weight of the excess over joint limits, m^2/rad^2, as in `jointfit markers`."""
 _MOST_HINTS = 5
-"""Most missing markers with a proposed name in one note."""
+"""Maximum number of missing markers for which one note proposes names."""
 _FEWEST_MARKERS = 3
-"""Markers of a frame with a solution: fewer do not determine the position of the first segment."""
+"""Smallest number of markers of a frame with a solution. Fewer markers do not determine the
+position of the first segment."""
 _MISFIT_RAD = 0.0017
-"""Rotation outside of the model's coordinates that is reported, rad: 0.1 degrees."""
+"""Rotation outside of the model's coordinates above which a note is given, rad: 0.1 degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,7 @@ class TrialSolution:
     solved: NDArray[np.bool_]
     """Frames with a solution, shape (T,)."""
     restarted: int
-    """Frames with a smaller error after a restart from another pose."""
+    """Number of frames with a smaller error after a restart from another pose."""
     notes: tuple[str, ...]
 
     @property
@@ -115,7 +115,7 @@ def solve_trial(asked: IkRequest) -> TrialSolution:
     weights, notes = _weights(asked, setup, model)
     notes = [*loaded.remarks, *trial.trajectories.warnings, *notes]
 
-    # The frames in the time range; options take precedence over the set-up file.
+    # Select the frames in the time range; options take precedence over the set-up file.
     t_s = trial.trajectories.t_s
     given = setup.time_range or (-np.inf, np.inf)
     low, high = (g if a is None else a for g, a in zip(given, asked.span, strict=True))
@@ -137,7 +137,7 @@ def solve_trial(asked: IkRequest) -> TrialSolution:
     found = solve_frames(model, targets, weights, options=options)
     found, improved = restart_local_minima(model, targets, weights, found, options)
 
-    # Remarks on exchanged labels; `RefinementError` if the model does not fit.
+    # Add remarks on exchanged labels; raise `RefinementError` if the model does not fit.
     remarks = []
     for group, frames in exchanged_markers(found.residuals, motion.targets).items():
         text = exchange_text(model, group)
@@ -190,7 +190,7 @@ def _weights(asked: IkRequest, setup: IkSetup, model: ChainModel) -> tuple[Array
 def _check(
     asked: IkRequest, model: ChainModel, motion: MotionTrial, trial: MarkerTrial, weights: Array
 ) -> list[str]:
-    """Return notes on missing markers; `RefinementError` if the trial is of another model."""
+    """Return notes on missing markers; raise `RefinementError` for a trial of another model."""
     seen: NDArray[np.bool_] = np.asarray(np.isfinite(motion.targets).all(axis=-1).any(axis=0))
     if not seen.any():
         raise RefinementError(
@@ -222,7 +222,7 @@ def _described(
     solved = found.converged & (seen.sum(axis=1) >= _FEWEST_MARKERS)
     covariance, determined = pose_covariance(model, found)
 
-    # coordinates of joints with markers for all degrees of freedom, shape (T, K)
+    # Coordinates of joints whose markers determine all degrees of freedom, shape (T, K).
     whole = [
         determined[:, columns].all(axis=1)
         for columns, joint in zip(loaded.chain.columns, loaded.coordinates, strict=True)

@@ -1,6 +1,7 @@
 """Answer files: the state of an interrupted dialogue, and the input of scripts.
 
-A question that is asked once is a key. One that is asked for several subjects is a table of them::
+A question that is asked once is a key. A question that is asked for several subjects is a table
+with a key for each subject::
 
     limb = "knee"
     [sensors]
@@ -48,10 +49,10 @@ def read_answers(path: Path) -> Answers:
 
 
 def write_answers(path: Path, answers: Mapping[Key, Any]) -> None:
-    """Write `answers`; a file is replaced at once, so that an interruption leaves a whole one."""
+    """Write `answers`; an existing file is replaced atomically."""
     tables: dict[str, list[str]] = {"": []}
     for (key, subject), value in answers.items():
-        # TOML has no null: an empty text is the empty answer.
+        # TOML has no null, so an empty text represents the empty answer.
         text = toml_value("" if value is None else value)
         if subject:
             tables.setdefault(key, []).append(f"{toml_key(subject)} = {text}")

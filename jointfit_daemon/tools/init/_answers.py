@@ -41,7 +41,7 @@ def sensors_of(answers: Mapping[Key, Any]) -> dict[str, str]:
 
 
 def wiring_of(answers: Mapping[Key, Any], device: str) -> str:
-    """Return ``serial`` for a port that is no CAN adapter, or for an open place; else ``can``."""
+    """Return ``serial`` for a serial port or an open place; ``can`` for a CAN bus or adapter."""
     if device == LATER:
         return "serial"
     return "serial" if "/" in device and device not in answers["can_adapters", ""] else "can"
@@ -68,7 +68,8 @@ def driver_of(answers: Mapping[Key, Any], found: Found, sensor: str) -> ImuDrive
     if ("driver", sensor) not in answers and recognized in named:
         return named[str(recognized)]
 
-    # unanswered: the driver of the sensor before, since most rigs have sensors of one family
+    # Without an answer, use the driver of the previous sensor: most rigs have sensors of one
+    # family.
     sensors = list(sensors_of(answers))
     known = [answers.get(("driver", name)) for name in sensors[: sensors.index(sensor) + 1]]
     return next((named[name] for name in reversed(known) if name in named), fitting[0])
@@ -93,14 +94,14 @@ def ids_of_others(answers: Mapping[Key, Any], sensor: str) -> list[tuple[int, ..
 
 
 def chosen_settings(answers: Mapping[Key, Any], sensor: str) -> dict[str, str]:
-    """Return the answers to the settings of `sensor`, by key."""
+    """Return the answers about the settings of `sensor`, by key."""
     settings = {subject: value for (key, subject), value in answers.items() if key == "setting"}
     names = ((subject.rpartition("."), value) for subject, value in settings.items())
     return {key: str(value) for (owner, _, key), value in names if owner == sensor}
 
 
 def settings_asked(answers: Mapping[Key, Any], found: Found) -> tuple[str, ...]:
-    """Return ``SENSOR.KEY`` of every key with few values that a driver needs."""
+    """Return ``SENSOR.KEY`` for every required driver key with few values."""
     return tuple(
         f"{name}.{choice.key}"
         for name in sensors_of(answers)
@@ -110,14 +111,14 @@ def settings_asked(answers: Mapping[Key, Any], found: Found) -> tuple[str, ...]:
 
 
 def choice_of(answers: Mapping[Key, Any], found: Found, subject: str) -> KeyChoice:
-    """Return the key that ``SENSOR.KEY`` means."""
+    """Return the key of a subject ``SENSOR.KEY``."""
     sensor, _, key = subject.rpartition(".")
     choices = driver_of(answers, found, sensor).choices
     return next(choice for choice in choices if choice.key == key)
 
 
 def previous_answer(answers: Mapping[Key, Any], found: Found, question: str, subject: str) -> Any:
-    """Return the answer for the last sensor with the same driver, None without one.
+    """Return the answer for the last sensor with the same driver; None without such a sensor.
 
     `subject` is a sensor, or ``SENSOR.KEY`` for a key of its driver.
     """

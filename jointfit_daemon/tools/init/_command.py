@@ -106,7 +106,7 @@ def _new_dialogue(
     *,
     network: bool,
 ) -> Dialogue:
-    """Return the dialogue with the answers of a file, or those of an interrupted dialogue."""
+    """Return the dialogue with answers from a file or from an interrupted dialogue."""
     from jointfit_daemon.tools.init._answer_file import read_answers, write_answers
     from jointfit_daemon.tools.init._dialogue import Dialogue
     from jointfit_daemon.tools.init._search import DeviceSearch
@@ -180,7 +180,7 @@ def _show_found(dialogue: Dialogue, show: Callable[[str], None]) -> None:
 
 
 def _finished(dialogue: Dialogue, state: Path) -> Answers:
-    """Run the dialogue; an interruption is reported with the way to continue."""
+    """Run the dialogue; after an interruption, report the command that continues it."""
     from jointfit_daemon.tools.init._dialogue import UnansweredError
 
     try:
@@ -197,7 +197,7 @@ def _finished(dialogue: Dialogue, state: Path) -> Answers:
 
 
 def _write_password(path: Path, given: Answers, show: Callable[[str], None]) -> str | None:
-    """Write the password of the broker to its file; return the path, None without an account."""
+    """Write the broker's password to its file; return the path, or None without an account."""
     from jointfit_daemon.tools.init._writing import write_password
 
     name = given.get(("password_file", ""))
@@ -211,6 +211,6 @@ def _write_password(path: Path, given: Answers, show: Callable[[str], None]) -> 
     if not password and sys.stdin.isatty():
         password = typer.prompt("Password for the broker", hide_input=True, err=True)
     if not password:
-        return str(file)  # the check warns of the missing file
+        return str(file)  # the check warns about the missing file
     write_password(file, password)
     return str(file)

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.init._search import DeviceSearch
 
 HELP, BACK, FIND = "?", "<", "find"
-"""Words instead of an answer: explain the question, return to the one before, start a search."""
+"""Words that are commands instead of answers: explain the question, return to the previous
+question, start a search."""
 
 
 class UnansweredError(ValueError):
@@ -33,27 +34,28 @@ class UnansweredError(ValueError):
 
 @dataclass
 class Dialogue:
-    """One dialogue, from its answers so far to the complete ones."""
+    """One dialogue that asks questions until all answers are known."""
 
     search: DeviceSearch
     show: Callable[[str], None]
-    """Prints a line."""
+    """Function that prints a line."""
     read_line: Callable[[str], str]
-    """Prints a prompt and returns a line; raises EOFError at the end of the input."""
+    """Function that prints a prompt and returns a line; it raises EOFError at the end of the
+    input."""
     store: Callable[[Answers], None]
-    """Stores the answers."""
+    """Function that stores the answers."""
     found: Found
     prepared: dict[Key, Any] = field(default_factory=dict)
     """Values of an answer file."""
     is_script: bool = False
-    """Whether questions without a prepared answer take their default, or fail."""
+    """Whether no user is asked: a question without a prepared answer takes its default or fails."""
     answers: Answers = field(default_factory=dict)
     _stored: Answers = field(default_factory=dict)
     """Answers of an interrupted dialogue to questions that were not asked again yet."""
 
     @property
     def known(self) -> Answers:
-        """All answers: those that were accepted, and stored ones whose questions follow."""
+        """All answers: accepted answers, and stored answers to questions that still follow."""
         return {**self._stored, **self.answers}
 
     def run(self) -> Answers:
@@ -96,19 +98,19 @@ class Dialogue:
         return self.asked()
 
     def asked(self) -> Asked | None:
-        """Return the next question, without the ports of stored answers that follow."""
+        """Return the next question; ports of stored answers to later questions are not offered."""
         stored = {value for (key, _), value in self._stored.items() if key == "device"}
         taken = stored - {*self.answers.get(("can_adapters", ""), ())}
         free = tuple(port for port in self.found.ports if port.address not in taken)
         return next_question(self.answers, replace(self.found, ports=free))
 
     def resume(self, stored: Answers) -> None:
-        """Take over stored answers; open places, and answers not accepted any more, are asked."""
+        """Accept stored answers; ask again for open places and for answers that became invalid."""
         self._stored = {key: value for key, value in stored.items() if value != LATER}
         self._take_stored()
 
     def _take_stored(self) -> None:
-        """Take over stored answers up to the first question without one."""
+        """Accept stored answers up to the first question without a stored answer."""
         while (asked := next_question(self.answers, self.found)) is not None:
             if asked.key not in self._stored:
                 break
@@ -120,7 +122,7 @@ class Dialogue:
                 break
 
     def accept_answer(self, asked: Asked, given: Any) -> None:
-        """Accept an answer, store it, and read what it makes available."""
+        """Accept and store an answer, and read the file or stream that the answer names."""
         self._accept(asked, given)
         self._take_stored()
 
@@ -254,7 +256,7 @@ class Dialogue:
 
 
 def answer_text(value: Any) -> str:
-    """Return an answer as a user types it."""
+    """Return an answer in the form that a user types."""
     if value is None:
         return ""
     if isinstance(value, bool):

@@ -1,7 +1,7 @@
 """The engine of the dialogue: the next question, and the check of an answer.
 
-Invariant: pure. Equal answers and findings yield the same question, and every completed dialogue
-yields a rig that `jointfit check` accepts.
+Invariant: all functions are pure. Equal answers and findings yield the same question, and every
+completed dialogue yields a rig that `jointfit check` accepts.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Asked:
     subject: str
     text: str
     default: Any
-    """Answer if nothing is typed; None without a proposal."""
+    """Proposed answer if nothing is typed; None without a proposal."""
     choices: tuple[FoundDevice, ...]
     optional: bool
     help: str
@@ -98,7 +98,7 @@ def _spoken(answers: Mapping[Key, Any], subject: str) -> str:
 
 
 def _in_order(answers: Mapping[Key, Any], found: Found) -> Iterator[tuple[Question, str]]:
-    """Yield the questions that apply; the consumer stops at the first one without an answer."""
+    """Yield the questions that apply; the caller stops at the first unanswered question."""
     for group, members in groupby(QUESTIONS, key=lambda question: question.group or question.key):
         questions = tuple(members)
         for subject in questions[0].subjects(answers, found):
@@ -112,7 +112,7 @@ def _in_order(answers: Mapping[Key, Any], found: Found) -> Iterator[tuple[Questi
 
 
 def _owner(question: Question, subject: str) -> str:
-    """Return the subject of the group to which a subject of a question belongs."""
+    """Return the subject by which a question is grouped, such as the sensor of a key."""
     return subject.rpartition(".")[0] if question.is_of_keys else subject
 
 
@@ -128,7 +128,7 @@ def answered(answers: Mapping[Key, Any], found: Found) -> list[tuple[str, Any]]:
 
 
 def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -> Answers:
-    """Return the answers with a further one.
+    """Return the answers with a further answer.
 
     Parameters
     ----------
@@ -137,13 +137,13 @@ def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -
     given
         A typed text, a value of an answer file, or None for the default.
     answers, found
-        As of `next_question`.
+        As in `next_question`.
 
     Raises
     ------
     AnswerError
-        The answer has another type, or yields a rig that `jointfit check` refuses; the message is
-        that of the check.
+        The answer has another type, or yields a rig that `jointfit check` refuses. The message is
+        the message of the check.
     """
     if given is None:
         value = asked.default
@@ -179,7 +179,7 @@ _PORT_WITHOUT_FOLDER = re.compile(r"tty\w+|COM\d+", re.IGNORECASE)
 def complete(answers: Mapping[Key, Any], found: Found) -> Answers:
     """Return an answer to every question: missing ones are defaults or stand-ins."""
     filled = dict(answers)
-    for question, subject in _in_order(filled, found):  # it reads what this loop adds
+    for question, subject in _in_order(filled, found):  # reads the answers that this loop adds
         key = question.key, subject
         if key not in filled:
             value = question.default(filled, found, subject)

@@ -22,7 +22,7 @@ class KeyChoice:
     """Description of the key."""
 
     def meaning(self, value: Any) -> str:
-        """Return the part of the description that begins with `value`; empty without one."""
+        """Return the part of the description that begins with `value`; empty if there is none."""
         starts = [(self.help.find(f"{mark}:"), mark) for mark in (f"`{value}`", f"{value}")]
         at, mark = max(starts)
         if at < 0:
@@ -35,44 +35,45 @@ class KeyChoice:
 
 @dataclass(frozen=True, slots=True)
 class CanSensor:
-    """A sensor on a CAN bus, as its frames show it."""
+    """A sensor on a CAN bus, recognized from its frames."""
 
     driver: str
     ids: tuple[int, ...]
-    """Identifiers in the order of the names in the table of its driver."""
+    """CAN identifiers, in the order of the names in the driver's table ``ids``."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Other keys of its ``[[imu]]`` table."""
+    """Other keys of the sensor's ``[[imu]]`` table."""
 
     @property
     def text(self) -> str:
-        """Driver, identifiers and settings in words."""
+        """Driver, identifiers and settings as text."""
         settings = "".join(f", {key} {value}" for key, value in self.settings.items())
         return f"{self.driver} {' '.join(map(hex, self.ids))}{settings}"
 
     def agrees(self, driver: str, settings: Mapping[str, str]) -> bool:
-        """Return whether driver and settings, as text, are those of this sensor."""
+        """Return whether this sensor has the given driver and settings, as text."""
         pairs = ((str(value), settings.get(key)) for key, value in self.settings.items())
         return driver == self.driver and all(given in {own, None} for own, given in pairs)
 
 
 @dataclass(frozen=True, slots=True)
 class ImuDriver:
-    """An installed driver of IMUs, as far as the dialogue asks for its keys."""
+    """An installed driver of IMUs, with the keys that the dialogue asks for."""
 
     name: str
     wiring: Wiring
     baud: int | None = None
-    """Default of its key ``baud``; None without that key."""
+    """Default of the driver's key ``baud``; None without that key."""
     ids: Mapping[str, int] = field(default_factory=dict)
-    """Names and defaults of the CAN identifiers in its table ``ids``; empty without that table."""
+    """Names and defaults of the CAN identifiers in the driver's table ``ids``; empty without that
+    table."""
     text: str = ""
-    """Description of its devices."""
+    """Description of the devices that the driver reads."""
     choices: tuple[KeyChoice, ...] = ()
-    """Keys without default that have few values."""
+    """Keys of the driver that have no default and few values."""
     needs_layout: bool = False
-    """Whether its table describes the frames of the device."""
+    """Whether the driver's table describes the frames of the device."""
     possible: tuple[CanSensor, ...] = ()
-    """Sensors with identifiers that could exist, if its identifiers have no default."""
+    """Possible sensors with their identifiers, if the driver's identifiers have no default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,13 +82,13 @@ class MocapDriver:
 
     name: str
     port: int | None = None
-    """Default of its key `port_key`; None without that key."""
+    """Default of the driver's key `port_key`; None without that key."""
     up_axis: str = "y"
-    """Default of its key ``up_axis``; ``auto`` if the server announces the axis."""
+    """Default of the driver's key ``up_axis``; ``auto`` if the server announces the axis."""
     port_key: str = "command_port"
     """Key with the port of the server."""
     text: str = ""
-    """Description of its systems."""
+    """Description of the motion-capture systems that the driver reads."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +103,7 @@ class FoundDevice:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Everything that was found so far."""
+    """All devices, drivers and names that were found so far."""
 
     imu_drivers: tuple[ImuDriver, ...] = ()
     mocap_drivers: tuple[MocapDriver, ...] = ()
@@ -110,7 +111,7 @@ class Found:
     interfaces: tuple[FoundDevice, ...] = ()
     servers: tuple[FoundDevice, ...] = ()
     can_sensors: Mapping[str, tuple[CanSensor, ...]] = field(default_factory=dict)
-    """Sensors that were received, by bus."""
+    """Recognized sensors, by CAN bus."""
     bauds: Mapping[str, int] = field(default_factory=dict)
     """Speeds at which devices answered, by serial port, baud."""
     recognized: Mapping[str, str] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Limbs that the dialogue offers, as in the folder ``examples``."""
+"""Limbs that the dialogue offers; they correspond to the rigs in the folder ``examples``."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Limb:
     text: str
     """Description for the list of choices."""
     places: Mapping[str, tuple[str, ...]]
-    """Proposed places of sensors on each segment; the keys are the segments."""
+    """Proposed places of sensors on each segment; the keys are the segment names."""
     prefixes: Mapping[str, tuple[str, ...]]
-    """Usual first letters of marker names on each body part; the first ones are proposed."""
+    """Usual first letters of marker names on each body part; the first letters are proposed."""
     joints: tuple[str, ...] = ()
     """Joints from proximal to distal; empty for a branched limb."""
     branches: tuple[Mapping[str, str], ...] = ()
@@ -33,7 +33,7 @@ class Limb:
     has_side: bool = True
     """Whether the limb is on one side of the body."""
     is_planar: bool = False
-    """Whether cameras alone follow a movement in a plane."""
+    """Whether the limb moves in a plane and only cameras measure it."""
 
     @property
     def segments(self) -> tuple[str, ...]:

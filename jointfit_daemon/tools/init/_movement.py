@@ -1,4 +1,4 @@
-"""Detection of a sensor by its movement, on any driver of IMUs."""
+"""Detection of a sensor by its movement, with any IMU driver."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk
 
 TURN_RAD = math.radians(40.0)
-"""Rotation that identifies a sensor; a hand turns it by 90° easily."""
+"""Rotation that identifies a sensor. A hand easily turns a sensor by 90°."""
 REST_SHARE = 0.5
-"""Largest rotation of every other sensor, as a share of that of the turned one."""
+"""Largest rotation of every other sensor, as a share of the rotation of the turned sensor."""
 CONNECT_S, LAST_S, TURN_S = 12.0, 4.0, 30.0
-"""Time limits for connecting all devices, for one more after the last one, and for turning the
-sensor, s. A port without a sensor is common, so that it must not cost the first limit."""
+"""Three time limits, s: for connecting all devices, for a further device after the last connection,
+and for turning the sensor. Ports without a sensor are common, so the second limit ends the wait
+early."""
 _POLL_S = 0.1
 _RETRY_S = 0.3
 _USUAL_BAUDS = (115_200, 921_600, 460_800, 230_400, 2_000_000)
@@ -32,7 +33,7 @@ _USUAL_BAUDS = (115_200, 921_600, 460_800, 230_400, 2_000_000)
 
 @dataclass
 class _Listener:
-    """One device that is read: its rotation since the start, and why it sends nothing."""
+    """One connected device: the rotation since the start, and the reason why it sends no data."""
 
     table: dict[str, Any]
     reason: str = "no answer yet"
@@ -79,7 +80,7 @@ async def find_moved(
     rate_hz: float,
     show: Callable[[str], None],
 ) -> tuple[str, dict[str, Any]]:
-    """Return address and table of the device that is turned while the others rest.
+    """Return address and table of the device that is turned while all other devices rest.
 
     Parameters
     ----------
@@ -144,7 +145,7 @@ async def _connect(listeners: Collection[_Listener]) -> None:
 
 
 def _turned(listeners: Mapping[str, _Listener]) -> str | None:
-    """Return the address of the one device that was turned."""
+    """Return the address of the only device that was turned."""
     first, *others = sorted(listeners.items(), key=lambda entry: entry[1].turned_rad, reverse=True)
     second = others[0][1].turned_rad if others else 0.0
     is_clear = first[1].turned_rad >= TURN_RAD and second <= REST_SHARE * first[1].turned_rad

@@ -27,7 +27,7 @@ class AnswerError(ValueError):
 def parse_answer(
     kind: Kind, given: Any, choices: Sequence[str] = (), *, optional: bool = False
 ) -> Any:
-    """Return the value of an answer; None for an optional one that is empty.
+    """Return the value of an answer; None for an empty optional answer.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def parse_answer(
     given
         A typed text, or a value of TOML.
     choices
-        Values of the list that is shown: their numbers, from 1, are accepted, too.
+        Values of the displayed list. Their numbers, from 1, are also accepted.
     optional
         Whether an empty answer is accepted.
 
@@ -96,7 +96,7 @@ def _yes_no(given: Any, _choices: Sequence[str]) -> bool:
 
 
 def _device(given: Any, choices: Sequence[str]) -> str:
-    """Return the choice with a number, or any other text."""
+    """Return the choice that a number selects; other texts are returned unchanged."""
     word = str(given)
     if word.isascii() and word.isdigit():
         if not 1 <= int(word) <= len(choices):
@@ -127,7 +127,7 @@ def _address(given: Any, choices: Sequence[str]) -> str:
 
 
 def _ids(given: Any, choices: Sequence[str]) -> tuple[int, ...]:
-    """Return identifiers; `choices` are their names."""
+    """Return CAN identifiers; `choices` are the names of the identifiers."""
     words = given.replace(",", " ").split() if isinstance(given, str) else given
     try:
         numbers = tuple(word if isinstance(word, int) else int(word, 0) for word in words)

@@ -1,4 +1,4 @@
-"""Default answers, derived from the answers before them and from found devices."""
+"""Default answers, derived from earlier answers and from found devices."""
 
 from __future__ import annotations
 
@@ -30,16 +30,17 @@ Given = Mapping[Key, Any]
 _USUAL_BAUDS = (115_200, 230_400, 460_800, 921_600, 2_000_000)
 """Speeds that are proposed, in this order, baud."""
 _BITS_PER_SAMPLE = 600
-"""Generous bit rate of one sensor at 1 Hz, bit/s: a message of orientation and raw readings."""
+"""Upper estimate of the bit rate of one sensor at 1 Hz, bit/s: a message of orientation and raw
+readings."""
 _MARKERS = 4
-"""Number of proposed markers: three, and one that may be hidden."""
+"""Number of proposed markers: three, and a fourth because one marker may be hidden."""
 _LEAST_MARKERS = 3
 _ID_STEP = 0x100
-"""Distance of the identifiers of two sensors in stand-ins."""
+"""Difference between the identifiers of two sensors in placeholder answers."""
 
 
 def sensor_rate(answers: Given, _found: Found, _subject: str) -> Any:
-    """Return the rate of the poses, if a sensor can be set to it."""
+    """Return the rate of the poses, if a sensor supports this rate."""
     rate = answers["output_rate_hz", ""]
     return rate if rate in (50, 100, 200, 400) else 100
 
@@ -67,7 +68,7 @@ def devices(answers: Given, found: Found, _sensor: str) -> tuple[FoundDevice, ..
 
 
 def device(answers: Given, found: Found, sensor: str) -> str | None:
-    """Return the only device that is left; None if there is a choice, or nothing."""
+    """Return the device if only one is left; None otherwise."""
     listed = devices(answers, found, sensor)
     waiting = [name for name in sensors_of(answers) if not is_connected(answers, name)]
     return listed[0].address if len(listed) == 1 and len(waiting) == 1 else None
@@ -81,7 +82,7 @@ def unused_port(answers: Given, found: Found, _sensor: str) -> str:
 
 
 def baud(answers: Given, found: Found, sensor: str) -> int:
-    """Return the speed at which the device answered, or the lowest usual one that suffices."""
+    """Return the speed at which the device answered, or the lowest sufficient usual speed."""
     known = found.bauds.get(answers["device", sensor])
     if known is not None:
         return known
@@ -92,7 +93,7 @@ def baud(answers: Given, found: Found, sensor: str) -> int:
 
 
 def setting(answers: Given, found: Found, subject: str) -> str | None:
-    """Return the received value, or that of the last sensor with the same driver, or None."""
+    """Return the received value, or the value of the last sensor with the same driver, or None."""
     sensor, _, key = subject.rpartition(".")
     name, given = driver_of(answers, found, sensor).name, chosen_settings(answers, sensor)
     for received in free_sensors(answers, found, sensor):
@@ -146,8 +147,8 @@ def _markers_in_use(answers: Given) -> set[str]:
 def markers(answers: Given, found: Found, part: str) -> tuple[str, ...] | None:
     """Return the markers of the stream whose names fit `part`, or usual names without a stream.
 
-    A group of names that differ in their last digits belongs to a part if the group is named like
-    the part, or begins with its usual letters.
+    A group of names that differ in their last digits belongs to a part if the group has the name of
+    the part, or begins with the usual letters of the part.
     """
     if not found.markers:
         return unused_markers(answers, found, part)
@@ -169,7 +170,7 @@ def _stem(name: str) -> str:
 
 
 def unused_markers(answers: Given, _found: Found, part: str) -> tuple[str, ...]:
-    """Return the usual names of markers on `part`, with other numbers where they are used."""
+    """Return the usual names of markers on `part`; used names get other numbers."""
     used = _markers_in_use(answers)
     prefix = limb_of(answers).prefixes[part][0]
     numbered = (f"{prefix}{k}" for k in count(1))
@@ -184,7 +185,7 @@ def is_optional(answers: Given, part: str) -> bool:
 
 
 def plate(_answers: Given, found: Found, _subject: str) -> str | None:
-    """Return the rigid body that is named like a plate; without a stream the usual name."""
+    """Return the rigid body with a name like ``plate``; without a stream the usual name."""
     if not found.bodies and not found.markers:
         return "Plate"
     return next((body for body in found.bodies if "plate" in body.casefold()), None)

@@ -1,7 +1,7 @@
 """The questions of the dialogue, in their order.
 
-Invariant: questions are frozen data. Every default and every stand-in is a valid answer, whatever
-the answers before it.
+Invariant: questions are frozen data. Every default and every stand-in is a valid answer, for any
+earlier answers.
 """
 
 from __future__ import annotations
@@ -57,24 +57,25 @@ class Question:
     """Text with a place for the subject."""
     help: str
     group: str = ""
-    """Adjacent questions of a group are asked subject by subject."""
+    """Name of a group. Adjacent questions of a group are asked subject by subject."""
     subjects: Callable[[Given, Found], tuple[str, ...]] = lambda _answers, _found: ONCE
-    """Subjects; none if the question does not apply to the answers before it."""
+    """Subjects of the question; none if earlier answers exclude the question."""
     default: Propose = _nothing
     """Proposal; None without one."""
     stand_in: Propose = _nothing
-    """Valid answer in place of a missing default, for the check of the answers before it."""
+    """Valid answer that replaces a missing default when earlier answers are checked."""
     choices: Callable[[Given, Found, str], tuple[FoundDevice, ...]] = lambda *_: ()
     """Entries of the list that is shown."""
     optional: bool = False
     """Whether the answer may be empty."""
     postponable: bool = False
-    """Whether the word ``later`` is an answer, and the proposal where there is no other one."""
+    """Whether the word ``later`` is an answer; it is then also the proposal if there is no other
+    proposal."""
     finder: Finder | None = None
     explain: Propose = _nothing
-    """Help for this subject; None for `help`."""
+    """Help text for one subject; None to use `help`."""
     is_of_keys: bool = False
-    """Whether it is asked for keys of the subjects of its group, such as ``S1.mode``."""
+    """Whether the question is asked for keys of the subjects of its group, such as ``S1.mode``."""
 
 
 def _if(condition: Callable[[Given], bool]) -> Callable[[Given, Found], tuple[str, ...]]:

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 Given = Mapping[Key, Any]
 
 AXES_CHECK_HZ = 10
-"""Rate of the topic that the check of axes in the dashboard needs, Hz."""
+"""Rate of the topic that the axis check of the dashboard needs, Hz."""
 
 
 def rig_table(answers: Given, found: Found) -> dict[str, Any]:
-    """Return the table of a rig.toml, in the order of its text.
+    """Return the tables of a rig.toml, in the order of its text.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def _imu(answers: Given, found: Found, buses: Mapping[str, str], name: str) -> d
 
 
 def _layout_stand_in(wiring: Wiring, at: int) -> dict[str, Any]:
-    """Return a layout for the check of answers before that of the sensor with number `at`."""
+    """Return a placeholder layout for checks before the layout of sensor `at` is known."""
     if wiring == "serial":
         return {"text": {}, "fields": {"quaternion": {"column": 1}}}
     quaternion = {"offset": 0, "type": "i16", "divisor": 32767}
@@ -160,7 +160,7 @@ def _mqtt(answers: Given) -> dict[str, Any]:
     if not limb_of(answers).is_planar:
         table["sensors_hz"] = AXES_CHECK_HZ
 
-    # Absent for a broker on this machine.
+    # These keys are absent for a broker on this machine.
     encryption = answers.get(("encryption", ""))
     if encryption == "none":
         table["insecure"] = True

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _COLUMN = 42
-"""Column of the comments behind keys."""
+"""Text column at which the comments after keys begin."""
 
 _HEADER = """\
 # Rig of jointfitd, written by `jointfit init`. You may edit it: `jointfit check` reports all
@@ -36,7 +36,7 @@ _COMMENTS = {
     "mqtt.insecure": "any computer on the network path can read and send",
 }
 _HEXADECIMAL = "ids"
-"""Table whose numbers are CAN identifiers."""
+"""Name of the table whose numbers are CAN identifiers."""
 
 
 def rig_text(table: Mapping[str, Any]) -> str:

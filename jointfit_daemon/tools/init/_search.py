@@ -43,13 +43,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.init._answers import Answers
 
 _DIALOGUE_KEYS = {"id", "segment", "driver", "port", "can", "ids", "fields", "server"}
-"""Keys without default that the dialogue can answer, in addition to those with few values. Drivers
-with others are not offered."""
+"""Keys without default that the dialogue can answer, in addition to those with few values. A driver
+with other required keys is not offered."""
 _LAYOUT_KEYS = (
     "frame", "text", "ids", "extended_ids", "sequence", "dbc", "fields", "byte_order", "world",
     "direction", "orientation", "magnetometer",
 )  # fmt: skip
-"""Keys of ``[[imu]]`` that a file with a layout may have."""
+"""Keys of ``[[imu]]`` that a layout file may contain."""
 _CONNECTION_KEYS = {"driver", "can", "ids"}
 """Keys of ``[[imu]]`` that locate a sensor on CAN."""
 _PROPOSED_FIRST = ("xbus", "xcdi", "natnet")
@@ -77,7 +77,7 @@ def drivers_found() -> Found:
         if issubclass(driver.Settings, ImuSettings) and required & {"port", "can"}:
             about = replace(_imu_driver(name, fields), text=_devices_of(driver), choices=choices)
             about = replace(about, needs_layout="fields" in required)
-            if "ids" in required and not about.needs_layout:  # identifiers without default
+            if "ids" in required and not about.needs_layout:  # identifiers have no default
                 about = _with_identifiers(about, driver, fields)
                 if not about.ids:
                     continue
@@ -91,11 +91,11 @@ def drivers_found() -> Found:
 
 
 _ARTICLES = ("One ", "The ``[mocap]`` table for ")
-"""Beginnings of descriptions of tables; the devices follow."""
+"""Beginnings of the descriptions of driver tables; the devices follow."""
 
 
 def _devices_of(driver: type[Driver]) -> str:
-    """Return the description of the devices of a driver, from that of its table."""
+    """Return the description of a driver's devices, from the description of its table."""
     text = (driver.Settings.__doc__ or "").strip().partition("\n")[0].rstrip(".")
     for article in _ARTICLES:
         text = text.removeprefix(article)
@@ -115,7 +115,7 @@ def _imu_driver(name: str, fields: Mapping[str, FieldInfo]) -> ImuDriver:
 def _with_identifiers(
     about: ImuDriver, driver: type[Driver], fields: Mapping[str, FieldInfo]
 ) -> ImuDriver:
-    """Return the driver with sensors that it would recognize on a bus with all identifiers."""
+    """Return the driver with the sensors that it recognizes on a bus that has all identifiers."""
     names = tuple(getattr(fields["ids"].annotation, "model_fields", ()))
     propose = getattr(driver, "candidate_tables", None)
     if not names or propose is None:
@@ -133,7 +133,7 @@ def _with_identifiers(
 
 
 _CAN_BYTES, _STANDARD_IDS = 8, 0x800
-"""Data bytes of a full frame, and number of 11-bit identifiers."""
+"""Number of data bytes of a full frame, and number of 11-bit identifiers."""
 
 
 def _can_sensor(driver: str, table: Mapping[str, Any], names: Sequence[str]) -> CanSensor:
@@ -147,14 +147,14 @@ class DeviceSearch:
     """Searches on this machine and its networks."""
 
     show: Callable[[str], None]
-    """Prints a line."""
+    """Function that prints a line."""
     ports: tuple[str, ...] = ()
     """Serial ports that are not found by themselves, such as pseudo-terminals."""
     network: bool = True
     """Whether to search for motion-capture servers in the networks of this machine."""
 
     def start(self, servers: Sequence[FoundDevice] | None = None) -> Found:
-        """Return drivers and devices; `servers` are those of an earlier search."""
+        """Return drivers and devices; `servers` are the servers of an earlier search."""
         known = {os.path.abspath(port): "named by --port" for port in self.ports}  # noqa: PTH100 - keeps links
         known = {**known, **{info.path: info.description for info in find_serial_ports()}}
         interfaces = [
@@ -171,7 +171,7 @@ class DeviceSearch:
         )
 
     def refresh(self, found: Found) -> Found:
-        """Return `found` with the ports and interfaces that are there now."""
+        """Return `found` with the ports and interfaces that are now present."""
         fresh = self.start(found.servers)
         return replace(found, ports=fresh.ports, interfaces=fresh.interfaces)
 
@@ -180,13 +180,13 @@ class DeviceSearch:
         return address in found.addresses or ("/" in address and os.path.exists(address))  # noqa: PTH110 - NUL returns False
 
     def _servers(self) -> list[tuple[FoundDevice, str]]:
-        """Return the servers of the networks, each with its driver."""
+        """Return the motion-capture servers in the networks, each with its driver."""
         if not self.network:
             return []
         try:
             servers = asyncio.run(find_mocap_servers(broadcast=True, wait_s=SERVER_WAIT_S))
         except OSError:
-            return []  # no network: nothing is found
+            return []  # without a network nothing is found
         usual = {driver.name: driver.port for driver in drivers_found().mocap_drivers}
         found = []
         for server in servers:
@@ -199,7 +199,7 @@ class DeviceSearch:
     def recognized_driver(self, found: Found, port: str) -> tuple[Found, str]:
         """Return the driver that decodes the data of a serial port, and a description.
 
-        Nothing is sent to the device.
+        The search sends nothing to the device.
 
         Raises
         ------
@@ -228,7 +228,7 @@ class DeviceSearch:
         Raises
         ------
         AnswerError
-            The file cannot be read, or has no such keys.
+            The file cannot be read, or contains no layout keys.
         """
         file = Path(path).expanduser()
         try:
@@ -344,7 +344,7 @@ class DeviceSearch:
                     name = found.recognized.get(address, serial[0])
                     tables[address] = {"driver": name, "port": address}
             elif "/" not in address:
-                with contextlib.suppress(AnswerError):  # a bus that is down has no sensor
+                with contextlib.suppress(AnswerError):  # a bus that is down has no sensors
                     for sensor in self._sensors_on(found, address):
                         if sensor.ids not in used:
                             name = f"{address} {' '.join(map(hex, sensor.ids))}"

@@ -1,4 +1,4 @@
-"""Files of a complete dialogue: the rig, the password, and what follows."""
+"""Files of a complete dialogue: rig and password; and the commands that follow."""
 
 from __future__ import annotations
 
@@ -57,14 +57,14 @@ class WrittenRig:
 
 
 def write_rig(path: Path, given: Answers, found: Found) -> WrittenRig:
-    """Write the rig; the stored answers remain while it has open places."""
+    """Write the rig; the stored answers are deleted once the rig has no open places."""
     table = rig_table(given, found)
     replace_file(path, rig_text(table))
     open_places: list[str] = []
     try:
         rig = load_rig(path)
     except ConfigError as error:
-        # The check accepted every answer, so that only open places are left.
+        # The check accepted every answer, so only open places remain.
         open_places += [fault.key for fault in error.faults if fault.value == LATER]
         if len(open_places) < len(error.faults):
             raise

@@ -38,7 +38,7 @@ class SetUpSession:
     search: DeviceSearch = field(default_factory=lambda: DeviceSearch(lambda _: None))
     notes: list[str] = field(default_factory=list)
     on_note: Callable[[str], None] = lambda _note: None
-    """Receives each note of a search at once; it is called in the thread of `handle`."""
+    """Function that receives each note of a search at once; called in the thread of `handle`."""
     _dialogue: Dialogue | None = None
     _written: dict[str, Any] | None = None
 
@@ -61,7 +61,7 @@ class SetUpSession:
 
     @property
     def dialogue(self) -> Dialogue:
-        """The dialogue; it begins with the answers of an interrupted one."""
+        """The dialogue; it begins with the answers of an interrupted dialogue."""
         if self._dialogue is None:
             self.search.show = self._note
             state = state_of(self.path)

@@ -1,7 +1,7 @@
 """Writes refined markers as a chain model, an OpenSim marker set, or offsets in a TRC file.
 
 OpenSim files use OpenSim axes (y up). Markers of a body that the import welded to its parent are
-written on the parent, which is the same position.
+written on the parent, at the same position in space.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Input of `jointfit markers`: a chain model, and trials with columns in its marker order.
 
-Markers that a trial lacks are NaN there. Unknown names in options raise `ValueError`.
+Positions of markers that are missing in a trial are NaN. Unknown names in options raise
+`ValueError`.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ModelRequest:
-    """Model options of the command line."""
+    """Options of the command line that change the model."""
 
     model: Path
     lock: tuple[str, ...] = ()

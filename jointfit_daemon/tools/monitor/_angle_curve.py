@@ -1,4 +1,4 @@
-"""Curve of the chosen angle over the last seconds, with that of the cameras."""
+"""Curves of the chosen angle over the last seconds, from the sensors and from the cameras."""
 
 from __future__ import annotations
 
@@ -17,17 +17,19 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.monitor._rig_view import AngleChoice, AngleSample, RigView
 
 _MARGIN = 6
-"""Cells for the numbers of the axis."""
+"""Number of cells for the numbers of the axis."""
 _LONG = 66
-"""Columns from which the curve shows the longest time range; narrower ones show half of it."""
+"""Smallest number of columns for the longest time range; a narrower curve shows half of this
+range."""
 _GAP_US = 400_000
 """Longest time between two points that a line connects, µs."""
 _LEAST_HALF_DEG = 10.0
 """Half of the smallest range of the axis, degrees."""
 _LEAST_PAIRS = 20
-"""Points from which the difference from the cameras is shown."""
+"""Smallest number of points from which the difference from the cameras is computed."""
 _PAIR_US = 60_000
-"""Largest time between an angle and that of the cameras for their difference, µs."""
+"""Largest time between an angle of the sensors and an angle of the cameras in the difference,
+µs."""
 _Point = tuple[int, float]
 
 
@@ -44,7 +46,8 @@ def curve_lines(
     span = _angle_range(values)
     front, back = (DotCanvas(columns, rows, unicode) for _ in range(2))
     column_us = shown_s * 1e6 / front.width
-    # The curve moves by whole cells: with each dot, every cell of it would be sent again.
+    # The curve moves by whole cells. If it moved by single dots, every cell of the curve would be
+    # sent again.
     cell_us = column_us * front.width / columns
     newest = (math.floor(newest_us / cell_us) + 1) * (front.width // columns) - 1
     for canvas, points, every in ((front, imu, 1), (back, optical, 2)):

@@ -1,4 +1,4 @@
-"""The Textual program: shows the state at a limited rate and passes keys on."""
+"""The Textual program: shows the state at a limited rate and passes keys to it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 MOST_UPDATES_HZ = 10.0
 """Largest rate of updates of the terminal, Hz."""
 _LONGEST_MARK = 200
-"""Characters of a mark, as in the request."""
+"""Maximum number of characters of a mark, as in the request."""
 
 
 def present() -> Moment:
@@ -124,12 +124,12 @@ class MonitorApp(App[int]):
             self.act(action)
 
     def on_key(self, event: Key) -> None:
-        """Cancel the mark: other keys do not come here."""
+        """Cancel the mark; other keys do not reach this method."""
         if event.key == "escape":
             self._close_mark()
 
     def act(self, action: Action) -> None:
-        """Carry out an action of the state."""
+        """Carry out an action that the state has returned."""
         match action:
             case Quit():
                 self.exit(0)
@@ -169,7 +169,7 @@ class MonitorApp(App[int]):
         self.state.take_answer(request.command, answer, self._now().monotonic_s)
 
     def _start(self, work: Coroutine[None, None, None]) -> None:
-        """Run a task until it ends or the program does; an error of it ends the program."""
+        """Run a task until the task or the program ends; an error of the task ends the program."""
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._ended)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 RECONNECT_S = 1.0
 """Pause before the next attempt, s."""
 SEARCH_S = 1.2
-"""Time for the retained information of rigs to arrive, s."""
+"""Time for the retained messages that describe rigs to arrive, s."""
 
 
 class BrokerLink:
@@ -32,7 +32,7 @@ class BrokerLink:
     Parameters
     ----------
     settings
-        Address and account of the broker; with an empty `base` the rig is searched for.
+        Address and account of the broker; with an empty `base`, the link searches for a rig.
     state
         Changed by messages, connections and losses.
     now
@@ -53,7 +53,7 @@ class BrokerLink:
         self._chosen.set()
 
     async def run(self) -> None:
-        """Connect, and again after each loss."""
+        """Connect, and reconnect after each loss of the connection."""
         if self._settings.base:
             self.choose(self._settings.base)
         while True:

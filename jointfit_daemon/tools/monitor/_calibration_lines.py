@@ -1,4 +1,4 @@
-"""Calibration in words: phases, progress, predicted errors, missing movement, results, history."""
+"""Calibration as text: phases, progress, predicted errors, missing movement, results, history."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.monitor._text_lines import Style
 
 _BAR = 30
-"""Most cells of the progress bar."""
+"""Maximum number of cells of the progress bar."""
 _WIDE = 66
-"""Least width of the table of joint centres."""
+"""Smallest width of the table of joint centres, cells."""
 _STEPS = (
     ("align", "a", "Align the sensors", True,
      "Fix all sensors to the plate. Turn it about all three axes until the time is over."),
@@ -51,7 +51,7 @@ def calibration_lines(rig: RigView, width: int) -> list[Line]:
         return wrap("Waiting for the calibration state of the daemon.", width, "muted")
     lines = _running(calibration, rig.progress, width) if calibration.phase in RUNNING else []
     if not lines:
-        # The phases with their keys; the next one is marked.
+        # List the phases with their keys; the next phase is marked.
         cameras = rig.info is not None and any(
             each.kind == "mocap" for each in rig.info.devices.values()
         )
@@ -129,7 +129,7 @@ def _joint_lines(joints: Mapping[str, Any], width: int) -> list[Line]:
 
 
 def _result(calibration: CalibrationState, width: int) -> list[Line]:
-    """Return outcome and quality of the last phase; a rejected result with its remedy."""
+    """Return outcome and quality of the last phase; a rejected result has a remedy."""
     lines = [Line.of(calibration_sentence(calibration), "strong")]
     if calibration.phase == "aborted":
         lines = wrap(f"✖ {calibration_sentence(calibration)}", width, "error", indent=2)
@@ -139,7 +139,7 @@ def _result(calibration: CalibrationState, width: int) -> list[Line]:
     quality = calibration.quality
     try:
         texts = report(quality)
-    except (KeyError, TypeError, ValueError, AttributeError):  # quality of another version
+    except (KeyError, TypeError, ValueError, AttributeError):  # quality is of another version
         texts = ["The quality of this calibration cannot be read: it is of another version."]
     for text in texts:
         lines += wrap(text, width, indent=2)
@@ -152,7 +152,7 @@ def _result(calibration: CalibrationState, width: int) -> list[Line]:
 
 
 def history_lines(state: MonitorState, width: int) -> list[Line]:
-    """Return the stored calibrations, the newest first; the selected one is marked."""
+    """Return the stored calibrations, the newest first, with a mark at the selected one."""
     if state.stored_fault:
         return wrap(f"✖ The list cannot be read: {state.stored_fault}", width, "error", indent=2)
     stored = state.stored

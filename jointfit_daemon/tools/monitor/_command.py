@@ -125,10 +125,10 @@ def _has_terminal() -> bool:
 
 
 def shows_unicode(environment: Mapping[str, str]) -> bool:
-    """Return whether a terminal shows Unicode: by its type, and by the locale if one is set."""
+    """Return whether a terminal shows Unicode: by terminal type, and by locale if set."""
     if environment.get("TERM", "") in _SIMPLE_TERMINALS:
         return False
-    # Python itself sets LC_CTYPE to C.UTF-8 in the locale C, so it is not asked.
+    # Python sets LC_CTYPE to C.UTF-8 in the locale C, so Python's own locale is not used here.
     locale = environment.get("LC_ALL") or environment.get("LANG") or "UTF-8"
     return "UTF8" in locale.upper().replace("-", "")
 
@@ -183,7 +183,7 @@ def _broker_settings(
 
 
 def _address(settings: MqttSettings) -> str:
-    """Return the address of the broker in words."""
+    """Return the address of the broker as text."""
     host = f"[{settings.host}]" if ":" in settings.host else settings.host
     plain = "" if settings.tls or settings.is_local else " (not encrypted)"
     return f"{host}:{settings.tcp_port}{' (TLS)' if settings.tls else plain}"

@@ -1,4 +1,7 @@
-"""Payloads of the daemon decoded through their published models; the only place that does so."""
+"""Decoding of the daemon's payloads with their published models.
+
+Invariant: no other module of the monitor decodes payloads.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ class UnreadablePayloadError(Exception):
 
 
 def decode(topic: str, payload: Any) -> BaseModel | None:
-    """Return the payload of a topic below the base as its model; None of an unknown topic.
+    """Return the payload of a topic below the base as its model; None for an unknown topic.
 
     Control characters in texts and names are replaced by escapes, so that no text of a message can
     control the terminal. Unknown keys are ignored, as docs/mqtt.md asks.
@@ -57,7 +60,7 @@ def _validated(model: type[BaseModel], topic: str, payload: Any) -> BaseModel:
         faults = error.errors(include_url=False, include_context=False, include_input=False)
     for fault in faults:
         if fault["type"] == "extra_forbidden":
-            # Remove the key, of a newer daemon perhaps.
+            # Remove the unknown key, which a newer daemon may have sent.
             table = payload
             *path, last = fault["loc"]
             for part in path:

@@ -1,4 +1,4 @@
-"""Devices of a rig in words: the table of the live view, and the health table."""
+"""Devices of a rig as text: the table of the live view, and the health table."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.monitor._words import Level
 
 _RATE_SHARE = 0.95
-"""Share of the output rate below which an IMU is slow."""
+"""Share of the output rate below which the rate of an IMU is reported as slow."""
 _WIDE = 72
-"""Least width of the table with all columns."""
+"""Smallest width of the table with all columns, cells."""
 _LONGEST_NAME = 14
-"""Most cells of a name in the table."""
+"""Maximum number of cells of a name in the table."""
 _NAME = 12
-"""Most cells of a name in the narrow form."""
+"""Maximum number of cells of a name in the narrow form."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceSummary:
-    """One device in words."""
+    """Texts about one device."""
 
     name: str
     place: str
@@ -59,7 +59,7 @@ def _summary(rig: RigView, name: str, now: Moment) -> DeviceSummary:
     counts = None if rig.health is None else rig.health.devices.get(name)
     online = rig.availability.get(name) == "online" and rig.bridge == "online"
 
-    # Level and state; an error needs a person.
+    # Determine level and state. The level ``error`` means that a person must act.
     availability = rig.availability.get(name, "unknown")
     flags = [] if rig.pose is None else rig.pose.flags
     sensor = None if counts is None else counts.sensor
@@ -120,7 +120,7 @@ def marked(level: Level, text: str) -> tuple[str, Style]:
 
 
 def device_lines(rig: RigView, width: int, now: Moment) -> list[Line]:
-    """Return the table of the live view: one line a device, more in a narrow terminal."""
+    """Return the table of the live view: one line per device, more in a narrow terminal."""
     devices = summaries(rig, now)
     if not devices:
         return []
@@ -197,7 +197,7 @@ def _ms(microseconds: float | None) -> float | None:
 
 
 def _latency_text(latency: Latency) -> str:
-    """Return the latency of the frames in words: in all, and the 99th percentile by stage."""
+    """Return the latency of frames as text: total, and the 99th percentile by stage."""
     total = latency.total_us
     if total is None:
         return "frames: none written since the last health message"
@@ -217,7 +217,7 @@ def _latency_text(latency: Latency) -> str:
 
 
 def _daemon(rig: RigView, health: Health, width: int, broker: str, now: Moment) -> list[Line]:
-    """Return the state of the process, its link, learning and recording."""
+    """Return the state of the daemon: process, link, learning and recording."""
     process, link, frames = health.process, health.link, health.frames
     memory_mb = None if process.rss_bytes is None else process.rss_bytes / 1e6
     learning = str(health.learning.state)

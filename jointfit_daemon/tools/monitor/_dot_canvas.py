@@ -1,7 +1,7 @@
 """A canvas of dots for curves and stick figures: Braille patterns, or one character a cell.
 
-A Braille cell has two columns and four rows of dots, so its dots are about square. In ASCII a cell
-is one dot, about twice as high as wide.
+A Braille cell has two columns and four rows of dots, so the dots have about equal distances in both
+directions. In ASCII a cell is one dot, about twice as high as wide.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _BITS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
 
 @dataclass(slots=True)
 class DotCanvas:
-    """Dots on `columns` by `rows` cells; the origin is the upper left."""
+    """Canvas of dots on `columns` by `rows` cells; the origin is the upper left."""
 
     columns: int
     rows: int
@@ -43,7 +43,7 @@ class DotCanvas:
 
     @property
     def aspect(self) -> float:
-        """Return height over width of a dot, as a length on the screen."""
+        """Return the ratio of height to width of a dot on the screen."""
         return 1.0 if self.unicode else 2.0
 
     def plot(self, x: int, y: int) -> None:
@@ -72,7 +72,7 @@ class DotCanvas:
 def render(front: DotCanvas, style: Style, back: DotCanvas, back_style: Style) -> list[Line]:
     """Return two canvases of the same size on top of each other, as lines.
 
-    A cell has one style: that of the front if it has a dot there.
+    A cell has one style: the style of the front canvas if the front has a dot in this cell.
     """
     lines = []
     for row in range(front.rows):
@@ -85,7 +85,7 @@ def render(front: DotCanvas, style: Style, back: DotCanvas, back_style: Style) -
             else:
                 character = "*" if above else "." if below else " "
 
-            # Cells of one style, and blank ones, are one span.
+            # Adjacent cells of one style form one span, blank cells included.
             chosen: Style = style if above else back_style if below else ""
             if spans and (spans[-1][1] == chosen or character == " "):
                 spans[-1] = (spans[-1][0] + character, spans[-1][1])

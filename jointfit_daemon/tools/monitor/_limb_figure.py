@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 _Dot = tuple[int, int]
 _LEAST_REACH_M = 0.2
-"""Smallest size of the drawing, m."""
+"""Smallest size of the drawn region, m."""
 _BRANCHED_TURN_DEG = 35.0
-"""Direction of view on a limb of two sides, degrees from the side: both are visible."""
+"""Direction of view on a limb of two sides, degrees from the side. Both sides are visible."""
 _LEAST_HORIZONTAL = 0.1
-"""Least horizontal part of the direction ahead."""
+"""Smallest horizontal part of a unit vector ahead at which the direction is used."""
 _LONGEST_LABEL = 12
-"""Most cells for the name of a joint next to the figure."""
+"""Maximum number of cells for the name of a joint next to the figure."""
 
 
 def limb_lines(
@@ -74,7 +74,7 @@ def limb_lines(
 
 
 class _Scale:
-    """Conversion of metres to dots: the whole reach of the limb fits, and dots stay square."""
+    """Conversion of metres to dots: the whole reach of the limb fits, with equal scales."""
 
     def __init__(self, reach_m: list[float], canvas: DotCanvas, columns: int) -> None:
         across_m, low_m, high_m = reach_m
@@ -135,7 +135,7 @@ def _bones(info: Info) -> list[tuple[str, str]]:
 
 
 def _bone(canvas: DotCanvas, first: _Dot, last: _Dot) -> None:
-    """Draw a segment, two dots wide."""
+    """Draw a segment as a line of two dots in width."""
     canvas.line(first, last)
     if canvas.unicode:
         canvas.line((first[0] + 1, first[1]), (last[0] + 1, last[1]))
@@ -167,7 +167,7 @@ def _labelled(
 
 
 def _cut(line: Line, width: int) -> Line:
-    """Return the first cells of a line whose rest is blank."""
+    """Return the first `width` cells of a line; the removed cells are blank."""
     spans, free = [], width
     for text, style in line.spans:
         spans.append((text[:free], style))

@@ -27,11 +27,11 @@ STALE_S = 1.5
 _OPTICAL_S = 0.6
 """Age of the cameras' pose, s, from which it is no longer drawn."""
 _WIDE = 72
-"""Least width for the limb to the left of the curve."""
+"""Smallest width at which the limb is to the left of the curve, cells."""
 _LEAST_CURVE, _MOST_CURVE = 3, 24
-"""Rows of the curve."""
+"""Number of rows of the curve."""
 _WITH_SD = ("flexion_deg", "elevation_deg", "inner_deg")
-"""Angles to which `sd_deg` of a joint belongs."""
+"""Names of the angles to which `sd_deg` of a joint can belong."""
 
 
 def pose_age_s(rig: RigView, now: Moment) -> float | None:
@@ -52,7 +52,7 @@ def live_lines(state: MonitorState, width: int, height: int, now: Moment) -> lis
         block = wrap("This rig has no joint between two segments, so it has no angle.", angle_width)
         block += [Line()] * max(0, height - len(devices) - 1 - len(block))
     else:
-        # Title, value with standard deviation, and the reason of a limitation.
+        # Show title, value with standard deviation, and the reason for a limitation.
         rig = state.rig
         joint = None if rig.pose is None else rig.pose.joints.get(choice[0])
         age_s = pose_age_s(rig, now) or 0.0
@@ -77,7 +77,7 @@ def live_lines(state: MonitorState, width: int, height: int, now: Moment) -> lis
 
 
 def _figure(state: MonitorState, width: int, rows: int, now: Moment) -> list[Line]:
-    """Return the limb; muted once the pose is old."""
+    """Return the drawing of the limb, in muted style once the pose is old."""
     rig = state.rig
     optical = rig.optical_s is not None and now.monotonic_s - rig.optical_s < _OPTICAL_S
     lines = limb_lines(rig, width, rows, state.turn_deg, optical=optical, unicode=state.unicode)
@@ -125,7 +125,7 @@ def _reason(rig: RigView, value: float | None, sd: float | None, age_s: float) -
     if age_s > STALE_S:
         return f"No pose for {age_s:.0f} s.", True
 
-    # The most urgent flags, then what makes a value or its sd unknown.
+    # List the most urgent flags first, then the reasons for an unknown value or standard deviation.
     flags = serious_flags([] if rig.pose is None else rig.pose.flags)
     if flags:
         return "▲ " + " ".join(map(flag_sentence, flags[:2])), True

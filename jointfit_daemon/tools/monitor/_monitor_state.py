@@ -27,7 +27,7 @@ ViewName = Literal["live", "calibrate", "history", "health", "log"]
 VIEWS: tuple[ViewName, ...] = ("live", "calibrate", "history", "health", "log")
 _TURN_DEG = 15
 _PAGE = 10
-"""Lines of a page for scrolling."""
+"""Number of lines of a page when scrolling."""
 _NOTICE_S = 20.0
 """Time for which the answer to a request is shown, s."""
 
@@ -74,7 +74,7 @@ class MonitorState:
     """Everything that the screen shows."""
 
     broker: str
-    """Address of the broker in words."""
+    """Address of the broker as text."""
     timezone: tzinfo | None = None
     unicode: bool = True
     base: str | None = None
@@ -89,7 +89,7 @@ class MonitorState:
     turn_deg: int = 0
     """Direction of view about the vertical, degrees from the side."""
     cursor: int = 0
-    """Selected entry of the history or of the list of rigs."""
+    """Index of the selected entry of the history or of the list of rigs."""
     scroll: int = 0
     only_problems: bool = False
     stored: CalibrationsAnswer | None = None
@@ -98,26 +98,26 @@ class MonitorState:
     """Calibration for which the stored versions were requested."""
     notice: RequestOutcome | None = None
     asked_to_stop: bool = False
-    """Whether the same key again stops the recording."""
+    """Whether the next press of the same key stops the recording."""
 
     # --- connection ----------------------------------------------------------------------------
 
     def begin_rig(self, base: str) -> None:
-        """Show the rig with this base topic; forget another one."""
+        """Show the rig with this base topic; discard the data of another rig."""
         self.base, self.rig, self.stored = base, RigView(), None
         self.choice, self.cursor, self.scroll = None, 0, 0
 
     def connected(self) -> None:
-        """Note a new connection: retained messages follow."""
+        """Store that the broker is connected; retained messages follow."""
         self.link, self.reason = ("connected" if self.base is not None else "searching"), ""
         self.rig.bridge, self.listed = "unknown", None
 
     def lost(self, reason: str) -> None:
-        """Note that the broker is lost."""
+        """Store that the broker is lost."""
         self.link, self.reason = "lost", printable(reason)
 
     def found_rigs(self, rigs: Mapping[str, str]) -> str | None:
-        """Note the result of a search; return the base topic of the only rig."""
+        """Store the result of a search; return the base topic if there is only one rig."""
         self.rigs = {base: printable(name) for base, name in sorted(rigs.items())}
         self.link, self.reason = "searching", ""
         return next(iter(self.rigs)) if len(self.rigs) == 1 else None
@@ -125,7 +125,7 @@ class MonitorState:
     # --- answers -------------------------------------------------------------------------------
 
     def take_answer(self, command: str, answer: Mapping[str, Any], now_s: float) -> None:
-        """Take the answer to a request."""
+        """Process the answer to a request."""
         if command == "calibrations":
             self._take_versions(answer)
         elif answer.get("status") == "error":
@@ -184,7 +184,7 @@ class MonitorState:
                 return ChooseRig(bases[min(self.cursor, len(bases) - 1)])
             return None
 
-        # Keys of a rig: views first, then selections in them, then requests.
+        # Keys of a rig: views first, then selections within a view, then requests.
         if key.isdecimal() and 1 <= int(key) <= len(VIEWS):
             self._show(VIEWS[int(key) - 1])
         elif key in {"tab", "shift+tab"}:
@@ -199,7 +199,7 @@ class MonitorState:
         return None
 
     def due_request(self) -> SendRequest | None:
-        """Return the request for the stored versions when the view needs them, once."""
+        """Return one request for the stored versions when the view needs the versions."""
         calibration = self.rig.calibration
         if self.view != "history" or self.link != "connected" or self.rig.bridge != "online":
             return None
@@ -243,7 +243,7 @@ class MonitorState:
         return True
 
     def _record(self) -> Action | None:
-        """Return the request that starts the recording, or at the second call the one to stop."""
+        """Return the request that starts the recording, or stops it at the second key press."""
         recording, asked = recording_of(self.rig), self.asked_to_stop
         self.asked_to_stop = recording is not None and recording.active and not asked
         if recording is None or self.asked_to_stop:
@@ -251,7 +251,7 @@ class MonitorState:
         return SendRequest("record", {"action": "stop" if recording.active else "start"})
 
     def _requested_by(self, key: str) -> Action | None:
-        """Return the request of a key; phases other than the static pose have it in their view."""
+        """Return the request of a key; only the calibration view has keys for the other phases."""
         if key == "m":
             return AskMark()
         if key == "R":
@@ -272,7 +272,7 @@ class MonitorState:
 
 
 def chosen_angle(state: MonitorState) -> AngleChoice | None:
-    """Return the angle to show: the chosen one, or the first one of the rig."""
+    """Return the angle to show: the chosen angle, or else the first angle of the rig."""
     choices = state.rig.angle_choices()
     if state.choice in choices:
         return state.choice
@@ -288,7 +288,7 @@ def _fault_text(answer: Mapping[str, Any]) -> str:
 
 
 def _words_of(command: str, answer: Mapping[str, Any]) -> str:
-    """Return the effect of a request, in words."""
+    """Return the effect of a request as text."""
     data = answer.get("data")
     data = data if isinstance(data, dict) else {}
     done = "started" if answer.get("status") == "accepted" else "done"

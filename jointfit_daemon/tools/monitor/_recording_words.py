@@ -1,4 +1,4 @@
-"""The recording in words: for the header, and for the view of the health."""
+"""State of the recording as text, for the header and for the health view."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ _GB = 1e9
 
 
 def recording_of(rig: RigView) -> RecordingState | None:
-    """Return the state of the recording; None while it is unknown."""
+    """Return the state of the recording; None while the state is unknown."""
     return None if rig.health is None or rig.bridge != "online" else rig.health.recording
 
 
 def recording_mark(rig: RigView, now: Moment) -> tuple[str, Style]:
-    """Return the recording for the header, at most 18 cells; empty while it is unknown."""
+    """Return the text for the header, at most 18 cells; empty while the state is unknown."""
     recording = recording_of(rig)
     if recording is None:
         return "", ""
@@ -30,7 +30,7 @@ def recording_mark(rig: RigView, now: Moment) -> tuple[str, Style]:
 
 
 def recording_text(rig: RigView, now: Moment) -> tuple[str, Style]:
-    """Return the recording with file, size, losses and free space."""
+    """Return the text with file, size, losses and free space."""
     recording = recording_of(rig)
     if recording is None:
         return "", ""
@@ -53,7 +53,7 @@ def format_bytes(count: float) -> str:
 
 
 def _duration_s(rig: RigView, recording: RecordingState, now: Moment) -> float:
-    """Return the duration of the recording; that of the message grows while it is active."""
+    """Return the duration of the recording: of the message, plus the time since if active."""
     gateway_us = rig.gateway_us(now)
     if not recording.active or gateway_us is None or rig.health is None:
         return recording.duration_s

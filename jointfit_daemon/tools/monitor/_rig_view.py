@@ -1,4 +1,4 @@
-"""State of a rig, reduced from the messages below its base topic.
+"""State of a rig, computed from the messages below its base topic.
 
 Invariants: no clock, no I/O, no terminal; memory is bounded for any sequence of messages.
 """
@@ -35,12 +35,12 @@ TOPICS = (
 SHOWN_S = 20.0
 """Longest time range of the curve, s."""
 _MOST_SAMPLES = 1000
-"""Stored points of a curve: 20 s of `pose/ui` at 30 Hz, or of `optical/pose` at 50 Hz."""
+"""Number of stored points of a curve: 20 s of `pose/ui` at 30 Hz, or of `optical/pose` at 50 Hz."""
 _MOST_EVENTS = 300
 _MOST_DEVICES = 200
-"""Devices and ids of events that are remembered; a rig has fewer than 50 devices."""
+"""Maximum number of stored devices and of stored event ids; a rig has fewer than 50 devices."""
 AngleChoice = tuple[str, str]
-"""Joint, and key of its angle such as ``flexion_deg``."""
+"""Name of a joint, and key of an angle such as ``flexion_deg``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class RigView:
     progress: Progress | None = None
     pose: Pose | None = None
     pose_s: float | None = None
-    """Receipt of `pose`, s of the monotonic clock."""
+    """Time of receipt of `pose`, s of the monotonic clock."""
     optical: OpticalPose | None = None
     optical_s: float | None = None
     availability: dict[str, str] = field(default_factory=dict)
@@ -81,16 +81,17 @@ class RigView:
     poses: deque[AngleSample] = field(default_factory=lambda: deque(maxlen=_MOST_SAMPLES))
     opticals: deque[AngleSample] = field(default_factory=lambda: deque(maxlen=_MOST_SAMPLES))
     faults: dict[str, str] = field(default_factory=dict)
-    """Reason why the last message of a topic could not be read."""
+    """Reason why the last message of a topic could not be decoded."""
     reach_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Largest horizontal distance from the first joint, lowest and highest point beside it, m."""
+    """Largest horizontal distance from the first joint, and lowest and highest point relative to
+    this joint, m."""
     clock_offset_us: float | None = None
     """UNIX time of the gateway minus monotonic time of this machine, µs."""
     clock_error_us: float = 0.0
-    """UNIX time of the gateway minus that of this machine, µs."""
+    """UNIX time of the gateway minus UNIX time of this machine, µs."""
 
     def take(self, topic: str, payload: Any, now: Moment) -> None:
-        """Take one message; `topic` is below the base topic."""
+        """Process one message; `topic` is below the base topic."""
         kind = "device" if topic.startswith("device/") else topic
         try:
             message = decode(topic, payload)
@@ -103,7 +104,7 @@ class RigView:
             self._reduce(topic, message, now)
 
     def gateway_us(self, now: Moment) -> float | None:
-        """Return the present UNIX time of the gateway, µs; None while it is unknown."""
+        """Return the present UNIX time of the gateway, µs; None while unknown."""
         if self.clock_offset_us is None:
             return None
         return self.clock_offset_us + now.monotonic_s * 1e6
@@ -149,7 +150,8 @@ class RigView:
                 pass
 
     def _take_pose(self, pose: Pose, now: Moment) -> None:
-        # An older instant is a restart of the daemon or a step of its clock: the curve begins anew.
+        # An instant before the last one means that the daemon restarted or its clock was set: the
+        # curve restarts.
         if self.pose is not None and pose.t_us < self.pose.t_us:
             self.poses.clear()
             self.opticals.clear()
@@ -158,7 +160,8 @@ class RigView:
         _append(self.poses, _angles(pose))
         self._extend_reach(pose)
 
-        # The smallest delay between instant and receipt converts our time to that of the gateway.
+        # The smallest difference between instant and receipt converts the time of this machine to
+        # gateway time.
         offset_us = pose.t_us - now.monotonic_s * 1e6
         if self.clock_offset_us is None or offset_us > self.clock_offset_us:
             self.clock_offset_us = offset_us
@@ -185,7 +188,7 @@ class RigView:
 
 
 def known_vector(vector: list[float | None] | None, length: int) -> list[float] | None:
-    """Return the components of a vector; None if one of them is unknown."""
+    """Return the components of a vector; None if a component is unknown."""
     if vector is None or len(vector) != length:
         return None
     known = [value for value in vector if value is not None and math.isfinite(value)]
@@ -214,7 +217,7 @@ def _append(samples: deque[AngleSample], sample: AngleSample) -> None:
 
 
 def _bounded_set(table: dict[str, Any], key: str, value: Any) -> None:
-    """Set a key as the newest of a table; remove the oldest beyond `_MOST_DEVICES`."""
+    """Set a key as the newest of a table; remove the oldest keys beyond `_MOST_DEVICES`."""
     table.pop(key, None)
     table[key] = value
     if len(table) > _MOST_DEVICES:

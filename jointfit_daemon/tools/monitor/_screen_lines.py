@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.monitor._words import Level
 
 _WIDE = 60
-"""Least width for the header in one line."""
+"""Smallest width for the header in one line, cells."""
 _LOSS_LINES = 3
 """Maximum number of lines of a banner or a notice."""
 _CLOCK_ERROR_S = 5.0
@@ -70,7 +70,7 @@ def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> l
         top.append(line)
     top += wrap(f"✖ {loss}" if loss else "", width, "error")[:_LOSS_LINES]
 
-    # The keys of the view, in one line or two.
+    # Show the keys of the view in one line or two.
     rows, row = [], Line()
     for key, words in _keys(state):
         item = Line.of(key, "strong").add(f" {words}", "muted")
@@ -92,7 +92,7 @@ def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> l
     if state.unicode:
         return [line.fit(width) for line in lines]
 
-    # The ellipsis of a line that is cropped is a point.
+    # In ASCII, a point replaces the ellipsis of a cropped line.
     fitted = [line.to_ascii().fit(width) for line in lines]
     return [
         Line(tuple((text.replace("…", "."), style) for text, style in line.spans))
@@ -101,7 +101,7 @@ def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> l
 
 
 def page_state(state: MonitorState, now: Moment) -> tuple[Level, str, str]:
-    """Return level and words of link, daemon and calibration, and the loss to show as a banner."""
+    """Return level and text of link, daemon and calibration, and the loss for the banner."""
     rig = state.rig
     if state.link == "lost":
         return "error", "Broker lost", f"{state.reason}. Trying again."
@@ -156,7 +156,7 @@ def _header(state: MonitorState, level: Level, words: str, width: int, now: Mome
 
 
 def _spread(left: Line, right: Line, width: int) -> Line:
-    """Return a left and a right-aligned part; the left one is cropped if there is no room."""
+    """Return a left and a right-aligned part; the left part is cropped to fit."""
     free = width - right.width - 1
     return left.fit(free).add(" ") + right if free > 0 else left.fit(width)
 
@@ -188,7 +188,7 @@ def _body(state: MonitorState, width: int, height: int, now: Moment) -> list[Lin
 
 
 def _waiting_lines(state: MonitorState, width: int) -> list[Line]:
-    """Return how to start a daemon, while the broker answers and no rig publishes."""
+    """Return the help for starting a daemon, shown while the broker has no rig."""
     if state.link not in ("searching", "connected"):
         return []
     base = "" if state.base is None else f" below {state.base}"
@@ -239,12 +239,12 @@ def _notice(state: MonitorState, width: int, now: Moment) -> list[Line]:
 
 
 def _keys(state: MonitorState) -> list[tuple[str, str]]:
-    """Return the keys that have an effect now, with their words."""
+    """Return the keys that have an effect now, each with a description."""
     if state.base is None:
         choose = [("↑↓", "select"), ("Enter", "show")] if len(state.rigs) > 1 else []
         return [*choose, ("q", "quit")]
 
-    # What the keys of a view do depends on whether a phase runs.
+    # The effect of a key depends on whether a calibration phase runs.
     keys = {
         "live": [("j", "next angle"), ("←→", "turn")],
         "calibrate": [] if state.is_running else [("a", "align"), ("f", "move")],

@@ -38,7 +38,7 @@ _Cell = tuple[str, "RichStyle | None"]
 
 
 class ScreenWidget(Widget):
-    """Lines of a screen; every key is passed to `press`."""
+    """Widget that shows the lines of a screen and passes every key to `press`."""
 
     can_focus = True
 
@@ -51,7 +51,7 @@ class ScreenWidget(Widget):
         """Number of updates that changed at least one cell."""
 
     def show(self, lines: list[Line]) -> None:
-        """Show lines of the width of the widget."""
+        """Show lines, each with the width of the widget."""
         if lines == self._lines:
             return
 
@@ -71,14 +71,14 @@ class ScreenWidget(Widget):
         self.refresh(*[region for region in regions if region])
 
     def on_key(self, event: Key) -> None:
-        """Pass a key on, before Textual's own keys see it."""
+        """Pass a key on before Textual processes it."""
         event.stop()
         printable = event.character is not None and event.is_printable
         self._press(str(event.character) if printable else event.key)
 
     @override
     def render_line(self, y: int) -> Strip:
-        """Return one line."""
+        """Return one line of the screen for Textual."""
         if y < len(self._strips):
             return self._strips[y]
         return Strip.blank(self.size.width)
@@ -101,13 +101,13 @@ def _changed(old: Strip | None, new: Strip, row: int) -> Region:
 
 
 def _cells(strip: Strip) -> list[_Cell]:
-    """Return character and style of every cell; the second cell of a wide one is empty."""
+    """Return character and style of every cell; the second cell of a wide character is empty."""
     cells: list[_Cell] = []
     for text, style, _ in strip:
         for part in Segment(text, style).split_cells(0)[1:]:
             for character in part.text:
                 width = Segment(character).cell_length
-                if width == 0 and cells:  # a combining mark belongs to the cell before
+                if width == 0 and cells:  # a combining mark belongs to the previous cell
                     cells[-1] = (cells[-1][0] + character, style)
                 else:
                     cells += [(character, style), *[("", style)] * (width - 1)]

@@ -1,7 +1,7 @@
 """Styled lines of a terminal: width in cells, cropping, wrapping, columns, and an ASCII form.
 
-A style is a word; `_screen_widget.py` has its colour. Invariant: no line contains control
-characters, and a fitted line has exactly its width.
+A style is a word; `_screen_widget.py` maps the word to a colour. Invariant: no line contains
+control characters, and a fitted line has exactly its width.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Line:
 
 
 def to_ascii(text: str) -> str:
-    """Return `text` with replacements; ``?`` for each cell of another character."""
+    """Return `text` in ASCII; ``?`` replaces each cell of an unknown character."""
     if text.isascii():
         return text
     return "".join(
@@ -94,7 +94,7 @@ def fit_text(text: str, width: int, *, right: bool = False) -> str:
 def wrap(text: str, width: int, style: Style = "", *, indent: int = 0) -> list[Line]:
     """Return a text as lines of at most `width` cells, broken at blanks where possible.
 
-    Further lines are indented by `indent` cells.
+    All lines after the first line are indented by `indent` cells.
     """
     lines: list[str] = []
     current, free = "", max(1, width)
@@ -113,7 +113,7 @@ def wrap(text: str, width: int, style: Style = "", *, indent: int = 0) -> list[L
 
 
 def beside(left: Sequence[Line], width: int, right: Sequence[Line], gap: int = 2) -> list[Line]:
-    """Return two blocks of lines side by side; `width` is that of the left one."""
+    """Return two blocks of lines side by side; `width` is the width of the left block."""
     rows = max(len(left), len(right))
     empty = Line()
     return [
@@ -129,7 +129,7 @@ class Column:
 
     title: str
     right: bool = False
-    """Whether its cells are right-aligned, as numbers."""
+    """Whether the cells are right-aligned, as for numbers."""
 
 
 def table(

@@ -19,9 +19,9 @@ Level = Literal["good", "warning", "error", "muted"]
 SYMBOLS: dict[Level, str] = {"good": "✔", "warning": "▲", "error": "✖", "muted": "○"}
 """Mark of a level, so that no meaning depends on colour."""
 RUNNING = frozenset({"align", "static", "functional", "fitting"})
-"""Phases during which the daemon records or fits."""
+"""Calibration phases during which the daemon records or fits."""
 LARGE_SIGMA_US = 2000.0
-"""Standard deviation of a clock, µs, above which it is a warning."""
+"""Standard deviation of a device clock, µs, above which a warning is shown."""
 _MINUTE_S = 60.0
 _PHASES = {
     "uncalibrated": "Not calibrated",
@@ -61,7 +61,7 @@ def format_duration(seconds: float) -> str:
 
 
 def format_clock(microseconds: float | None, timezone: tzinfo | None = None) -> str:
-    """Return the time of day of a UNIX time, µs; `timezone` None: that of this machine."""
+    """Return the time of day of a UNIX time, µs; `timezone` None is the local one."""
     if microseconds is None:
         return UNKNOWN
     try:
@@ -72,7 +72,7 @@ def format_clock(microseconds: float | None, timezone: tzinfo | None = None) -> 
 
 
 def format_date(text: str | None, timezone: tzinfo | None = None) -> str:
-    """Return date and time of an ISO 8601 text; the text itself if it is none."""
+    """Return date and time of an ISO 8601 text; the text itself otherwise."""
     if text is None:
         return UNKNOWN
     try:
@@ -91,12 +91,12 @@ def title_of(name: str) -> str:
 
 
 def angle_name(key: str) -> str:
-    """Return the words of an angle's key: ``flexion_deg`` as ``flexion``."""
+    """Return the name of an angle from its key: ``flexion_deg`` as ``flexion``."""
     return "inner angle" if key == "inner_deg" else key.removesuffix("_deg").replace("_", " ")
 
 
 def calibration_sentence(calibration: CalibrationState | None, now_us: float | None = None) -> str:
-    """Return the state of the calibration in words, with its age at a UNIX time of the gateway."""
+    """Return the state of the calibration as text, with its age at a gateway UNIX time."""
     if calibration is None:
         return "Waiting for the calibration state"
     phase = str(calibration.phase)
@@ -112,7 +112,7 @@ def calibration_sentence(calibration: CalibrationState | None, now_us: float | N
 
 
 def _age_words(created_utc: str | None, now_us: float | None) -> str:
-    """Return the time since a date in words; empty if it is unknown."""
+    """Return the time since a date as text; empty if unknown."""
     if created_utc is None or now_us is None:
         return ""
     try:
@@ -122,12 +122,12 @@ def _age_words(created_utc: str | None, now_us: float | None) -> str:
     age_s = (now_us - created_us) / 1e6
     if age_s < _MINUTE_S:
         return ", just now"
-    # In whole minutes, which do not change every second.
+    # Round to whole minutes, so that the text does not change every second.
     return f", {format_duration(age_s) if age_s >= 1.5 * _MINUTE_S else '1 min'} ago"
 
 
 def clock_quality(device: DeviceCounts | None) -> tuple[Level, str]:
-    """Return level and words of the clock of a device."""
+    """Return level and text about the clock of a device."""
     if device is None:
         return "muted", UNKNOWN
     level, words = _CLOCKS[device.clock]

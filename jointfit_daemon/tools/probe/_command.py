@@ -204,11 +204,11 @@ def _report(
 async def _servers(
     hosts: Sequence[tuple[str, int | None]], *, network: bool, wait_s: float
 ) -> tuple[list[FoundServer], list[str]]:
-    """Return the servers that answered, and the fault of each host that did not."""
+    """Return the servers that answered, and the fault of each host without an answer."""
     from jointfit_daemon.tools.discovery import find_mocap_servers
 
     async def ask(name: str, port: int | None) -> list[FoundServer] | str:
-        """Return the servers that answered, or the fault."""
+        """Return the servers that answered, or the fault if none answered."""
         named = name != _NETWORK
         try:
             answered = await find_mocap_servers(
@@ -241,7 +241,7 @@ _REMEDIES = {
     "rig.toml` names the cause)",
     False: "routers and firewalls stop broadcasts; name the server with --mocap HOST",
 }
-"""Remedy where no server answered, by whether a host was named."""
+"""Remedy if no server answered, by whether the user named a host."""
 
 
 def _faults(

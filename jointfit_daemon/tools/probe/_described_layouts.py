@@ -1,4 +1,4 @@
-"""Layouts of devices without a driver of their own, as an existing rig.toml describes them."""
+"""Layouts in an existing rig.toml that describe devices without their own driver."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.discovery import Layouts
 
 _CONNECTION = ("id", "segment", "driver", "port", "can", "baud", "transport", "silence_s")
-"""Keys of ``[[imu]]`` that do not describe data."""
+"""Keys of ``[[imu]]`` that do not describe the data of a device."""
 
 
 def described_layouts(rig: Path) -> Layouts:
-    """Return the described layouts of a rig by driver; none if it is absent or cannot be read.
+    """Return the described layouts of a rig by driver; none without a readable rig.
 
-    Faults of the rig are the subject of `jointfit check`.
+    Faults of the rig are reported by `jointfit check`.
     """
     try:
         imus = parse_toml(rig.read_text(encoding="utf-8")).get("imu", [])

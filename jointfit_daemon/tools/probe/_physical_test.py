@@ -1,6 +1,7 @@
-"""Guided test of one sensor: three rotations by hand show whether its frames are as configured.
+"""Guided test of one sensor: three rotations by hand check the configured frames.
 
-The driver runs as in the daemon; `jointfit_daemon.physical_test` judges its chunks.
+The driver runs as in the daemon; `jointfit_daemon.physical_test` evaluates the chunks of the
+driver.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk
 
 OPEN_S = 20.0
-"""Longest time from opening to the first orientation, s; a search at other speeds is included."""
+"""Longest time from opening to the first orientation, s; including a search at other speeds."""
 
 
 class PhysicalTestError(Exception):
@@ -28,7 +29,7 @@ class PhysicalTestError(Exception):
 async def run_physical_test(
     source: Source, tell: Callable[[str], None], *, step_s: float
 ) -> PhysicalTestResult:
-    """Guide through the rotations, and judge them.
+    """Guide through the rotations, and evaluate them.
 
     Parameters
     ----------
@@ -84,7 +85,7 @@ async def _wait_for_change(
     Raises
     ------
     PhysicalTestError
-        The driver ended before.
+        The driver ended before the event was set.
     """
     waiting = asyncio.create_task(changed.wait())
     await asyncio.wait({waiting, reading}, timeout=limit_s, return_when=asyncio.FIRST_COMPLETED)

@@ -1,4 +1,4 @@
-"""The result of `jointfit probe`, and its text."""
+"""Result of `jointfit probe`, and the conversion to text."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ class ProbeReport:
     can_channels: list[CanChannel]
     """Buses in the configuration files of python-can."""
     serial: list[SerialTraffic]
-    """Reception on the ports of ``--serial``."""
+    """Results of the reception on the ports of ``--serial``."""
     can: list[CanTraffic]
-    """Reception on the interfaces of ``--can``."""
+    """Results of the reception on the interfaces of ``--can``."""
     mocap_servers: list[FoundServer]
     """Servers that answered to ``--mocap`` or ``--network``."""
     faults: list[str]
-    """Each request without a result, with its remedy."""
+    """Requests without a result, each with a remedy."""
     rig_toml: str
     """Lines for rig.toml; empty if nothing was recognized."""
 
 
 def report_lines(report: ProbeReport) -> Iterator[str]:
-    """Yield the text of a report."""
+    """Yield the lines of text of a report."""
     yield "Serial ports"
     rows = [(port.path, port.device, port.description) for port in report.serial_ports]
     yield _table(rows, "none: plug an adapter in, and look at `dmesg`")

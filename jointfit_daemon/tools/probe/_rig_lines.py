@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     )
 
 _USB_SERIAL = "cdc_acm"
-"""Driver of the kernel for devices that are on USB themselves, without a line of their own."""
+"""Kernel driver of devices that are on USB themselves and therefore have no line of their own."""
 
 
 def rig_lines(
@@ -28,7 +28,7 @@ def rig_lines(
     can: Sequence[CanTraffic],
     servers: Sequence[FoundServer],
 ) -> str:
-    """Return tables of rig.toml; names of sensors and segments are to be replaced."""
+    """Return tables of rig.toml; the user replaces names of sensors and segments."""
     names = [traffic.interface for traffic in can if traffic.devices]
     buses = [
         _table(f"[can.{toml_key(name)}]", {"interface": "socketcan", "channel": name})
@@ -75,7 +75,7 @@ def _imu(number: int, device: DecodedDevice, connection: dict[str, Any]) -> str:
     if device.usual_rate_hz is not None:
         keys["rate_hz"] = device.usual_rate_hz
 
-    # keys without default that no stream shows
+    # required keys that the data do not contain
     fields = find_driver(device.driver).Settings.model_fields
     missing = [key for key, field in fields.items() if field.is_required() and key not in keys]
     return _table("[[imu]]", keys) + "".join(
@@ -86,10 +86,10 @@ def _imu(number: int, device: DecodedDevice, connection: dict[str, Any]) -> str:
 def _cameras(servers: Sequence[FoundServer]) -> Iterator[str]:
     from jointfit_daemon.driver import find_driver
 
-    for server in servers[:1]:  # a rig has one
+    for server in servers[:1]:  # a rig has one camera system
         keys: dict[str, Any] = {"driver": server.driver, "server": server.server}
 
-        # The command port, if it is not the default of the driver.
+        # Write the command port if it is not the default of the driver.
         field = find_driver(server.driver).Settings.model_fields.get("command_port")
         if field is not None and field.default != server.port:
             keys["command_port"] = server.port

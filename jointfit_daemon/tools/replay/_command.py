@@ -1,4 +1,4 @@
-"""Command `jointfit replay`: a recording in a new core, verified, timed or published over MQTT.
+"""Command `jointfit replay`: processes a recording in a new core, to verify, show or publish it.
 
 Invariant: a replay changes no file.
 """
@@ -117,7 +117,7 @@ def _changes(file: Path, rig: Path | None, calibration: str | None) -> Changes:
 
 
 def _calibration(given: str, rig: Rig) -> Calibration:
-    """Return a stored version of the rig, or the calibration in a file.
+    """Return a stored calibration of the rig, or the calibration in a file.
 
     Raises
     ------

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _NS_PER_S = 1e9
 _YIELD_EVENTS = 200
-"""Events between two pauses for other tasks at the highest speed."""
+"""Number of events between two pauses for other tasks at the highest speed."""
 
 
 @dataclass(slots=True)
@@ -38,18 +38,18 @@ class PlaySummary:
     """Recorded time, s."""
     took_s: float = 0.0
     dropped: int = 0
-    """Messages that the broker did not take."""
+    """Number of messages that the broker did not accept."""
     settings: str = "as recorded"
-    """Whether rig and calibration are the recorded ones."""
+    """Whether the replay uses the recorded rig and the recorded calibration."""
 
     def add(self, seconds: float, outputs: list[Output]) -> None:
-        """Add an event at `seconds` with its outputs."""
+        """Add an event at the recorded time `seconds`, with its outputs."""
         self.events += 1
         self.states += sum(isinstance(output, LimbState) for output in outputs)
         self.seconds = max(self.seconds, seconds)
 
     def table(self) -> dict[str, object]:
-        """Return the summary with its names."""
+        """Return the summary as a table of names and values."""
         return {
             "rig": self.rig, "events": self.events, "states": self.states, "seconds": self.seconds,
             "took_s": self.took_s, "settings": self.settings, "dropped": self.dropped,
@@ -85,7 +85,8 @@ async def play_recording(
     speed
         Multiple of the recorded speed; infinity: as fast as possible.
     destination
-        Base topic and broker to publish to, each None for its default; None: no publication.
+        Base topic and broker for the publication, each None for the default. None publishes
+        nothing.
     quiet
         Whether to print no time line.
 
@@ -139,7 +140,7 @@ class _Pace:
         self._events = 0
 
     async def wait(self, t_ns: int) -> None:
-        """Return when `t_ns` is due; let other tasks run now and then."""
+        """Return when `t_ns` is due; let other tasks run at intervals."""
         if self._first_ns is None:
             self._first_ns, self._began_s = t_ns, time.monotonic()
         self._events += 1

@@ -1,8 +1,8 @@
 """Publication of a replay: topics and payloads of the daemon, below a base topic of their own.
 
-Stamps in the payloads are those of the recording. The topic ``bridge/health`` is not published: it
-describes a running daemon.
-Invariant: requests to a replay are ignored, and no message leaves the base topic.
+The payloads contain the time stamps of the recording. The topic ``bridge/health`` is not published:
+it describes a running daemon. Invariant: requests to a replay are ignored, and no message leaves
+the base topic.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from pydantic import ValidationError
-from typing_extensions import override  # typing has it from Python 3.12
+from typing_extensions import override  # typing contains it from Python 3.12
 
 from jointfit_daemon.config import MqttSettings
 from jointfit_daemon.outputs import topics
@@ -28,17 +28,18 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output
 
 PREFIX = "replay/"
-"""Prefix of the base topic, so that no subscriber takes a replay for the daemon."""
+"""Prefix of the base topic; it prevents subscribers from mistaking a replay for the daemon."""
 CONNECT_S = 5.0
 """Longest wait for the broker, s."""
 _DRAIN_S = 5.0
 """Longest wait for the broker to accept the last messages, s."""
 _FULL, _POLL_S = 100, 0.002
-"""Waiting messages at which the replay waits for the broker, and the interval of its checks, s."""
+"""Number of queued messages at which the replay waits for the broker, and the interval of the
+checks, s."""
 
 
 class RecordedClock(UnixClock):
-    """UNIX time and host time of the instant that is played."""
+    """Clock that returns UNIX time and host time of the instant that is played."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -66,7 +67,7 @@ class Publication:
     base
         Base topic; None: `PREFIX` and the base topic of the rig.
     broker
-        ``HOST`` or ``HOST:PORT``; None: that of the rig.
+        ``HOST`` or ``HOST:PORT``; None: the broker of the rig.
 
     Raises
     ------
@@ -79,7 +80,7 @@ class Publication:
         self._clock = RecordedClock()
         rig = self._moved(rig)
         self._settings = rig.mqtt
-        # Without a clock no message expires: a replay waits for the broker instead.
+        # The client has no clock, so no message expires. A replay waits for the broker instead.
         self._outbox = Outbox(topics.BRIDGE_STATE.name(rig.mqtt.base), clock=lambda: 0.0)
         self._link = MqttPublisher(rig.mqtt, self._outbox, lambda _: None)
         self._topics = TopicWriter(rig, self._outbox, self._clock)
@@ -92,13 +93,13 @@ class Publication:
 
     @property
     def dropped(self) -> int:
-        """Messages that the broker did not take."""
+        """Number of messages that the broker did not accept."""
         return self._outbox.dropped + self._outbox.queued
 
     def _moved(self, rig: Rig) -> Rig:
         """Return `rig` with the broker and the base topic of the replay."""
         changed: dict[str, object] = {"base": self._base or PREFIX + rig.mqtt.base}
-        changed["home_assistant"] = None  # it would announce a second device
+        changed["home_assistant"] = None  # discovery would announce a second device
         if self._broker is not None:
             host, _, port = self._broker.partition(":")
             changed |= {"host": host, "port": port or 0}
@@ -115,7 +116,7 @@ class Publication:
         Raises
         ------
         BrokerLostError
-            There is no connection within `CONNECT_S`.
+            The broker does not accept a connection within `CONNECT_S`.
         """
         self._task = asyncio.create_task(self._link.run(), name="mqtt")
         loop = asyncio.get_running_loop()

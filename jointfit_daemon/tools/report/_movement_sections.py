@@ -57,12 +57,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.report.session_results import SessionResults
 
 _DETAIL_S = 10.0
-"""Duration of the detail of a long session, s."""
+"""Duration of the section of a long session that is drawn in detail, s."""
 _UNSHOWN = 0.1
-"""Share of a session without angles at its beginning, such as a calibration, above which the curves
-begin later."""
+"""If no angles exist in the first part of a session, for example during calibration, the curves
+begin later. This is the smallest such share of the session."""
 _PANEL, _HALF = 320.0, 450.0
-"""Widths of a panel, one of three or of two in a row, px."""
+"""Widths of a panel with three and with two panels in a row, px."""
 _MOST_POINTS = 800
 """Maximum number of points of a scatter plot."""
 _IMU_LEGEND = [("imu", "from the sensors"), ("band", "95 % interval")]
@@ -70,7 +70,7 @@ _OPTICAL_LEGEND = ("optical", "from the cameras")
 
 
 def angles_section(results: SessionResults) -> str:
-    """Return the curves of every angle, with a detail if the session is long."""
+    """Return the curves of every angle, with a detailed section if the session is long."""
     if not results.angles:
         text = "No joint angle is known: the session has no calibration or no limb states."
         return section("angles", "Joint angles", [paragraph(text)])
@@ -108,7 +108,7 @@ def angles_section(results: SessionResults) -> str:
 
 
 def _detail_start(results: SessionResults) -> float | None:
-    """Return the start of the detail: the first walking, or the largest movement, s."""
+    """Return the start of the detailed section, s: the first walking, or the largest movement."""
     if results.end_s - results.start_s < 3.0 * _DETAIL_S:
         return None
     first = _first_cycle(results)
@@ -345,7 +345,7 @@ def comparison_section(results: SessionResults) -> str:
     ]
     head = ("Angle", "RMS", "Bias", "SD", "Limits of agreement", "Largest", "Inside interval")
 
-    # Panels of the first angle of every joint: flexion, or elevation.
+    # Draw a panel for the first angle of every joint: flexion or elevation.
     shown: dict[str, AngleDifference] = {}
     for found in results.differences:
         shown.setdefault(found.joint, found)
@@ -374,7 +374,7 @@ def _difference_figure(found: AngleDifference) -> str:
     span = (float(found.t_s[0]), float(found.t_s[-1]))
     area = PlotArea(_HALF, 200.0, span, limits)
 
-    # NaN where the cameras saw nothing for a while, so that no line bridges it.
+    # Insert NaN where the cameras have a long gap, so that no line is drawn across the gap.
     t_s = found.t_s
     if len(t_s) > 1:
         wide = np.flatnonzero(np.diff(t_s) > 5.0 * np.median(np.diff(t_s))) + 1

@@ -36,9 +36,9 @@ if TYPE_CHECKING:
 _ROW = 22.0
 """Height of a row of the timeline, px."""
 _MOST_EVENTS = 200
-"""Most events in the list."""
+"""Maximum number of events in the list."""
 _MOST_MARKS = 12
-"""Most marks with a label in the timeline."""
+"""Maximum number of labelled marks in the timeline."""
 
 
 def sources_section(results: SessionResults) -> str:
@@ -80,7 +80,7 @@ def sources_section(results: SessionResults) -> str:
 
 
 def _loss(found: SeriesQuality, counts: Mapping[str, Any]) -> float:
-    """Return the share of samples lost, with the configured rate if it is known."""
+    """Return the share of lost samples as text, with the configured rate if it is known."""
     rate_hz = counts.get("rate_hz")
     if not rate_hz or not np.isfinite(found.rate_hz):
         return found.lost_share
@@ -143,7 +143,7 @@ def _bar(area: PlotArea, start_s: float, end_s: float, y: float, kind: str) -> s
 
 
 def timing_section(results: SessionResults) -> str:
-    """Return quality of the clocks and the latency."""
+    """Return the section on the quality of the clocks and on latency."""
     clocks, latency = results.values("clock"), results.values("latency").get("", {})
     parts = []
     if clocks:
@@ -181,7 +181,7 @@ def timing_section(results: SessionResults) -> str:
 
 
 def calibration_section(results: SessionResults) -> str:
-    """Return the errors that the calibration stated for itself."""
+    """Return the section on the errors that the calibration estimated."""
     tables = [
         event.data["quality"]
         for event in results.session.events

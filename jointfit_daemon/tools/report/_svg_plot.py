@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 WIDE, NARROW = 920.0, 343.0
-"""Widths of the two drawings of a chart: for screens and paper, and for phones, CSS pixels."""
+"""Widths of the two drawings of a chart, CSS pixels: for screens and paper, and for phones."""
 _TICK_STEPS = (1.0, 2.0, 5.0, 10.0)
 _TIME_STEPS_S = (
     0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0, 900.0, 1800.0,
@@ -72,12 +72,12 @@ def image(width: float, height: float, label: str, parts: Iterable[str], kind: s
 
 
 def responsive(draw: Callable[[float, str], str]) -> str:
-    """Return a chart drawn twice: `draw` receives a width and the class that shows it."""
+    """Return a chart drawn twice: `draw` receives width and CSS class."""
     return draw(WIDE, "wide") + draw(NARROW, "narrow")
 
 
 def nice_ticks(low: float, high: float, most: int) -> list[float]:
-    """Return at most about `most` round values from `low` to `high`."""
+    """Return about `most` round values, or fewer, from `low` to `high`."""
     span = high - low
     if not isfinite(span) or span <= 0.0:
         return [low]
@@ -94,7 +94,7 @@ def time_ticks(low: float, high: float, most: int) -> list[float]:
 
 
 def time_text(t_s: float, span_s: float) -> str:
-    """Return an instant as seconds, or as minutes and seconds in a long session."""
+    """Return an instant as text in seconds; in a long session as minutes and seconds."""
     if span_s < _MINUTES_FROM_S:
         return f"{t_s:g}"
     minutes, seconds = divmod(round(t_s), 60)
@@ -154,7 +154,7 @@ def degree_ticks(area: PlotArea, most: int = 5) -> list[tuple[float, str]]:
 
 
 def second_ticks(area: PlotArea, unit: str = " s") -> list[tuple[float, str]]:
-    """Return ticks of a horizontal time axis; the last one carries the unit."""
+    """Return ticks of a horizontal time axis; the last label has the unit."""
     most = max(3, int(area.columns / 70))
     span = area.x[1] - area.x[0]
     found = time_ticks(*area.x, most)
@@ -165,7 +165,7 @@ def second_ticks(area: PlotArea, unit: str = " s") -> list[tuple[float, str]]:
 
 
 def number(value: float) -> str:
-    """Return a number with a real minus sign; a dash if it is unknown."""
+    """Return a number with a real minus sign; a dash if unknown."""
     if not isfinite(value):
         return "–"
     text = f"{value:.6g}"
@@ -173,7 +173,7 @@ def number(value: float) -> str:
 
 
 def line(area: PlotArea, x: Array, y: Array, kind: str) -> str:
-    """Return a line; of several values in a pixel column the extremes are drawn. NaN is a gap."""
+    """Return a line; each pixel column shows the extremes of its values. NaN is a gap."""
     if len(x) > 2 * area.columns:
         x, low, high = column_extremes(area, x, y, y)
         x, y = np.repeat(x, 2), np.column_stack([low, high]).ravel()

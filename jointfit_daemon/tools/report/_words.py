@@ -1,4 +1,4 @@
-"""Names and numbers as readers of the report see them: degrees, percent, minutes."""
+"""Conversion of names and numbers to text for the report: degrees, percent, minutes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from math import degrees, isfinite
 
 UNKNOWN = "–"
 _PERCENT_OF_NONE = 0.0005
-"""Smallest share that is written as a number; a smaller one is written as a limit."""
+"""Smallest share that is written as a number; a smaller share is written as a limit."""
 
 
 def joint_angle(joint: str, angle: str) -> str:
@@ -21,7 +21,7 @@ def title(name: str) -> str:
 
 
 def decimal(value: float, places: int = 1) -> str:
-    """Return a number with a real minus sign, or a dash if it is unknown."""
+    """Return a number with a real minus sign, or a dash for an unknown value."""
     if not isfinite(value):
         return UNKNOWN
     text = f"{value:.{places}f}"
@@ -29,17 +29,17 @@ def decimal(value: float, places: int = 1) -> str:
 
 
 def degree(value_rad: float, places: int = 1) -> str:
-    """Return an angle in degrees, or a dash if it is unknown."""
+    """Return an angle in degrees, or a dash for an unknown angle."""
     return f"{decimal(degrees(value_rad), places)}°" if isfinite(value_rad) else UNKNOWN
 
 
 def with_sd(value_rad: float, sd_rad: float) -> str:
-    """Return an angle with its standard deviation, where it is known."""
+    """Return an angle, with the standard deviation if that is known."""
     return degree(value_rad) + (f" ± {degree(sd_rad)}" if isfinite(sd_rad) else "")
 
 
 def percent(share: float) -> str:
-    """Return a share in percent; a small one as a limit."""
+    """Return a share in percent; a small share is written as a limit."""
     if not isfinite(share):
         return UNKNOWN
     if 0.0 < share < _PERCENT_OF_NONE:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Drawing(str):
-    """SVG text of `_svg_plot`, which is inserted into a table as it is."""
+    """SVG text of `_svg_plot`, which is inserted into a table without escaping."""
 
     __slots__ = ()
 
@@ -44,7 +44,7 @@ def document(title: str, body: str) -> str:
     theme = (tools / "dashboard" / "page" / "css" / "theme.css").read_text("utf-8")
     own = (tools / "report" / "report.css").read_text("utf-8")
 
-    # Colours of the dashboard, but paper is white, whatever the colours of the screen.
+    # The colours are the colours of the dashboard, but printed pages are always white.
     dark = "(prefers-color-scheme: dark)"
     style = f"{theme.replace(dark, f'screen and {dark}')}\n{own}"
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
@@ -113,7 +113,7 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], text
 
 
 def figure(drawing: str, caption: str, legend: Sequence[tuple[str, str]] = ()) -> str:
-    """Return a drawing with caption and legend: pairs of class and text."""
+    """Return a drawing with caption and legend; the legend is pairs of CSS class and text."""
     keys = "".join(
         f'<span class="key"><svg class="swatch" viewBox="0 0 22 12" aria-hidden="true">'
         f"{_SWATCHES[kind]}</svg>{escape(text)}</span>"

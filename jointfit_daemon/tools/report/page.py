@@ -63,7 +63,7 @@ _DESCRIBED = (
 )
 """Keys of the description of a session, and their names on the page."""
 _MUCH_LOSS = 0.05
-"""Share of lost samples that is marked."""
+"""Share of lost samples above which a value is marked."""
 _DISCLAIMER = (
     "jointfitd is not a medical device. Angles and their uncertainty were estimated by software"
     " from body-worn sensors; a diagnosis must not rest on them alone."
@@ -107,7 +107,7 @@ def _header(results: SessionResults) -> str:
 
 
 def _summary(results: SessionResults) -> str:
-    """Return the tiles with the results that a reader wants first."""
+    """Return the tiles with the most important results."""
     count = results.faults
     faults = "see the list below" if count else "none reported"
     tiles = [

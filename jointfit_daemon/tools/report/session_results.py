@@ -26,16 +26,16 @@ if TYPE_CHECKING:
     from jointfit_daemon.session_data import JointSeries, SessionData, TimelineEvent
 
 SHANK_WORDS = ("shank", "tibia", "lower_leg")
-"""Parts of the names of segments whose rotation defines gait cycles."""
+"""Substrings in the names of segments whose rotation defines gait cycles."""
 FAULT_LEVELS = ("warning", "error")
 """Levels of events that count as faults."""
 VALUE_KINDS = ("clock", "latency", "source", "calibration")
-"""Kinds of events whose values have sections of their own."""
+"""Kinds of events whose values have their own sections."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionResults:
-    """A session and all that was computed from it."""
+    """A session and all results computed from it."""
 
     session: SessionData
     start_s: float
@@ -58,7 +58,7 @@ class SessionResults:
         ]
 
     def optical_joint(self, name: str) -> JointSeries | None:
-        """Return a joint according to the cameras."""
+        """Return the angles of a joint as measured by the cameras."""
         return next((j for j in self.session.optical_joints if j.name == name), None)
 
     def values(self, kind: str) -> dict[str, Mapping[str, Any]]:
@@ -112,7 +112,7 @@ def is_fault(event: TimelineEvent) -> bool:
 
 
 def side_of(name: str) -> str:
-    """Return the side that a segment or joint name contains: ``right``, ``left`` or none."""
+    """Return the side that a segment or joint name contains: ``right``, ``left`` or empty."""
     words = name.lower().replace("-", "_").split("_")
     for side in ("right", "left"):
         if side in words or words[-1] == side[0] or words[0] == side[0]:

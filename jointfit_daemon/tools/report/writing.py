@@ -1,4 +1,4 @@
-"""Report of a file on disk: `jointfit report` and `jointfit batch` share it."""
+"""Writing of the report of a recording, for `jointfit report` and `jointfit batch`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def report_name(recording: Path) -> Path:
-    """Return the default name of the page of a recording."""
+    """Return the default file name of the report of a recording."""
     return recording.with_name(f"{recording.name.split('.')[0]}-report.html")
 
 
@@ -35,5 +35,5 @@ def write_report(recording: Path, page: Path) -> SessionData:
 
 
 def write_page(session: SessionData, page: Path) -> None:
-    """Write the page of a session; a page that exists stays until the new one is complete."""
+    """Write the page of a session; an existing page is replaced when the new page is complete."""
     replace_file(page, render_report(session))

@@ -32,7 +32,7 @@ def request_schema(name: str) -> dict[str, Any]:
 def asyncapi_document() -> dict[str, Any]:
     """Return the document: one channel for each topic, request and answer.
 
-    It is written from the view of the daemon: it sends states and streams, and receives requests.
+    The document takes the view of the daemon, which sends states and streams and receives requests.
     """
     channels: dict[str, Any] = {}
     operations: dict[str, Any] = {}
@@ -42,7 +42,7 @@ def asyncapi_document() -> dict[str, Any]:
         title = schema["title"]
         schemas[title] = _moved(schema, f"#/components/schemas/{title}")
 
-        # A topic as a key of the document.
+        # Convert a topic to a key of the document.
 
         channels[key := re.sub(r"[^A-Za-z0-9]", "_", pattern)] = _channel(topic, pattern, title)
         return key
@@ -113,7 +113,7 @@ def _operation(action: str, key: str, topic: Topic) -> dict[str, Any]:
 
 
 def _moved(schema: Any, place: str) -> Any:
-    """Return a schema whose references to its own definitions begin at `place`."""
+    """Return a schema with references to its own definitions moved to `place`."""
     if isinstance(schema, list):
         return [_moved(item, place) for item in schema]
     if not isinstance(schema, dict):
