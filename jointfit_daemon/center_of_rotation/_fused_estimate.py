@@ -1,8 +1,8 @@
 """Robust fusion of several estimates of one center.
 
-Each estimate is weighted by its information matrix, so that the weak direction of one marker is
-covered by the others. An estimate that differs from the others by more than its covariance allows
-has a reduced weight and is named in a flag.
+Each estimate is weighted by its information matrix: other markers determine the center along the
+direction in which one marker's estimate is weak. An estimate that differs from the others by more
+than its covariance allows has a reduced weight and is named in a flag.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
 
 TOLERATED = 2.5
-"""Mahalanobis distance over the root of the dimension above which an estimate has less weight
-(Huber)."""
+"""Threshold of Huber's weight: Mahalanobis distance of an estimate, divided by the root of the
+dimension, above which its weight is reduced."""
 _PASSES = 50
 
 
@@ -32,9 +32,10 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
     .. math:: I_k = C_k^{-1}, \qquad C = \Big(\sum_k w_k I_k\Big)^{-1}, \qquad
               c = C \sum_k w_k I_k c_k
 
-    with w_k = min(1, κ/D_k), D_k the Mahalanobis distance to the center fused from the others. The
-    information is zero along unobserved directions. The covariance is widened by how much the
-    estimates disagree beyond their own covariances.
+    with :math:`C_k` the covariance of estimate k and w_k = min(1, κ/D_k). D_k is the Mahalanobis
+    distance of estimate k from the center fused from the other estimates, κ is `TOLERATED` times
+    the root of the dimension. The information :math:`I_k` is zero along unobserved directions. If
+    the estimates differ by more than their covariances predict, C is increased accordingly.
 
     Parameters
     ----------
@@ -47,7 +48,7 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
     Returns
     -------
     CenterEstimate
-        Refused estimates are ignored unless all are refused.
+        Fused estimate. Refused estimates are ignored unless all are refused.
 
     Raises
     ------
@@ -77,7 +78,7 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
 
 
 def _information(estimate: CenterEstimate) -> Array:
-    """Return the inverse covariance, zero along unobserved directions."""
+    """Return the inverse covariance of an estimate, which is zero along unobserved directions."""
     d = len(estimate.center)
     across = (
         np.linalg.svd(estimate.unseen)[2][len(estimate.unseen) :]
@@ -89,7 +90,7 @@ def _information(estimate: CenterEstimate) -> Array:
 
 
 def _seen(total: Array) -> Array:
-    """Return the directions with information, as columns."""
+    """Return the directions in which the total information is not zero, as columns."""
     if total.size == 0:
         return total
     known, axes = np.linalg.eigh(total)
@@ -97,7 +98,7 @@ def _seen(total: Array) -> Array:
 
 
 def _weight(i: int, w: Array, knowledge: Array, centers: Array) -> float:
-    """Return Huber's weight of an estimate by its distance from the center of the others."""
+    """Return Huber's weight of estimate i from its distance to the center fused from the others."""
     others = np.where(np.arange(len(w)) == i, 0.0, w)
     total = np.einsum("k,kab->ab", others, knowledge)
     B = _seen(total)

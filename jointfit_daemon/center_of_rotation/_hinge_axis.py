@@ -1,4 +1,4 @@
-"""Uncertainty of the axis of a hinge, for every estimator that returns one."""
+"""Uncertainty of a hinge axis, used by all estimators that return an axis."""
 
 from __future__ import annotations
 
@@ -23,20 +23,22 @@ _FEWEST = 4
 def hinge_axis_sd(points: Array, axis: Array | None) -> float | None:
     r"""Return the standard deviation of a hinge's axis from the paths of markers, rad.
 
-    The axis is the common normal of the paths. Its error is that of the two slopes β in a
-    regression of the positions along the axis on those across it, both from their means,
+    The axis is the common normal of the marker paths. The axis error equals the error of two slopes
+    β. They regress the marker positions e along the axis on the positions x across the axis, both
+    relative to their means,
 
     .. math:: e_{tj} = x_{tj}^T \beta, \qquad
               \mathrm{Cov}(\beta) = s_e^2 \Big( \sum_{tj} x_{tj} x_{tj}^T \Big)^{-1}
               \frac{1+\rho}{1-\rho}
 
-    with ρ the correlation of e from frame to frame. Soft-tissue artefact and rotations about
-    another axis are part of :math:`s_e`.
+    with :math:`s_e^2` the residual variance and ρ the correlation of e from frame to frame, for
+    frame t and marker j. Soft-tissue artefact and rotations about another axis are part of
+    :math:`s_e`.
 
     Parameters
     ----------
     points : ndarray, shape (n, k, 3)
-        Markers of one part in coordinates of the other, m; NaN if not visible.
+        Markers of the child in the parent's coordinates, m; NaN if not visible.
     axis : ndarray, shape (3,), or None
         Unit axis.
 

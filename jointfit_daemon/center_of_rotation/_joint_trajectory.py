@@ -1,4 +1,4 @@
-r"""Trajectory of a joint in the world, from centers that are fixed in its two segments.
+r"""Trajectory of a joint in the world, from a center of rotation fixed in each of two segments.
 
 A center of rotation is estimated once, in the coordinates of a segment. The pose of the segment
 then gives the position of the joint in every frame, also where the other segment is occluded.
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation._result import CenterEstimate
 
 _LEAST_VARIANCE_M2 = 1e-12
-"""Variance, m², of a side without noise, so that weights remain finite."""
+"""Smallest variance assigned to a side, m²; it limits the weight of a side without noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +35,8 @@ class JointSide:
     poses: BodyPoses
     """Poses of the segment in the world; NaN where unknown."""
     basis: Array
-    """Maps coordinates of the segment, (d,), to those of `poses`: identity, or the plane's basis,
-    shape (3, d)."""
+    """Matrix from segment coordinates, shape (d,), to the coordinates of `poses`: the identity in
+    space, the basis of the plane in a planar method. Shape (3, d)."""
     markers: Array
     """Markers of the segment in its coordinates, m, shape (m, d)."""
     fit_rms: float
@@ -55,8 +55,8 @@ class JointTrajectory:
     """Predicted RMS error of the position, m, shape (n,), along the directions in which the center
     was observed; NaN where the position is unknown."""
     sides_apart: float
-    """RMS distance, in a plane within it, between the positions that the two segments give, m; NaN
-    with one segment."""
+    """RMS distance between the two joint positions computed from the two segments, m. In a planar
+    method, the distance within the plane. NaN if only one segment is used."""
 
 
 def joint_trajectory(sides: Sequence[JointSide], frames: int) -> JointTrajectory:
@@ -65,25 +65,28 @@ def joint_trajectory(sides: Sequence[JointSide], frames: int) -> JointTrajectory
     .. math:: x(t) = \sum_k w_k(t)\, (R_k(t)\, c_k + t_k(t)), \qquad
               w_k \propto 1 / (s_k^2 + f_k^2)
 
-    over the segments k with a pose in this frame. :math:`s_k^2` is the trace of the covariance of
-    the center, and :math:`f_k^2` that of the error of the segment's pose at the center. Both
-    centers are estimated from the same movement, so their errors are counted as equal in sign; the
-    errors of the poses are independent:
+    The sum is over the segments k with a pose in frame t, :math:`c_k` is the center in segment k.
+    :math:`s_k^2` is the trace of the covariance of the center. :math:`f_k^2` is the trace of the
+    covariance of the segment's pose error at the center. Both centers are estimated from the same
+    movement, so their errors are added with equal sign. The pose errors are independent. The
+    predicted error E is
 
     .. math:: E^2 = \Big( \sum_k w_k s_k \Big)^2 + \sum_k w_k^2 f_k^2
 
-    If the two sides differ by more than their errors predict, E is multiplied by the ratio.
+    If the two sides differ by more than their errors predict, E is multiplied by the ratio of
+    observed to predicted difference.
 
-    A direction that only one side has observed is taken from this side. If neither has, the
-    position along it is that of the first side, and the other one agrees with it on average. In a
-    plane this is the position along the normal: the mean of the segment's markers.
+    Along a direction observed by only one side, the position comes from this side. Along a
+    direction observed by neither side, the position comes from the first side. The second side is
+    then shifted to agree with the first side on average. For a planar method this direction is the
+    normal, and the position along the normal is the mean of the segment's markers.
 
     Parameters
     ----------
     sides : sequence of JointSide
         One or two segments; a side with a refused center is not used.
     frames : int
-        Number of frames n, the result's length if no side is usable.
+        Number of frames n; it sets the length of the result if no side is usable.
 
     Returns
     -------
@@ -127,7 +130,7 @@ def _in_world(side: JointSide, center: Array) -> Array:
 
 
 def _agreeing_track(side: JointSide, reference: Array) -> Array:
-    """Return positions in the world that on average agree with others where nothing is observed."""
+    """Return the positions, moved to the mean of `reference` along unobserved directions."""
     center, unseen = side.estimate.center, side.estimate.unseen
     other = side.poses.to_body(reference[:, None])[:, 0] @ side.basis
     shared = np.isfinite(other).all(axis=1)
@@ -137,14 +140,14 @@ def _agreeing_track(side: JointSide, reference: Array) -> Array:
         center = center + unseen.T @ (unseen @ (other[shared].mean(axis=0) - center))
 
     found = _in_world(side, center)
-    if len(center) == len("xy"):  # the position normal to the plane is that of the markers
+    if len(center) == len("xy"):  # the position normal to the plane is the mean of the markers
         normal = np.cross(*side.basis.T)
         found = found + normal * ((reference - found)[shared] @ normal).mean()
     return found
 
 
 def _pose_variance(side: JointSide) -> float:
-    """Return the variance of the pose at the center along the observed directions, m²."""
+    """Return the variance of the pose error at the center along the observed directions, m²."""
     m, d = side.markers.shape
     estimate = side.estimate
     # m markers have m·d coordinates, of which the fit of the pose uses d (d + 1) / 2
@@ -152,7 +155,7 @@ def _pose_variance(side: JointSide) -> float:
     covariance = planar_noise if d == len("xy") else spatial_noise
     of_point = covariance(estimate.center, side.markers, noise)
 
-    # motion of the joint that the noise of the markers does not explain, per direction
+    # variance per direction that the marker noise does not explain: motion of the joint
     excess = max(estimate.residual**2 - float(np.trace(of_point)) / d, 0.0)
     per_direction = of_point + (excess - noise**2) * np.eye(d)
     unseen = estimate.unseen.reshape(-1, d) if len(estimate.unseen) else np.zeros((0, d))

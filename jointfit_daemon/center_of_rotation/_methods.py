@@ -1,4 +1,4 @@
-"""Table of all estimators and one function that runs any of them.
+"""Table of all estimators, and the function `estimate_center` that runs an estimator by name.
 
 `METHODS` lists the inputs that each method needs.
 """
@@ -42,7 +42,7 @@ _ASK_EVERY = 50
 
 @dataclass(frozen=True, slots=True)
 class EstimationMethod:
-    """One estimator by name."""
+    """Entry of the estimator table `METHODS`."""
 
     name: str
     about: str
@@ -113,7 +113,7 @@ def _automatic(movement: Movement) -> str:
 
 
 def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimate:
-    """Refuse a rotation that is no larger than the noise of the parent's frame."""
+    """Refuse an estimate whose rotation is no larger than the noise of the parent's frame."""
     if parent is None or found.refused is not None or len(found.center) < 3:
         return found
     turn = sqrt(NOISE_FACTOR) * turn_noise(parent, found.noise)

@@ -1,7 +1,7 @@
 """Input of the estimators: marker positions, body poses and joint angles.
 
-Positions are in meters, NaN where a marker was not visible. Both body poses of a pair are given in
-one world.
+Positions are in meters, NaN where a marker was not visible. The poses of parent and child are given
+in the same world coordinates.
 """
 
 from __future__ import annotations
@@ -19,10 +19,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 PARENT_TURN_RAD = radians(0.8)
-"""Rotation against the parent that is attributed to noise of its markers, rad.
+"""Largest rotation of the child relative to the parent that the parent's marker noise may cause,
+rad.
 
-Noise of 1 mm of markers 10 cm from their mean rotates the fitted frame by half of this value. Such
-rotations cannot be distinguished from joint rotations."""
+Noise of 1 mm of markers 10 cm from their mean rotates the fitted parent frame by half of this
+value. Such rotations cannot be distinguished from joint rotations.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,23 +61,23 @@ class Movement:
     """The child's own markers in its coordinates, m, shape (k, 3). None: the median of `points` in
     the child's coordinates, if `child` is given."""
     residuals: Array | None = None
-    """Residual of the cameras for each of `points`, m, shape (n, k); NaN where unknown. Only their
-    ratios are used: of two frames, the one with the larger residual is noisier."""
+    """Residual of the cameras for each of `points`, m, shape (n, k); NaN where unknown. Only ratios
+    of residuals are used: a frame with a larger residual is noisier."""
     angles: Array | None = None
     """Angle of the child about the joint's axis relative to the parent, rad, shape (n,), from
     inertial sensors: for ``oriented``."""
     axis: Array | None = None
     """Normal of the plane for planar methods on points in space, shape (3,); estimated if None."""
     near: Array | None = None
-    """Initial center, and its value along unobserved directions, m, shape (d,); the markers' mean
-    if None."""
+    """Initial center, m, shape (d,); the mean of the markers if None. Along unobserved directions
+    the estimate keeps the initial value."""
     interval: float = 0.01
     """Time between frames, s."""
 
     def both_markers(self) -> tuple[Array, Array] | None:
         """Return the markers of parent and child in own coordinates, m, shape (n, k, 3) each.
 
-        None if those of one body are unknown, fewer than three, or on a line.
+        None if the markers of either body are unknown, fewer than three, or on a line.
         """
         child = self.child_markers
         if child is None and not (self.points is None or self.parent is None or self.child is None):
@@ -91,5 +93,5 @@ class Movement:
 
     @property
     def least_turn(self) -> float:
-        """Return the rotation, rad, that noise of a moving parent's frame may cause."""
+        """Return the largest apparent rotation due to noise of a moving parent's frame, rad."""
         return PARENT_TURN_RAD if self.parent is not None else 0.0

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def lag_one_correlation(e: Array, seen: NDArray[np.bool_]) -> float:
-    """Return the lag-one correlation of residuals, (n, k), 0 to 0.99; 0 if not significant."""
+    """Return the lag-one correlation, 0 to 0.99, of residuals (n, k); 0 if not significant."""
     both = seen[1:] & seen[:-1]
     count = int(np.count_nonzero(seen))
     power = float((e[seen] ** 2).sum()) / max(count, 1)
@@ -33,7 +33,7 @@ def variance_inflation(rho: float) -> float:
 
 
 def radial_residuals(v: Array, m: Array, w: Array) -> tuple[Array, Array]:
-    """Return radial residuals of k markers and their derivatives by the center.
+    """Return radial residuals of k markers and the derivatives of the residuals by the center.
 
     Parameters
     ----------
@@ -78,5 +78,5 @@ def arc_of_spread(spread: float) -> float:
 
 
 def arc_of(resultant: float) -> float:
-    """Return the arc, rad, on which evenly spread directions have this mean resultant."""
+    """Return the arc, rad, of evenly spread unit vectors whose mean has the length `resultant`."""
     return arc_of_spread(1.0 - min(max(resultant, 0.0), 1.0) ** 2)

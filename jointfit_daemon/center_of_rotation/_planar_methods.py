@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation.planar import CircleMethod
 
 MarkerFit = Callable[[Array, Movement], "CenterEstimate"]
-"""Fit in a plane: points of one marker, m, shape (n, 2), or of k, shape (n, k, 2)."""
+"""Fit in a plane to the points of one marker, m, shape (n, 2), or of k markers, shape (n, k, 2)."""
 
 OFF_AXIS = (
     "the marker paths are not planar, so the joint rotated about more than one axis: use sphere "
@@ -51,7 +51,7 @@ _GRID_STEP_M = 0.005
 
 
 def circle(method: CircleMethod) -> MarkerFit:
-    """Return a closed-form circle fit of one marker."""
+    """Return the function that fits a circle to the path of one marker in closed form."""
     return lambda p, _: circle_estimate(p, method=method, limits=LIMITS)
 
 
@@ -65,12 +65,12 @@ def running(p: Array, _: Movement) -> CenterEstimate:
 
 def oriented(p: Array, movement: Movement) -> CenterEstimate:
     """Fit the path of one marker together with the child's angle."""
-    angles = cast("Array", movement.angles)  # the method needs them
+    angles = cast("Array", movement.angles)  # `METHODS` requires the angles for this method
     return oriented_estimate(p, angles, movement.interval, limits=LIMITS)
 
 
 def grid(p: Array, _: Movement) -> CenterEstimate:
-    """Search the grid nodes around the circle fit of one marker; a baseline method."""
+    """Search the grid nodes around the circle fit of one marker; this is a baseline method."""
     about = replace(circle_estimate(p, limits=LIMITS), method="grid")
     if about.refused is not None:
         return about
@@ -82,28 +82,28 @@ def grid(p: Array, _: Movement) -> CenterEstimate:
 
 
 def three_frames(p: Array, movement: Movement) -> CenterEstimate:
-    """Use the first, middle and last frame of one marker, with noise estimated from all frames.
+    """Estimate from the first, middle and last frame of one marker, with the noise of all frames.
 
-    Where the cameras state a residual for every position, the noise of a frame is proportional to
-    it.
+    If the cameras report a residual for every position, the noise of a frame is proportional to the
+    residual.
     """
     whole = circle_estimate(p, limits=LIMITS)
     if whole.refused is not None:
         return replace(whole, method="three_frames")
     visible = np.asarray(np.isfinite(p).all(axis=1))
     seen = p[visible]
-    # along the arc, not along time: a movement may end where it began
+    # first, middle and last along the arc, not in time: a movement may end where it began
     turn = np.unwrap(np.arctan2(*(seen - whole.center).T[::-1]))
     order = np.argsort(turn)
     middle = int(np.argmin(np.abs(turn - turn[order[[0, -1]]].mean())))
     chosen = [order[0], middle, order[-1]]
     noise = whole.noise * _relative_noise(movement.residuals, visible)[chosen]
     found = three_frame_estimate(seen[chosen], noise[:, None])
-    return replace(found, bound=whole.bound)  # of the movement, not of its three frames
+    return replace(found, bound=whole.bound)  # bound of the whole movement
 
 
 def _relative_noise(residuals: Array | None, visible: NDArray[np.bool_]) -> Array:
-    """Return the noise of every visible frame of one marker relative to the RMS of all of them."""
+    """Return the noise of each visible frame of one marker, relative to the RMS of these frames."""
     if residuals is None:
         return np.ones(int(visible.sum()))
     stated = residuals[visible, 0]

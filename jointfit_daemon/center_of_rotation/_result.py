@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 class CenterEstimate:
     """Estimated point that is fixed in both the parent and the child segment.
 
-    This is the only result type of centers of rotation. A `JointCenter` of the calibration contains
-    one; priors combine it with the other joints of the chain.
+    All estimators return this type. A `JointCenter` of the calibration contains a `CenterEstimate`,
+    which priors combine with the other joints of the chain.
     """
 
     method: str
@@ -40,9 +40,10 @@ class CenterEstimate:
     """Angle covered by the markers about the center, rad."""
     bound: float
     """Cramér-Rao bound of the RMS error for `noise` that is independent from frame to frame, m; inf
-    if a direction is unobserved. It depends on the movement, not on the method."""
+    if a direction is unobserved. The bound depends on the movement, not on the method."""
     conditioning: float
-    """T, the curvature divided by its standard error; below 6 a circle is not usable."""
+    """T, the curvature of the path divided by the standard error of the curvature; a circle with T
+    below 6 is not usable."""
     frames: int
     effective_frames: float
     """Effective number of frames, after forgetting and correlation from frame to frame."""
@@ -61,7 +62,7 @@ class CenterEstimate:
     """Squared Mahalanobis distance eᵀC⁻¹e of the 95 % error ellipse of this method; None: use the
     quantile of chi-square."""
     refused: str | None = None
-    """Cause and remedy if the center must not be used; None if it may."""
+    """Cause and remedy if the center must not be used; None if the center is usable."""
 
     @property
     def sd(self) -> float:
@@ -72,7 +73,7 @@ class CenterEstimate:
 
 
 def refusal(method: str, d: int, frames: int, reason: str) -> CenterEstimate:
-    """Return an estimate without information in any direction, with the reason."""
+    """Return a refused estimate: no information in any direction, and the reason in `refused`."""
     return CenterEstimate(
         method=method,
         center=np.full(d, np.nan),

@@ -43,14 +43,15 @@ class CircleLimits:
     """Acceptance limits of a planar center."""
 
     gate: float = GATE
-    """Least T, the radius over the largest standard error of the center."""
+    """Smallest accepted T, the radius divided by the largest standard error of the center."""
     reach: tuple[float, float] = (0.02, 1.0)
-    """Distance of a marker from the center, m."""
+    """Smallest and largest accepted distance of a marker from the center, m."""
     arc: float = radians(10.0)
     """Smallest arc of the movement, rad."""
     sd: float = inf
-    """Largest predicted RMS error, m. Noise that curves the arc by chance reduces the prediction. A
-    limit near the expected error therefore selects biased centers outside their ellipses."""
+    """Largest accepted predicted RMS error, m. Noise that increases the curvature of the arc by
+    chance reduces the predicted error. A limit near the expected error therefore selects biased
+    centers outside their error ellipses."""
 
 
 def circle_estimate(
@@ -67,7 +68,7 @@ def circle_estimate(
     points : array_like, shape (n, 2)
         Positions in the parent's coordinates, in order of time, m; NaN where missing.
     weights : array_like, shape (n,), optional
-        Not negative.
+        Weight of each point, not negative; 1 by default.
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
     limits : CircleLimits, optional
@@ -76,7 +77,8 @@ def circle_estimate(
     Returns
     -------
     CenterEstimate
-        Equals, except for rounding, the estimate of a `RunningCircle` fed with these points.
+        Estimate that equals, except for rounding, the estimate of a `RunningCircle` fed with these
+        points.
     """
     p = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     seen = seen_places(p)
@@ -111,8 +113,8 @@ def publish(
     m : CircleMoments
         Moments of the points.
     lagged : callable
-        Mean product of the radial residuals of neighbours in time, m², about the center (a, b) from
-        the centroid and for R²; the source of the correlation.
+        Function of a center (a, b), relative to the centroid, and R². It returns the mean product
+        of the radial residuals of successive frames, m², from which their correlation is computed.
     method : str
         Name of the circle fit.
     frames : int
@@ -160,7 +162,7 @@ def publish(
 
 
 def objection(radius: float, arc: float, T: float, sd: float, limits: CircleLimits) -> str | None:
-    """Return why a circle must not be used, with the remedy; None if it may."""
+    """Return why a circle must not be used, with the remedy; None if the circle is usable."""
     if not limits.reach[0] <= radius <= limits.reach[1]:
         return (
             f"the marker would be {radius:.2f} m from the center, not {limits.reach[0]:g} to "
@@ -197,7 +199,7 @@ def refused_circle(method: str, at: ArrayLike, frames: int, reason: str) -> Cent
 
 
 def _reason_without_circle(m: CircleMoments[float], frames: int) -> str | None:
-    spread = max(m.xx + m.yy, 0.0)  # rounding of equal points
+    spread = max(m.xx + m.yy, 0.0)  # a difference this small is rounding of equal points
     if frames == 0:
         return "the marker is missing in every frame: check its name, the cameras and occlusion"
     if frames < 4 or m.effective <= 3.0:
@@ -210,7 +212,7 @@ def _reason_without_circle(m: CircleMoments[float], frames: int) -> str | None:
 
 
 def arc_about(points: Array, center: Array) -> float:
-    """Return the angle between the outermost of the points about a center, rad, at most 2π.
+    """Return the angle between the two outermost points, seen from a center, rad, at most 2π.
 
     Points have shape (n, 2), m, with NaN where hidden, and the center has shape (2,), m.
     """

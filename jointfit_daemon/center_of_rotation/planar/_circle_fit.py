@@ -1,7 +1,8 @@
 """Algebraic circle fits in closed form: Kåsa, Pratt, Taubin and Hyper.
 
-The fits need no start value and no iteration over points, for one circle or for arrays of them.
-Hyper is the default because it has no essential bias. Source: Al-Sharadqah and Chernov 2009.
+The fits need no start value and no iteration over points. They accept one circle or arrays of
+circles. Hyper is the default because it has no essential bias. Source: Al-Sharadqah and Chernov
+2009.
 """
 
 from __future__ import annotations
@@ -42,20 +43,21 @@ class Circles(NamedTuple):
     noise: Array
     """Standard deviation of each coordinate of a point, m."""
     conditioning: Array
-    """T, the radius over the center's largest standard error."""
+    """T, the radius divided by the largest standard error of the center."""
     valid: NDArray[np.bool_]
     """Whether a circle exists and its arc exceeds the noise."""
 
 
 def polynomial(m: CircleMoments[Number], method: str) -> tuple[Number, Number, Number, float]:
-    r"""Return A0, A1, A2 and the factor of η⁴ of the characteristic polynomial.
+    r"""Return the coefficients A0, A1, A2 and the factor of η⁴ of the characteristic polynomial.
 
     .. math::
         C &= M_{xx} M_{yy} - M_{xy}^2, \qquad V = M_{zz} - M_z^2, \qquad M_z = M_{xx} + M_{yy} \\
         A_0 &= M_{xz}(M_{xz} M_{yy} - M_{yz} M_{xy}) + M_{yz}(M_{yz} M_{xx} - M_{xz} M_{xy}) - VC \\
         A_1 &= V M_z + 4 C M_z - M_{xz}^2 - M_{yz}^2
 
-    Pratt and Hyper: A₂ = 4C - 3M_z² - M_zz, with 4η⁴. Taubin: A₂ = -3M_z² - M_zz, with 4M_z η³.
+    M are the moments in `CircleMoments`. For Pratt and Hyper, A₂ = 4C - 3M_z² - M_zz and the
+    leading term is 4η⁴. For Taubin, A₂ = -3M_z² - M_zz and the leading term is 4M_z η³.
     """
     z = m.xx + m.yy
     C = m.xx * m.yy - m.xy * m.xy
@@ -69,7 +71,7 @@ def polynomial(m: CircleMoments[Number], method: str) -> tuple[Number, Number, N
 
 
 def smallest_root(m: CircleMoments[float], method: str = "hyper") -> float:
-    """Return η by 5 or 6 Newton steps from zero, until the polynomial no longer decreases."""
+    """Return the smallest root η, found by 5 or 6 Newton steps from zero."""
     if method == "kasa":
         return 0.0
     A0, A1, A2, A4 = polynomial(m, method)
@@ -90,7 +92,7 @@ def smallest_root(m: CircleMoments[float], method: str = "hyper") -> float:
 
 
 def smallest_roots(m: CircleMoments[Array], method: str = "hyper") -> Array:
-    """Return `smallest_root` of many circles at once."""
+    """Return the result of `smallest_root` for many circles at once."""
     if method == "kasa":
         return np.zeros_like(m.xx)
     A0, A1, A2, A4 = polynomial(m, method)
@@ -122,7 +124,7 @@ def circle_from_root(
         R^2 &= a^2 + b^2 + M_z + \{0, 2\eta, 0, -2\eta\}
     """
     z = m.xx + m.yy
-    # η² - ηMz + C as a product and a remainder: on short arcs the plain sum cancels
+    # Δ = η² - ηMz + C is computed as a product and a remainder: on short arcs the plain sum cancels
     twice = 2.0 * ((m.xx - eta) * (m.yy - eta) - m.xy * m.xy)
     a = (m.xz * (m.yy - eta) - m.yz * m.xy) / twice
     b = (m.yz * (m.xx - eta) - m.xz * m.xy) / twice
@@ -132,7 +134,7 @@ def circle_from_root(
 
 
 def circle_of(m: CircleMoments[float], method: str = "hyper") -> tuple[float, float, float] | None:
-    """Return `circle_from_root` of one circle; None if the moments determine no circle."""
+    """Return `circle_from_root` of one circle; None if the moments do not determine a circle."""
     eta = smallest_root(m, method)
     if (m.xx - eta) * (m.yy - eta) == m.xy * m.xy:
         return None
@@ -150,16 +152,17 @@ def temper(
     for the vector d from the centroid to the center, with covariance C. On a short arc the
     estimated curvature κ has a nearly normal error s, and the distance of the center is 1/κ. The
     mean square error of 1/κ is dominated by the few cases near κ = 0, and 1/κ is too large on
-    average. It is therefore replaced by κ/(κ² + s²), Zellner's minimum expected loss estimator of
-    an inverse (1978). This removes the bias to second order and the tail; the error is 1 + 1/T²
-    times the bound, not 1 + 4.5/T². On long arcs S is the identity.
+    average. The distance 1/κ is therefore replaced by κ/(κ² + s²), Zellner's minimum expected loss
+    estimator of an inverse (1978). The replacement removes the tail of the error distribution, and
+    the bias to second order. The error is 1 + 1/T² times the Cramér-Rao bound, without the
+    replacement 1 + 4.5/T² times. On long arcs S is the identity.
     """
     xx, xy, yy = cov
     p, q, r = 1.0 + xx / square, xy / square, 1.0 + yy / square
     determinant = p * r - q * q
     s, t, u = r / determinant, -q / determinant, p / determinant
 
-    # S C = R² (I - S), so that S C S needs no third matrix
+    # since S C = R² (I - S), the product S C S needs no third matrix
     k, m, n = square * (1.0 - s), -square * t, square * (1.0 - u)
     drawn = (k * s + m * t, k * t + m * u, m * t + n * u)
     return s * a + t * b, t * a + u * b, drawn
@@ -177,14 +180,14 @@ def fit_circles(
     Parameters
     ----------
     points : array_like, shape (..., n, 2)
-        m; NaN where not seen.
+        Points of each set, m; NaN where a marker is not visible.
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
     tempered : bool
         Shrink centers with `temper`; False gives the textbook center.
     correlated : bool
-        The points are in order of time: increase the covariance for the correlation between
-        successive residuals.
+        Increase the covariance for the correlation between successive residuals; the points must be
+        in order of time.
 
     Returns
     -------
@@ -229,7 +232,7 @@ def fit_circle(points: ArrayLike, *, method: CircleMethod = "hyper") -> tuple[fl
     Parameters
     ----------
     points : array_like, shape (n, 2)
-        m; no NaN.
+        Points, m; no NaN.
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
 
@@ -250,7 +253,7 @@ def fit_circle(points: ArrayLike, *, method: CircleMethod = "hyper") -> tuple[fl
 
 
 def _lagged(points: ArrayLike, m: CircleMoments[Array], a: Array, b: Array, square: Array) -> Array:
-    """Return the mean product of radial residuals of neighbours, m², shape (...)."""
+    """Return the mean product of the radial residuals of successive points, m², shape (...)."""
     p = np.asarray(points, dtype=np.float64)
     d = p - np.stack((m.x + a, m.y + b), axis=-1)[..., None, :]
     e = ((d**2).sum(axis=-1) - square[..., None]) / (2.0 * np.sqrt(square))[..., None]

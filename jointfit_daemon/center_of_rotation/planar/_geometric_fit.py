@@ -1,6 +1,7 @@
 """Geometric circle fit: the maximum-likelihood estimate by Levenberg-Marquardt.
 
-On clean points it equals Hyper. It adds Huber's loss and several markers with one center.
+On points without outliers the estimate equals that of the Hyper fit. In addition, the geometric fit
+supports Huber's loss and several markers with one center.
 """
 
 from __future__ import annotations
@@ -48,10 +49,11 @@ def geometric_estimate(
 
     .. math:: \min_c \sum_{tk} \rho\left( |x_{tk} - c| - R_k \right)
 
-    with R_k the mean distance of marker k. Several markers have one common center. Markers at
-    different angles about the joint reduce the error by much more than √k, because their weak
-    directions differ. Correlated residuals of neighboring frames (lag-one correlation r) increase
-    the covariance by (1 + r)/(1 - r), as in the other circle fits.
+    with x_tk the position of marker k in frame t, R_k the mean distance of marker k from the center
+    c, and ρ Huber's loss. Several markers have one common center. Markers at different angles about
+    the joint reduce the error by much more than √k, because their weak directions differ.
+    Correlated residuals of neighboring frames (lag-one correlation r) increase the covariance by
+    (1 + r)/(1 - r), as in the other circle fits.
 
     Parameters
     ----------
@@ -69,7 +71,7 @@ def geometric_estimate(
     p = p[:, None, :] if p.ndim == 2 else p
     seen = seen_places(p)
     frames = int(seen.any(axis=1).sum())
-    if start is None:  # Hyper's center of the best conditioned marker
+    if start is None:  # start at the Hyper center of the marker with the largest T
         circles = fit_circles(np.moveaxis(p, 1, 0))
         best = int(np.argmax(circles.conditioning)) if p.shape[1] else 0
         begin = circles.center[best] if p.shape[1] and circles.valid[best] else None
@@ -132,7 +134,7 @@ def _accept_estimate(
     variance = pull / max(float((w[seen] >= 1.0).mean()), 0.1) ** 2
     information = np.einsum("tk,tka,tkb->ab", seen.astype(np.float64), J, J)
 
-    # noise also changes directions; its contribution to H is not information
+    # noise also changes the directions; this contribution to H is not information
     u2 = np.maximum(((x - c) ** 2).sum(axis=-1), 1e-6)
     across = np.eye(2) * float((seen / u2).sum()) - np.einsum(
         "tk,tka,tkb->ab", seen / u2**2, x - c, x - c

@@ -1,7 +1,7 @@
 """Grid search for the center with the smallest variance of distances.
 
-This is the published baseline of the planar method. Its accuracy is limited by the extent of the
-grid on short arcs and by its step on long ones.
+This is the published baseline of the planar method. On short arcs the extent of the grid limits the
+accuracy, on long arcs the step of the grid.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _AT_ONCE = 400_000
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """A square grid of nodes; its middle is a node."""
+    """Square grid of nodes with a node in the middle."""
 
     middle: tuple[float, float] = (0.0, 0.0)
     """Middle of the grid, m."""
@@ -41,7 +41,7 @@ class Grid:
 
 
 def grid_center(points: ArrayLike, grid: Grid) -> Array:
-    r"""Return the node whose distances to the points vary least, for any number of movements.
+    r"""Return the grid node with the smallest variance of distances, for any number of movements.
 
     .. math:: J(p) = \sum_n d_n^2 - \Big(\sum_n d_n\Big)^2 / N, \qquad d_n = |p - x_n|
 
@@ -57,7 +57,7 @@ def grid_center(points: ArrayLike, grid: Grid) -> Array:
     Returns
     -------
     ndarray, shape (..., 2)
-        m; the first node in row order where several are equal.
+        Node with the smallest cost J, m; of several equal nodes, the first in row order.
     """
     p = np.asarray(points, dtype=np.float64)
     flat = p.reshape(-1, *p.shape[-2:])
@@ -74,7 +74,7 @@ def grid_cost(points: ArrayLike, nodes: Array) -> Array:
     p = np.asarray(points, dtype=np.float64)
     frames = p.shape[-2]
     square, total = np.zeros((2, *p.shape[:-2], len(nodes)))
-    for n in range(frames):  # frame by frame and in place: five times faster than all at once
+    for n in range(frames):  # a loop is five times faster than one large array
         distance = (p[..., n, 0, None] - nodes[:, 0]) ** 2
         distance += (p[..., n, 1, None] - nodes[:, 1]) ** 2
         square += distance

@@ -19,17 +19,17 @@ if TYPE_CHECKING:
 Number = TypeVar("Number", float, Array)
 
 GATE = 6.0
-"""Smallest T, curvature over its standard error, of a published center: the error is then within 15
-% of the bound."""
+"""Smallest T of a published center, with T the curvature divided by its standard error. From this T
+on, the error is within 15 % of the Cramér-Rao bound."""
 LOG_20 = log(20.0)
 FARTHEST_M = 1e4
-"""Coordinates beyond this, m, are treated as missing, like NaN."""
+"""Largest valid coordinate, m; larger coordinates are treated as missing, like NaN."""
 ROUNDING = 1e-13
 """Share of the points' variance below which a difference of moments is attributed to rounding."""
 
 
 class CircleMoments(NamedTuple, Generic[Number]):
-    """Weighted moments of points about their centroid; z is the squared distance from it."""
+    """Weighted moments of points about their centroid; z is the squared distance to it."""
 
     weight: Number
     """Sum of the weights."""
@@ -39,7 +39,7 @@ class CircleMoments(NamedTuple, Generic[Number]):
     """Centroid, m."""
     y: Number
     xx: Number
-    """Means of products, m², m³, m⁴."""
+    """Weighted means of the products that the field names state, m², m³, m⁴."""
     xy: Number
     yy: Number
     xz: Number
@@ -75,9 +75,9 @@ def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMom
     Parameters
     ----------
     points : array_like, shape (..., n, 2)
-        m; a point with NaN has no weight.
+        Points of each set, m; a point with NaN has no weight.
     weights : array_like, shape (..., n), optional
-        Not negative; 1 if None.
+        Weight of each point, not negative; 1 if None.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMom
 
 
 def moments_of_one(points: Array, weights: Array | None = None) -> CircleMoments[float]:
-    """Return the moments of one set of points, shape (n, 2), without NaN, faster than `moments_of`.
+    """Return the moments of one set of points, shape (n, 2), without NaN; faster than `moments_of`.
 
     Weights, shape (n,), are not negative and not all zero.
     """
@@ -147,13 +147,13 @@ def noise_of(
     Parameters are those of `circle_statistics`.
     """
     u = sum_of_squares(m, a, b, square)
-    u = (u + abs(u)) * 0.5  # with a perfect fit, rounding may make this negative
+    u = (u + abs(u)) * 0.5  # for a perfect fit, rounding may make the mean square negative
     residual = u / (4.0 * square)
     return residual * m.effective / (m.effective - 3.0), residual
 
 
 def arc_shows(m: CircleMoments[Number], noise: Number) -> Any:
-    """Return whether the covariance of the points is positive definite without their noise.
+    """Return whether the covariance of the points minus the noise covariance is positive definite.
 
     Otherwise the arc is within the noise, and variances of `circle_statistics` may be negative.
     """
@@ -176,10 +176,10 @@ def circle_statistics(
 
     with n the effective number of points. The noise variance is subtracted from the moments because
     noise widens the arc and would count as curvature. Without the subtraction, the predicted error
-    on an arc of 20° is half the true error. The bracket accounts for noise along the arc, which
-    disturbs the reference of the curvature. The factor 5 is exact for a parabola: noise on t adds
-    5σ²/var t to the variance of t² over evenly spread t. Half of it, for the whole circle, was
-    found by simulation. The bracket matters for σ above R/30.
+    on an arc of 20° is half the true error. The factor in round brackets accounts for noise along
+    the arc, which disturbs the reference of the curvature. Its constant 5 is exact for a parabola:
+    noise on t adds 5σ²/var t to the variance of t² over evenly spread t. The constant 5/2, which
+    applies to a whole circle, was found by simulation. The factor matters for σ above R/30.
 
     Parameters
     ----------
@@ -213,7 +213,8 @@ def ellipse_scale(effective: float, conditioning: float) -> float:
     The second factor is twice the quantile of F with 2 and ν degrees of freedom, because the noise
     is estimated, too. The first factor corrects the selection of published centers. A center is
     published if its T, which is nearly T₀ + N(0, 1), exceeds `GATE`. Close to the gate, most
-    published centers have a curvature that is too large, and are therefore too near. The factor
+    published centers have too large a curvature, and are therefore too close to the markers. The
+    factor
 
     .. math:: g(T) = 1 + 12.6\, e^{-(T-6)/0.455} + 0.172\, (6/T)^{2.25}
 

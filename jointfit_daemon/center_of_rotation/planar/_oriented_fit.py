@@ -1,7 +1,7 @@
 """Center of rotation from a marker path and the measured angle of the child segment.
 
-Both measurements have errors. Invariant: the result stays within a bounded number of standard
-errors of the circle fit, however wrong the angles are.
+Positions and angles both have errors. Invariant: the result stays within a bounded number of
+standard errors of the circle fit, even with arbitrary angle errors.
 """
 
 from __future__ import annotations
@@ -76,11 +76,15 @@ def oriented_estimate(
             \qquad M = \left( (\sigma/\rho)^2 I + \Sigma_\theta \right)^{-1} \\
         q_t &= |x_t - c|, \quad e_t = q_t - \rho, \quad a_t = \arg(x_t - c) - \theta_t - \beta
 
-    Plain least squares on the first line is attenuated by δ; the last term of J subtracts the
-    contribution of marker noise to aᵀMa, which decreases with distance and would bias c outward.
+    In the first line, c is the center, ρ the radius, u the unit vector at an angle, θ the measured
+    angle of the child with error δ, and β the angle of the marker on the child. ε is marker noise
+    of variance σ². Plain least squares on the first line is attenuated by δ. The last term of J
+    subtracts the contribution of marker noise to aᵀMa. This contribution decreases with the
+    distance of the center, and would bias c outward.
 
-    The guard is a limited translation (Efron and Morris 1971). With Δ = aided - circle, E its
-    covariance if the errors of the angles are as stated, and s² = ΔᵀE⁻¹Δ, the result is
+    The guard is a limited translation (Efron and Morris 1971). Let Δ be the difference between the
+    center with angles and the center of the circle fit. With E the covariance of Δ for angle errors
+    as stated, and s² = ΔᵀE⁻¹Δ, the result is
 
     .. math:: c = c_{circle} + \Delta \min(1, \lambda/s), \qquad
               \lambda = 0.7 \left( 1 + (6/T)^2/2 \right)
@@ -134,7 +138,7 @@ def oriented_estimate(
     Sigma = (noise or AngleNoise()).covariance(times, smooth)
     try:
         aided = _solve(x, theta, sigma, Sigma)
-    except np.linalg.LinAlgError:  # no information in some direction at all
+    except np.linalg.LinAlgError:  # there is no information in at least one direction
         aided = None
 
     if aided is None and alone.refused is None:
@@ -162,11 +166,11 @@ def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, flo
     Parameters
     ----------
     center : ndarray, shape (2,)
-        Estimated with the angles, m.
+        Center estimated with the angles, m.
     C : ndarray, shape (2, 2)
-        Its covariance, m², if the errors of the angles are as stated.
+        Covariance of `center`, m², if the angle errors are as stated.
     circle : Circles
-        Fit of the path alone; where it is not valid the center is returned unchanged.
+        Circle fit of the path alone. If the circle is not valid, the center is returned unchanged.
 
     Returns
     -------
@@ -176,7 +180,7 @@ def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, flo
     if not bool(circle.valid):
         return center, C, 0.0
     spread, axes = np.linalg.eigh(circle.covariance)
-    # E may be nearly singular or negative; its lower bound is a quarter of the circle's variance
+    # E may be nearly singular or negative; a quarter of the circle's variance is its lower bound
     apart = np.einsum("ai,ab,bi->i", axes, circle.covariance - C, axes)
     apart = np.maximum(apart, 0.25 * np.maximum(spread, 1e-18))
     delta = center - circle.center
@@ -211,7 +215,7 @@ def _path_noise(x: Array) -> float:
     circle = fit_circles(x)
     if bool(circle.valid):
         return float(circle.noise)
-    # nearly no arc: use the direction across the straight path, or a flat parabola
+    # the arc is nearly straight: use the direction across the path, or a flat parabola
     d = x - x.mean(axis=0)
     along, across = (d @ np.linalg.svd(d, full_matrices=False)[2].T).T
     terms = np.column_stack((np.ones(len(x)), along, along**2))
@@ -224,7 +228,7 @@ def _solve(x: Array, theta: Array, sigma: float, Sigma: Array) -> tuple[Array, A
     Returns
     -------
     center, covariance, residual or None
-        m, m² and the RMS radial residual, m; None where J has no minimum.
+        Center, m, its covariance, m², and the RMS radial residual, m; None where J has no minimum.
     """
     # start: linear least squares of x = c + R(θ) p, which is attenuated
     c, s, one, zero = np.cos(theta), np.sin(theta), np.ones_like(theta), np.zeros_like(theta)
@@ -261,7 +265,7 @@ def _solve(x: Array, theta: Array, sigma: float, Sigma: Array) -> tuple[Array, A
 def _normal(
     x: Array, theta: Array, z: Array, M: Array, *, sigma: float, rho0: float
 ) -> tuple[Array, Array]:
-    """Return the Gauss-Newton matrix and half the gradient of J by (c, ρ, β)."""
+    """Return the Gauss-Newton matrix and half the gradient of J with respect to (c, ρ, β)."""
     d = x - z[:2]
     q = np.maximum(np.linalg.norm(d, axis=1), 1e-9)
     e = q - z[2]
@@ -273,7 +277,7 @@ def _normal(
     H = Je.T @ Je / sigma**2 + Ja.T @ MJ
     g = Je.T @ e / sigma**2 + MJ.T @ a
 
-    # bounded from below: the compensation diverges for a point close to the center
+    # the distance has a lower bound: the compensation diverges for a point close to the center
     counted = np.where(q > rho0 / 2, np.diag(M) / q**4, 0.0)
     g[:2] -= sigma**2 * counted @ d
     return H, g
@@ -282,7 +286,7 @@ def _normal(
 def _accept_estimate(
     x: Array, held: tuple[Array, Array, float], alone: CenterEstimate, limits: CircleLimits
 ) -> CenterEstimate:
-    """Return the estimate `alone` of the path with the guarded center and its acceptance."""
+    """Return a copy of the estimate `alone` with the guarded center and its acceptance."""
     center, C, s2 = held
     radius = float(np.linalg.norm(x - center, axis=1).mean())
     largest = float(np.linalg.eigvalsh(C)[-1])

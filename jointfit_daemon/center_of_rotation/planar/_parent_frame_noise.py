@@ -20,7 +20,9 @@ def planar_noise(points: Array, parent: Array, noise: float) -> Array:
               + \frac{λ_⊥ λ_⊥^T}{\sum_j |d_j|^2} \right], \quad λ = x - \bar y,
               \quad d_j = y_j - \bar y
 
-    to first order in the noise. It is `spatial_noise` for rotations about one axis.
+    to first order in the noise, with m parent markers y_j of noise σ and their mean ȳ. λ is the
+    lever arm of the point x, λ_⊥ is λ rotated by 90°. For rotations about one axis, the result
+    equals that of `spatial_noise`.
 
     Parameters
     ----------
@@ -34,7 +36,7 @@ def planar_noise(points: Array, parent: Array, noise: float) -> Array:
     Returns
     -------
     ndarray, shape (..., 2, 2)
-        m².
+        Covariance of each point, m².
 
     Raises
     ------

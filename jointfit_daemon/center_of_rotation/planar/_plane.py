@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
 
 def plane_of(axis: ArrayLike) -> Array:
-    """Return two unit directions across an axis, right-handed with it, shape (3, 2).
+    """Return two unit directions normal to an axis, right-handed with the axis, shape (3, 2).
 
-    For x they are exactly y and z. A center (a, b) found in the plane is ``plane @ (a, b)`` in
-    space, plus anything along the axis.
+    For the x axis the directions are exactly y and z. A center (a, b) found in the plane is ``plane
+    @ (a, b)`` in space, plus any multiple of the axis.
 
     Raises
     ------

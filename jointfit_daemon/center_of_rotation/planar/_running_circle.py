@@ -42,8 +42,8 @@ class RunningCircle:
     Parameters
     ----------
     forgetting : float
-        Remaining share of a frame's weight one frame later, in (0, 1]; exp(-Δt/τ) gives the
-        time constant τ.
+        Factor on the weight of all earlier frames at each new frame, in (0, 1]. The factor
+        exp(-Δt/τ) gives the time constant τ for frames Δt apart.
     window : int, optional
         Number of most recent valid frames that count. It cannot be combined with forgetting.
     method : str
@@ -56,7 +56,8 @@ class RunningCircle:
     Raises
     ------
     ValueError
-        Forgetting outside (0, 1], a window under four frames, or both.
+        Forgetting is outside (0, 1], the window is shorter than four frames, or both options are
+        used.
     """
 
     def __init__(
@@ -93,9 +94,9 @@ class RunningCircle:
         self.frames = 0
 
     def feed(self, x: float, y: float, weight: float = 1.0) -> None:
-        """Process one frame in the parent's coordinates, m.
+        """Process the position of the marker in one frame, in the parent's coordinates, m.
 
-        A NaN (missing), or a weight not above zero, leaves a gap in time.
+        A frame with NaN (missing marker), or without positive weight, leaves a gap in time.
         """
         if not (abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and 0.0 < weight < inf):
             # Advance one frame without a measurement.
@@ -152,7 +153,7 @@ class RunningCircle:
         self._before = (x, y, w)
 
     def _slide(self, frame: Kept) -> None:
-        """Remove the oldest frame; recompute sums every `_RESUM_FRAMES` to limit rounding."""
+        """Remove the oldest frame; recompute all sums every `_RESUM_FRAMES` to limit rounding."""
         kept = self._kept
         kept.append(frame)
         if self.frames <= (self._window or 0):
@@ -176,7 +177,7 @@ class RunningCircle:
             self._add(x, y, w)
 
     def _recenter(self, x: float, y: float) -> tuple[float, float]:
-        """Move the origin to the mean if that is far, because fourth powers lose digits there."""
+        """Move the origin to the mean if the mean is far, since fourth powers would lose digits."""
         weight = self._sums[9]
         if weight <= 0.0 or self._origin is None:
             return x, y
@@ -204,7 +205,7 @@ class RunningCircle:
 
         return CircleMoments(
             w,
-            w * w / self._squares if self._squares > 0.0 else 0.0,  # all have decayed to zero
+            w * w / self._squares if self._squares > 0.0 else 0.0,  # all weights decayed to 0
             self._origin[0] + xb,
             self._origin[1] + yb,
             cxx,
@@ -246,7 +247,7 @@ class RunningCircle:
         )
 
     def _residual_product(self, a: float, b: float, square: float) -> float:
-        """Return the mean product of neighbours' radial residuals about (a, b), m²."""
+        """Return the mean product of the radial residuals of successive frames about (a, b), m²."""
         zz, zx, zy, z, xx, xy, yy, x, y, w = self._lagged
         if w <= 0.0:
             return 0.0
@@ -277,7 +278,7 @@ def _scaled(sums: Sums, factor: float) -> Sums:
 
 
 def _paired(sums: Sums, mu: float, now: Kept, before: Kept) -> Sums:
-    """Return the sums of products of each frame with the one before it, symmetrized."""
+    """Return the symmetrized sums of products of each frame with the preceding frame."""
     x, y, w = now
     u, v, weight = before
     a, b, c, d, e, f, g, h, i, j = sums

@@ -26,8 +26,9 @@ def three_frame_error(angles: ArrayLike, radius: ArrayLike, errors: ArrayLike) -
         \hat y = -\frac{1}{2 \tilde D} \sum_i u_i (\tilde x_j - \tilde x_k), \qquad
         u_i = 2 r (ε_{xi} \cos θ_i + ε_{yi} \sin θ_i) + ε_{xi}^2 + ε_{yi}^2
 
-    with i, j, k cyclic and :math:`\tilde D` twice the signed area of the measured triangle. Source:
-    equations 12 and 13, corrected, including the terms of second order that the source drops.
+    with i, j, k cyclic, ε the errors, and :math:`\tilde D` twice the signed area of the measured
+    triangle. Source: equations 12 and 13, corrected, including the terms of second order that the
+    source omits.
 
     Parameters
     ----------
@@ -57,29 +58,30 @@ def three_frame_error(angles: ArrayLike, radius: ArrayLike, errors: ArrayLike) -
 
 
 def three_frame_mean_squares(angles: ArrayLike, noise: ArrayLike) -> Array:
-    r"""Predict the mean squares of the error of a center along x and y.
+    r"""Predict the mean square errors of a three-frame center along x and y.
 
     .. math::
         E[\hat x^2] = \frac{1}{Q^2} \sum_i (σ_{xi}^2 \cos^2 θ_i + σ_{yi}^2 \sin^2 θ_i)
                       (\sin θ_j - \sin θ_k)^2, \qquad
         Q = \sin(θ_1 - θ_2) - \sin(θ_1 - θ_3) + \sin(θ_2 - θ_3)
 
-    and for y with cosines in the second factor; i, j, k cyclic. The prediction is of first order in
-    the noise, and the radius cancels. The sum of both is equation 14 (with its last sign corrected)
-    if all standard deviations are equal.
+    with i, j, k cyclic and σ the standard deviations of the coordinates. The mean square along y
+    has cosines in the second factor. The prediction is of first order in the noise, and the radius
+    cancels. If all standard deviations are equal, the sum of the two mean squares is equation 14
+    with its last sign corrected.
 
     Parameters
     ----------
     angles : array_like, shape (..., 3)
         Directions of the marker from the center in the three frames, rad.
     noise : array_like, broadcast to (..., 3, 2)
-        Standard deviations of x and y in each frame, m: six values, shape (3, 2); one value a
-        frame, shape (3, 1); one for each axis, shape (2,); or one value for all.
+        Standard deviations of x and y in each frame, m: six values, shape (3, 2); one value per
+        frame, shape (3, 1); one value per axis, shape (2,); or one value for all coordinates.
 
     Returns
     -------
     ndarray, shape (..., 2)
-        m²; inf where two of the angles coincide.
+        Mean square errors along x and y, m²; inf where two of the angles coincide.
     """
     t = np.asarray(angles, dtype=np.float64)
     spoke = np.stack((np.cos(t), np.sin(t)), axis=-1)
@@ -88,7 +90,7 @@ def three_frame_mean_squares(angles: ArrayLike, noise: ArrayLike) -> Array:
     side = (_next(spoke) - _next(_next(spoke)))[..., ::-1]
     above = (radial * side**2).sum(axis=-2)
 
-    # Q is twice the area of the triangle of unit spokes; a multiple of rounding is not an area
+    # Q is twice the area of the triangle on the unit circle; an area near rounding counts as zero
     double_area = (spoke[..., 0] * side[..., 0]).sum(axis=-1)[..., None]
     lost = np.abs(double_area) < 1e-15
     return np.where(lost, np.inf, above / np.where(lost, 1.0, double_area) ** 2)

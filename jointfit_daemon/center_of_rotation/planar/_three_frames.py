@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 FLAT = 1e-9
-"""Twice the area over the longest side squared, below which three points are a line."""
+"""Twice the area of a triangle over the square of its longest side, below which the three points
+count as a line."""
 
 
 def three_frame_center(points: ArrayLike) -> Array:
@@ -34,14 +35,14 @@ def three_frame_center(points: ArrayLike) -> Array:
         y_c &= y_1 + \left[ s_3 (x_2-x_1) - s_2 (x_3-x_1) \right] / 2D,
         \qquad s_i = |p_i - p_1|^2
 
-    Source: Akbarifar et al. 2021, equations 7 and 8, about the first point, which saves the digits
-    that squares of far coordinates lose.
+    Source: Akbarifar et al. 2021, equations 7 and 8. Here coordinates are relative to the first
+    point, because squares of large coordinates lose digits.
 
     Parameters
     ----------
     points : array_like, shape (..., 3, 2)
-        One marker in three frames, in the parent's coordinates, m. Frames need not be neighbours:
-        the first, the middle and the last of an arc are best.
+        One marker in three frames, in the parent's coordinates, m. The frames need not be
+        successive: the first, the middle and the last frame of an arc are best.
 
     Returns
     -------
@@ -57,7 +58,7 @@ def three_frame_center(points: ArrayLike) -> Array:
 
 
 def _sides(p: Array) -> tuple[Array, Array, Array]:
-    """Return the sides from the first point, divided by the largest side, and that side, m.
+    """Return the sides from the first point, divided by the largest side, and the largest side, m.
 
     Without the division, squares of implausible coordinates would underflow or overflow.
     """
@@ -68,7 +69,7 @@ def _sides(p: Array) -> tuple[Array, Array, Array]:
 
 
 def _offset(u: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the center from the first point, over the largest side, and a mask of missing ones."""
+    """Return the center from the first point, over the largest side, and a mask of failures."""
     D = u[..., 0] * v[..., 1] - v[..., 0] * u[..., 1]
     s2, s3 = (u**2).sum(axis=-1), (v**2).sum(axis=-1)
     longest = np.maximum(np.maximum(s2, s3), ((u - v) ** 2).sum(axis=-1))
@@ -87,14 +88,15 @@ def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
     points : array_like, shape (3, 2)
         One marker in three frames, m.
     noise : array_like, broadcast to (3, 2)
-        Standard deviations of x and y in each frame, m; three points do not determine them. Six
-        values; or one for each frame, shape (3, 1), one for each axis, shape (2,), or one for all.
+        Standard deviations of x and y in each frame, m, which three points do not determine. Six
+        values, shape (3, 2); one value per frame, shape (3, 1); one value per axis, shape (2,); or
+        one value for all coordinates.
 
     Returns
     -------
     CenterEstimate
-        The covariance is first-order noise through the closed form; refused if points are missing,
-        on a line, or closer to a line than the noise.
+        Estimate with a covariance propagated to first order. The estimate is refused if points are
+        missing, on a line, or closer to a line than the noise.
     """
     p = np.asarray(points, dtype=np.float64)
     variances = np.broadcast_to(np.asarray(noise, dtype=np.float64) ** 2, (3, 2))
@@ -110,7 +112,7 @@ def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
         return _refusal(p, typical, reason)
 
     spokes = np.stack((-offset, u - offset, v - offset))
-    # noise e along the spokes gives u·δ = r (e₂ - e₁), v·δ = r (e₃ - e₁), so that
+    # radial noise e shifts the center by δ: u·δ = r (e₂ - e₁), v·δ = r (e₃ - e₁), so that
     # C = r² A⁻¹ [[σ₁² + σ₂², σ₁²], [σ₁², σ₁² + σ₃²]] A⁻ᵀ with A = (u v)ᵀ and radial variances σ²;
     # the unit of sides and radius cancels
     moves = float(np.hypot(*offset)) * np.linalg.inv(np.stack((u, v)))
@@ -120,7 +122,7 @@ def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
     error = sqrt(float(np.trace(covariance)))
     radius = float(size * np.hypot(*offset))
 
-    # beyond it noise dominates and the mean square error is not finite
+    # above this ratio noise dominates, and the mean square error is not finite
     lost = f"noise of {1000 * typical:.1f} mm hides the arc: choose frames further apart"
     turned = np.unwrap(np.arctan2(spokes[:, 1], spokes[:, 0]))
     return CenterEstimate(
@@ -144,9 +146,10 @@ def equal_step_error(step: ArrayLike, noise: ArrayLike) -> Array:
 
     .. math:: E^2 = \sigma^2 \frac{2 + \cos\alpha}{(1 - \cos\alpha)^2 (1 + \cos\alpha)}
 
-    Source: Akbarifar et al. 2021, equation 15, first order in the noise: the Cramér-Rao bound of
-    three points. The prediction holds while noise/radius is below (1 - cos α)/6;
-    beyond it the error has no finite mean square. Its minimum is 1.155 σ at 120°.
+    with α the step and σ the noise. Source: Akbarifar et al. 2021, equation 15, of first order in
+    the noise. This is the Cramér-Rao bound of three points. The prediction holds while noise/radius
+    is below (1 - cos α)/6; above this ratio the error has no finite mean square. The minimum of E
+    is 1.155 σ at 120°.
 
     Parameters
     ----------
@@ -164,7 +167,7 @@ def equal_step_error(step: ArrayLike, noise: ArrayLike) -> Array:
     one_less = 2.0 * np.sin(a / 2) ** 2
     one_more = 2.0 * np.cos(a / 2) ** 2
 
-    # π is not representable: the remaining cosine is rounding
+    # π is not representable: at the nearest float, 1 + cos α is rounding
     one_more = np.where(one_more < 1e-30, 0.0, one_more)
     error = np.asarray(noise) * np.sqrt(1.0 + one_more)
     below = one_less * np.sqrt(one_more)

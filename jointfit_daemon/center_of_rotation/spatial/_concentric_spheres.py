@@ -1,15 +1,17 @@
-r"""One center for the spheres (in a plane: circles) of several markers, from their sums.
+r"""Common center of the spheres (in a plane: circles) of several markers, from sums over frames.
 
-The algebraic residual of marker j about its mean, F = |x|² - 2 a·x - mean|x|², is 2 R_j times the
-radial residual. Therefore
+Let x be the position of marker j relative to its mean, a the center, and R_j the radius. The
+algebraic residual F = |x|² - 2 a·x - mean|x|² is 2 R_j times the radial residual. Therefore the
+condition
 
 .. math:: \min_a \sum_j \frac{n_j}{R_j^2 s_j} \left( \mathrm{var} F_j - \eta\, E_j(a) \right)
           = 0 \text{ at the smallest } \eta
 
-weights all markers as a geometric fit does. E_j, the contribution of unit noise to var F_j, removes
-the bias of short arcs. For one marker in a plane the center equals that of the hyper fit
-(Al-Sharadqah and Chernov 2009; Kanatani and Rangarajan 2011; for spheres it is the limit of the
-iteration of Halvorsen 2003).
+weights all markers as a geometric fit does. n_j is the number of frames of marker j and s_j its
+relative noise variance. The term E_j, the contribution of unit noise to var F_j, removes the bias
+of short arcs. For one marker in a plane the center equals the center of the Hyper fit (Al-Sharadqah
+and Chernov 2009; Kanatani and Rangarajan 2011). For spheres the center is the limit of the
+iteration of Halvorsen 2003.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ if TYPE_CHECKING:
 _STEPS = 40
 _REWEIGHED = 6
 _NOTHING_M2 = 1e-18
-"""Variance below which noise is rounding, m²: a nanometer squared."""
+"""Noise variance that counts as rounding, m²: one nanometer squared."""
 _REACH_M = 1e3
 
 
@@ -57,12 +59,12 @@ class MarkerPaths:
 
 
 def paths_of(sums: SphereSums, shape: Array | None = None) -> MarkerPaths:
-    """Return the central moments of `sums`, which must be about each marker's mean.
+    """Return the central moments of the marker paths from centered sums.
 
     Parameters
     ----------
     sums : SphereSums
-        Centered.
+        Sums, centered about the mean of each marker.
     shape : ndarray, shape (k, d, d), optional
         Covariance of each marker's noise relative to the common variance; the identity if None.
     """
@@ -76,7 +78,7 @@ def paths_of(sums: SphereSums, shape: Array | None = None) -> MarkerPaths:
 
 @dataclass(frozen=True, slots=True)
 class ConcentricSpheres:
-    """Common center with noise and radius of each marker."""
+    """Common center of several markers, with the noise and the radius of each marker."""
 
     center: Array
     """Common center, m, shape (r,)."""
@@ -87,10 +89,11 @@ class ConcentricSpheres:
     radii2: Array
     """Squared radius of each marker, m², shape (k,)."""
     information: Array
-    """Squared change of direction, summed over frames and markers, without noise; each marker is
-    weighted by the common noise variance over its own. Shape (r, r)."""
+    """Squared change of the marker directions, summed over frames and markers, minus the noise
+    contribution. The weight of a marker is the common noise variance over the marker's noise
+    variance. Shape (r, r)."""
     floor: Array
-    """Contribution of noise alone to the same sum, shape (r, r)."""
+    """Contribution of noise to the sum in `information`, shape (r, r)."""
 
 
 def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
@@ -103,7 +106,8 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
         if found is None:
             return None
 
-        # The relative noise variance of each marker; differences within chance are removed.
+        # Compute the relative noise variance of each marker; remove differences that are within
+        # chance.
         ratio = found[2] / np.maximum(relative * found[1], _NOTHING_M2) * relative
         ratio = ratio / np.median(ratio) if np.median(ratio) > 0 else np.ones_like(ratio)
         ratio = np.clip(ratio, 0.0, 1e6)
@@ -133,10 +137,11 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
 
 
 def _smallest_root(paths: MarkerPaths, relative: Array) -> tuple[Array, float, Array, Array] | None:
-    """Return center, eta, each marker's radial variance and its squared radius.
+    """Return center, eta, and the radial variance and the squared radius of each marker.
 
-    Newton's method on G(η) det B(η), which has no smaller root, converges from zero without
-    overshoot. On G alone, which is concave, it would overshoot on short arcs, where B is nearly
+    G is the sum that vanishes at the root η, and B the normal matrix of the center at η. Newton's
+    method on G(η) det B(η), which has no smaller root, converges from zero without overshoot.
+    Newton's method on G alone would overshoot on short arcs, because G is concave and B nearly
     singular.
     """
     g = np.average(paths.mean, axis=0, weights=paths.n)

@@ -40,17 +40,19 @@ class SphereOptions:
     """Settings of a geometric sphere fit."""
 
     huber: float = HUBER
-    """Residual, in robust standard deviations, above which the weight is reduced; inf: plain least
-    squares."""
+    """Residual, in robust standard deviations, above which the weight of a point is reduced; inf
+    gives plain least squares."""
     smallest_scale: float = _ROUNDED
-    """Smallest residual scale, m; 0.1 mm with soft-tissue artefact, so that a few good
-    frames do not dominate."""
+    """Smallest residual scale, m. With soft-tissue artefact use 0.1 mm, so that a few frames with
+    small residuals do not dominate."""
     start: Array | None = None
-    """Initial center, and its value along unobserved directions, m, shape (3,)."""
+    """Initial center, m, shape (3,). The estimate keeps this value along unobserved directions."""
     hold: float = 0.0
-    """Noise, m, that must not move the initial estimate away from `start`."""
+    """Noise of the markers, m. Along directions in which this noise dominates, the initial estimate
+    stays at `start`."""
     min_direction: float = 0.0
-    """RMS rotation, rad, below which a direction is unobserved for any noise."""
+    """RMS rotation, rad, below which a direction counts as unobserved, however small the noise
+    is."""
     keep_one: bool = False
     """Fit the best direction even if it is not observable."""
 
@@ -67,7 +69,7 @@ class SphereFit:
     """Radial residuals, m, shape (n, k); zero where missing."""
     seen: Mask
     weights: Array
-    """Huber weights, shape (n, k); zero where missing."""
+    """Huber weights of the points, shape (n, k); zero where a point is missing."""
     turning: Array
     """Derivatives of the residuals by the center, shape (n, k, 3)."""
     radii: Array
@@ -90,13 +92,14 @@ class SphereFit:
 def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
     """Fit spheres about one center by Gauss-Newton with Huber weights; radii are eliminated.
 
-    The center keeps its start value along unobserved directions: noise would move it to the plane
-    of the markers, with a covariance that is too small. Halvorsen 2003; Chang and Pollard 2007.
+    The center keeps its start value along unobserved directions. Otherwise noise would move the
+    center to the plane of the markers, with too small a covariance. Source: Halvorsen 2003; Chang
+    and Pollard 2007.
 
     Parameters
     ----------
     points : ndarray, shape (n, k, 3)
-        m; NaN where missing; every marker is visible at least twice.
+        Marker positions, m; NaN where missing. Every marker is visible at least twice.
     options : SphereOptions
         Start value of the center, Huber's bound and the limits of observability.
     """
@@ -148,7 +151,7 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
 
 
 def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
-    """Return Gamage and Lasenby's center; it stays at `start` where the noise `hold` dominates."""
+    """Return Gamage and Lasenby's center, or `start` along directions where `hold` dominates."""
     total = np.maximum(w.sum(axis=0), 1e-12)
     d = v - start
     d = d - (w[..., None] * d).sum(axis=0) / total[:, None]
@@ -165,8 +168,9 @@ def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
 def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions) -> Array:
     """Return an orthonormal basis (3, r) of the observed directions.
 
-    Noise changes the direction u from the center to a marker only across u. So the threshold along
-    each axis b of the basis is scaled by the mean of 1 - (b·u)² over all markers.
+    Noise changes the unit vector u from the center to a marker only normal to u. Therefore the
+    threshold along each axis b of the basis is multiplied by the mean of 1 - (b·u)² over all
+    markers.
     """
     _, J = radial_residuals(v, m, w)
     total = w.sum()
@@ -176,7 +180,7 @@ def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions
     along = np.einsum("tj,tja,tjb->ab", w / u2, d, d) / total
     across = np.maximum(1.0 - np.einsum("ai,ab,bi->i", axes, along, axes), 0.0)
     noise = scale**2 * float((w / u2).sum() / total)
-    if options.keep_one:  # soft-tissue artefact: a fixed multiple of the noise
+    if options.keep_one:  # for soft-tissue artefact, the threshold is a fixed multiple of the noise
         keep = spread >= max(options.min_direction**2, NOISE_FACTOR * noise) * across
         keep[-1] = True
         return np.asarray(axes[:, keep])
@@ -193,14 +197,16 @@ def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions
 def judge_sphere(
     fit: SphereFit, method: str, frames: int, limits: SphereLimits, options: SphereOptions
 ) -> CenterEstimate:
-    r"""Return a fit with its covariance, or the reason not to use it.
+    r"""Return the estimate of a fit with its covariance, or a refused estimate.
 
     .. math:: C = \frac{\sum ψ^2 / (N - k - r)}{p^2} \Big(\sum J J^T - \text{noise's part}
               \Big)^{-1} \frac{1+\rho}{1-\rho}
 
-    with ψ the residuals limited to Huber's bound, p the share that is not limited, and ρ the
-    correlation of the residuals from one frame to the next (Huber 1964). With a smooth disturbance
-    only ρ prevents an underestimate of the covariance at a high frame rate.
+    with ψ the residuals limited to Huber's bound, p the share of residuals that are not limited,
+    and ρ the correlation of the residuals from one frame to the next (Huber 1964). N is the number
+    of residuals, k the number of markers, r the number of observed directions, J the derivatives of
+    the residuals. The factor with ρ prevents an underestimate of the covariance for smooth
+    disturbances at a high frame rate.
     """
     n, k = int(fit.seen.sum()), fit.seen.shape[1]
     rank = fit.basis.shape[1]
@@ -226,7 +232,7 @@ def judge_sphere(
     conditioning = radius / float(np.sqrt(np.linalg.norm(shown, 2)))
     unseen = fit.unseen
 
-    # the marker that rotated most determines the arc, since oblique ones rotate less
+    # the marker that rotated most determines the arc, since markers near the axis rotate less
     inside = np.linalg.norm(fit.resultant @ fit.basis, axis=1)
     off = np.linalg.norm(fit.resultant @ unseen.T, axis=1) if len(unseen) else 0.0 * inside
     arc = arc_of(float((inside / np.sqrt(np.maximum(1.0 - off**2, 1e-12))).min()))

@@ -3,7 +3,8 @@
 A direction is observable if the markers rotated along it by more than the noise, and if the
 standard deviation of the center along it is below a sixth of the radius. The covariance is
 increased for residuals that persist between frames and for noise shared between markers.
-Soft-tissue artefact repeats with posture, so all frames together count as one observation of it.
+Soft-tissue artefact repeats with posture, so all frames together count as one observation of the
+artefact.
 """
 
 from __future__ import annotations
@@ -30,16 +31,17 @@ MIN_CONDITIONING = 6.0
 """T, the radius over the standard deviation of the center, below which a direction is
 unobserved."""
 MIN_SIGNIFICANCE = 7.0
-"""Standard deviations by which the rotation along a third direction must exceed that of noise.
-Otherwise many frames of noise along a hinge's axis would appear as a well-conditioned center."""
+"""Standard deviations by which the rotation along a third direction must exceed the rotation that
+noise causes. Otherwise many frames of noise along a hinge's axis would appear as a well-conditioned
+center."""
 FADED = 0.5 ** LAGS[1]
-"""Correlation over `LAGS[1]` frames of noise that halves itself each frame; longer correlation is
-soft-tissue artefact."""
+"""Correlation over `LAGS[1]` frames of noise that halves from frame to frame; a larger correlation
+is attributed to soft-tissue artefact."""
 FILLED = 0.1
-"""Share of the movement's variance above which residuals are not noise about an arc."""
+"""Share of the variance of the path above which the radial residuals are not noise about an arc."""
 _STILL_M = 1e-6
 _PERSISTENT = 0.99
-_CHI2 = (3.841, 5.991, 7.815)  # 95 % of one, two, three squares
+_CHI2 = (3.841, 5.991, 7.815)  # 95 % quantiles of χ² for one, two, three degrees of freedom
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +50,15 @@ class SphereLimits:
 
     min_direction: float = 0.0
     """RMS rotation of the markers along the third direction, rad, below which the joint counts as a
-    hinge for any noise: 3° with soft-tissue artefact. It must exceed the rotation that noise causes
-    in the parent's frame, which cannot be distinguished from joint rotation."""
+    hinge, however small the noise is. Use 3° with soft-tissue artefact. The value must exceed the
+    rotation of the parent's frame due to noise, which cannot be distinguished from joint
+    rotation."""
     min_arc: float = radians(8.0)
     reach: tuple[float, float] = (0.02, 1.0)
     """Least and largest distance of the markers from the center, m."""
     posture: bool = True
-    """Whether persistent residuals count as soft-tissue artefact; if not, the caller adds its
-    variance."""
+    """Whether persistent residuals count as soft-tissue artefact. If False, the caller adds the
+    variance of the artefact."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,30 +66,29 @@ class ResidualStatistics:
     """Statistics of the radial residuals of a fit."""
 
     together: Array
-    """Covariance from marker to marker, m², shape (k, k)."""
+    """Covariance of the radial residuals of each pair of markers, m², shape (k, k)."""
     persistence: float
-    """Correlation from one frame to the next, 0 to 0.99; 0 if not significant."""
+    """Correlation of the residuals from one frame to the next, 0 to 0.99; 0 if not significant."""
     posture: float
     """Share of the residual variance that repeats with posture."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObservedCenter:
-    """Observable part of a center."""
+    """Part of a center along the directions that the movement makes observable."""
 
     basis: Array
     """Directions of the fit, the columns, shape (d, r)."""
     shown: Array
-    """Directions observable despite soft-tissue artefact, along the basis, the columns, shape
-    (r, s)."""
+    """Directions that are observable despite soft-tissue artefact, in coordinates of the basis, as
+    columns; shape (r, s)."""
     paths: MarkerPaths
-    """Center along the basis, m."""
+    """Fitted center and radii in coordinates of the basis, m."""
     found: ConcentricSpheres
     spread: Array
-    """Covariance along the basis, m², shape (r, r)."""
+    """Covariance of the center in coordinates of the basis, m², shape (r, r)."""
     tilt: Array
-    """Part of a squared lever arm along unobserved directions that adds to `spread`, shape (r,
-    r)."""
+    """Increase of `spread` per squared lever arm along unobserved directions, shape (r, r)."""
     bound2: float
     """Trace of the Cramér-Rao bound, m²."""
     left: ResidualStatistics
@@ -103,10 +105,11 @@ def moving_directions(paths: MarkerPaths) -> Array:
 def observe(
     sums: SphereSums, paths: MarkerPaths, basis: Array, limits: SphereLimits
 ) -> ObservedCenter | None:
-    """Fit, dropping the least observable direction until all others are observable.
+    """Fit the center, dropping the least observable direction until all others are observable.
 
     Directions hidden by noise are left out of the fit. Directions that only soft-tissue artefact
-    excites remain in the fit, since the residuals would grow without them, but not in the result.
+    excites remain in the fit, since the residuals would grow without these directions. The result
+    does not contain them.
     """
     while basis.shape[1] >= 2:
         flat = paths.seen_along(basis)
@@ -152,10 +155,11 @@ def soft_tissue_variance(
 
     .. math:: \mathrm{Cov}_{posture} = p^2 \left[ \overline{u u^T} - \bar u \bar u^T \right]^{-1}
 
-    p² is the persistent variance of the residuals. The part of the artefact that is linear in the
-    directions u moves the center and leaves no residual. It is assumed to be as large as the part
-    that leaves residuals. It repeats with every cycle: no number of frames and no number of
-    markers, which share their parent's soft tissue, reduces it.
+    p² is the persistent variance of the residuals, u the unit vectors from the center to the
+    markers. The part of the artefact that is linear in u moves the center and leaves no residual.
+    This part is assumed to be as large as the part that leaves residuals. The artefact repeats with
+    every cycle, and all markers share the soft tissue of their parent. Therefore neither more
+    frames nor more markers reduce this variance.
     """
     return left.posture * found.noise2 * float((paths.n / found.relative).sum())
 
@@ -163,8 +167,8 @@ def soft_tissue_variance(
 def posture_share(lasting: float, frames: float) -> float:
     """Return the share of the residual variance that repeats with posture.
 
-    It is the correlation of the residuals over `LAGS[1]` frames, if it exceeds the 99.7 % quantile
-    of decayed noise.
+    The share is the correlation of the residuals over `LAGS[1]` frames if this correlation exceeds
+    the 99.7 % quantile of decayed noise, otherwise zero.
     """
     # a correlation ρ per frame divides the effective frames by (1 + ρ²)/(1 - ρ²)
     chance = FADED + 3.0 * float(np.sqrt((5.0 / 3.0) / max(frames, 1.0)))
@@ -176,7 +180,8 @@ def within95(rank: int, freedom: float) -> float:
 
     .. math:: r F_{0.95}(r, \nu) \approx \chi^2 \left( 1 + \frac{\chi^2 - r + 2}{2 \nu} \right)
 
-    for r directions and noise estimated with ν degrees of freedom.
+    for r directions and noise estimated with ν degrees of freedom; χ² is the 95 % quantile for r
+    degrees of freedom.
     """
     chi2 = _CHI2[rank - 1]
     return chi2 * (1.0 + (chi2 - rank + 2.0) / (2.0 * max(freedom, 2.0)))
@@ -196,9 +201,11 @@ def _spread(
     .. math:: \mathrm{Cov} = B^{-1} \Big[ \sum_{jl} \frac{n_{jl}\, \overline{e_j e_l}\;
               \overline{u_j u_l^T}}{s_j s_l} \Big] B^{-1} \cdot \frac{1+\rho\rho_u}{1-\rho\rho_u}
 
-    e the radial residuals, u the directions, s the relative noise, ρ and ρ_u their
-    lag-one correlations (persistent noise matters only if the movement persists, too); plus
-    `soft_tissue_variance` over the information.
+    with e the radial residuals of markers j and l, u the unit vectors from the center to the
+    markers, s the relative noise, and B the information. n_jl is the number of frames in which both
+    markers are visible. ρ is the lag-one correlation of e and ρ_u the one of u: persistent noise
+    matters only if the movement persists, too. The function adds `soft_tissue_variance` divided by
+    the information.
     """
     k, rank = paths.mean.shape
     total = float(paths.n.sum())
@@ -216,7 +223,7 @@ def _spread(
     bread = np.linalg.inv(found.information)
     dof = max(total * (1.0 - rho) / (1.0 + rho) - k - rank, 2.0)
 
-    # a fit absorbs more of persistent noise
+    # a fit absorbs more of persistent noise than of white noise
     own = total * (1.0 - both) / (1.0 + both)
     widened = total / max(own - k - rank, 1.0)
     bound2 = found.noise2 * float(np.trace(bread))
@@ -224,14 +231,14 @@ def _spread(
     spread = spread + soft_tissue_variance(left, paths, found) * bread
     path = np.einsum("j,jab->ab", paths.n / found.relative, paths.C)
 
-    # of a plane through the paths
+    # normal of a plane through the paths
     tilt = (found.noise2 + soft_tissue_variance(left, paths, found)) * np.linalg.inv(path)
     size = within95(shown.shape[1], dof)
     return ObservedCenter(basis, shown, paths, found, spread, tilt, bound2, left, size)
 
 
 def _no_better(spread: Array, white: Array) -> Array:
-    """Return `spread` no smaller in any direction than a quarter of the covariance for white noise.
+    """Return `spread`, raised in every direction to a quarter of the white-noise covariance.
 
     In few frames, chance correlations between markers could cancel all noise.
     """
@@ -270,7 +277,7 @@ def _residuals(
     power = float(share @ np.diagonal(together))
     rho, lasting = (lagged @ share / max(power, 1e-300)).tolist()
 
-    # below the sampling error of white noise it is treated as zero
+    # a correlation below the sampling error of white noise is treated as zero
     rho = min(rho, _PERSISTENT) if rho > 2.0 / np.sqrt(paths.n.sum()) else 0.0
     posture = posture_share(lasting, float(paths.n.mean())) if limits.posture else 0.0
     return ResidualStatistics(together, rho, posture)

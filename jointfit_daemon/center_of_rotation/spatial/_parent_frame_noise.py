@@ -1,8 +1,8 @@
 r"""Effect of the parent's marker noise on a point in the parent's coordinates.
 
 The parent's frame is itself a fit to noisy markers. A rotation error of this fit moves a point in
-proportion to its lever arm. Close parent markers and long lever arms amplify noise, which is common
-to all markers of the child.
+proportion to its lever arm. Parent markers close to each other and long lever arms amplify this
+noise. The noise is common to all markers of the child.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
               \quad G = \sum_j \left(|d_j|^2 I - d_j d_j^T\right), \quad λ = x - \bar y,
               \quad d_j = y_j - \bar y
 
-    to first order in the noise, for a frame by Kabsch's fit of equal weights.
+    to first order in the noise, for a frame fitted by Kabsch's method with equal weights. σ is the
+    noise of the m parent markers y_j, ȳ their mean, and λ the lever arm of the point x.
 
     Parameters
     ----------
@@ -38,7 +39,7 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
     Returns
     -------
     ndarray, shape (..., 3, 3)
-        m².
+        Covariance of each point, m².
 
     Raises
     ------
@@ -49,7 +50,7 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
     d = parent - middle
     G = np.trace(d.T @ d) * np.eye(3) - d.T @ d
 
-    # on a line, turning about it moves no marker
+    # if all markers are on a line, a rotation about this line moves no marker
     if len(parent) < 3 or float(np.linalg.eigvalsh(G)[0]) < 1e-9 * float(np.trace(G)):
         raise ValueError("a frame needs three markers that are not on a line: move one aside")
     L = rotation.skew(np.asarray(points, dtype=np.float64) - middle)
@@ -80,9 +81,10 @@ def relative(points: Array, parent: Array, center: Array) -> Array:
     .. math:: S_j = Σ_c / \overline{\hat r_j^T Σ_c \hat r_j}, \qquad
               Σ_c = \left(1 + \tfrac1m\right) I + [λ_c]_× G^{-1} [λ_c]_×^T
 
-    with the lever arm of the center, not of the marker: a rotation of the parent's frame moves
-    markers and center alike, so that only the displacement of the center changes the distance
-    between them.
+    with :math:`λ_c` the lever arm of the center, not of the marker, and :math:`\hat r_j` the unit
+    vector from the center to marker j; G as in `spatial_noise`. A rotation of the parent's frame
+    moves markers and center alike. Therefore only the displacement of the center changes the
+    distance between marker and center.
 
     Parameters
     ----------
@@ -96,7 +98,8 @@ def relative(points: Array, parent: Array, center: Array) -> Array:
     Returns
     -------
     ndarray, shape (k, 3, 3)
-        A marker that is never visible has the common covariance.
+        Relative noise covariance of each marker. A marker that is never visible has the common
+        covariance.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1), dtype=np.float64)
     S = spatial_noise(center, parent, 1.0)

@@ -29,15 +29,17 @@ if TYPE_CHECKING:
 
 
 OUTLIER = 3.0
-"""Residual in standard deviations above which the weight is reduced. It is larger than Huber's 1.5
-because a frame is weighted only once, and the noise estimate must not shrink."""
+"""Residual in standard deviations above which the weight of a marker is reduced. This threshold is
+larger than Huber's 1.5 because a frame is weighted only once, and the noise estimate must not
+shrink."""
 OFF = 8.0
 """Residual in standard deviations, and at least `OFF_M`, above which a marker is off its sphere."""
 OFF_M = 0.01
 STAYED_OFF = 25
 """Consecutive frames off its sphere after which a marker is restarted at its new position."""
 _FAR_M = 2.0
-"""Largest distance from the fixed point, m; beyond it fourth powers lose digits."""
+"""Largest distance of a marker from its fixed point, m; fourth powers of larger distances lose
+digits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,13 +47,15 @@ class _ExpectedMarkers:
     """Marker positions expected from the last estimate."""
 
     f: Array
-    """Radial residual of a marker is f·φ, m, shape (k, e); zero where nothing is known."""
+    """Coefficients f of each marker, m, shape (k, e): the radial residual is f·φ. Zero for a marker
+    without estimate."""
     noise: Array
     """Standard deviation of a coordinate of each marker, m, shape (k,); inf where unknown."""
     mean: Array
-    """Mean of each marker's path, from its fixed point, m, shape (k, d)."""
+    """Mean path position of each marker relative to the fixed point of the marker, m, shape (k,
+    d)."""
     unsure: Array
-    """Covariance of the center over each squared radius, shape (k, d, d)."""
+    """Covariance of the center divided by the squared radius of each marker, shape (k, d, d)."""
 
 
 class RunningSphere:
@@ -62,17 +66,20 @@ class RunningSphere:
     markers : int
         Number of markers k in a frame.
     forgetting : float
-        Remaining share of a frame's weight one frame later, in (0, 1]; 1 keeps all.
+        Factor on the weight of all earlier frames at each new frame, in (0, 1]; 1 disables
+        forgetting.
     dimension : int
         3, or 2 for points in a plane.
     near : ndarray, shape (dimension,), optional
         Position along unobserved directions, m.
     robust : bool
-        Reduce the weight of markers that leave their sphere (soft tissue, exchanged labels), and
-        restart a marker that stays away. Uses the last `estimate`.
+        Reduce the weight of markers that leave their sphere (soft-tissue artefact, exchanged
+        labels), and restart a marker that remains off its sphere. The spheres are those of the last
+        call of `estimate`.
     limits : SphereLimits, optional
-        Acceptance limits. If None, persistent residuals are not counted as soft-tissue
-        artefact: in live use the caller adds its variance (pass ``SphereLimits()`` to count it).
+        Acceptance limits. If None, persistent residuals are not counted as soft-tissue artefact,
+        and the caller adds the variance of the artefact. Pass ``SphereLimits()`` to count the
+        artefact here.
     shape : ndarray, shape (k, d, d), optional
         Covariance of each marker's noise relative to the common variance, see ``relative``.
 
@@ -117,14 +124,14 @@ class RunningSphere:
         self._restarted: set[int] = set()
 
     def feed(self, points: Array, weights: Array | None = None) -> None:
-        """Process one frame, m, shape (k, d), in the parent's coordinates; NaN where missing.
+        """Process the marker positions of one frame.
 
         Parameters
         ----------
         points : ndarray, shape (k, d)
-            m.
+            Markers in the parent's coordinates, m; NaN where missing.
         weights : ndarray, shape (k,), optional
-            Non-negative; one if None.
+            Weight of each marker, non-negative; one if None.
         """
         if not self._placed:
             self._place(points)
@@ -162,7 +169,8 @@ class RunningSphere:
     def estimate(self) -> CenterEstimate:
         """Return center, covariance and predicted error of all frames so far; never raises.
 
-        It costs more than `feed`; call it when a result is published, not for every frame.
+        This method takes longer than `feed`. Call it when a result is published, not for every
+        frame.
         """
         sums = self.sums()
         found, spheres = center_of(sums, near=self._near, shape=self._shape, limits=self._limits)
@@ -180,9 +188,9 @@ class RunningSphere:
         self._placed = bool(np.isfinite(self._origin).all())
 
     def _weights(self, given: Array | None) -> Array | None:
-        """Return the weights of the frame in `_phi`; None if all are one."""
+        """Return the marker weights of the frame stored in `_phi`; None if all weights are one."""
         phi, expected = self._phi, self._expected
-        near = phi[:, 0] < _FAR_M**2  # also False for NaN
+        near = phi[:, 0] < _FAR_M**2  # the comparison is False for NaN
         if expected is None:
             if given is None and near.all():
                 return None
@@ -209,7 +217,7 @@ class RunningSphere:
         return self._restart(w, off | (np.isfinite(phi[:, 0]) & ~near))
 
     def _restart(self, w: Array, off: NDArray[np.bool_]) -> Array:
-        """Restart markers that remained off their sphere: they slipped or were relabelled."""
+        """Restart markers that remained off their sphere because of slip or exchanged labels."""
         self._off = np.where(off, self._off + 1, np.where(w > 0.0, 0, self._off))
         k, e = self._phi.shape
         for j in np.flatnonzero(self._off >= STAYED_OFF):
@@ -268,9 +276,10 @@ def fit_running(
     Parameters
     ----------
     points : ndarray, shape (n, k, d)
-        m; NaN where not seen.
+        Marker positions, m; NaN where a marker is not visible.
     weights : ndarray, shape (n, k), optional
-        Non-negative; for forgetting, the final weights of the frames. One if None.
+        Weights of the markers, non-negative; one if None. To model forgetting, pass the final
+        weights of the frames.
     near, limits, shape
         See `RunningSphere`.
     """

@@ -26,27 +26,30 @@ def fit_axis(
     robust: bool = True,
     markers: tuple[Array, Array] | None = None,
 ) -> CenterEstimate:
-    """Estimate the axis of a hinge and the point on it nearest to `near`.
+    """Estimate the axis of a hinge and the point of the axis nearest to `near`.
 
-    Ehrig et al. 2007: the right singular vector of [R₁, -R₂] with the least singular value.
+    The axis is the right singular vector of [R₁, -R₂] with the smallest singular value, where R₁
+    and R₂ are the rotations of parent and child in all frames. Source: Ehrig et al. 2007.
 
     Parameters
     ----------
     parent, child : BodyPoses
-        In one world.
+        Poses of both bodies in the same world coordinates.
     near : ndarray, shape (3,), optional
         Position along the axis, in the parent's coordinates, m; None: nearest the parent's origin.
     toward : ndarray, shape (3,), optional
-        Direction along which the axis has a positive component, such as the subject's right.
+        Direction that determines the sign of the axis: the axis has a positive component along it.
+        An example is the subject's right.
     robust : bool
-        Huber weights on the gap between the two sides.
+        Apply Huber weights to the gap between the points of both bodies.
     markers : tuple of ndarray, optional
         Markers of parent and child, see `two_sided_estimate`.
 
     Returns
     -------
     CenterEstimate
-        `axis` is in the parent's coordinates; refused if the movement was about more than one axis.
+        Estimate with `axis` in the parent's coordinates. The estimate is refused if the movement
+        was about more than one axis.
     """
     estimate = two_sided_estimate(
         "sara", parent, child, near, hinge=True, robust=robust, markers=markers

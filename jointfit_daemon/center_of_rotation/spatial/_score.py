@@ -1,8 +1,9 @@
 """Center of rotation from the poses of two bodies (SCoRE), or the axis of a hinge.
 
 The method finds the point of the parent and the point of the child that coincide in every frame.
-Both poses may be noisy. The singular values of N = [R₁, -R₂] distinguish a point from an axis. If
-the markers of both bodies are known, their noise is separated from the movement (`fit_two_sides`).
+Both poses may be noisy. The singular values of N = [R₁, -R₂], the rotations of both bodies in all
+frames, distinguish a point from an axis. If the markers of both bodies are known, the noise of the
+markers is separated from the movement (`fit_two_sides`).
 """
 
 from __future__ import annotations
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
 
 
 HINGE_RATIO = 0.3
-"""σ₆/σ₅ below which only an axis was observed (hips in squats 0.07 to 0.35; a ball joint moved in
-all directions 0.85 and more)."""
+"""Ratio σ₆/σ₅ of the two smallest singular values below which only an axis was observed. The ratio
+is 0.07 to 0.35 for hips in squats, and at least 0.85 for a ball joint moved in all directions."""
 MIN_FRAMES = 15
 FEW = f"fewer than {MIN_FRAMES} frames show both bodies: keep three markers of each body visible"
 SEVERAL_AXES = (
@@ -46,10 +47,11 @@ SEVERAL_AXES = (
 )
 NO_TURN = "the child did not rotate against the parent: move the joint, at least 30° each way"
 MIN_TURN_RAD = 0.02
-"""RMS rotation, rad, about the second axis of the movement below which there was no rotation."""
+"""RMS rotation about the second axis of the movement, rad, below which the movement counts as no
+rotation."""
 LEVER_M = 0.24
-"""Length, m, that replaces the radius in the conditioning T, since poses carry no marker positions:
-the center must be known to 40 mm."""
+"""Length that replaces the radius in the conditioning T, m, since poses do not contain marker
+positions. With this length T = 6 corresponds to a standard error of 40 mm."""
 HIDDEN = (
     "noise of the markers rotates both bodies as much as the joint does: move the joint further, "
     "or put the markers of each body further apart"
@@ -69,7 +71,7 @@ def fit_score(
 ) -> CenterEstimate:
     """Estimate a center by SCoRE; if only an axis was observed, return the estimate of a hinge.
 
-    Ehrig et al. 2006. Parameters as in `two_sided_estimate`.
+    Source: Ehrig et al. 2006. The parameters are those of `two_sided_estimate`.
     """
     return two_sided_estimate(
         "score", parent, child, near, hinge=False, robust=robust, markers=markers, posture=posture
@@ -91,35 +93,39 @@ def two_sided_estimate(
 
     .. math:: \min \sum_t \rho\left(|R_1 c_1 + t_1 - R_2 c_2 - t_2|\right)
 
-    With `markers`, the estimate continues from this point by `fit_two_sides`.
+    R and t are rotation and translation of parent (1) and child (2), c the point in each body, ρ
+    Huber's loss. If `markers` are given, this point is the start value of `fit_two_sides`.
 
     Parameters
     ----------
     name : str
         Name of the estimator.
     parent, child : BodyPoses
-        In one world; frames with NaN are left out.
+        Poses of both bodies in the same world coordinates; frames with NaN are ignored.
     near : ndarray, shape (3,), or None
         Position along a hinge's axis, in the parent's coordinates, m; None: nearest the parent's
         origin.
     hinge : bool
-        Solve for an axis, without the sixth singular value. False: only if the ratio of the last
-        two singular values is below `HINGE_RATIO`.
+        Always solve for an axis, without the sixth singular value. If False, solve for an axis only
+        if the ratio of the last two singular values is below `HINGE_RATIO`.
     robust : bool
-        Huber weights on the gap, which reduce the influence of marker swaps.
+        Apply Huber weights to the gap between the points of both bodies. The weights reduce the
+        influence of exchanged markers.
     markers : tuple of ndarray, shapes (m, 3) and (k, 3), or None
-        Markers of parent and child that the poses were fitted to, each in coordinates of its body,
-        m; at least three each, not on a line. None: the noise of the poses is unknown, and a small
-        movement gives a biased center with too small an error.
+        Markers of parent and child to which the poses were fitted, each in the coordinates of its
+        body, m. Each body needs at least three markers that are not on a line. If None, the noise
+        of the poses is unknown: for a small movement the center is biased and its predicted error
+        too small.
     posture : bool
-        Whether persistent residuals count as soft-tissue artefact; if not, the caller adds its
-        variance.
+        Whether persistent residuals count as soft-tissue artefact. If False, the caller adds the
+        variance of the artefact.
 
     Returns
     -------
     CenterEstimate
-        In the parent's coordinates; `residual` is the RMS gap between the two sides. `noise` is
-        that of a marker's coordinate, without `markers` that of the gap's.
+        Estimate in the parent's coordinates; `residual` is the RMS gap between the points of both
+        bodies. `noise` is the standard deviation of a marker coordinate, or of a gap coordinate
+        without `markers`.
     """
     good = np.isfinite(parent.q).all(1) & np.isfinite(child.q).all(1)
     good &= np.isfinite(parent.t).all(1) & np.isfinite(child.t).all(1)
@@ -133,14 +139,14 @@ def two_sided_estimate(
     w = _huber_weights(N, rhs, hinge=hinge) if robust else np.ones(n)
     c, gaps, s, Vt, rank = _solve(N, rhs, w, hinge=hinge)
 
-    # RMS turning about the second axis of the movement, rad
+    # RMS rotation about the second axis of the movement, rad
     ratio, turn = float(s[5] / max(s[4], 1e-300)), float(s[4]) / sqrt(float(w.sum()))
     if turn < MIN_TURN_RAD:
         return refusal(name, 3, n, NO_TURN)
     if hinge and ratio >= HINGE_RATIO:
         return refusal(name, 3, n, SEVERAL_AXES.format(ratio))
 
-    # with unit noise of the gap, S = M = NᵀWN
+    # for unit noise of the gap, score S and information M are equal: NᵀWN
     squares = np.diag(s[:rank] ** 2)
     residual = sqrt(float((gaps**2).sum(axis=1).mean()))
     fit = TwoSidedFit(c, gaps, w, residual, squares, squares)
@@ -148,14 +154,14 @@ def two_sided_estimate(
         noise = ClusterNoise.of(markers[0]), ClusterNoise.of(markers[1])
         fit = fit_two_sides(poses, noise, c, Vt[:rank].T, robust=robust)
 
-    # Arc of the direction that rotated most; the length of its mean is the resultant.
+    # Arc of the direction that rotated most; the resultant is the length of the mean direction.
     R = rotation.to_matrix(rotation.multiply(rotation.conjugate(poses[0].q), poses[1].q))
     arc = arc_of(float(np.linalg.svd(R.mean(axis=0))[1][2]))
     found = _answer(name, fit, Vt, arc, near, posture=posture)
     if markers is None or not np.isfinite(found.center).all():
         return found
 
-    # The distances of markers from the center, m; across the axis (rows) of a hinge.
+    # Distances of the markers from the center, m; for a hinge, distances from the axis (rows).
     away = markers[1] - fit.point[3:]
     axis = Vt[len(fit.score) :, 3:]
     along = axis / np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-300)
@@ -165,7 +171,7 @@ def two_sided_estimate(
 def _answer(
     name: str, fit: TwoSidedFit, Vt: Array, arc: float, near: Array | None, *, posture: bool
 ) -> CenterEstimate:
-    """Return the estimate of a fit along the first rows of `Vt`."""
+    """Return the estimate of a fit along the directions in the first rows of `Vt`."""
     n, rank = len(fit.gaps), len(fit.score)
     inner = fit.spread()
     if inner is None:
@@ -212,8 +218,8 @@ def _covariances(
     """Return the covariance of the parent's point for white noise and in total, m², shape (3, 3).
 
     The third value is the correlation of the gaps from one frame to the next. Persistent noise
-    reduces the effective frames; with soft-tissue artefact a single one remains. The fourth value
-    is the share of the gaps' variance that repeats with posture.
+    reduces the effective number of frames; with soft-tissue artefact this number is one. The fourth
+    value is the share of the gap variance that repeats with posture.
     """
     gaps, w = fit.gaps, fit.weights
     n = len(gaps)

@@ -2,7 +2,7 @@
 
 A hinge movement determines the center in two directions, and the hinge axis. A straight path or a
 marker at rest is refused with a remedy. Along an unobserved direction the caller chooses the
-position.
+position of the center.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 MIN_FRAMES = 15
-"""Least effective number of frames in which a marker is visible."""
+"""Smallest effective number of visible frames of a usable marker."""
 LOUD = 9.0
 """Ratio of a marker's variance to the median variance above which the marker is flagged as
 noisy."""
@@ -67,20 +67,20 @@ def center_of(
     method : str
         Method name stored in the result.
     near : ndarray, shape (d,), optional
-        Position along unobserved directions, m; None: at the markers' mean.
+        Position along unobserved directions, m; None: the mean of the markers.
     shape : ndarray, shape (k, d, d), optional
-        Covariance of each marker's noise relative to the common variance, as
-        ``relative`` gives it for a moving parent; None: isotropic.
+        Noise covariance of each marker relative to the common variance, see ``relative`` for a
+        moving parent; None: isotropic noise.
     limits : SphereLimits, optional
         Acceptance limits.
 
     Returns
     -------
     estimate : CenterEstimate
-        The center is NaN if it was refused before one was found. The radius is NaN for markers
-        visible in too few frames.
+        Estimate of the center, which is NaN if the data were refused before the fit. The radius is
+        NaN for markers that are visible in too few frames.
     spheres : ConcentricSpheres or None
-        The markers' spheres; None unless the center is observable in all directions.
+        Fitted spheres of the markers; None unless the center is observable in all directions.
     """
     limits = limits or SphereLimits()
     d = sums.origin.shape[1]
@@ -118,7 +118,7 @@ def _answer(
     stay = middle if near is None else np.asarray(near, dtype=np.float64)
     center, spread = shrink_center(seen, middle @ seen.basis)
     fitted = seen.basis @ center
-    hidden = unseen @ seen.basis @ seen.basis.T  # in the fit, but not in the result
+    hidden = unseen @ seen.basis @ seen.basis.T  # fitted, but not in the result
     lean = float(((unseen @ stay - hidden @ fitted - (unseen - hidden) @ middle) ** 2).sum())
     spread = seen.shown.T @ spread @ seen.shown
     C = basis @ (spread + lean * (seen.shown.T @ seen.tilt @ seen.shown)) @ basis.T
@@ -165,9 +165,9 @@ def shrink_center(seen: ObservedCenter, middle: Array) -> tuple[Array, Array]:
     .. math:: S = (I + C/R^2)^{-1}, \qquad d' = S d, \qquad C' = S C S
 
     for the vector d from the markers' mean to the center. The error of the estimated curvature is
-    nearly normal; its inverse, the distance, is therefore too large on average. The shrinkage
-    removes this outward bias. It is Zellner's minimum expected loss estimator of an inverse (1978),
-    as in the plane. On long arcs S is the identity.
+    nearly normal; its inverse, the distance, is therefore too large on average. The shrinkage,
+    Zellner's minimum expected loss estimator of an inverse (1978), removes this outward bias, as in
+    the plane. On long arcs S is the identity.
     """
     R2 = float(np.median(seen.found.radii2))
     S = np.linalg.inv(np.eye(len(middle)) + seen.spread / R2)
@@ -182,7 +182,7 @@ def objection(
     *,
     soft_tissue: bool = False,
 ) -> str | None:
-    """Return the cause and the remedy if a center must not be used; None if it may."""
+    """Return the cause and the remedy if a center must not be used; None if it is usable."""
     if arc < limits.min_arc:
         return f"the joint turned {degrees(arc):.0f}°: move it through at least 30°"
     if not limits.reach[0] <= radius <= limits.reach[1]:

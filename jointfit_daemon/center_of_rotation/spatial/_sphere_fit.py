@@ -1,7 +1,7 @@
 """Sphere fits of all frames at once.
 
-`fit_sphere` is robust and is the recommended method. The linear fits serve comparisons.
-Invariant: acceptance equals that of a `RunningSphere` fed with the same frames.
+`fit_sphere` is robust and is the recommended method. The linear fits are for comparison. Invariant:
+acceptance equals that of a `RunningSphere` fed with the same frames.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 
 OUTLIER = 3.0
-"""Residual in standard deviations above which the weight is reduced. Noise rarely exceeds it, so
-that the noise variance is not underestimated."""
+"""Residual in standard deviations above which the weight of a point is reduced. Noise rarely
+exceeds this threshold, so that the noise variance is not underestimated."""
 STILL_M = 1e-6
 _HALVORSEN_STEPS = 20
 FLAT = (
@@ -42,8 +42,8 @@ def gamage_lasenby(points: Array, min_direction: float = 0.0) -> CenterEstimate:
     .. math:: 2 \sum_j \left(\overline{vv^T} - \bar v \bar v^T\right) m
               = \sum_j \left(\overline{v|v|^2} - \bar v\, \overline{|v|^2}\right)
 
-    The center is biased towards the markers on short arcs, as in Kåsa's circle fit. Gamage and
-    Lasenby 2002.
+    with v the positions of marker j and m the center. On short arcs the center is biased towards
+    the markers, as in Kåsa's circle fit. Source: Gamage and Lasenby 2002.
 
     Parameters
     ----------
@@ -56,12 +56,13 @@ def gamage_lasenby(points: Array, min_direction: float = 0.0) -> CenterEstimate:
 
 
 def halvorsen(points: Array, min_direction: float = 0.0) -> CenterEstimate:
-    r"""Correct the bias of `gamage_lasenby` for the estimated noise in twenty iterations.
+    r"""Estimate the center of `gamage_lasenby`, corrected for noise bias in twenty iterations.
 
     .. math:: A m = b - 2 σ^2 \sum_j (\bar v_j - m), \qquad
               σ^2 = \frac{\sum (u - \bar u_j)^2}{nk - k - 3}, \quad u = |v - m|
 
-    Halvorsen 2003. Parameters as in `gamage_lasenby`.
+    with A and b the matrix and the right side of `gamage_lasenby`, n frames and k markers. Source:
+    Halvorsen 2003. The parameters are those of `gamage_lasenby`.
     """
     return _linear(points, "halvorsen", _HALVORSEN_STEPS, min_direction)
 
@@ -102,25 +103,26 @@ def fit_sphere(
     .. math:: \min_m \sum_{tj} \rho\left(|v_{tj} - m| - \bar u_j\right),
               \qquad \bar u_j = \mathrm{mean}_t |v_{tj} - m|
 
-    determines the outliers; center and covariance are computed from the sums of the other frames.
+    This fit determines the outliers, with ρ Huber's loss. Center and covariance are then computed
+    from the sums over the other points.
 
     Parameters
     ----------
     points : ndarray, shape (n, k, 3)
         Markers of the child in the parent's coordinates, m; NaN where not seen.
     options : SphereOptions, optional
-        Start, robustness.
+        Start value and robustness of the fit.
     limits : SphereLimits, optional
         Acceptance limits.
     parent : ndarray, shape (m, 3), optional
-        The parent's own markers in its coordinates, m. Their noise, common to all markers of the
-        child, is separated from the noise of the child's markers.
+        The parent's own markers in the parent's coordinates, m. Noise of the parent's markers is
+        common to all markers of the child, and is separated from the noise of the child's markers.
 
     Returns
     -------
     CenterEstimate
-        `unseen` contains the unobserved directions (a hinge's axis). Along them the center is at
-        `options.start`, or at the markers' mean.
+        Estimate; `unseen` contains the unobserved directions, such as the axis of a hinge. Along
+        these directions the center is at `options.start`, or at the mean of the markers.
     """
     options = options or SphereOptions()
     weights = _weights(points, options)

@@ -1,14 +1,15 @@
 r"""Sums of fixed size over any number of frames, sufficient for a fit of spheres.
 
-For every marker, φ = (|p|², p, 1) with p its position relative to a fixed point near it. All
-estimates of spheres about one center are functions of
+For every marker, φ = (|p|², p, 1) with p the position of the marker relative to a fixed point near
+the marker. All estimates of spheres about one center are functions of
 
 .. math:: M_{jl} = \sum_t \sqrt{w_{tj} w_{tl}}\, φ_{tj} φ_{tl}^T, \qquad
           L_{gj} = \sum_t \sqrt{w_{tj} w_{t-g,j}}\, φ_{tj} φ_{t-g,j}^T, \quad g \in \{1, 4\}
 
-M determines the variances of the residuals and their covariance between markers (noise of the
-parent's frame), L their correlation in time. Forgetting scales both. A marker that is not visible
-adds nothing.
+with w the weight of marker j or l in frame t. M determines the variances of the residuals and their
+covariance between markers (noise of the parent's frame). L determines the correlation of the
+residuals in time. Forgetting multiplies M and L by a factor. A marker that is not visible adds
+nothing to either sum.
 """
 
 from __future__ import annotations
@@ -38,37 +39,37 @@ class SphereSums:
     L: Array
     """Lagged sums for each of `LAGS`, shape (2, k, e, e)."""
     squares: Array
-    """Σ w², shape (k,)."""
+    """Sum of the squared weights of each marker, Σ w², shape (k,)."""
     frames: int
     """Number of frames with any visible marker."""
 
     @property
     def weights(self) -> Array:
-        """Return Σ w per marker, shape (k,)."""
+        """Return the sum of the weights of each marker, Σ w, shape (k,)."""
         last = self.M.shape[1] - 1
         return np.asarray(np.einsum("jj->j", self.M[:, last, :, last]).copy())
 
     @property
     def counts(self) -> Array:
-        """Return the effective number of frames, (Σw)²/Σw² per marker, shape (k,)."""
+        """Return the effective number of frames of each marker, (Σw)²/Σw², shape (k,)."""
         return np.asarray(self.weights**2 / np.maximum(self.squares, 1e-300))
 
     def only(self, markers: NDArray[np.bool_]) -> SphereSums:
-        """Return the sums of some markers, given as a mask."""
+        """Return the sums of the markers that are selected by a mask."""
         pick = np.flatnonzero(markers)
         M = self.M[pick][:, :, pick]
         return SphereSums(self.origin[pick], M, self.L[:, pick], self.squares[pick], self.frames)
 
 
 def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
-    """Sum over all frames at once.
+    """Return the sums over all frames, computed at once.
 
     Parameters
     ----------
     points : ndarray, shape (n, k, d)
-        Markers, m; NaN where not seen.
+        Positions of the markers, m; NaN where a marker is not visible.
     weights : ndarray, shape (n, k), optional
-        Non-negative; one if None.
+        Weights of the markers, non-negative; one if None.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1))
     w = np.where(seen, 1.0 if weights is None else weights, 0.0)
@@ -87,10 +88,10 @@ def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
 
 
 def centered(sums: SphereSums) -> SphereSums:
-    r"""Return the sums about each marker's mean; those of markers never visible are unchanged.
+    r"""Return the sums about each marker's mean; sums of markers never visible are unchanged.
 
-    For a reference point moved by b, :math:`\varphi' = T \varphi`, so that :math:`M' = T M T^T` and
-    :math:`L' = T L T^T`.
+    If the reference point moves, φ is multiplied by a matrix T. The sums then are :math:`M' = T M
+    T^T` and :math:`L' = T L T^T`.
     """
     k, d = sums.origin.shape
     by = np.einsum("jaj->ja", sums.M[:, 1:-1, :, -1])

@@ -1,9 +1,10 @@
 r"""Center of two bodies whose poses are fitted to noisy markers.
 
 Noise of the markers rotates the fitted bodies, and moves a point in proportion to its distance from
-the markers. Least squares on the gap between both sides (SCoRE) therefore prefers points near the
-markers: its center is biased, by millimeters in small movements. The fit of this module estimates
-the errors of both rotations in every frame together with the center (errors in variables).
+the markers. Least squares on the gap between both bodies (SCoRE) therefore prefers points near the
+markers. The SCoRE center is biased by millimeters in small movements. The fit of this module
+estimates the errors of both rotations in every frame together with the center (errors in
+variables).
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ if TYPE_CHECKING:
 
 
 HUBER = 1.5
-"""Gap in standard deviations of a coordinate above which half of it reduces a frame's weight."""
+"""Threshold of Huber's weight of a frame: length of the gap, in standard deviations of a
+coordinate."""
 MEDIAN_LENGTH = 1.538
 """Median length of a vector of three standard normal components."""
 _PASSES = 40
@@ -38,7 +40,8 @@ class ClusterNoise:
     .. math:: \mathrm{Cov}(\varphi) = G^{-1}, \quad \mathrm{Cov}(\bar y) = \tfrac1k I, \quad
               G = \sum_j \left(|d_j|^2 I - d_j d_j^T\right)
 
-    φ is a rotation about the mean of the markers, d_j their distances from it.
+    φ is the rotation error about the mean ȳ of the markers, d_j is the vector from this mean to
+    marker j.
     """
 
     middle: Array
@@ -50,7 +53,7 @@ class ClusterNoise:
 
     @classmethod
     def of(cls, markers: Array) -> ClusterNoise:
-        """Return the errors of a fit to these markers, m, shape (k, 3), not on a line."""
+        """Return the pose errors of a fit to markers, m, shape (k, 3), that are not on a line."""
         middle = markers.mean(axis=0)
         d = markers - middle
         G = np.trace(d.T @ d) * np.eye(3) - d.T @ d
@@ -64,7 +67,7 @@ class TwoSidedFit:
     point: Array
     """Point in parent and in child coordinates, m, shape (6,)."""
     gaps: Array
-    """Gaps divided by their standard deviation for unit noise, m, shape (n, 3)."""
+    """Gaps divided by the standard deviation that unit noise causes, m, shape (n, 3)."""
     weights: Array
     """Weight of each frame, shape (n,)."""
     residual: float
@@ -72,12 +75,14 @@ class TwoSidedFit:
     score: Array
     """Variance of the estimating equations for unit noise, along the basis, shape (r, r)."""
     information: Array
-    """Their derivative: the inverse covariance without noise in the rotations, shape (r, r)."""
+    """Derivative of the estimating equations, shape (r, r). Without noise in the rotations it is
+    the inverse covariance."""
 
     def spread(self) -> Array | None:
         r"""Return the covariance along the basis per noise variance, :math:`M^{-1} S M^{-1}`.
 
-        None if the rotations are no larger than their noise, so that M is not positive definite.
+        S is `score`, M is `information`. The result is None if the rotations are no larger than the
+        rotation noise, so that M is not positive definite.
         """
         values, axes = np.linalg.eigh(self.information)
         if values[0] <= 1e-9 * values[-1]:
@@ -101,23 +106,24 @@ def fit_two_sides(
               R_1 e^{[\varphi_1]} \lambda_1 + p_1 + \rho_1 = R_2 e^{[\varphi_2]} \lambda_2 + p_2
               + \rho_2
 
-    with λ the point relative to the mean of a body's markers, p the measured mean, and φ, ρ the
-    errors of the pose. To first order this is the maximum of the likelihood for isotropic noise of
-    all markers, whatever its variance. A gap across the line to a distant cluster has less weight
-    than one along it, which its rotation does not affect.
+    with λ the point relative to the mean of a body's markers, p the measured mean, k the number of
+    markers, and φ, ρ the errors of the pose. G is defined in `ClusterNoise`. To first order this is
+    the maximum-likelihood estimate for isotropic marker noise of any variance. Rotation errors of a
+    distant cluster only cause gaps normal to the line to the cluster. Such gaps have less weight
+    than gaps along the line.
 
     Parameters
     ----------
     poses : tuple of BodyPoses
-        Parent and child in one world, without NaN, n frames.
+        Poses of parent and child in the same world coordinates, without NaN, n frames.
     noise : tuple of ClusterNoise
-        Parent and child.
+        Pose errors of parent and child.
     start : ndarray, shape (6,)
         Initial point in parent and child coordinates, m.
     basis : ndarray, shape (6, r)
         Directions in which the point is fitted, orthonormal columns.
     robust : bool
-        Huber weights on the gaps.
+        Apply Huber weights to the gaps.
     """
     (parent, child), (above, below) = poses, noise
     R1 = rotation.to_matrix(parent.q)
@@ -128,7 +134,7 @@ def fit_two_sides(
     lever, turned, w = start - middles, (np.zeros_like(p), np.zeros_like(p)), np.ones(len(Q))
 
     for _ in range(_PASSES):
-        # a step of the point, then the rotations that close the remaining gap
+        # take a step of the point, then compute the rotations that close the remaining gap
         frames = _linearize((Q, p), noise, turned, lever)
         step, gap, _ = _step(frames, basis, w)
         force = _apply(frames.V, gap)
@@ -164,15 +170,15 @@ class _LinearGaps:
     """Gaps in parent coordinates, linear in the point and in the errors of both rotations."""
 
     turns: tuple[Array, Array]
-    """Corrected rotations of parent and child, (n, 3, 3) each."""
+    """Rotations of parent and child after correction, shape (n, 3, 3) each."""
     gains: tuple[Array, Array]
-    """Covariance of each rotation's error with the gap, for unit noise, (n, 3, 3) each."""
+    """Covariance of each rotation error with the gap, for unit noise, shape (n, 3, 3) each."""
     V: Array
     """Inverse covariance of the gap for unit noise, (n, 3, 3)."""
     A: Array
     """Derivative of the gap by the point, (n, 3, 6)."""
     gap: Array
-    """Gap without the corrections of the rotations, m, (n, 3)."""
+    """Gap before the correction of the rotations, m, (n, 3)."""
 
 
 def _linearize(
@@ -181,7 +187,7 @@ def _linearize(
     turned: tuple[Array, Array],
     lever: Array,
 ) -> _LinearGaps:
-    """Return the gaps about the rotations corrected by `turned`, and about the point `lever`."""
+    """Return the gaps, linearized at the point `lever` and the rotations corrected by `turned`."""
     (Q, p), (above, below) = measured, noise
     E1 = rotation.to_matrix(rotation.exp(turned[0]))
     E2 = Q @ rotation.to_matrix(rotation.exp(turned[1]))
@@ -215,13 +221,15 @@ def _apply(matrices: Array, vectors: Array) -> Array:
 def _remaining_noise(
     frames: _LinearGaps, w: Array, noise: tuple[ClusterNoise, ClusterNoise]
 ) -> Array:
-    r"""Return the part of S that comes from errors of the corrected rotations, shape (6, 6).
+    r"""Return the part of the score S due to errors of the corrected rotations, shape (6, 6).
 
     .. math:: \sum_t w_t\, E\left[ δA^T V δA \right], \qquad
               δA = (E_1 [δφ_1]_×, \; -E_2 [δφ_2]_×), \qquad
               \mathrm{Cov}(δφ) = \mathrm{diag}(G_i^{-1}) - K V K^T
 
-    per noise variance: the covariance of the rotations after their correction by the gap.
+    per noise variance. A is the derivative of the gap by the point, V the inverse covariance of the
+    gap, and w the weight of frame t. Cov(δφ) is the covariance of the rotations after the
+    correction by the gap.
     """
     out = np.zeros((6, 6))
     for i in (0, 1):

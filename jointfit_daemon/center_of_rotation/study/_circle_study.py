@@ -5,13 +5,13 @@ at once.
 
 A marker at distance r from the center is at the angles 0, α and 2α; each coordinate has independent
 noise of standard deviation σ. Two of (r, σ, α) vary over a map, the third is fixed. Every cell
-contains the RMS errors of the methods over many runs, the error predicted for three frames
+contains the RMS errors of the methods over many runs, and the error predicted for three frames,
 
 .. math:: F = \sigma \sqrt{\frac{2 + \cos\alpha}{(1 - \cos\alpha)^2 (1 + \cos\alpha)}}
 
-and, for many frames spread evenly over the same arc 0 … 2α, the Cramér-Rao bound. Source: Akbarifar
-et al., section 2-2-3, figure 2 and table 1, whose setup is only partly printed; `StudySetup`
-documents the interpretation.
+Every cell also contains the Cramér-Rao bound for many frames spread evenly over the same arc 0 …
+2α. Source: Akbarifar et al. 2021, section 2-2-3, figure 2 and table 1. The source prints only part
+of the setup; `StudySetup` documents the assumptions.
 """
 
 from __future__ import annotations
@@ -38,9 +38,11 @@ if TYPE_CHECKING:
 
 
 CLIPS_M = (None, 0.05, 0.15, 0.3, 0.5)
-"""Upper limit of the values of both maps of a correlation, m; None: no limit."""
+"""Upper limits that are applied to both maps before their correlation is computed, m; None: no
+limit."""
 PRINTED = {"α–σ": (0.99, 0.78), "r–σ": (0.99, 0.98), "r–α": (0.99, 0.94)}
-"""Correlations of table 1 of the source: analytic solution with prediction, and with grid."""
+"""Correlations in table 1 of the source: analytic solution with prediction, analytic solution with
+grid."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,19 +54,19 @@ class StudySetup:
     steps: Array = field(default_factory=lambda: np.arange(5.0, 176.0, 5.0) * (np.pi / 180.0))
     """α, the angle between successive frames; the poles 0 and π are excluded."""
     radius: float = 0.6
-    """r in the map in which r is fixed."""
+    """Radius r in the map with fixed r, m."""
     noise: float = 0.001
     step: float = np.pi / 3.0
     repeats: int = 1000
     """Number of runs of the three-frame solution in each cell."""
     grid_repeats: int = 150
-    """Number of runs of the grid searches, the first of the same runs."""
+    """Number of runs with grid searches: the first of the `repeats` runs."""
     box: float = 0.05
     """Half width of the grid about the true center, m."""
     node: float = 0.005
     """Distance between nodes, m."""
     frames: int = 100
-    """Number of frames, evenly over the same arc, for the estimators that use all frames."""
+    """Number of frames, spread evenly over the arc, for the estimators that use all frames."""
     frames_repeats: int = 30
     orientation_noise: float = float(np.deg2rad(1.0))
     """Standard deviation of the white error of the angle for the orientation-aided estimator,
@@ -74,10 +76,10 @@ class StudySetup:
 
 @dataclass(frozen=True, slots=True)
 class PairMaps:
-    """The maps of one pair of quantities."""
+    """Error maps over one pair of the quantities r, σ and α."""
 
     name: str
-    """``α–σ``, ``r–σ`` or ``r–α``: rows first."""
+    """Name of the pair, ``α–σ``, ``r–σ`` or ``r–α``, with the quantity of the rows first."""
     rows: Array
     """Values of the first quantity, SI."""
     columns: Array
@@ -89,7 +91,7 @@ class PairMaps:
 
 
 def correlation(a: Array, b: Array, clip: float | None = None) -> float:
-    """Return Pearson's correlation of two maps, both limited to `clip`; 0 if one is constant."""
+    """Return Pearson's correlation of two maps limited to `clip`; 0 if one map is constant."""
     x, y = (np.minimum(m, np.inf if clip is None else clip).ravel() for m in (a, b))
     x, y = x - x.mean(), y - y.mean()
     scale = float(np.sqrt((x @ x) * (y @ y)))
@@ -105,12 +107,12 @@ def run_study(
     ----------
     setup : StudySetup
     on_progress : callable, optional
-        Called with the share done, 0 to 1, after every row of cells.
+        Function that is called with the completed share, 0 to 1, after every row of cells.
 
     Returns
     -------
     list of PairMaps
-        α–σ, r–σ, r–α.
+        Maps of the pairs α–σ, r–σ and r–α.
     """
     r, s, a = setup.radii, setup.noises, setup.steps
     fixed = np.array([setup.radius]), np.array([setup.noise]), np.array([setup.step])
@@ -128,7 +130,7 @@ def run_study(
         for row in rows:
             radius, noise, step = np.broadcast_arrays(*cells(float(row)))
 
-            # All results of one row of cells, each of shape (cells,).
+            # Compute all results of one row of cells, each of shape (cells,).
             three = _noisy(rng, radius, noise, step[:, None] * np.arange(3.0), setup.repeats)
             few = three[:, : setup.grid_repeats]
             results = {
@@ -157,7 +159,8 @@ def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool
     .. math:: E^2 = \frac{\sigma^2}{n} \left[ \frac{2}{1-c} + \frac{2}{1+c-2s^2} \right],
               \quad s = \frac{\sin(\varphi/2)}{\varphi/2}, \quad c = \frac{\sin\varphi}{\varphi}
 
-    and without 2s² where the radius is known; about 26.8 σ/(√n φ²) on short arcs.
+    with φ the arc, n the number of frames and σ the noise. If the radius is known, the term 2s² is
+    zero. On short arcs E is about 26.8 σ/(√n φ²) for an unknown radius.
 
     Parameters
     ----------
@@ -175,7 +178,7 @@ def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool
     along = 1.0 + c - (0.0 if known_radius else 2.0 * s**2)
     if not known_radius and arc < 0.05:
         along = arc**4 / 360.0  # series expansion, because the difference cancels there
-    if c >= 1.0 or along <= 0.0 or frames <= 0:  # no arc, or an arc within rounding
+    if c >= 1.0 or along <= 0.0 or frames <= 0:  # the arc is zero or within rounding
         return float("inf")
     return float(noise * np.sqrt((2.0 / (1.0 - c) + 2.0 / along) / frames))
 

@@ -1,7 +1,8 @@
-"""Two claims of the source about three-frame centers: repetition of small angles, and the radius.
+"""Tests of two claims about three-frame centers in the source of the study.
 
-The source recommends small angles α, repeated and averaged, and states that the distance r of the
-marker has no effect unless the noise is large relative to it.
+The source (Akbarifar et al. 2021) recommends to repeat movements with small angles α and to average
+the results. It also states that the distance r of the marker has no effect unless the noise is
+large relative to r.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ if TYPE_CHECKING:
 STEPS_RAD = np.deg2rad([10.0, 20.0, 30.0, 45.0])
 """Angles α at which repetitions are averaged, rad."""
 RADII_M = np.array([0.03, 0.04, 0.06, 0.07, 0.08, 0.1, 0.2])
-"""Distances of the marker, m."""
+"""Distances r of the marker from the center, m."""
 LARGE_NOISE_M = 0.005
-"""Noise at which the radius is varied, m: the largest of the source."""
+"""Noise in the runs with varied radius, m: the largest noise in the source."""
 _BLOCKS = 40
 _RUNS = 40_000
 
@@ -52,10 +53,10 @@ def average_repetitions(setup: StudySetup) -> Repetition:
 
 
 def effect_of_radius(setup: StudySetup) -> Array:
-    """Return the 95th percentile of the error at `RADII_M` over that at the largest radius.
+    """Return the error at each of `RADII_M`, divided by the error at the largest radius.
 
-    With noise of `LARGE_NOISE_M` and the fixed step of the setup. The percentile, because the error
-    has no finite mean square.
+    The error is its 95th percentile, because its mean square is not finite. The noise is
+    `LARGE_NOISE_M`, and the step is the fixed step of the setup.
     """
     rng = np.random.default_rng(setup.seed)
     drawn = rng.normal(0.0, LARGE_NOISE_M, (_RUNS, 3, 2))
@@ -69,10 +70,10 @@ def effect_of_radius(setup: StudySetup) -> Array:
 
 
 class StudyExtension(NamedTuple):
-    """Results beyond the maps of the source."""
+    """Results of the study that the source does not contain."""
 
     median_errors: Mapping[str, Array]
-    """`compare_methods`: m, by method."""
+    """Median errors of `compare_methods`, m, by method."""
     repetition: Repetition
     radius_effect: Array
 

@@ -1,7 +1,7 @@
 r"""Comparison of the three-frame solution with geometric methods at the same range of motion.
 
-Two markers of a rigid body, at the same distance from the center and `APART_RAD` apart, rotate by
-2α. Methods of two frames use the first and the last.
+Two markers of a rigid body rotate by 2α. Both are at the same distance from the center, `APART_RAD`
+apart. Methods that need two frames use the first and the last frame.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 APART_RAD = np.pi / 3.0
 """Angle between the two markers about the center, rad."""
 _LEAST_TURN = 1e-12
-"""Rotation, rad, that is rounding."""
+"""Rotation that counts as rounding, rad."""
 
 
 def bisector_center(points: ArrayLike) -> Array:
@@ -33,13 +33,13 @@ def bisector_center(points: ArrayLike) -> Array:
     .. math:: \min_c \sum_{k,a<b} \left[ (p_{kb} - p_{ka})^T c
               - \tfrac12 (|p_{kb}|^2 - |p_{ka}|^2) \right]^2
 
-    over markers k and pairs of frames a, b. Two markers in two frames give Reuleaux's construction,
-    and one marker in three frames gives `three_frame_center`.
+    over markers k and pairs of frames a, b, with p the marker positions. Two markers in two frames
+    give Reuleaux's construction, and one marker in three frames gives `three_frame_center`.
 
     Parameters
     ----------
     points : array_like, shape (..., k, n, 2)
-        k markers in n frames, m.
+        Positions of k markers in n frames, m.
 
     Returns
     -------
@@ -63,22 +63,22 @@ def bisector_center(points: ArrayLike) -> Array:
 
 
 def rotation_pole(first: ArrayLike, second: ArrayLike) -> Array:
-    r"""Return the pole of a planar displacement: where the finite helical axis meets the plane.
+    r"""Return the pole of a planar displacement, the point that the displacement does not move.
 
     .. math:: c = (\bar b - R \bar a) (I - R)^{-1}
 
-    in complex numbers, with R the rotation of the least-squares rigid fit of both marker sets
-    a and b.
+    in complex numbers, with R the rotation of the least-squares rigid fit of the marker sets a and
+    b, and :math:`\bar a`, :math:`\bar b` their means.
 
     Parameters
     ----------
     first, second : array_like, shape (..., k, 2)
-        k markers in two frames, m; at least two markers.
+        Positions of at least two markers in two frames, m.
 
     Returns
     -------
     ndarray, shape (..., 2)
-        m; not finite without rotation.
+        Poles, m; not finite without rotation.
     """
     a, b = (np.asarray(p, dtype=np.float64) @ np.array([1.0, 1.0j]) for p in (first, second))
     mean_a, mean_b = a.mean(axis=-1), b.mean(axis=-1)
@@ -92,8 +92,8 @@ def rotation_pole(first: ArrayLike, second: ArrayLike) -> Array:
 def compare_methods(setup: StudySetup) -> Mapping[str, Array]:
     """Return the median error of each method over α, m, shape (len(setup.steps),).
 
-    The median, because some of the errors have no finite mean square. Radius, noise, number of runs
-    and seed are those of the setup.
+    The result is a median because some errors have no finite mean square. Radius, noise, number of
+    runs and seed are those of the setup.
     """
     rng = np.random.default_rng(setup.seed)
     found: dict[str, list[float]] = {}
@@ -116,7 +116,7 @@ def compare_methods(setup: StudySetup) -> Mapping[str, Array]:
 
 
 def _body(setup: StudySetup, rng: np.random.Generator, angles: Array, repeats: int) -> Array:
-    """Return both markers about the origin, measured, shape (repeats, 2, frames, 2)."""
+    """Return measured positions of both markers about the origin, shape (repeats, 2, frames, 2)."""
     turned = angles + np.array([[0.0], [APART_RAD]])
     true = setup.radius * np.stack((np.cos(turned), np.sin(turned)), axis=-1)
     return np.asarray(true + rng.normal(0.0, setup.noise, (repeats, *true.shape)))

@@ -23,7 +23,7 @@ _TOLD = AngleNoise()
 _STEPS = 12
 _LEAST_NOISE_M = 1e-6
 _STUCK = 1e3
-"""Damping above which a run ends."""
+"""Damping above which the descent of a run ends."""
 
 
 class _Weights(NamedTuple):
@@ -52,7 +52,7 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     Parameters
     ----------
     points : ndarray, shape (..., n, 2)
-        m; no NaN.
+        Marker positions, m; no NaN.
     angles : ndarray, shape (..., n)
         Measured angle of the child relative to the parent, rad.
     interval : float
@@ -76,7 +76,7 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     noise = np.maximum(noise, _LEAST_NOISE_M)
     found, H = start, np.zeros((len(z), 4, 4))
 
-    # the scale part without angle noise; the angles grow evenly from frame to frame
+    # the scale error uses angles without noise, which grow evenly from frame to frame
     values, U = _wandering(n, interval)
     even = np.arange(n) - 0.5 * (n - 1)
     g = _TOLD.gain * np.outer(theta @ even, even) / (even @ even)
@@ -93,7 +93,7 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
 
 @cache
 def _wandering(n: int, interval: float) -> tuple[Array, Array]:
-    """Return eigenvalues and eigenvectors of the angles' covariance without the scale part."""
+    """Return eigenvalues and eigenvectors of the angle covariance without the scale error."""
     apart = interval * np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     slow = _TOLD.slow**2 * np.exp(-apart / _TOLD.time)
     values, U = np.linalg.eigh(slow + _TOLD.white**2 * np.eye(n))
@@ -101,7 +101,7 @@ def _wandering(n: int, interval: float) -> tuple[Array, Array]:
 
 
 class _Runs(NamedTuple):
-    """Data of the runs that stay constant during the descent."""
+    """Data of the runs that are constant during the descent."""
 
     z: Complex
     theta: Array
@@ -113,14 +113,14 @@ class _Runs(NamedTuple):
     """Radius at which M is computed, shape (runs,)."""
 
     def only(self, i: NDArray[np.intp]) -> _Runs:
-        """Return selected runs."""
+        """Return the data of the selected runs."""
         U, d, h = self.weights
         kept = _Weights(U, d[i], h[i])
         return _Runs(self.z[i], self.theta[i], self.noise[i], kept, self.diagonal[i], self.rho0[i])
 
 
 def _descend(runs: _Runs, start: Array) -> tuple[Array, Array]:
-    """Run Levenberg-Marquardt on every run from (x, y, ρ, β); return the parameters and their H."""
+    """Run Levenberg-Marquardt on every run from (x, y, ρ, β); return parameters and Hessian."""
     at, mu = start.copy(), np.full(len(start), 1e-3)
     cost, g, H = _cost(runs, at)
     moving = np.arange(len(start))
@@ -167,7 +167,7 @@ def _cost(runs: _Runs, at: Array) -> tuple[Array, Array, Array]:
 
 
 def _guarded(center: Array, H: Array, circles: Circles) -> Array:
-    """Limit the distance of aided centers from the circle fits; the batch form of `guarded`."""
+    """Limit the distance of the centers from the circle fits, as `guarded` does for one run."""
     C = np.linalg.inv(H + 1e-9 * H * np.eye(4))[:, :2, :2]
     held = circles.valid & (circles.noise > _LEAST_NOISE_M)
     of_circle = np.where(held[:, None, None], circles.covariance, np.eye(2))
