@@ -1,7 +1,7 @@
 """Latency of frames by stage: from the arrival of the last chunk to the socket of the broker.
 
-Invariant: a chunk of bytes costs one reading of the clock. A frame costs four more, one addition to
-a histogram per stage, and two small objects.
+Invariant: a chunk of bytes costs one reading of the clock. A frame costs four more readings, one
+addition to a histogram per stage, and two small objects.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 _UNIT_BITS = 10
-"""Times are counted in units of 1024 ns: a shift is faster than a division."""
+"""Number of bits by which times, ns, are shifted: the unit of the counts is 1024 ns, and a shift is
+faster than a division."""
 _OCTAVE_BITS = 2
 """Each octave has four buckets, so an upper limit exceeds a time by at most a quarter."""
 _BUCKETS = 100
@@ -24,7 +25,7 @@ _BUCKETS = 100
 
 
 class LatencyHistogram:
-    """Counts of times in logarithmic buckets, four an octave."""
+    """Histogram of times with logarithmic buckets, four per octave."""
 
     def __init__(self) -> None:
         self.counts = [0] * _BUCKETS
@@ -76,7 +77,7 @@ class LatencyHealth:
     frames: int
     """Number of frames fused."""
     stages: Mapping[str, StageLatency | None]
-    """By stage, in the order of processing; None for a stage that no frame has passed."""
+    """Latency by stage, in the order of processing; None for a stage that no frame has passed."""
 
 
 STAGES = ("decoded", "aligned", "fused", "encoded", "written", "total")
@@ -91,7 +92,7 @@ class FrameLatency:
     Parameters
     ----------
     clock
-        Returns the present instant, CLOCK_MONOTONIC ns.
+        Function that returns the present instant, CLOCK_MONOTONIC ns.
     """
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
@@ -115,11 +116,11 @@ class FrameLatency:
         self.health = LatencyHealth(found["fused"].total, stages)
 
     def mark_decoded(self, arrival_ns: int) -> None:
-        """Note that a chunk was decoded."""
+        """Store the instant at which a chunk was decoded."""
         self._arrival_ns, self._decoded_ns = arrival_ns, self._clock()
 
     def mark_aligned(self) -> None:
-        """Note that one or more frames were released."""
+        """Store the instant at which one or more frames were released."""
         self._aligned_ns = self._clock()
         self._fused.clear()  # states of the previous event that no output encoded
 
@@ -137,9 +138,10 @@ class FrameLatency:
         self._fused.append((began_ns, fused_ns))
 
     def mark_encoded(self) -> Callable[[], None] | None:
-        """Count the encoding of a frame; return the function to call once it was written.
+        """Count the encoding of a frame; return the function to call once the frame is written.
 
-        Frames are encoded in the order of their fusion. None for a state that was not marked.
+        Frames are encoded in the order of their fusion. The result is None for a state whose fusion
+        was not observed.
         """
         if not self._fused:
             return None

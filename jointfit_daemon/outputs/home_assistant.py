@@ -28,7 +28,7 @@ _BUTTONS = {
     "calibrate": ("Calibrate by movement", "calibrate", {"phase": "functional"}, "mdi:run"),
     "abort": ("Abort calibration", "calibrate", {"phase": "abort"}, "mdi:stop"),
 }
-"""Name, request, its arguments and icon of each button."""
+"""Name, request, arguments of the request, and icon of each button."""
 
 
 def discovery_topic(settings: MqttSettings) -> str | None:
@@ -81,8 +81,8 @@ def discovery_payload(rig: Rig) -> dict[str, Any]:
 
 
 def _angles(rig: Rig) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the angles and the standard deviation of each joint between two segments."""
-    if rig.chain.planar:  # published as optical/sticks, without angles
+    """Yield entities for the angles and the standard deviation of each inner joint."""
+    if rig.chain.planar:  # A planar chain is published as optical/sticks, without angles.
         return
     for joint in inner_joints(rig.chain):
         names = ANGLE_NAMES[angle_convention(rig.chain, joint.number)]
@@ -138,7 +138,7 @@ def _calibration(base: str) -> Iterator[tuple[str, dict[str, Any]]]:
 def _problems(rig: Rig) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield a problem sensor for each device: disconnected, silent or stuck."""
     for source in rig.sources:
-        device = f"value_json.devices[{json.dumps(source.id)}]"  # escaped as in Jinja
+        device = f"value_json.devices[{json.dumps(source.id)}]"  # escaped as in Jinja templates
         yield (
             f"device_{source.id}_problem",
             {

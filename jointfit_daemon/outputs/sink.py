@@ -1,4 +1,4 @@
-"""The interface of everything that receives the input events and the outputs of the core.
+"""Interface of the components that receive the input events and the outputs of the core.
 
 The supervisor creates and subscribes the sinks that rig.toml requests.
 """

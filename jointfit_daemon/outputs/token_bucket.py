@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class TokenBucket:
-    """A bucket that fills with `rate_hz` tokens per second and holds at most `burst`.
+    """A bucket that fills with `rate_hz` tokens per second up to a capacity of `burst`.
 
     Parameters
     ----------

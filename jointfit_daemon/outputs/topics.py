@@ -65,8 +65,8 @@ TOPICS = (
 def client_identifier(base: str) -> str:
     """Return the daemon's client id on the broker, also its device id in Home Assistant.
 
-    It is fixed, so that a new process takes over the connection of a dead one. It has letters,
-    digits and dashes only: rumqttd fails on a slash.
+    It is fixed, so that a new process takes over the connection of a dead one. The id contains
+    letters, digits and dashes only, because rumqttd fails on a slash.
     """
     return "jointfitd-" + "".join(
         letter if letter.isascii() and letter.isalnum() else "-" for letter in base

@@ -1,6 +1,6 @@
 """UNIX time of CLOCK_MONOTONIC stamps.
 
-The kernel slews both clocks alike (NTP), so their offset changes only if UNIX time is set, or if
+NTP makes the kernel slew both clocks alike, so their offset changes only if UNIX time is set, or if
 the host was suspended, which stops CLOCK_MONOTONIC.
 """
 
@@ -10,14 +10,14 @@ import time
 from typing import NamedTuple
 
 STEP_NS = 50_000
-"""A change of the offset by more than this and the reading errors is a step, ns."""
+"""Smallest change of the offset, beyond the reading errors, that counts as a step, ns."""
 _READINGS = 5
-"""Readings per measurement; the one that took the shortest time is used."""
+"""Number of readings per measurement; the reading with the shortest duration is used."""
 _NS_PER_S = 1_000_000_000
 
 
 class _OffsetReading(NamedTuple):
-    """One comparison of both clocks."""
+    """One comparison of UNIX time with CLOCK_MONOTONIC."""
 
     width_ns: int
     """Duration of the comparison, ns: twice its largest error."""

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 SOCKET = "/run/systemd/journal/socket"
 FIELDS = "journal"
-"""Attribute of a log record that holds its additional journal fields."""
+"""Attribute of a log record that contains the additional journal fields."""
 _LEVELS = {"CRITICAL": 2, "ERROR": 3, "WARNING": 4, "INFO": 6, "DEBUG": 7}
 """Syslog priorities of the levels of Python."""
 _INFO = 6
@@ -58,7 +58,7 @@ def is_journal(stream: TextIO) -> bool:
 
 
 def datagram(fields: Mapping[str, str]) -> bytes:
-    """Return `fields` in the native protocol: values with line ends have a length prefix."""
+    """Return `fields` in journald's native protocol: values with line ends have a length prefix."""
     parts = []
     for name, value in fields.items():
         data = value.encode(errors="replace")
@@ -70,7 +70,10 @@ def datagram(fields: Mapping[str, str]) -> bytes:
 
 
 class LevelFormatter(logging.Formatter):
-    """Prefixes every line with its level as in sd-daemon(3); the journal adds the time."""
+    """Formatter that prefixes every line with its level as in sd-daemon(3).
+
+    The journal adds the time.
+    """
 
     def __init__(self) -> None:
         super().__init__("%(name)s: %(message)s")

@@ -1,4 +1,4 @@
-"""Text from devices, servers, adapters and clients, made safe for the log, events and topics.
+"""Text from devices, servers, adapters and clients, with control characters escaped.
 
 Invariant: `printable` returns one line of limited length without control characters.
 """
@@ -51,7 +51,7 @@ def printable_data(data: Any, depth: int = 0) -> Any:
 class PrintableRecord(logging.LogRecord):
     """A log record whose further lines are indented behind a bar, so that no text forges an entry.
 
-    Installed by ``logging.setLogRecordFactory``: it applies to every handler.
+    The class is installed by ``logging.setLogRecordFactory``, so it applies to every handler.
     """
 
     @override

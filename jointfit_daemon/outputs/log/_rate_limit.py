@@ -1,7 +1,8 @@
 """Log handler with a limited rate.
 
 Invariant: errors are always written, and the number of omitted lines is logged. systemd limits
-services at 10 000 lines in 30 s. Half of that rate writes gigabytes per day to a memory card.
+services at 10 000 lines in 30 s. Even half of this rate would write gigabytes per day to a memory
+card.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ if TYPE_CHECKING:
     from typing import TextIO
 
 RATE_HZ = 5.0
-"""Permitted mean rate, lines per second: enough for every state change of a rig."""
+"""Permitted mean rate, lines per second. It suffices for every state change of a rig."""
 BURST = 50.0
-"""Permitted lines at once: a start or a reload logs about twenty."""
+"""Permitted number of lines at once. A start or a reload logs about twenty lines."""
 
 
 class RateLimitedHandler(logging.StreamHandler["TextIO"]):
@@ -30,7 +31,7 @@ class RateLimitedHandler(logging.StreamHandler["TextIO"]):
     stream
         Destination.
     clock
-        Returns monotonic time, s.
+        Function that returns monotonic time, s.
     bucket
         Rate limit; default: `RATE_HZ` and `BURST`.
     """

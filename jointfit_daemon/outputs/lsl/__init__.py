@@ -1,6 +1,6 @@
 """Live outlet to the Lab Streaming Layer, off by default.
 
-``pylsl`` is an extra, imported only by `LslOutlet.start`.
+``pylsl`` is an optional dependency that only `LslOutlet.start` imports.
 """
 
 from jointfit_daemon.outputs.lsl._lsl_outlet import LslError, LslOutlet

@@ -1,7 +1,7 @@
 """Two streams of the Lab Streaming Layer: orientations of segments, and angles of joints.
 
-A sample is stamped with the instant of its frame on the clock of LSL, not with that of its
-transmission. Receivers on other hosts correct the offset of that clock by themselves.
+The stamp of a sample is the instant of its frame on the clock of LSL, not the instant of
+transmission. Receivers on other hosts correct the offset between their clocks and this clock.
 
 Invariant: a frame costs one call of the library for each stream; the library sends in its own
 threads, and drops samples of receivers that do not read.
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 _NAN = math.nan
 _NAN_4, _NAN_3 = (_NAN,) * 4, (_NAN,) * 3
 _READINGS = 5
-"""Comparisons of both clocks; the one that took the shortest time is used."""
+"""Number of comparisons of both clocks. The comparison with the shortest duration is used."""
 _AGAIN_NS = 1_000_000_000
 """Interval between comparisons of the clocks, ns."""
 _BUFFER_S = 60
-"""Samples kept for a receiver that does not read, s."""
+"""Duration of the samples that are stored for a receiver that does not read, s."""
 _Channels = list[tuple[str, str, str]]
 """Label, type and unit of each channel."""
 
 
 class LslError(Exception):
-    """The streams cannot be offered; the text names the remedy."""
+    """The streams cannot be created; the message gives the remedy."""
 
 
 class LslOutlet:
@@ -58,7 +58,7 @@ class LslOutlet:
         self._compare_ns = -1
 
     def start(self) -> None:
-        """Load the library; the streams appear with the first frame.
+        """Load the library; the first frame creates the streams.
 
         Raises
         ------
@@ -71,7 +71,7 @@ class LslOutlet:
             raise LslError(
                 "the package pylsl is missing: pip install 'jointfitd[lsl]'"
             ) from missing
-        except (RuntimeError, OSError) as missing:  # pylsl without its library
+        except (RuntimeError, OSError) as missing:  # pylsl is installed without liblsl
             raise LslError(
                 "pylsl finds no library liblsl, which its packages contain for x86-64 only: install"
                 " liblsl (https://github.com/sccn/liblsl) and set PYLSL_LIB to its path"
@@ -101,7 +101,7 @@ class LslOutlet:
         joints.push_sample(_joint_values(output.joints), at_s)
 
     def _open(self, contents: str, channels: _Channels) -> Any:
-        """Return the outlet of a stream whose channels are described as in motion capture."""
+        """Return the outlet of a stream with channel descriptions as in motion capture."""
         info = self._lsl.StreamInfo(
             f"{self._name} {contents}",
             "MoCap",

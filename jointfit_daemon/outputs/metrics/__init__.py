@@ -1,6 +1,6 @@
-"""Metrics in the format of Prometheus: collected when they are requested, off by default.
+"""Metrics in the format of Prometheus, collected on request; off by default.
 
-``prometheus_client`` is an extra, imported only by `MetricsServer.start`.
+``prometheus_client`` is an optional dependency that only `MetricsServer.start` imports.
 """
 
 from jointfit_daemon.outputs.metrics._frame_statistics import FrameStatistics

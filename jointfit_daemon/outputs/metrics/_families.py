@@ -37,7 +37,8 @@ if TYPE_CHECKING:
 _NS = 1e-9
 _CLOCK_STATES = ("settling", "direct", "echo", "passive", "arrival", "stale")
 _STARTED_S = time.time_ns() * _NS - time.process_time()
-"""UNIX time at which this process started, s; /proc/stat is hidden by systemd's ProcSubset."""
+"""UNIX time at which this process started, s. It is not read from /proc/stat, because systemd's
+ProcSubset hides this file."""
 _Device = dict[str, tuple[str, "Callable[[DeviceHealth], float | None]"]]
 
 _COUNTERS: _Device = {
@@ -54,7 +55,7 @@ _COUNTERS: _Device = {
         lambda d: max(0, d.wire.opened - 1),
     ),
 }
-"""Counters of a device, without prefix and suffix."""
+"""Names of the counters of a device, without prefix and suffix."""
 
 _GAUGES: _Device = {
     "up": ("1 if the device is online.", lambda d: float(d.online)),
@@ -81,7 +82,7 @@ _GAUGES: _Device = {
         lambda d: None if d.clock.skew_ppm is None else d.clock.skew_ppm * 1e-6,
     ),
 }
-"""Gauges of a device, without prefix; the value is None while unknown."""
+"""Gauges of a device by name without prefix; the value is None while unknown."""
 
 
 def metric_families(rig: str, health: BridgeHealth, frames: FrameStatistics) -> Iterator[Metric]:

@@ -1,4 +1,4 @@
-"""The two statistics that no health counter contains: latency of frames, date of the calibration.
+"""Two statistics that no health counter contains: latency of frames, date of the calibration.
 
 A frame costs one search in a table of twelve limits, and no allocation.
 """
@@ -30,19 +30,19 @@ class FrameStatistics:
 
     def __init__(self) -> None:
         self.counts = [0] * (len(_LIMITS_NS) + 1)
-        """Frames by bucket, not cumulated."""
+        """Number of frames in each bucket, not cumulated."""
         self.sum_ns = 0
         self.calibrated_s: float | None = None
         """UNIX time at which the calibration in force was stored, s; None if unknown."""
 
     def event(self, event: Event) -> None:
-        """Note the date of a calibration that is loaded."""
+        """Store the date of a loaded calibration."""
         if type(event) is Configured or type(event) is CalibrationSelected:
             found = event.calibration
             self._note_date("" if found is None else found.created_utc)
 
     def output(self, output: Output) -> None:
-        """Count the latency of a frame, and note the date of a new calibration."""
+        """Count the latency of a frame, or store the date of a new calibration."""
         if type(output) is LimbState:
             latency_ns = time.monotonic_ns() - output.completed_ns
             self.counts[bisect_left(_LIMITS_NS, latency_ns)] += 1

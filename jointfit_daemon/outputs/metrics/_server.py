@@ -1,7 +1,7 @@
-"""HTTP server of the metrics: one thread, which asks the event loop for a snapshot per request.
+"""HTTP server of the metrics: one thread that requests a snapshot from the event loop.
 
 Invariant: a client that sends nothing, or reads nothing, delays other scrapes by at most
-`_CLIENT_S`, and the event loop not at all.
+`_CLIENT_S`, and does not delay the event loop.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import threading
 from typing import TYPE_CHECKING, Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from typing_extensions import override  # typing has it from Python 3.12
+from typing_extensions import override  # typing contains it from Python 3.12
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 _CLIENT_S = 2.0
 """Longest wait for a client or for a snapshot, s."""
 _POLL_S = 0.1
-"""Interval at which the thread checks for the end, s."""
+"""Interval at which the thread checks whether it must end, s."""
 
 
 class MetricsError(Exception):
-    """The metrics cannot be offered; the text names the remedy."""
+    """The metrics cannot be served; the message gives the remedy."""
 
 
 class MetricsServer:
@@ -42,7 +42,7 @@ class MetricsServer:
     rig
         Name of the rig.
     health
-        Returns the health of this instant; called on the event loop.
+        Function that returns the health of this instant; called on the event loop.
     frames
         Latency histogram, shared with the event loop.
     """
@@ -164,7 +164,7 @@ def _end(connection: socket.socket) -> None:
 
 
 def _only_metrics(app: Any) -> Any:
-    """Return an application that serves ``/metrics`` and refuses all else."""
+    """Return an application that serves ``/metrics`` and refuses all other paths."""
 
     def serve(environ: dict[str, Any], start_response: Any) -> Iterable[bytes]:
         if environ.get("PATH_INFO") != "/metrics":

@@ -1,4 +1,4 @@
-"""Connection to an MQTT broker, publisher, outbox, client, TLS, secrets and signatures."""
+"""MQTT: connection to a broker, publisher, outbox, client, TLS, secrets and signatures."""
 
 from jointfit_daemon.outputs.mqtt._client import MqttClient, NoAnswerError
 from jointfit_daemon.outputs.mqtt._connection import (

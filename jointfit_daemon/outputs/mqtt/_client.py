@@ -1,6 +1,6 @@
 """MQTT client of the command-line tools: receives the topics of a daemon and sends requests.
 
-The client does not reconnect: a tool that loses its broker reports it and ends.
+The client does not reconnect: a tool that loses its broker reports the loss and ends.
 """
 
 from __future__ import annotations
@@ -29,11 +29,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 _UNREAD_CAPACITY = 2000
-"""Messages kept for a slow reader: some ten seconds of poses."""
+"""Number of messages stored for a slow reader: about ten seconds of poses."""
 _LONGEST_BYTES = 1024 * 1024
-"""Largest incoming packet, bytes: the quality of a calibration takes a tenth of it."""
+"""Largest incoming packet, bytes: the quality of a calibration takes a tenth of this size."""
 _EXPIRY_S = 30
-"""Time after which the broker drops an undelivered request, s: a late request must not run."""
+"""Time after which the broker drops an undelivered request, s, because a late request must not be
+executed."""
 
 
 class NoAnswerError(Exception):
@@ -57,9 +58,10 @@ class MqttClient:
     def __init__(self, settings: MqttSettings) -> None:
         self.base = settings.base
         self.dropped = 0
-        """Messages dropped because the reader was too slow."""
+        """Number of messages dropped because the reader was too slow."""
         self._settings = settings
-        # One read of the socket may receive many messages before the reader runs.
+        # One read of the socket may receive many messages before the task that reads the queue
+        # runs.
         self._connection = MqttConnection(
             settings, longest_bytes=_LONGEST_BYTES, most_unread=_UNREAD_CAPACITY
         )
@@ -88,7 +90,7 @@ class MqttClient:
         await self._connection.__aexit__(None, None, None)
 
     async def subscribe(self, *names: str) -> None:
-        """Subscribe to topics below the base, as ``pose`` or ``device/+/availability``."""
+        """Subscribe to topics below the base, such as ``pose`` or ``device/+/availability``."""
         await self._connection.subscribe([f"{self.base}/{name}" for name in names])
 
     async def messages(self) -> AsyncIterator[tuple[str, Any]]:

@@ -6,13 +6,14 @@ connects with another client id and looks for messages of another daemon. If it 
 publishes nothing and waits for its end.
 
 Two daemons that start together do not find each other, and the broker may have lost the state of a
-daemon. Then the daemon that was connected first takes its connection back. The newer daemon gives
-way: it connects with another client id and waits until the other daemon is gone.
+daemon. In these cases the daemon that was connected first takes its connection back. The newer
+daemon gives way: it connects with another client id and waits until the other daemon is gone.
 
-Neither daemon knows when the other one connected. Each compares the duration of its own first
-connection with a limit that doubles with every further loss. The first connection of the newer
-daemon lasts only until the first daemon reconnects, so the newer daemon is below the limit earlier.
-Only the disconnected daemon decides, while the other is connected, so both never give way together.
+Neither daemon knows when the other one connected. Each daemon compares the duration of its own
+first connection with a limit that doubles with every further loss. The first connection of the
+newer daemon lasts only until the first daemon reconnects, so the newer daemon is below the limit
+earlier. Only the disconnected daemon decides, while the other is connected, so the two daemons
+never give way together.
 """
 
 from __future__ import annotations
@@ -32,16 +33,16 @@ NEWCOMER_S = 0.25
 """First limit of the first connection, s: several times the wait and the handshake of the other
 daemon's reconnection."""
 UNEXPLAINED = 3
-"""Short connections in a row, without a reason from the broker, that raise the suspicion: MQTT
-3.1.1 has no reasons, and some MQTT 5 brokers send none."""
+"""Number of short connections in a row, without a reason from the broker, that raise the suspicion.
+MQTT 3.1.1 has no reasons, and some MQTT 5 brokers send none."""
 STORED_S = 0.1
 """Time to wait for the stored state of a daemon after two exchanges with the broker, s: some
 brokers send stored messages after the confirmation of the subscription."""
 GLANCE_S = 2.0
 """Time to wait for a pose of a suspected daemon, s."""
 SETTLED_S = 5.0
-"""Time without a message after ``offline`` that confirms it, s: ``offline`` may be the will of our
-own last connection."""
+"""Time without a message after which the state ``offline`` is accepted, s. The message ``offline``
+may be the will of this daemon's own last connection."""
 
 
 class TakeoverDetector:
@@ -54,14 +55,14 @@ class TakeoverDetector:
     def suspects(self, lasted_s: float, *, taken_over: bool) -> bool:
         """Return whether an older daemon probably ended the last connection.
 
-        The n-th short connection in a row, or the (n + 2)-th without a reason, raises the
-        suspicion if the first one was shorter than ``NEWCOMER_S * 2**(n - 1)``. An established
-        daemon counts as connected for `SHORT_S`, so of two such daemons one gives way, too.
+        The n-th short connection in a row, or the (n + 2)-th without a reason, raises the suspicion
+        if the first one was shorter than ``NEWCOMER_S * 2**(n - 1)``. An established daemon counts
+        as connected for `SHORT_S`, so one of two established daemons also gives way.
 
         Parameters
         ----------
         lasted_s
-            Duration of the connection, s; 0 if none was made.
+            Duration of the connection, s; 0 if the connection failed.
         taken_over
             Whether the broker gave the reason "session taken over".
         """
@@ -79,14 +80,15 @@ class TakeoverDetector:
         return doublings >= 0 and self._first_s < NEWCOMER_S * 2**doublings
 
     def give_way(self) -> None:
-        """Count as the newer daemon from now on, also after a restart of the broker."""
+        """Treat this daemon as the newer one from now on, also after a restart of the broker."""
         self._first_s, self._losses = 0.0, 0
 
 
 async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
-    """Return whether a daemon with this base publishes: its state is stored, and a message arrives.
+    """Return whether a daemon publishes below this base: state is stored, a message arrives.
 
-    A broker that is cut off from a daemon stores ``online`` for some seconds after its end.
+    If a daemon ends without disconnecting, the broker stores the state ``online`` for some seconds
+    longer.
 
     Raises
     ------

@@ -42,18 +42,19 @@ if TYPE_CHECKING:
 KEEPALIVE_S = 5
 """Keep-alive interval, s: an unresponsive broker is detected within 1.5 intervals."""
 ANSWER_S = 3.0
-"""Limit of one exchange with the broker, s."""
+"""Time limit of one exchange with the broker, s."""
 WINDOW = 16
-"""Messages that may be sent before the first one is acknowledged: brokers usually allow 20 or more,
-and a broker may announce a smaller number (MQTT 5.0, 3.2.2.3.3)."""
+"""Number of messages that may be sent before the first message is acknowledged. Brokers usually
+allow 20 or more; a broker may announce a smaller number (MQTT 5.0, 3.2.2.3.3)."""
 SUBSCRIBED_S = 30.0
-"""Limit of a subscription, s: a broker may send thousands of stored messages before it confirms."""
+"""Time limit of a subscription, s: a broker may send thousands of stored messages before it
+confirms."""
 GOODBYE_S = 1.0
-"""Limit of an orderly disconnect, s."""
+"""Time limit of an orderly disconnect, s."""
 _Properties: Any = Properties  # the constructor is not annotated, its attributes are dynamic
 
 _UNREAD_CAPACITY = 64
-"""Unread messages of a daemon; requests are rare."""
+"""Largest number of unread messages of a daemon; requests are rare."""
 _REFUSED = 0x80
 """Lowest MQTT reason code of a refusal."""
 _TAKEN_OVER = 0x8E
@@ -69,7 +70,7 @@ LONGEST_PACKET_BYTES = 32 * 1024
 _SOCKET_OPTIONS = (
     (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),  # Nagle's algorithm delays by 40 ms
     (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * KEEPALIVE_S),
-    # messages in the kernel's buffer are lost without being counted
+    # Messages in the kernel's buffer are lost without being counted, so the buffer is small.
     (socket.SOL_SOCKET, socket.SO_SNDBUF, 16 * 1024),
 )
 
@@ -106,7 +107,7 @@ class Incoming:
 
 
 def stop_if_cancelled() -> None:
-    """Raise a cancellation that ``wait_for`` of Python 3.11, inside aiomqtt, may have suppressed.
+    """Raise a cancellation that aiomqtt's ``wait_for`` may have suppressed in Python 3.11.
 
     ``wait_for`` prefers a result that arrives at the same instant. Call this in leaf tasks only: a
     task that contained a failed TaskGroup may appear cancelled from then on.
@@ -127,9 +128,11 @@ class MqttConnection:
     settings
         Address, user and MQTT version.
     identifier
-        Client id; a fixed one replaces a dead connection of an earlier process.
+        Client id. With a fixed id, a new connection replaces a dead connection of an earlier
+        process.
     will, farewell
-        Published by the broker if the connection breaks, and by the client before it disconnects.
+        `will` is published by the broker if the connection breaks. `farewell` is published by the
+        client before it disconnects.
     longest_bytes
         Largest incoming packet, bytes: announced to the broker with MQTT 5, and enforced here.
     admit
@@ -165,7 +168,7 @@ class MqttConnection:
     async def __aenter__(self) -> Self:
         self._client = await self._new_client()
         task = asyncio.current_task()
-        asked_before = task.cancelling() if task else 0  # earlier requests, of tasks that continue
+        asked_before = task.cancelling() if task else 0  # number of earlier cancellation requests
         try:
             await self._client.__aenter__()
             if task and task.cancelling() > asked_before:
@@ -244,7 +247,8 @@ class MqttConnection:
     async def subscribe(self, topics: Sequence[str], *, live: bool = False) -> list[str]:
         """Subscribe and return the topics that the broker refused.
 
-        With MQTT 5 a message sent with the retain flag arrives with it, even when new.
+        With MQTT 5 a message that is sent with the retain flag arrives with this flag, even if it
+        is new.
 
         Parameters
         ----------
@@ -349,7 +353,7 @@ class MqttConnection:
     def _properties(self, message: Outgoing) -> Any:
         plain = message.response_topic is None and message.correlation is None
         if plain and (cached := self._cached.get(message.expiry_s)) is not None:
-            return cached  # building one takes 40 µs
+            return cached  # building properties takes 40 µs
         made: Any = _Properties(PacketTypes.PUBLISH)
         made.ContentType = "application/json"
         made.UserProperty = ("v", str(PAYLOAD_VERSION))
@@ -367,8 +371,8 @@ class MqttConnection:
 class _Client(aiomqtt.Client):
     """aiomqtt's client with a limit on incoming packets and immediate detection of failures.
 
-    It can be abandoned while it connects, fails at once if the connection breaks during the
-    handshake, and sends several messages before the first one is acknowledged.
+    The client can be abandoned while it connects. It fails at once if the connection breaks during
+    the handshake. It sends several messages before the first message is acknowledged.
     """
 
     _abandoned = False
@@ -384,7 +388,8 @@ class _Client(aiomqtt.Client):
         super().__init__(*arguments, **options)
         self._encoder = PublishEncoder()
         self._unacknowledged: dict[int, tuple[float, Callable[[str | None], None]]] = {}
-        """Time limit, s, and callback of each message sent, by message id, the oldest first."""
+        """Time limit, s, and callback of each unacknowledged message, by message id, the oldest
+        first."""
         self._acknowledged = asyncio.Event()
         self._limit_timer: asyncio.TimerHandle | None = None
         self._window = WINDOW
@@ -405,7 +410,7 @@ class _Client(aiomqtt.Client):
     async def __aenter__(self) -> Self:  # type: ignore[explicit-override]  # Python 3.12's
         """Connect; fail if the connection ended at the moment of its acceptance.
 
-        aiomqtt ignores such an end, and would wait for messages without limit.
+        aiomqtt ignores such an end of the connection, and would wait for messages without limit.
         """
         ended = self._disconnected
         await super().__aenter__()
@@ -464,7 +469,7 @@ class _Client(aiomqtt.Client):
     def _on_socket_unregister_write(  # type: ignore[explicit-override]  # Python 3.12's
         self, client: Any, userdata: Any, sock: Any
     ) -> None:
-        """Make the kernel acknowledge the next data at once; called when everything is sent.
+        """Make the kernel acknowledge the next data at once; called after sending.
 
         After a transmission such as a ping, the kernel delays an acknowledgement by 40 ms. For this
         time a broker with Nagle's algorithm holds back its next messages (RFC 1122, 4.2.3.2 and
@@ -509,17 +514,17 @@ class _Client(aiomqtt.Client):
         client: Any = self._client
         opened = client.socket()
         if opened is None or client.want_write():
-            return False  # closed, or other messages come first
+            return False  # closed, or other messages are sent first
         packet = self._encoder.encode(message.topic, message.payload, properties, message.retain)
         try:
             written = opened.send(packet)
-        except OSError:  # full, or broken: then the library meets the same error and reports it
+        except OSError:  # full or broken: the library gets the same error and reports it
             return False
         if written == len(packet):
             accepted(None)
             return True
 
-        # The library writes the rest before anything else.
+        # The library writes the rest of this message before any other message.
         sent = MQTTMessageInfo(client._mid_generate())  # noqa: SLF001 - it has no public equivalent
         self._await_acceptance(sent.mid, accepted)
         client._packet_queue(PUBLISH, packet[written:], sent.mid, 0, sent)  # noqa: SLF001 - also
@@ -534,7 +539,7 @@ class _Client(aiomqtt.Client):
     def _check_limit(self) -> None:
         """End the connection if the oldest message has waited too long; else check again later.
 
-        One timer for all messages, since starting one per message takes longer than sending it.
+        All messages share one timer, because starting a timer takes longer than sending a message.
         """
         self._limit_timer = None
         if not self._unacknowledged:
@@ -558,8 +563,8 @@ class DisconnectErrorFilter:
     """Exception handler of the event loop that drops two harmless errors of aiomqtt.
 
     At a disconnect aiomqtt leaves an ``MqttError`` in a future that is no longer awaited, and a
-    callback on a closed socket fails with a bad file descriptor. Both are counted; all other
-    errors are handled as usual.
+    callback on a closed socket fails with a bad file descriptor. These two errors are counted; all
+    other errors are handled as usual.
     """
 
     def __init__(self) -> None:

@@ -72,7 +72,7 @@ _MQTT_ERRORS = {
     159: "the broker limits the rate of connections: wait, or check its configuration",
 }
 """Messages by the reason code of MQTT 3.1.1 (below 128) or MQTT 5."""
-VERSION_REFUSED = (  # an answer that is not of MQTT ends in the same fault of the library
+VERSION_REFUSED = (  # For an answer that is not MQTT, the library reports the same code.
     'the broker refuses MQTT 3.1.1, or this port does not serve MQTT: set version = "5", or correct'
     " host and port in [mqtt]"
 )
@@ -95,13 +95,13 @@ def refusal_fault(error: BaseException) -> str:
 
 
 def broker_fault(error: BaseException) -> str:
-    """Return cause and remedy of a failed connection; the text of an unknown `error`."""
+    """Return cause and remedy of a failed connection; for an unknown `error` its text."""
     text = str(error)
     if found := _ERRNO.search(text):
         return _SYSTEM_ERRORS.get(int(found[1]), text)
     if found := _CODE.search(text):
         code = int(found[1])
-        if code > _UNSPECIFIED:  # smaller numbers are errors of paho, with its text
+        if code > _UNSPECIFIED:  # smaller numbers are errors of paho, with text
             text = f"the broker ended the connection with code {code}: check its log"
         return _MQTT_ERRORS.get(code, text)
     return text
@@ -110,7 +110,8 @@ def broker_fault(error: BaseException) -> str:
 def session_fault(error: BaseException) -> str:
     """Return cause and remedy of a failed operation on an established connection.
 
-    For an operation, the numbers are those of paho: 4 means "not connected", not "wrong password".
+    Error numbers of an operation are defined by paho: 4 means "not connected", not "wrong
+    password".
     """
     text = str(error)
     if text == "Operation timed out":

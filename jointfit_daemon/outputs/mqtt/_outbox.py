@@ -4,13 +4,13 @@ Invariant: the size is limited, the oldest message is dropped first, and drops a
 
 Five kinds wait separately and are sent in this order. A client waits for a response. State is
 retained: the last value of a topic replaces earlier ones, and all state is sent again on every
-connection. Events are sent in order. Stream messages are useless when late. Late messages are those
-of the spool, which waits for their delivery. All but state and late messages are dropped when they
-have waited longer than their expiry.
+connection. Events are sent in order. Stream messages are useless when late. Late messages come from
+the spool, which waits for their delivery. Responses, events and stream messages are dropped when
+they have waited longer than their expiry.
 
-Several messages can be sent before the first one is acknowledged. After a loss of the connection,
-responses, events and late messages without an acknowledgement are sent again, so they may arrive
-twice.
+Several messages can be sent before the first message is acknowledged. After a loss of the
+connection, responses, events and late messages without an acknowledgement are sent again, so they
+may arrive twice.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ RESPONSE_EXPIRY_S = 30
 """Time after which the broker drops an undelivered event or response, s."""
 
 _STREAM_CAPACITY = 200
-"""Stream messages that may wait: one to two seconds of poses and other streams."""
+"""Largest number of waiting stream messages: one to two seconds of poses and other streams."""
 _EVENT_CAPACITY = 256
-"""Events that may wait: several minutes of a rig with faults."""
+"""Largest number of waiting events: several minutes of a rig with faults."""
 
 _Waiting = tuple[float, Outgoing]
 """Time at which a message expires, s of the clock, and the message."""
@@ -49,7 +49,7 @@ class Outbox:
     ----------
     state_topic
         Topic of the daemon's own state. On a new connection it is sent after all other retained
-        messages, so that a subscriber of it can rely on them.
+        messages, so that a subscriber of this topic can rely on the other messages.
     clock
         Monotonic time, s, for the expiry of waiting messages.
     """
@@ -57,7 +57,7 @@ class Outbox:
     def __init__(self, state_topic: str, clock: Callable[[], float] = time.monotonic) -> None:
         self.state_topic = state_topic
         self.dropped = 0
-        """Messages dropped without having been sent."""
+        """Number of messages dropped without having been sent."""
         self._state: dict[str, bytes] = {}
         self._unsent: dict[str, None] = {}
         self._clock = clock
@@ -66,7 +66,7 @@ class Outbox:
         self._streams: deque[_Waiting] = deque()
         self._late: deque[_Waiting] = deque()
         self._unacknowledged: dict[int, tuple[deque[_Waiting], _Waiting] | None] = {}
-        """Messages being sent, in order, with the queue that they came from; None for state."""
+        """Messages that are being sent, in order, each with its original queue; None for state."""
         self._numbers = count()
         self._wake = asyncio.Event()
 
@@ -131,7 +131,7 @@ class Outbox:
         self._push(self._streams, _STREAM_CAPACITY, message)
 
     def late(self, topic: str, payload: bytes) -> None:
-        """Queue a message of the past, at QoS 1; the caller limits their number."""
+        """Queue a message of an earlier outage, at QoS 1; the caller limits the number of these."""
         self._late.append((math.inf, Outgoing(topic, payload, 1, False)))
         self._wake.set()
 
@@ -172,7 +172,7 @@ class Outbox:
             await self._wake.wait()
 
     def _take(self, queue: deque[_Waiting]) -> _Waiting | None:
-        """Return the oldest message that has not expired; drop and count those before it."""
+        """Return the oldest message that has not expired; drop and count expired messages."""
         while queue:
             waiting = queue.popleft()
             if self._clock() <= waiting[0]:
@@ -181,7 +181,7 @@ class Outbox:
         return None
 
     def _hand_out(self, origin: tuple[deque[_Waiting], _Waiting] | None) -> Callable[[], None]:
-        """Store a message until it is acknowledged; return the callback for that moment."""
+        """Store a message until it is acknowledged; return the callback for the acknowledgement."""
         number = next(self._numbers)
         self._unacknowledged[number] = origin
         return partial(self._acknowledge, number)

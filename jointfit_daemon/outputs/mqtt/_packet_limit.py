@@ -2,7 +2,8 @@
 
 Invariant: a packet above the limit occupies no memory, and a message that is not admitted is
 dropped before it is decoded. paho buffers a whole packet before it decodes it. MQTT 5 lets a client
-announce a maximum packet size; MQTT 3.1.1 does not, and some brokers ignore the announcement.
+announce a maximum packet size; MQTT 3.1.1 does not permit this, and some brokers ignore the
+announcement.
 """
 
 from __future__ import annotations
@@ -13,15 +14,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 _DISCARDED_BYTES = 64 * 1024
-"""Bytes read and discarded in one iteration of the event loop, so that other tasks run."""
+"""Largest number of bytes read and discarded in one iteration of the event loop. The limit lets
+other tasks run."""
 _DROPPED_AT_ONCE = 16
-"""Packets dropped in one iteration of the event loop; each takes 10 µs."""
+"""Largest number of packets dropped in one iteration of the event loop; each packet takes 10 µs."""
 _MORE = 0x80
-"""Bit of a length byte: another length byte follows."""
+"""Bit of a length byte that is set if another length byte follows."""
 _SHORTEST_HEADER, _LONGEST_HEADER = 2, 5
 """Lengths of a fixed header, bytes: packet type and one to four length bytes (MQTT 5.0, 2.1.4)."""
 _TYPE, _PUBLISH, _RETAIN = 0xF0, 0x30, 0x01
-"""Bits of the first byte: packet type, its value for a message, and the retain flag."""
+"""Bits of the first byte: mask of the packet type, type PUBLISH, and the retain flag."""
 _TOPIC_LENGTH_BYTES = 2
 
 
@@ -39,8 +41,8 @@ class PacketLimitSocket:
         Largest remaining length of a packet that is passed on, bytes.
     admit
         Called with topic and retain flag of each message within the limit; the message is dropped
-        if it returns False. A dropped message is not acknowledged: only for subscriptions at
-        QoS 0.
+        if the function returns False. A dropped message is not acknowledged, so the function is
+        only for subscriptions at QoS 0.
     """
 
     def __init__(
@@ -141,7 +143,7 @@ class PacketLimitSocket:
         Raises
         ------
         BlockingIOError
-            More than `_DISCARDED_BYTES` of it are left.
+            More than `_DISCARDED_BYTES` of the packet are left.
         """
         data = self._wrapped.recv(min(self._excess_bytes, _DISCARDED_BYTES))
         self._excess_bytes -= len(data)

@@ -1,4 +1,4 @@
-"""The log of paho: it contains the error with which a broker ended a connection."""
+"""Log of paho, which contains the error with which a broker ended a connection."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import logging
 class PahoLog(logging.Logger):
     """Logger of paho that stores the last exception of a socket instead of logging it.
 
-    With TLS 1.3 a broker rejects the client's certificate after the handshake. paho logs that
-    alert, and aiomqtt reports a timeout only.
+    With TLS 1.3 a broker rejects the client's certificate after the handshake. paho only logs this
+    alert, and aiomqtt reports a timeout.
     """
 
     def __init__(self) -> None:

@@ -1,6 +1,6 @@
 """PUBLISH packets at QoS 0 (MQTT 5.0 and 3.1.1, section 3.3), encoded without the library.
 
-Invariant: the packets are those of paho, byte for byte.
+Invariant: the packets equal the packets of paho, byte for byte.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ PUBLISH = 0x30
 """First byte of a PUBLISH packet at QoS 0."""
 _RETAIN = 0x01
 _MORE = 0x80
-"""Bit of a length byte: another length byte follows."""
+"""Bit of a length byte that is set if another length byte follows."""
 
 
 class PublishEncoder:
-    """Encodes messages at QoS 0; topic and properties of a stream only once."""
+    """Encodes messages at QoS 0; topic and properties of a stream are encoded only once."""
 
     def __init__(self) -> None:
         self._headers: dict[str, tuple[Any, bytes]] = {}
@@ -29,7 +29,8 @@ class PublishEncoder:
         topic, payload, retain
             The message.
         properties
-            Properties of paho, which are not changed later; None with MQTT 3.1.1, which has none.
+            Properties object of paho, which is not changed later; None with MQTT 3.1.1, which has
+            no properties.
         """
         known, header = self._headers.get(topic, (None, b""))
         if not header or known is not properties:
@@ -40,7 +41,7 @@ class PublishEncoder:
 
         length = len(header) + len(payload)
         fixed = bytearray((PUBLISH | _RETAIN if retain else PUBLISH,))
-        while length >= _MORE:  # seven bits a byte, the lowest first (MQTT 5.0, 1.5.5)
+        while length >= _MORE:  # seven bits per byte, lowest first (MQTT 5.0, 1.5.5)
             fixed.append(length % _MORE | _MORE)
             length >>= 7
         fixed.append(length)

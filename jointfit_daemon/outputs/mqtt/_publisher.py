@@ -1,7 +1,7 @@
 """The daemon's own connection to the broker: publishes the outbox and passes on requests.
 
-Invariant: `MqttPublisher.run` ends by cancellation only, whatever the broker does. Requests are
-passed on synchronously, at a limited rate, and never from a retained message.
+Invariant: `MqttPublisher.run` ends by cancellation only, for any behaviour of the broker. Requests
+are passed on synchronously, at a limited rate, and never from a retained message.
 """
 
 from __future__ import annotations
@@ -49,9 +49,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ECHO_S = 5.0
-"""Time within which the daemon's own message must come back, s; otherwise the ACL may forbid it."""
+"""Time within which the daemon's own message must come back, s. After this time, the access list of
+the broker may forbid the message."""
 REQUEST_RATE_HZ = 10.0
-"""Permitted mean rate of requests, 1/s; a person sends one in several seconds."""
+"""Permitted mean rate of requests, 1/s; a person sends a request in several seconds."""
 REQUEST_BURST = 20.0
 """Permitted requests at once after a pause."""
 CHECK_S = 10.0
@@ -60,11 +61,13 @@ refusals."""
 _NOTICE_S = 10.0
 """Shortest interval between log lines on ignored requests, s."""
 _CORRECTION_S = 0.1
-"""Delay before a foreign ``bridge/state`` is overwritten, s: limits a flood to ten per second."""
+"""Delay before a foreign ``bridge/state`` is overwritten, s. The delay limits a flood of messages
+to ten per second."""
 _POLL_S = 0.01
 """Interval between checks whether the outbox is empty, s."""
 _FIRST_RETRY_S = 0.05
-"""Wait before the first retry, s: a broker that reset one connection may accept the next."""
+"""Wait before the first retry, s. A broker that reset one connection may accept the next
+connection."""
 _LAST_RETRY_S = 0.6
 """Longest wait before a retry, s: a refused attempt is cheap, and a user waits for the broker."""
 _HEALTHY_S = 5.0
@@ -121,7 +124,8 @@ class MqttPublisher:
         self._notice_due_s = 0.0
         self._modern = settings.version == "5"
 
-        # With MQTT 3.1.1 only a message that comes back proves that it was accepted.
+        # With MQTT 3.1.1, the broker has provably accepted a message only if the message comes
+        # back.
         own = [outbox.state_topic]
         if not self._modern:
             own.append(topics.POSE.name(settings.base))
@@ -167,7 +171,7 @@ class MqttPublisher:
         )
 
     async def run(self) -> None:
-        """Connect and serve, again after each loss, until cancelled."""
+        """Connect and serve until cancelled; reconnect after each loss."""
         for warning in security_warnings(self._settings):
             log.warning("mqtt: %s", warning)
         if (missing := missing_password(self._settings)) is not None:
@@ -180,7 +184,7 @@ class MqttPublisher:
         delay_s = _FIRST_RETRY_S
         while True:
             began_s = self._loop.time()
-            # reason: see _serve
+            # see `_serve` for the reason
             attempt = asyncio.create_task(self._serve(), name="mqtt connection")
             reason = ""
             try:
@@ -193,13 +197,13 @@ class MqttPublisher:
                 reason = str(error)
             stop_if_cancelled()
 
-            # A daemon that was connected takes its connection back at once: see TakeoverDetector.
+            # A daemon that was connected takes its connection back at once; see `TakeoverDetector`.
             lasted_s, self._lasted_s = self._lasted_s, 0.0
             if lasted_s >= NEWCOMER_S:
                 delay_s = _FIRST_RETRY_S
 
             try:
-                # A takeover closes the connection, so a broker that fell silent is not one.
+                # A takeover closes the connection, so a silent broker does not indicate a takeover.
                 silent = NO_ANSWER in reason
                 if silent or not await self._gave_way(lasted_s):
                     self._report_loss(reason, lasted_s)
@@ -214,7 +218,7 @@ class MqttPublisher:
     async def emptied(self, within_s: float, *, streams: bool = False) -> None:
         """Wait until the broker has all state and events; at most `within_s`, if connected.
 
-        With `streams`, also until the streams are sent.
+        With `streams`, the method also waits until the streams are sent.
         """
         until, outbox = self._loop.time() + within_s, self._outbox
         while self.connected and self._loop.time() < until:
@@ -231,7 +235,7 @@ class MqttPublisher:
         )
 
     async def _gave_way(self, lasted_s: float) -> bool:
-        """Leave the client id to a daemon that had it before, and wait until that one is gone."""
+        """Leave the client id to the daemon that used it before, and wait for the daemon's end."""
         if not self._takeovers.suspects(lasted_s, taken_over=self._taken_over):
             return False
         if not (self._taken_over or await is_publishing(self._settings, GLANCE_S)):
@@ -249,11 +253,11 @@ class MqttPublisher:
     def _report_loss(self, reason: str, lasted_s: float) -> None:
         """Log why the last attempt or connection ended."""
         if lasted_s >= SHORT_S:
-            self._reported = ""  # short connections in a row have one line
+            self._reported = ""  # short connections in a row share one log line
         if lasted_s > 0.0 and self._taken_over:
             reason = self._contested
         elif lasted_s > 0.0 and (CONNECTION_LOST in reason or CONNECTION_CLOSED in reason):
-            # The operation that failed first is accidental, and a takeover has the same error.
+            # Which operation fails first is accidental, and a takeover causes the same error.
             reason = (
                 f"broker {self._settings.host}:{self._settings.tcp_port}: the connection ended "
                 "without a reason: the broker stopped, the network failed, or another client uses "
@@ -262,19 +266,19 @@ class MqttPublisher:
         self._report(reason)
 
     def _report(self, reason: str) -> None:
-        if reason != self._reported:  # one line per change, not per attempt
+        if reason != self._reported:  # log one line per change, not per attempt
             log.warning("mqtt: %s; retrying", reason)
             self._reported = reason
 
     async def _serve(self) -> None:
         """Serve one connection.
 
-        Each connection has a task of its own: in Python 3.11 a task that contained a failed
+        Each connection has its own task, because in Python 3.11 a task that contained a failed
         TaskGroup appears cancelled from then on.
         """
         if self.connects == 0:
             # A connection takes over the client id, and the broker then publishes the will of
-            # another daemon. A fault of the broker is reported by the attempt that follows.
+            # another daemon. The next attempt to connect reports a fault of the broker.
             with contextlib.suppress(BrokerLostError):
                 if await is_in_use(self._settings, OFFLINE):
                     await self._pause()
@@ -311,7 +315,7 @@ class MqttPublisher:
         while True:
             message, sent = await self._outbox.next()
             if message.qos == 0 and self._modern:
-                # Every CHECK_S one message of a stream is acknowledged.
+                # Once per CHECK_S, a message of each stream is sent at QoS 1 and acknowledged.
                 topic, now_s = message.topic, self._loop.time()
                 if now_s >= self._checked_s.get(topic, now_s):
                     self._checked_s[topic] = now_s + CHECK_S
@@ -322,7 +326,7 @@ class MqttPublisher:
     def _note_acceptance(
         self, message: Outgoing, sent: Callable[[], None], refusal: str | None
     ) -> None:
-        """Note that the broker, or at QoS 0 the kernel, has accepted or refused `message`."""
+        """Process the acceptance or refusal of `message` by the broker (at QoS 0 by the kernel)."""
         sent()
         self.sent += 1
         if message.written is not None and not message.qos:
@@ -331,7 +335,7 @@ class MqttPublisher:
             # Log a change of whether the broker accepts messages on this topic.
             topic = message.topic
             if topic.startswith(responses := topics.RESPONSE.name(self._base)):
-                topic = responses + "#"  # clients choose the last levels: one entry for all
+                topic = responses + "#"  # clients choose the last levels, so all share one entry
 
             if refusal is None:
                 self.denied.discard(topic)
@@ -362,8 +366,8 @@ class MqttPublisher:
                 self._on_request(message)
                 continue
 
-            # With MQTT 3.1.1 a retained message is an earlier process's. MQTT 5 marks new messages
-            # as retained, too, and sends no stored ones.
+            # With MQTT 3.1.1 a retained message comes from an earlier process. With MQTT 5 new
+            # messages are marked as retained, too, and no stored messages are sent.
             if message.retained and not self._modern:
                 continue
             if message.topic == self._outbox.state_topic:
@@ -405,7 +409,7 @@ class MqttPublisher:
         self._outbox.retain(self._outbox.state_topic, ONLINE)
 
     async def _await_echo(self, topic: str) -> None:
-        """Check that messages on `topic` come back: a forbidden message is acknowledged, too."""
+        """Check that messages on `topic` come back; forbidden messages are acknowledged, too."""
         echo = self._echoes[topic]
         await echo.sent.wait()
         try:
@@ -423,7 +427,7 @@ class MqttPublisher:
 
 
 class _TopicEcho:
-    """Whether a message of the daemon was sent, and whether it came back."""
+    """State of the check whether a sent message of the daemon came back."""
 
     def __init__(self) -> None:
         self.sent, self.arrived = asyncio.Event(), asyncio.Event()

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 _DEEPEST_BASE = 4
-"""Most levels of a base topic that the search finds."""
+"""Maximum number of levels of a base topic that the search finds."""
 _MOST_RIGS = 100
 _LONGEST_BYTES = 256 * 1024
 """Largest incoming packet, bytes."""
@@ -51,7 +51,7 @@ async def find_rigs(settings: MqttSettings, patience_s: float) -> dict[str, str]
 
 
 def _rig_name(payload: bytes) -> str | None:
-    """Return the name in a payload of `bridge/info`; None if it is none."""
+    """Return the name in a payload of `bridge/info`; None for any other payload."""
     try:
         info = orjson.loads(payload)
     except orjson.JSONDecodeError:

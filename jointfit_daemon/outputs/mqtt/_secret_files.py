@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CREDENTIAL = "jointfitd.mqtt-password"
-"""Name of the systemd credential that holds the password."""
+"""Name of the systemd credential that contains the password."""
 LEAST_KEY_BYTES = 16
-"""Shortest request key, bytes: 128 bit cannot be guessed."""
+"""Shortest request key, bytes: a key of 128 bit cannot be guessed."""
 _OTHERS = stat.S_IROTH | stat.S_IWOTH
 
 
@@ -42,7 +42,7 @@ def password_of(settings: MqttSettings) -> str | None:
 
 
 def missing_password(settings: MqttSettings) -> str | None:
-    """Return why the configured user has no password; None if there is one, or no user."""
+    """Return why the configured user has no password; None with a password or without user."""
     if settings.username is None or password_of(settings) is not None:
         return None
     path = _password_path(settings)

@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 SIGNATURE_LIFETIME_US = 30_000_000
-"""Largest difference of a signature's time from the present, either way, microseconds."""
+"""Largest absolute difference between a signature's time and the present, microseconds."""
 SIGNING_KEYS = ("nonce", "signature", "t_us")
-"""Keys of a request that belong to its signature."""
+"""Keys that a signature adds to a request."""
 _NONCE = re.compile(r"[A-Za-z0-9-]{16,64}")
 
 
@@ -61,7 +61,7 @@ def verify(key: bytes, topic: str, request: Mapping[str, Any], now_us: int) -> t
     Raises
     ------
     SignatureRejectedError
-        A key is missing or malformed, the signature is wrong, or its time is too far from `now_us`.
+        A key is missing or malformed, the signature is wrong, or `t_us` is too far from `now_us`.
     """
     if missing := [name for name in SIGNING_KEYS if name not in request]:
         raise SignatureRejectedError(

@@ -1,8 +1,8 @@
 """TLS to a broker.
 
-Invariant: certificates are always verified, and the version is at least TLS 1.2. Verification
-cannot be switched off: a private broker has a private certificate authority, which
-``[mqtt.tls] ca`` names.
+Invariant: certificates are always verified, and the TLS version is at least 1.2. Verification
+cannot be switched off: a private broker has a private certificate authority, which ``[mqtt.tls]
+ca`` names.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings, TlsSettings
 
-# Numbers of OpenSSL, X509_V_ERR_… in x509_vfy.h.
+# Error numbers of OpenSSL, X509_V_ERR_… in x509_vfy.h.
 _NOT_YET_VALID, _EXPIRED = 9, 10
 _OTHER_NAME, _OTHER_ADDRESS = 62, 64
 _PLAIN_ANSWERS = {"WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "HTTP_REQUEST"}
@@ -22,7 +22,7 @@ _PLAIN_ANSWERS = {"WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "HTTP_REQUEST"
 
 
 class _ClosingTlsSocket(ssl.SSLSocket):
-    """A TLS socket that is closed if its handshake fails; paho would leave it open."""
+    """A TLS socket that closes if its handshake fails; paho would leave the socket open."""
 
     def do_handshake(self, block: bool = False) -> None:  # type: ignore[explicit-override]  # 3.12's
         """Perform the handshake, or close the socket."""
@@ -85,8 +85,8 @@ def tls_remedy(
         ``[mqtt]``.
     established
         Whether the client side of the handshake was completed. A broker that closes the connection
-        after that has rejected the client's certificate: TLS 1.3 checks it last, and a reset
-        connection loses the alert.
+        later has rejected the client's certificate. TLS 1.3 checks this certificate last, and a
+        reset connection loses the alert.
     """
     if isinstance(error, ssl.SSLCertVerificationError):
         return f" ({_verification_remedy(error.verify_code, settings)})"

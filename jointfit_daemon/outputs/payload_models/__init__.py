@@ -1,6 +1,7 @@
 """Models of all payloads, the source of their JSON Schemas. The daemon itself does not load them.
 
-Invariant: every topic that the daemon publishes has one model, and what it publishes fits.
+Invariant: every topic that the daemon publishes has one model, and every published payload fits its
+model.
 """
 
 from __future__ import annotations
@@ -99,7 +100,7 @@ def answer_schema(request: str) -> dict[str, Any]:
 
 
 def payload_topic(name: str) -> Topic | None:
-    """Return the topic of a name below the base, as ``joint/knee``; None for requests."""
+    """Return the topic of a name below the base, such as ``joint/knee``; None for requests."""
     levels = name.split("/")
     for topic in PAYLOADS:
         pattern = topic.pattern.split("/")

@@ -292,7 +292,7 @@ def _joint(state: LimbState, number: int) -> dict[str, Any]:
     }
     inner = 0 < number < (len(state.segments) or len(state.joints) - 1)
     if not inner and joint.angles is None:
-        return shown  # the ends of the chain have no angles
+        return shown  # the ends of the chain have no joint angles
     return shown | {
         **_angles(_ANGLE_KEYS[joint.convention], joint.angles),
         "inner_deg": _degrees(joint.inner),
@@ -340,7 +340,7 @@ def _rounded(values: Iterable[float] | None, digits: int) -> list[float | None] 
 
 
 def _sanitized(value: object) -> object:
-    """Return `value` with integers and characters replaced that JSON cannot represent."""
+    """Return `value`; integers and characters that JSON cannot represent are replaced."""
     if isinstance(value, int):
         return value if abs(value) <= _EXACT else None
     if isinstance(value, str):
@@ -354,7 +354,7 @@ def _sanitized(value: object) -> object:
 
 def _to_json(value: object) -> object:
     """Return a JSON-compatible value for an object that orjson does not support."""
-    if isinstance(value, tuple | set | frozenset):  # named tuples among them
+    if isinstance(value, tuple | set | frozenset):  # includes named tuples
         return list(value)
     if isinstance(value, bytes):
         return value.hex()

@@ -23,7 +23,7 @@ _NS_PER_US, _NS_PER_MS, _NS_PER_S = 1e3, 1e6, 1e9
 
 @dataclass(frozen=True, slots=True)
 class ProcessHealth:
-    """The process since the last health message."""
+    """Resource usage of the process since the last health message."""
 
     cpu_pct: float
     """CPU time over elapsed time, percent of one core."""
@@ -35,12 +35,12 @@ class ProcessHealth:
 
 @dataclass(frozen=True, slots=True)
 class StateHealth:
-    """Persistent data; the fields are reasons, None without a fault."""
+    """Faults of persistent data; each field is a reason, or None without a fault."""
 
     fault: str | None
-    """Why the state directory cannot be written."""
+    """Reason why the state directory cannot be written."""
     not_stored: str | None
-    """Why the calibration in force is not stored."""
+    """Reason why the calibration in force is not stored."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Units of a calibration's quality on MQTT: degrees, milliseconds, and four digits.
 
-The core uses radians and nanoseconds, and its tables by method have no unit. Invariant: on a topic
-every quantity has a unit, in its own key or in the key of the table that contains it.
+The core uses radians and nanoseconds, and the tables by method in the core have no unit. Invariant:
+on a topic every quantity has a unit, in its own key or in the key of the table that contains it.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from collections.abc import Mapping
 from typing import Any
 
 _CONVERTED = {"_rad": ("_deg", 180.0 / math.pi), "_ns": ("_ms", 1e-6)}
-"""Suffix of the core, suffix on MQTT, and factor."""
+"""Suffix of a key in the core, suffix on MQTT, and conversion factor."""
 _TABLES = {"segments": "segments_rad", "flexion": "flexion_rad"}
 """Tables of ``holdout`` with values in radians by segment or joint, and method."""
 _PARAMETERS = ("sensors", "regression")
-"""Tables of quaternions and coefficients, which are published with all digits: with four, an
-orientation computed from them would be about 0.1 degrees off."""
+"""Tables of quaternions and coefficients, which are published with all digits: with four digits, an
+orientation computed from the table would have an error of about 0.1 degrees."""
 _DIGITS = 4
 
 

@@ -73,7 +73,7 @@ _STREAMS: dict[type, tuple[Topic, Callable[[Any, int], bytes]]] = {
     RunningCenters: (topics.OPTICAL_CENTERS, encode_centers),
     StickFigure: (topics.OPTICAL_STICKS, encode_sticks),
 }
-"""Topic and encoder of the outputs with a payload of their own instant."""
+"""Topic and encoder of each output whose payload contains its own instant."""
 
 
 class TopicWriter:
@@ -88,7 +88,7 @@ class TopicWriter:
     clock
         Converts stamps to UNIX time.
     spool
-        Receives events and decimated poses, in case of an outage; None without a spool.
+        Receives events and decimated poses, for the case of an outage; None without a spool.
     latency
         Measures encoding and writing of every frame.
     """
@@ -141,7 +141,7 @@ class TopicWriter:
             self._outbox.retain(topic, b"")
             return
 
-        # Home Assistant removes an entity of which only the platform is left.
+        # Home Assistant removes an entity whose description contains only the platform.
         payload = discovery_payload(rig)
         removed = {
             key: {"platform": component["platform"]}
@@ -185,7 +185,7 @@ class TopicWriter:
                 pass
 
     def _publish(self, topic: Topic, payload: bytes, value: str = "") -> None:
-        """Put a message into the queue of its topic; `value` replaces the placeholder."""
+        """Add a message to the queue of its topic; `value` replaces the placeholder."""
         name = topic.name(self._base, value)
         if topic.retained:
             self._outbox.retain(name, payload)
@@ -248,7 +248,7 @@ class TopicWriter:
         address = reply.reply_to
         topic = address.topic or topics.RESPONSE.name(self._base, reply.command)
 
-        # An error contains the list of its faults; a fault of the core is the only one.
+        # An error contains a list of faults; an error of the core has exactly one fault.
         error = None
         if reply.error is not None:
             fault = {key: reply.error.get(key) for key in ("key", "message")}
@@ -278,7 +278,7 @@ class TopicWriter:
 
 
 def _sides(chain: Chain) -> dict[str, Any]:
-    """Return the side of a limb; of a branched one also its connections."""
+    """Return the side of a limb; for a branched limb also the connections."""
     if not chain.parents:
         return {"side": "left" if chain.left_side else "right"}
     parts = body_parts(chain)

@@ -1,11 +1,12 @@
-"""Delivers events and decimated poses of a broker outage after it, also after a restart.
+"""Delivers events and decimated poses of a broker outage after its end, also after a restart.
 
 While the daemon is connected, only the messages of the last seconds are stored, in memory: a loss
 of the connection is noticed late, and messages sent before may not have arrived. During an outage
-messages are written to disk; after it they are sent in order, at least once, behind all others.
+messages are written to disk. After the outage they are sent in order, at least once, behind all
+other messages.
 
 Invariant: `Spool.add` appends to a list of limited size and returns. Messages that exceed a limit
-are counted, the oldest ones first.
+are counted, the oldest messages first.
 """
 
 from __future__ import annotations
@@ -31,14 +32,15 @@ within 8 s."""
 START_S = 3.0
 """Time after the start within which a first connection is not an outage, s."""
 WRITE_S = 0.5
-"""Interval between two writes during an outage, s: a kill loses this."""
+"""Interval between two writes during an outage, s: a kill of the daemon loses the messages of this
+time."""
 SUBSCRIBE_S = 5.0
-"""Time of a connection before the delivery begins, s: after a restart of the broker its readers
-connect and subscribe again, too."""
+"""Time of a connection before the delivery begins, s: after a restart of the broker, subscribers
+need time to reconnect."""
 MOST_PENDING = 2000
-"""Messages that wait for the disk."""
+"""Largest number of messages that wait for the disk."""
 BATCH = 16
-"""Messages in delivery at once."""
+"""Largest number of messages in delivery at once."""
 _POLL_S = 0.02
 """Interval between checks whether a batch was delivered, s."""
 
@@ -50,20 +52,20 @@ class SpoolHealth:
     __pydantic_config__: ClassVar = {"extra": "forbid"}
 
     waiting: int
-    """Messages that wait for the broker."""
+    """Number of messages that wait for the broker."""
     stored_bytes: int
     delivered: int
-    """Messages that the broker has accepted since the start."""
+    """Number of messages that the broker has accepted since the start."""
     dropped: int
-    """Messages deleted because the spool was full."""
+    """Number of messages deleted because the spool was full."""
     damaged: int
-    """Lines of the files that cannot be read."""
+    """Number of lines of the files that cannot be read."""
     failure: str | None
-    """Why messages are not stored at present; None while they are."""
+    """Reason why messages are not stored at present; None while storing works."""
 
 
 class Link(Protocol):
-    """The connection to a broker."""
+    """State of the connection to a broker."""
 
     connected: bool
     connects: int
@@ -71,7 +73,7 @@ class Link(Protocol):
 
     @property
     def outbox(self) -> Outbox:
-        """Messages to publish."""
+        """Outbox of the connection, with the messages to publish."""
 
     @property
     def base(self) -> str:
@@ -84,9 +86,9 @@ class Spool:
     Parameters
     ----------
     files
-        Its files.
+        Files of the spool.
     link
-        Returns the connection to the present broker.
+        Function that returns the connection to the present broker.
     """
 
     def __init__(self, files: SpoolFiles, link: Callable[[], Link]) -> None:
@@ -96,14 +98,16 @@ class Spool:
         self._using_files = asyncio.Lock()
         self._starting_until_s = time.monotonic() + START_S
         self._began = False
-        """Whether the daemon was connected, or has waited for the broker too long."""
+        """Whether a missing connection counts as an outage: the daemon was connected before, or has
+        waited too long."""
         self._delivered = self._dropped = 0
         self._position = (0, 0)
-        """File in delivery, and the number of its messages that the broker has."""
+        """Number of the file in delivery, and number of its messages that the broker has
+        accepted."""
         self._failure: str | None = None
 
     def add(self, topic: str, payload: bytes) -> None:
-        """Store a message in case of an outage; `topic` is the name below the base."""
+        """Store a message for the case of an outage; `topic` is the name below the base."""
         now_s, message = time.monotonic(), SpooledMessage(topic, payload)
         if not self._link().connected:
             self._begin_outage(now_s)
@@ -115,7 +119,7 @@ class Spool:
             self._recent.popleft()
 
     def _begin(self) -> None:
-        """Note a connection: the outbox sends the messages that waited for the first one."""
+        """Process a new connection; the outbox sends messages from before the first connection."""
         if not self._began:
             self._began = True
             self._pending.clear()
@@ -168,7 +172,7 @@ class Spool:
             await asyncio.sleep(WRITE_S)
 
     def _store_pending(self) -> None:
-        """Write the messages that wait; those that the disk refuses wait further."""
+        """Write the waiting messages; messages that the disk refuses remain in the queue."""
         pending, self._pending = self._pending, deque()
         try:
             self._files.append(pending)
@@ -189,7 +193,7 @@ class Spool:
             await asyncio.sleep(WRITE_S)
 
     async def _deliver_file(self) -> None:
-        """Send the oldest file, and delete it once the broker has all of its messages."""
+        """Send the oldest file, and delete it once the broker has accepted all messages."""
         found = await self._with_files(self._files.oldest)
         if found is None:
             return
@@ -201,7 +205,7 @@ class Spool:
             for topic, payload in batch:
                 link.outbox.late(f"{link.base}/{topic}", payload)
             while link.outbox.late_waiting:
-                if link is not self._link():  # another broker: it gets the whole batch
+                if link is not self._link():  # another broker gets the whole batch
                     return
                 await asyncio.sleep(_POLL_S)
             self._delivered += len(batch)
@@ -209,7 +213,7 @@ class Spool:
         await self._with_files(lambda: self._files.remove(number))
 
     async def _with_files(self, work: Callable[[], T]) -> T | None:
-        """Run `work` in a thread, one at a time; a failure of the disk is noted."""
+        """Run `work` in a thread, one at a time; a failure of the disk is stored."""
         async with self._using_files:
             running = asyncio.create_task(asyncio.to_thread(work), name="spool files")
             try:

@@ -1,11 +1,11 @@
 """Files of the spool: messages in the order of their writing, in files of limited size.
 
 A line is the CRC-32 of the rest in hexadecimal digits, the topic below the base, and the payload,
-separated by spaces. A process appends to files of its own only, so a line that a power cut tore is
-the last one of its file.
+separated by spaces. A process appends only to files that it created, so only the last line of a
+file can be torn by a power cut.
 
-Invariant: the files exceed `keep_bytes` by at most one file. The oldest one is deleted for a new
-one, and its messages are counted. A line with a wrong CRC is counted and skipped.
+Invariant: the files exceed `keep_bytes` by at most one file. When a new file is needed, the oldest
+file is deleted and its messages are counted. A line with a wrong CRC is counted and skipped.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FILES = 16
-"""Number of files of a full spool: so much of it is deleted at once."""
+"""Number of files of a full spool; one file is deleted at once."""
 _TOPIC = re.compile(r"[!-~]{1,200}")
-"""A topic: printable ASCII. A client rejects those with wildcards, spaces or control characters."""
+"""A topic: printable ASCII. A client rejects topics with wildcards, spaces or control
+characters."""
 _WILDCARDS = frozenset("+#")
 _NUMBERED = re.compile(r"(\d{8})\.spool")
 
@@ -32,7 +33,7 @@ class SpooledMessage(NamedTuple):
     """One message that waits for the broker."""
 
     topic: str
-    """Name below the base."""
+    """Topic below the base."""
     payload: bytes
 
 
@@ -50,15 +51,15 @@ class SpoolFiles:
     def __init__(self, folder: Path, keep_bytes: int) -> None:
         self._folder, self._keep_bytes = folder, keep_bytes
         self._counts: dict[int, int] = {}
-        """Messages by the number of their file, oldest first."""
+        """Number of messages by file number, oldest first."""
         self._sizes: dict[int, int] = {}
         self._open: int | None = None
         """File to which this process appends."""
         self._last = 0
         self.dropped = 0
-        """Messages deleted because the spool was full."""
+        """Number of messages deleted because the spool was full."""
         self.damaged = 0
-        """Lines that cannot be read."""
+        """Number of lines that cannot be read."""
 
     @property
     def waiting(self) -> int:
@@ -76,7 +77,7 @@ class SpoolFiles:
         Raises
         ------
         OSError
-            They cannot be read.
+            The files cannot be read.
         """
         if not self._folder.is_dir():
             return
@@ -97,7 +98,7 @@ class SpoolFiles:
         Raises
         ------
         OSError
-            The disk does not take them; none is written.
+            The disk does not accept the messages; no message is written.
         """
         lines = [_line(message) for message in messages]
         if not lines:
@@ -131,12 +132,12 @@ class SpoolFiles:
             self.remove(oldest)
 
     def oldest(self) -> tuple[int, list[SpooledMessage]] | None:
-        """Return the number and the messages of the oldest file; nothing is appended to it then.
+        """Return number and messages of the oldest file; no more messages are added to this file.
 
         Raises
         ------
         OSError
-            It cannot be read.
+            The file cannot be read.
         """
         if not self._counts:
             return None
@@ -151,7 +152,7 @@ class SpoolFiles:
         Raises
         ------
         OSError
-            It cannot be deleted.
+            The file cannot be deleted.
         """
         self._path(number).unlink(missing_ok=True)
         self._counts.pop(number, None)
@@ -175,7 +176,7 @@ def _line(message: SpooledMessage) -> bytes:
 
 
 def _message(line: bytes) -> SpooledMessage | None:
-    """Return the message of a line; None if it is damaged."""
+    """Return the message of a line; None for a damaged line."""
     digits, _, rest = line.removesuffix(b"\n").partition(b" ")
     topic, _, payload = rest.partition(b" ")
     if not line.endswith(b"\n") or digits != b"%08x" % crc32(rest):
