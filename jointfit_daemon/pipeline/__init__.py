@@ -1,4 +1,4 @@
-"""The core of the daemon: input events to limb states, notices and calibration jobs."""
+"""The core of the daemon: it converts input events to limb states, notices and calibration jobs."""
 
 from jointfit_daemon.pipeline._core import Core
 from jointfit_daemon.pipeline._moving_centers import MovingCenters

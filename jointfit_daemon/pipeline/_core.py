@@ -1,7 +1,7 @@
-"""The core: input events to limb states, notices and calibration jobs.
+"""The core, which converts input events to limb states, notices and calibration jobs.
 
-Invariant: synchronous and deterministic, without clock, I/O, logging or randomness. The same events
-in the same order give the same outputs, byte for byte, so a recording can be replayed.
+Invariant: the core is synchronous and deterministic, without clock, I/O, logging or randomness. The
+same events in the same order give the same outputs, byte for byte, so a recording can be replayed.
 """
 
 from __future__ import annotations
@@ -84,8 +84,8 @@ class Core:
     Parameters
     ----------
     observe
-        Called with the source and every measurement of it, once its instant is known, in the order
-        of processing. It must not change the measurement.
+        Function called with source and measurement once the instant of the measurement is known, in
+        the order of processing. It must not change the measurement.
     """
 
     def __init__(self, observe: Callable[[str, StampedMeasurement], None] | None = None) -> None:
@@ -136,7 +136,7 @@ class Core:
 
     def feed(self, event: Event) -> list[Output]:
         """Process one event and return its outputs, in order."""
-        # checked first: thousands of chunks arrive per other event
+        # Chunks are checked first, because thousands of chunks arrive per other event.
         if isinstance(event, ChunkArrived):
             self._now_ns = max(self._now_ns, event.chunk.t_ns)
             return self._add_chunk(event)
@@ -223,7 +223,7 @@ class Core:
         return [*outputs, session.status(event.t_ns, text)]
 
     def _reload_sources(self, rig: Rig) -> None:
-        """Create the states of new and changed sources; those of unchanged sources continue."""
+        """Create states of new and changed sources; states of unchanged sources continue."""
         unchanged = {
             source.id: state
             for source in rig.sources
@@ -288,7 +288,8 @@ class Core:
         if state is None:
             return [notice]
 
-        # A source that is retried and fails as before, without a sample, has nothing new to report.
+        # A repeated failure for the same reason, without a sample in between, is not reported
+        # again.
         repeated = not state.online and event.text == state.closed_text
         state.closed_text = event.text
         notices: list[Output] = [] if repeated else [notice]
@@ -326,7 +327,7 @@ class Core:
                 outputs += self._report(source, state, item)
                 continue
 
-            if state.open and not state.online:  # not for the remaining output of a closed decoder
+            if state.open and not state.online:  # not for the last output of a closed decoder
                 state.online = True
                 outputs.append(DeviceStatus(source, online=True))
                 outputs.append(Notice(self._now_ns, NoticeKind.DEVICE, source, "streaming"))
@@ -354,7 +355,8 @@ class Core:
         t_ns, _, synced, epoch, _ = stamp
         q = sample.q_world_sensor
 
-        # The aligner gets instants of the optical system: stamps minus the lag in use.
+        # The aligner receives stamps minus the lag in use, which are instants of the optical
+        # system.
         self._aligner.push(
             source,
             t_ns - self._lag_ns.get(source, 0),
@@ -373,7 +375,7 @@ class Core:
     def _add_mocap(self, frame: MocapFrame, stamp: Stamp) -> list[Output]:
         outputs: list[Output] = []
         if self._label_monitor is not None and frame.live:
-            # markers are placed and named again while a calibration is made
+            # markers may be moved and renamed during a calibration
             if self._session.phase == CalibrationPhase.CALIBRATED:
                 outputs += self._label_monitor.add_frame(stamp.t_ns, frame)
                 frame = self._label_monitor.hide_faulty(frame)

@@ -18,7 +18,7 @@ _NS = 1_000_000_000
 
 
 class FrameGrid:
-    """Holds the frame aligner of one rig and replaces it when a reload requires it.
+    """Owns the frame aligner of one rig; replaces the aligner if a reload needs a new grid.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class FrameGrid:
         self._layout = _layout(rig)
         self._names = [source.id for source in rig.sources if source.kind == "imu"]
         self._counts_before: dict[str, dict[str, int]] = {}
-        """Counts of the aligners that reloads replaced."""
+        """Sample counts of the aligners that reloads have replaced."""
         self.aligner = _aligner(rig, begin_ns)
 
     def reload(self, rig: Rig) -> None:
@@ -44,7 +44,8 @@ class FrameGrid:
         self.aligner = _aligner(rig, self.aligner.next_ns)
         self._layout = _layout(rig)
         self._names = [source.id for source in rig.sources if source.kind == "imu"]
-        # A removed sensor loses its counts: if it is added again, it starts from 0.
+        # The counts of a removed sensor are deleted; if the sensor is added again, they start from
+        # 0.
         self._counts_before = {name: counts[name] for name in self._names if name in counts}
 
     def counts(self) -> dict[str, dict[str, int]]:

@@ -1,10 +1,10 @@
 """Detection of exchanged, mislabelled and displaced markers from the shapes of marker clusters.
 
-For rigs without chain model: the clusters are those of the calibration in force. Markers with
-faulty labels are hidden from fusion until they are at their places again.
+The monitor is for rigs without chain model and uses the clusters of the calibration in force.
+Markers with faulty labels are hidden from fusion until they are at their places again.
 
-Invariant: a fault is reported after it explained the frames of 2 s, and its end after 2 s without
-it. Hidden markers neither begin nor end a fault.
+Invariant: a fault is reported after it explained the frames of 2 s, and its end is reported after 2
+s without this fault. Hidden markers neither begin nor end a fault.
 """
 
 from __future__ import annotations
@@ -40,23 +40,26 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 RATE_HZ = 5.0
-"""Examined frames per second. A search takes milliseconds and is spread over the next frames."""
+"""Examined frames per second. A search takes milliseconds and is therefore spread over several
+frames."""
 FAULT_NS = 2_000_000_000
 """Time after which a fault begins or ends, ns."""
 MISFIT_NS = 4_000_000_000
 """Time after which a cluster without explanation is reported, ns."""
 _FEWEST = 7
-"""Number of frames with all clusters of a fault that a decision needs: over half of `FAULT_NS`."""
+"""Number of frames with all clusters of a fault that a decision needs. They cover over half of
+`FAULT_NS`."""
 _PRESENT = 0.6
-"""Share of the frames that a fault explains at its beginning: the rest may have hidden markers."""
+"""Smallest share of the frames that a fault must explain to begin; the other frames may have hidden
+markers."""
 _ABSENT = 0.1
-"""Share of the frames that a fault explains, or that do not fit, at its end."""
+"""Share of the frames that a fault explains, or that do not fit, below which the fault ends."""
 _REFUSED = 0.8
-"""Share of the frames that do not fit without explanation."""
+"""Share of unexplained frames that do not fit, above which a misfit is reported."""
 
 
 class _Examined(NamedTuple):
-    """One examined frame."""
+    """Result of one examined frame."""
 
     t_ns: int
     fitted: frozenset[str]
@@ -101,7 +104,7 @@ class LabelMonitor:
         return self._given == given
 
     def reset(self) -> None:
-        """Forget all frames and faults: markers are being placed or calibrated again."""
+        """Discard all frames and faults, because markers are being placed or calibrated again."""
         self._examination = None
         self._examined.clear()
         self.faults, self.misfits = {}, frozenset()
@@ -116,7 +119,7 @@ class LabelMonitor:
         return replace(frame, markers=markers)
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
-        """Examine a live frame, if one is due, or continue with an earlier one. Return notices."""
+        """Examine a live frame, if due, or continue with an earlier frame; return notices."""
         if not self._search.clusters:
             return []
         if frame.layout is not self._layout:
@@ -127,7 +130,7 @@ class LabelMonitor:
         if self._examination is None:
             if not self._rate.is_due(t_ns):
                 return []
-            # The markers of the clusters in a frame, m, shape (M, 3); NaN where missing.
+            # Find the markers of the clusters in a frame, m, shape (M, 3); NaN where missing.
             padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
             points = padded[self._columns]
             self._examination = LabelExamination(self._search, t_ns, points)
@@ -152,7 +155,7 @@ class LabelMonitor:
         return [*self._end(t_ns), *self._begin(t_ns)]
 
     def _frames(self, t_ns: int, parts: Iterable[str], span_ns: int) -> list[_Examined]:
-        """Return the frames of the last time in which all these body parts had visible markers."""
+        """Return the recent frames in which all these body parts had visible markers."""
         needed = set(parts)
         return [
             one for one in self._examined if t_ns - one.t_ns <= span_ns and needed <= one.fitted
@@ -171,10 +174,11 @@ class LabelMonitor:
             frames = self._frames(t_ns, fault.parts, FAULT_NS)
             if len(frames) < _FEWEST or count < _PRESENT * len(frames):
                 continue
-            # It takes the place of an earlier explanation of the same markers.
+            # The new fault replaces an earlier explanation of the same markers.
             for other in [f for f in self.faults if not set(f.markers).isdisjoint(fault.markers)]:
                 del self.faults[other]
-            # Clusters that fit in spite of it are at fault only in relation to adjacent ones.
+            # Clusters that fit in spite of the fault are at fault only in relation to adjacent
+            # clusters.
             bad = sum(not one.refused.keys().isdisjoint(fault.parts) for one in frames)
             parts = frozenset(fault.parts)
             fits = bad < _PRESENT * len(frames)
@@ -224,7 +228,7 @@ class LabelMonitor:
 
 
 def _centers(chain: Chain, calibration: Calibration) -> dict[tuple[str, str], Vector]:
-    """Return the known joint centers, static world, m, by the two body parts of each joint."""
+    """Return the known joint centers in the static world, m, by pair of adjacent body parts."""
     parts, found = body_parts(chain), {}
     for name, (proximal, distal) in zip(chain.joints, joint_parts(chain), strict=True):
         joint = calibration.joint.get(name)

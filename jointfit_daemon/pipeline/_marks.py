@@ -1,4 +1,4 @@
-"""Marks: labels of an instant, requested by a person or a program during a session."""
+"""Marks: labels of instants that a person or a program requests during a session."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def mark_outputs(
     Parameters
     ----------
     request
-        The request, with the ``text`` of the mark.
+        The request with the ``text`` of the mark.
     number
         Number of the mark since the start, from 1.
     unix_offset_ns

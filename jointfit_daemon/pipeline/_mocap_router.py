@@ -1,4 +1,4 @@
-"""Distribution of mocap frames: calibration, lag monitoring, online learning, position of O1.
+"""Distribution of mocap frames: calibration, lag monitoring, online learning, first joint center.
 
 Invariant: every frame is counted once, as used or idle. Only live frames are used, and only frames
 whose stamp is synchronized to the host clock are paired with sensors.
@@ -31,7 +31,8 @@ class MocapRouter:
         self._locator: OpticalOrigin | None = None
         self._origin: Vector | None = None
         self._unlocated: MocapFrame | None = None
-        """Last frame, until O1 is requested: cameras may be faster than the limb states."""
+        """Last frame until O1 is requested. O1 is computed on request, because cameras may be
+        faster than the limb states."""
 
     @property
     def origin(self) -> Vector | None:
@@ -41,11 +42,11 @@ class MocapRouter:
         return self._origin
 
     def reset_counts(self) -> None:
-        """Set the counts to 0: the rig has no mocap source any more."""
+        """Set the counts to 0, because the rig no longer has a mocap source."""
         self._used = self._idle = 0
 
     def set_calibration(self, chain: Chain, calibration: Calibration | None) -> None:
-        """Locate O1 by the markers of `calibration`, or not at all."""
+        """Locate O1 by the markers of `calibration`; without calibration O1 is not located."""
         self._locator = OpticalOrigin(chain, calibration) if calibration else None
         self._origin = self._unlocated = None
 

@@ -1,4 +1,4 @@
-"""Running joint centers after calibration, with a test of their shift from the calibrated ones.
+"""Running joint centers after calibration, with a test of the shift from calibrated centers.
 
 Invariant: only live mocap frames change the estimates, and limb states do not depend on them.
 """
@@ -25,10 +25,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, MocapFrame
 
 RATE_HZ = 20.0
-"""Camera frames used per second: joints turn by a few degrees between two of them."""
+"""Number of camera frames used per second. Joints turn by a few degrees between two of these
+frames."""
 PUBLISHED_HZ = 1.0
 MOVED_P = 1e-4
-"""Probability of the shift by chance below which a center has moved.
+"""Probability of a shift by chance below which a center is reported as moved.
 
 In an hour with a time constant of 20 s, 180 independent estimates are tested."""
 _UNSEEN_SD_M = 1.0
@@ -40,13 +41,13 @@ _SAME_DIRECTION = 0.3
 class MovingCenters:
     r"""Estimates the center of every joint from the last frames, and tests its shift.
 
-    Frames have the weight :math:`e^{-(t - t_k)/T}`. The shift δ between the running center and the
-    calibrated one is tested with the covariances of both,
+    Frames have the weight :math:`e^{-(t - t_k)/T}`. The shift δ between running and calibrated
+    center is tested with their covariances C,
 
     .. math:: D^2 = \delta^T (C + C_{calibrated})^{-1} \delta \sim \chi^2_r,
 
-    over the r directions that both movements observed. Residuals that persist, as those of
-    soft-tissue artefact do, are counted once per posture in both covariances.
+    over the r directions that both movements observed. Residuals that persist, such as residuals
+    from soft-tissue artefact, are counted once per posture in both covariances.
 
     Parameters
     ----------
@@ -94,7 +95,7 @@ class MovingCenters:
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[RunningCenters]:
         """Add one live mocap frame with its stamp; return the centers about once a second.
 
-        Each call estimates one joint at most, so that no frame of the limb waits for all of them.
+        Each call estimates one joint at most, so that no frame of the limb waits for all joints.
         """
         centers = self._centers
         if centers is None or not centers.joints or not self._frames.is_due(t_ns):
@@ -118,7 +119,7 @@ class MovingCenters:
     def _placed(
         centers: LiveJointCenters, found: RunningCenter, fit: CenterEstimate | None
     ) -> RunningCenter:
-        """Add the position in the newest frame."""
+        """Add the positions of the joint's markers in the newest frame."""
         parts = centers.parts
         number = parts.names.index(found.segment)
         if fit is None or found.center is None or not parts.placed[number]:
@@ -167,7 +168,7 @@ class MovingCenters:
 
 
 def _shift_test(fit: CenterEstimate, reference: CalibratedCenter) -> tuple[Array | None, float]:
-    """Return the shift in the directions that both observed, m, and its probability by chance."""
+    """Return the shift in directions that both observed, m, and its probability by chance."""
     unseen = np.concatenate((fit.unseen.reshape(-1, 3), np.reshape(reference.unseen, (-1, 3))))
     size, axes = np.linalg.svd(unseen, full_matrices=False)[1:]
     hidden = axes[size > _SAME_DIRECTION]

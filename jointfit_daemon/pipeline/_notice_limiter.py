@@ -1,7 +1,8 @@
 """Rate limit for notices about wires and clocks: one per minute, device and kind.
 
 A condition is reported when it begins, with its totals once a minute while it lasts, and when a
-minute passed without it. Lost samples are a warning above `MOST_LOST` of a minute's samples.
+minute passed without the condition. Lost samples are a warning above `MOST_LOST` of a minute's
+samples.
 
 Invariant: the totals of all notices equal the totals of all events; no event is left out of the
 totals.
@@ -18,17 +19,18 @@ from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.pipeline.health import MOST_LOST
 
 QUIET_NS = 60_000_000_000
-"""Shortest time between two notices of one device and kind, ns. ``bridge/health`` counts all."""
+"""Shortest time between two notices of one device and kind, ns. The counts in ``bridge/health``
+include all events."""
 
 _NS_PER_S = 1_000_000_000
 
 STEP_NS = 2_000_000
-"""Smallest step of UNIX time that is reported, ns: NTP adjusts by less."""
+"""Smallest step of UNIX time that is reported, ns; the steps of NTP are smaller."""
 
 _LEVELS = {"warning": NoticeLevel.WARNING, "error": NoticeLevel.ERROR}
 """Level of the notice by kind of device event, if it is not ``info``."""
 _JUMPS = {"restart": NoticeKind.CLOCK, "clock": NoticeKind.CLOCK, "counter": NoticeKind.WIRE}
-"""Kind of the notice for device events that are reported by their last text and their number."""
+"""Kind of the notice for device events whose notice contains their last text and their number."""
 _NO_DATA: Mapping[str, object] = MappingProxyType({})
 
 
@@ -39,7 +41,7 @@ class _Condition:
     """Sample rate of the device."""
     count: int = 0
     amount: int = 0
-    """Lost samples or discarded bytes."""
+    """Number of lost samples or discarded bytes."""
     lasting: bool = False
     """Whether the condition was reported more than once, so that its end is reported, too."""
     text: str = ""
@@ -48,7 +50,7 @@ class _Condition:
 
 @dataclass(slots=True)
 class NoticeLimiter:
-    """Collects corruption, gaps and clock jumps; passes on all other events at once."""
+    """Collects corruption, gaps and clock jumps, and passes on all other events at once."""
 
     _conditions: dict[tuple[str, str], _Condition] = field(default_factory=dict)
 
@@ -116,7 +118,8 @@ def _notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
         if condition.lasting:
             text = f"{text}, in the last {elapsed_s:.0f} s"
         if kind == "gap":
-            # A first notice has no interval; its samples are compared with those of a minute.
+            # A first notice has no interval, so its samples are compared with the samples of a
+            # minute.
             interval_s = elapsed_s if condition.lasting else QUIET_NS / _NS_PER_S
             share = condition.amount / (condition.rate_hz * interval_s)
             text = f"{text} ({100 * share:.2f} %)" if condition.lasting else text
@@ -140,6 +143,6 @@ def unix_step_notices(now_ns: int, step_ns: int) -> list[Notice]:
         return []
     step_s = step_ns / 1e9
     text = f"UNIX time of this host was set back by {-step_s:.3f} s"
-    if step_s > 0:  # CLOCK_MONOTONIC stops in suspend
+    if step_s > 0:  # CLOCK_MONOTONIC stops while suspended
         text = f"UNIX time was set forward by {step_s:.3f} s, or the host was suspended that long"
     return [Notice(now_ns, NoticeKind.CLOCK, "host", text, NoticeLevel.WARNING, {"step_s": step_s})]

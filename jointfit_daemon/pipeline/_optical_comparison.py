@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 RMS_TIME_S = 10.0
 """Time constant of the running RMS, s: a few gait cycles."""
 MAX_GAP_NS = 50_000_000
-"""Greatest distance of two limb states to interpolate between, ns: five frames at 100 Hz."""
+"""Longest time between two limb states for interpolation, ns: five frames at 100 Hz."""
 _WAITING = 64
 """Largest number of mocap frames that wait for the next limb state: 0.25 s at 240 Hz."""
 _STATES = 64
@@ -46,7 +46,7 @@ _STATES = 64
 
 
 class RunningRms:
-    r"""Root mean square with exponentially decreasing weights.
+    r"""Running root mean square with exponentially decreasing weights and time constant T.
 
     .. math:: \mathrm{rms}^2 = \frac{\sum_k w_k x_k^2}{\sum_k w_k}, \qquad w_k = e^{-(t - t_k) / T}
     """
@@ -122,7 +122,7 @@ class OpticalComparison:
         return done
 
     def _states_around(self, t_ns: int) -> tuple[LimbState, LimbState] | None:
-        """Return the last state before and the first after an instant, or None over a gap."""
+        """Return the last state before and the first after an instant; None across a gap."""
         after = None
         for state in reversed(self._states):
             if state.t_ns <= t_ns:
@@ -194,9 +194,9 @@ def _segments_at(t_ns: int, before: LimbState, after: LimbState) -> list[Quatern
 
 
 def _position_at(t_ns: int, joint: int, pair: tuple[LimbState, LimbState] | None) -> Vector | None:
-    """Return a joint position between two states; None unless it begins at the cameras' origin.
+    """Return a joint position between two states; None without the cameras' origin.
 
-    The first joint is the origin itself: there is nothing to compare.
+    The first joint is the origin itself, so its position is not compared.
     """
     if pair is None or joint == 0:
         return None

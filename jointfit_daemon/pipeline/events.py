@@ -1,7 +1,7 @@
 """Input events and outputs of the core, as frozen data.
 
-Invariant: only input events change the core. A log of them, fed to a new core, gives the same
-outputs again.
+Invariant: only input events change the core. A log of the input events, fed to a new core, gives
+the same outputs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Configured:
     """Newest stored calibration of the rig."""
     calibration_version: int | None = None
     calibration_age_s: float = 0.0
-    """Time since it was stored, s: heading uncertainty has grown since."""
+    """Time since the calibration was stored, s. The heading uncertainty grows with this time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,10 @@ class SourceOpened:
 
 @dataclass(frozen=True, slots=True)
 class SourceClosed:
-    """A driver ended: lost (will be retried), misconfigured (will not), or removed by a reload."""
+    """A driver ended because the device is lost, misconfigured, or removed by a reload.
+
+    Only a lost device is retried.
+    """
 
     t_ns: int
     source: str
@@ -94,7 +97,7 @@ class Request:
     transaction: str
     arguments: Mapping[str, object]
     reply_to: ReplyAddress = field(default_factory=ReplyAddress)
-    """Where to publish the reply; not part of a recording."""
+    """Destination of the reply; not part of a recording."""
 
     def refusal(self, key: str, message: str) -> Reply:
         """Return the reply that refuses this request because of one fault."""
@@ -119,7 +122,8 @@ class CalibrationSelected:
     version: int
     """Version from which it was loaded."""
     age_s: float
-    """Time since its static pose, s: heading uncertainty has grown since."""
+    """Time since the static pose of the calibration, s. The heading uncertainty grows with this
+    time."""
     request: Request
 
 
@@ -134,7 +138,7 @@ class JobFinished:
 
     @property
     def failure(self) -> str | None:
-        """Reason why there is no usable result; None if there is one."""
+        """Reason why there is no usable result; None with a usable result."""
         if self.result is None:
             return self.error or "no result"
         return self.error or self.result.refused
@@ -268,17 +272,17 @@ class CalibrationStatus:
     phase: CalibrationPhase
     text: str
     version: int | None = None
-    """Version of the calibration in force; None if there is none or it is not stored."""
+    """Version of the calibration in force; None without a calibration or if it is not stored."""
     quality: Mapping[str, object] = field(default_factory=dict)
-    """Quality of the phase that ended, else of the calibration in force."""
+    """Quality of the phase that ended, or else of the calibration in force."""
     kept: str | None = None
-    """Reason why a new result was rejected and the calibration in force is kept."""
+    """Reason why a new result was rejected and the calibration in force remains in use."""
     refused: Mapping[str, object] = field(default_factory=dict)
     """Quality of the rejected result."""
     done: tuple[CalibrationPhase, ...] = ()
     """Recorded phases whose results the functional phase uses."""
     created_utc: str | None = None
-    """Date of the version in force, ISO 8601; None if there is none or it is unknown."""
+    """Date of the version in force, ISO 8601; None without a version or with an unknown date."""
 
     @property
     def level(self) -> NoticeLevel:

@@ -29,20 +29,20 @@ class WireCounts:
     received: int = 0
     """Number of decoded samples."""
     corrupt: int = 0
-    """Runs of discarded bytes."""
+    """Number of runs of discarded bytes."""
     discarded_bytes: int = 0
     lost: int = 0
-    """Samples that the device counted but that did not arrive."""
+    """Number of samples that the device counted but that did not arrive."""
     restarts: int = 0
-    """Restarts of the device, reported by it or seen in its clock. A device that was disconnected
-    counts as restarted unless its clock continued."""
+    """Number of restarts of the device, reported by the device or detected from its clock. A device
+    that was disconnected counts as restarted unless its clock continued."""
     opened: int = 0
-    """Times the source was opened; all but the first are reconnects."""
+    """Number of times the source was opened; all openings but the first are reconnects."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockHealth:
-    """Clock of one device."""
+    """State of the clock of one device."""
 
     state: str
     epoch: int
@@ -59,14 +59,14 @@ class ClockHealth:
     latency_sd_ns: int
     jitter_ns: float | None
     delays: DelayPercentiles | None
-    """Delays from sampling instant to arrival in the last minute."""
+    """Quantiles of the delay from sampling instant to arrival in the last minute."""
     rate_hz: float | None
     """Sample rate in the last minute."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceHealth:
-    """One device.
+    """Health of one device.
 
     Invariant: ``received = used + decimated + idle + late + duplicate + dropped + pending``.
     Pending samples are counted elsewhere within a few sample periods.
@@ -80,7 +80,7 @@ class DeviceHealth:
     """Samples by outcome (CONVENTIONS.md), and ``pending``."""
     clock: ClockHealth
     orientation_filter: object = None
-    """Report of an orientation filter on the gateway; None without one."""
+    """Report of the orientation filter on the gateway; None without such a filter."""
     sensor: SensorState | None = None
     """State of an IMU; None for mocap."""
 
@@ -102,11 +102,11 @@ class LagHealth:
     sigma_ns: float | None
     """Standard deviation of the lag in use."""
     found_by: str | None
-    """Method of the calibration that estimated it."""
+    """Method by which the calibration estimated the lag."""
     tracked: TrackedLag | None
-    """Estimate during operation."""
+    """Lag estimated during operation."""
     refused: str | None
-    """Reason why the last window gave no estimate."""
+    """Reason why the last window gave no estimate of the lag."""
 
 
 class LearningState(StrEnum):
@@ -120,7 +120,7 @@ class LearningState(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LearningHealth:
-    """Online learning."""
+    """State and counts of online learning."""
 
     state: LearningState = LearningState.OFF
     reason: str | None = None
@@ -143,14 +143,14 @@ class FrameCounts:
 
 @dataclass(frozen=True, slots=True)
 class CoreHealth:
-    """Health of the core; the default is that of a core without configuration."""
+    """Health of the core; the default values are the health of a core without configuration."""
 
     devices: Mapping[str, DeviceHealth] = field(default_factory=dict)
     phase: CalibrationPhase = CalibrationPhase.UNCALIBRATED
     version: int | None = None
     """Version of the calibration in force."""
     fusion: Mapping[str, object] = field(default_factory=dict)
-    """Consistency of the sensors, JSON form."""
+    """Report on the consistency of the sensors, in JSON form."""
     lags: Mapping[str, LagHealth] = field(default_factory=dict)
     frames: FrameCounts = field(default_factory=FrameCounts)
     learning: LearningHealth = field(default_factory=LearningHealth)

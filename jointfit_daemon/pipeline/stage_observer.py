@@ -1,6 +1,7 @@
-"""The interface by which a core reports that an event has passed a stage of its processing.
+"""Interface with which a core reports that an event has passed a stage of processing.
 
-Invariant: a core receives nothing from its observer. Its outputs are those of a core without one.
+Invariant: a core receives no data from its observer, so the outputs are the same as without an
+observer.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ class StageObserver(Protocol):
     """Observer of the stages of a frame, for example with a clock, which a core does not have."""
 
     def mark_decoded(self, arrival_ns: int) -> None:
-        """Note that a chunk was decoded and its measurements were stamped.
+        """Process the report that a chunk was decoded and its measurements were stamped.
 
         Parameters
         ----------
@@ -21,10 +22,10 @@ class StageObserver(Protocol):
         """
 
     def mark_aligned(self) -> None:
-        """Note that the aligner released one or more frames."""
+        """Process the report that the aligner released one or more frames."""
 
     def mark_fused(self, deadline_ns: int | None) -> None:
-        """Note that the limb state of the next released frame was computed.
+        """Process the report that the limb state of the next released frame was computed.
 
         Parameters
         ----------

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _NS = 1_000_000_000
 PROGRESS_NS = 200_000_000
-"""Interval of progress reports, ns: five a second suffice for a progress bar."""
+"""Interval of progress reports, ns. Five reports per second suffice for a progress bar."""
 STATIC_TIMEOUT_S = 120.0
 """Time after which a static phase without stillness is aborted, s."""
 MOCAP = "the mocap system"
@@ -43,7 +43,7 @@ class PhaseRecording:
     start_ns : int
         Host time of the start.
     wanted_s : float
-        Length, s.
+        Required duration, s.
     guide : MovementGuide, optional
         Guide of a functional phase.
     min_s : float
@@ -74,7 +74,7 @@ class PhaseRecording:
             self._last_ns[MOCAP] = start_ns
 
     def add_sample(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> bool:
-        """Add one orientation; return whether it ended a stillness."""
+        """Add one orientation; return whether it ended a period of stillness."""
         self._recorder.add_sample(sensor, t_ns, q_world_sensor)
         self._latest[sensor] = q_world_sensor
         self._last_ns[sensor] = t_ns
@@ -151,7 +151,7 @@ class PhaseRecording:
         return self._recorder.overflowed
 
     def trial(self, now_ns: int) -> CalibrationTrial:
-        """Return the recording; for a static phase only the stillness at its end."""
+        """Return the recording; for a static phase only the still period at its end."""
         if self._gate is None:
             return self._recorder.trial()
         return self._recorder.trial(self._gate.still_since_ns, now_ns)

@@ -85,7 +85,7 @@ class CalibrationSession:
     calibration : Calibration or None
         The calibration in force.
     version : int or None
-        Its version in the store.
+        Version of `calibration` in the store.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class CalibrationSession:
         self._alignment: Mapping[str, Any] | None = None
         self._static: CalibrationTrial | None = None
         self._static_s = settings.static_s
-        """Requested length of the static pose, s; may differ from rig.toml."""
+        """Requested length of the static pose, s; this length may differ from rig.toml."""
         self._jobs = 0
         self._force = False
         self.refits = OnlineRefits()
@@ -198,7 +198,7 @@ class CalibrationSession:
         """Discard the static pose: the heading of a restarted sensor may have changed."""
         recording, fit = self._recording, self._fit
         moving = recording is not None and recording.phase != CalibrationPhase.STATIC
-        # The result of a functional phase stays useful: the notice asks for a new pose.
+        # The result of a functional phase remains valid; the notice requests a new static pose.
         outdated = fit is not None and not isinstance(fit.work, FunctionalJob)
         outputs: list[Output] = []
         if moving or outdated:
@@ -241,7 +241,7 @@ class CalibrationSession:
         ]
 
     def _revert_refits(self, request: Request) -> list[Output]:
-        """Restore the models from before online learning, and pause it until the next movement."""
+        """Restore the models from before online learning; pause it until a functional phase."""
         now, running = self.calibration, self._state not in RESTING
         before = None if now is None or running else self.refits.revert(now)
         if before is None:
@@ -259,7 +259,7 @@ class CalibrationSession:
     def select(self, event: CalibrationSelected) -> list[Output]:
         """Use a stored calibration, and pause online learning until the next movement.
 
-        It is stored again as a new version: the newest version is the one in force.
+        The calibration is stored again as a new version, because the newest version is in force.
         """
         request, chosen = event.request, event.calibration
         if self._state not in RESTING:
@@ -363,7 +363,7 @@ class CalibrationSession:
             self._static_s = recording.wanted_s
 
         self._jobs += 1
-        self.refits.job = None  # the only worker drops a running refit for this fit
+        self.refits.job = None  # The only worker drops a running refit in favour of this fit.
         self._fit = FitJob(self._jobs, self._job(phase, recording.trial(now_ns)))
 
         outputs: list[Output] = []
@@ -378,7 +378,7 @@ class CalibrationSession:
         return [*outputs, self.status(now_ns, text, CalibrationPhase.FITTING), self._fit]
 
     def _job(self, phase: CalibrationPhase, trial: CalibrationTrial) -> CalibrationJob:
-        """Return the fit of the phase that ended."""
+        """Return the fit that follows the phase that ended."""
         chain, settings = self._chain, replace(self._settings, static_s=self._static_s)
         lag_ns = None if self.lags is None else self.lags.known_ns()
         if phase == CalibrationPhase.ALIGN:
@@ -393,7 +393,7 @@ class CalibrationSession:
         )
 
     def report_job(self, event: JobProgress) -> list[Output]:
-        """Publish the progress of the running fit; that of cancelled jobs is ignored."""
+        """Publish the progress of the running fit; progress of cancelled jobs is ignored."""
         if self._fit is None or event.job != self._fit.job:
             return []
         fitting = CalibrationPhase.FITTING

@@ -20,7 +20,7 @@ RESTING = (
     CalibrationPhase.CALIBRATED,
     CalibrationPhase.ABORTED,
 )
-"""Phases in which nothing runs and a request is accepted."""
+"""Phases in which neither a recording nor a fit runs and a request is accepted."""
 
 
 class SessionEvent(StrEnum):

@@ -19,7 +19,8 @@ _NS = 1_000_000_000
 SILENT_NS = 500_000_000
 """Time without data after which a sensor is silent, ns."""
 REPORTED_NS = 500_000_000
-"""Shortest stillness whose end is reported, ns: a slow movement ends several in a row."""
+"""Shortest period of stillness whose end is reported, ns. A slow movement ends several short
+periods in a row."""
 
 
 class StillnessGate:
@@ -39,7 +40,7 @@ class StillnessGate:
         """Instant from which all sensors are still; None while they are not."""
 
     def feed(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> bool:
-        """Add one orientation; return whether it ended a stillness of `REPORTED_NS` or more."""
+        """Add one orientation; return whether it ended a stillness of at least `REPORTED_NS`."""
         monitor = self._monitors.get(sensor)
         if monitor is None:
             return False
@@ -55,7 +56,7 @@ class StillnessGate:
         return ended and t_ns - (before or 0) >= REPORTED_NS
 
     def still_s(self, now_ns: int) -> float:
-        """Return the time for which all sensors have been still, s; silence ends it."""
+        """Return the time for which all sensors have been still, s; a silent sensor ends it."""
         if self.silent(now_ns):
             self.still_since_ns = None
         since_ns = self.still_since_ns

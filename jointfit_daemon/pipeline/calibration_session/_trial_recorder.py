@@ -20,7 +20,7 @@ _MAX_SAMPLES = MAX_PHASE_S * 400
 
 @dataclass(slots=True)
 class TrialRecorder:
-    """Records from construction on.
+    """Records samples and mocap frames from construction on.
 
     Invariant: the tracks of a trial are strictly increasing in time.
     """
@@ -28,7 +28,7 @@ class TrialRecorder:
     _samples: dict[str, list[tuple[int, Quaternion]]] = field(default_factory=dict)
     _frames: list[tuple[int, MocapFrame]] = field(default_factory=list)
     overflowed: int = 0
-    """Measurements rejected because the recording was full."""
+    """Number of measurements rejected because the recording was full."""
 
     def add_sample(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> None:
         """Record one orientation."""
@@ -62,7 +62,7 @@ class TrialRecorder:
 
 
 def _increasing(t_ns: np.ndarray) -> np.ndarray:
-    """Return the indices of a strictly increasing subsequence: restarted clocks may step back."""
+    """Return the indices of a strictly increasing subsequence; a restarted clock may step back."""
     before = np.concatenate(([np.iinfo(np.int64).min], np.maximum.accumulate(t_ns)))[:-1]
     return np.flatnonzero(t_ns > before)
 
@@ -77,7 +77,7 @@ def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
     positions = np.full((n, len(markers), 3), np.nan)
     body_positions = np.full((n, len(bodies), 3), np.nan)
     body_orientations = np.full((n, len(bodies), 4), np.nan)
-    for layout in layouts:  # one copy per layout; one copy per frame would block the core
+    for layout in layouts:  # Copy once per layout; one copy per frame would block the core.
         rows = np.array([row for row, (_, frame) in enumerate(frames) if frame.layout == layout])
         seen = [frame for _, frame in frames if frame.layout == layout]
         to_marker = np.array([markers.index(name) for name in layout.markers], dtype=np.intp)

@@ -35,16 +35,18 @@ if TYPE_CHECKING:
 RECENT_NS = 10_000_000_000
 """Time over which recent errors are computed, ns: a few gait cycles."""
 FARTHEST_M = 1000.0
-"""Distance from the origin beyond which a marker counts as missing, m: no camera sees so far, and
-the squares of larger distances would spoil the solution."""
+"""Distance from the origin beyond which a marker counts as missing, m: no camera has this range,
+and the squares of larger distances would spoil the solution."""
 FEWEST_MARKERS = 3
-"""Markers of a frame with a solution: fewer do not determine the position of the first segment."""
+"""Smallest number of markers of a frame with a solution. Fewer markers do not determine the
+position of the first segment."""
 _FEW_EVALUATIONS = 8
-"""Most evaluations of the marker errors after which the same frame may also search labels."""
+"""Largest number of evaluations of the marker errors after which the same frame may also search
+labels."""
 OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
-"""Up to six steps, because frames are 100 ms apart. The Huber threshold bounds the influence of an
-exchanged marker until it is excluded. A restart takes longer than a frame, so restarts that do not
-help become rare."""
+"""The solver takes up to six steps, because frames are 100 ms apart. The Huber threshold bounds the
+influence of an exchanged marker until it is excluded. A restart takes longer than a frame, so
+restarts that do not help become rare."""
 
 
 class _FrameErrors(NamedTuple):
@@ -65,7 +67,7 @@ class ChainTracker:
     rate_hz : float
         Greatest number of fitted frames per second; above 0.
     refined : bool
-        Whether the marker positions are those of a calibration.
+        Whether the marker positions come from a calibration.
     """
 
     def __init__(self, loaded: LoadedModel, rate_hz: float, *, refined: bool = False) -> None:
@@ -99,7 +101,7 @@ class ChainTracker:
             self._monitor.search_labels(t_ns)
             return []
 
-        # The markers of the model in a frame, m, shape (M, 3); NaN where missing.
+        # Find the markers of the model in a frame, m, shape (M, 3); NaN where missing.
         if frame.layout is not self._layout:
             self._layout = frame.layout
             column = {name: k for k, name in enumerate(frame.layout.markers)}
@@ -118,7 +120,8 @@ class ChainTracker:
             return [state, *_notices(t_ns, reports)]
 
         pose = self._solver.feed(np.where(used[:, None], measured, np.nan))
-        # not in the frame of a restart, which takes as long
+        # Labels are not searched in the frame of a restart, because a restart takes as long as a
+        # search.
         if pose.evaluations <= _FEW_EVALUATIONS:
             self._monitor.search_labels(t_ns)
         distances, faults = self._monitor.compare(t_ns, measured, pose.rotations, pose.origins)

@@ -1,11 +1,11 @@
 """Detection of lost, exchanged and misplaced markers from their distances to a chain model.
 
-Faulty markers are excluded from inverse kinematics and compared with the model as before, so that
+Faulty markers are excluded from inverse kinematics. They are still compared with the model, so that
 their recovery is detected.
 
 Invariant: markers are excluded only while the others fit: at most a third of the visible markers is
-far from its place, and the median distance is small. Otherwise the model itself does not fit, which
-is reported, and no marker is excluded.
+far from its place, and the median distance is small. Otherwise the model itself does not fit. The
+monitor then reports the misfit and excludes no marker.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel
 
 FAR_M = 0.06
-"""Distance of a misplaced marker, m: soft-tissue artefact is smaller, and 0.04 m is accepted."""
+"""Distance from its place above which a marker is misplaced, m. Soft-tissue artefact is smaller,
+and 0.04 m is accepted."""
 NEAR_M = 0.03
 """Distance below which a faulty marker recovers, m."""
 FAULT_NS = 1_000_000_000
@@ -42,18 +43,20 @@ _MOST_EXCLUDED = 1 / 3
 _MEMORY = 0.02
 """Weight of a new frame in the mean position of a misplaced marker: 5 s at 10 Hz."""
 _OBSERVED = 50
-"""Frames after which the movement of a misplaced marker is compared with the segments."""
+"""Number of frames after which the movement of a misplaced marker is compared with the segments."""
 _RIGID_M = 0.012
-"""Standard deviation below which a marker is fixed to a segment, m."""
+"""Standard deviation of a marker in the axes of a segment below which it is fixed to this segment,
+m."""
 _MOVING_M = 0.025
-"""Standard deviation above which it is not fixed to its own segment, m."""
+"""Standard deviation of a marker in the axes of its own segment above which it is not fixed to this
+segment, m."""
 
 
 class MarkerReport(NamedTuple):
     """A change worth a notice."""
 
     id: str
-    """Name of a marker, or of the model."""
+    """Name of the marker or model."""
     state: str
     """`MarkerFlag`, or ``ok``."""
     text: str
@@ -96,7 +99,7 @@ class MarkerMonitor:
     _began_ns: int | None = None
     _labels: SegmentLabels = field(init=False)
     _by_shape: set[str] = field(default_factory=set)
-    """Flags of exchanges in force that the shapes of the segments showed."""
+    """Flags of exchanges in force that were found from the shapes of the segments."""
 
     def __post_init__(self) -> None:
         self._labels = SegmentLabels(self.model)
@@ -163,7 +166,8 @@ class MarkerMonitor:
         Returns
         -------
         distances
-            Of the markers from their places in the model, m, shape (M,); NaN where hidden.
+            Distances of the markers from their places in the model, m, shape (M,); NaN where
+            hidden.
         reports
             Faults that were found or ended.
         """
@@ -172,7 +176,7 @@ class MarkerMonitor:
         places += origins[segments]
         distances = np.sqrt(((places - measured) ** 2).sum(axis=1))
 
-        far = distances > FAR_M  # False where NaN
+        far = distances > FAR_M  # the comparison is False where NaN
         exchanged: list[tuple[int, ...]] = []
         if far.any() or self._by_shape:
             # First by the shapes of the segments, because exchanged markers turn a fitted segment;
@@ -198,7 +202,7 @@ class MarkerMonitor:
         return f"{kind}:{'~'.join(self.model.markers[m].name for m in markers)}"
 
     def _lasting(self, t_ns: int, condition: str, flags: Iterable[str], least_ns: int) -> set[str]:
-        """Return the flags whose condition has lasted `least_ns`; forget those not in `flags`."""
+        """Return the flags whose condition has lasted `least_ns`; discard other flags."""
         before = self._since_ns.get(condition, {})
         now = self._since_ns[condition] = {flag: before.get(flag, t_ns) for flag in flags}
         return {flag for flag, since_ns in now.items() if t_ns - since_ns >= least_ns}
@@ -261,8 +265,9 @@ class MarkerMonitor:
         return MarkerReport(names[0], MarkerFlag.MISPLACED, text, {"segment": segment})
 
     def _recover(self, t_ns: int, distances: Array) -> list[MarkerReport]:
-        """Use the markers of faults again that are near their places."""
-        # Excluded markers may have left their segment without a pose: its shape decides then.
+        """Use faulty markers again if they are near their places."""
+        # Without the excluded markers, a segment may have no pose. The shape of the segment then
+        # decides.
         near = [
             flag
             for flag, m in self._faults.items()

@@ -1,8 +1,8 @@
-"""Exchanged labels by the shapes of the segments of a chain model.
+"""Search of exchanged labels by the shapes of the segments of a chain model.
 
 Inverse kinematics turns a segment at the end of a chain to where its exchanged markers fit best.
-They are then near the places of other markers, or only some of them are far from their own. The
-shape of its markers does not change.
+The exchanged markers are then near the places of other markers, or only some are far from their own
+places. The shape of the segment's marker cluster does not change.
 
 Invariant: a frame takes a bounded part of a search. The last result holds until the next one.
 """
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel
 
 _FITS_M = 0.02
-"""RMS residual of a segment with correct labels, m."""
+"""Largest RMS residual of a segment with correct labels, m."""
 SEARCH_HZ = 5.0
-"""Most searches per second."""
+"""Maximum number of searches per second."""
 
 
 class SegmentLabels:
@@ -73,14 +73,14 @@ class SegmentLabels:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the last result and end the search, because no marker is suspect."""
+        """Discard the last result and end the search, because no marker is suspect."""
         self._examination = None
         self.faults: tuple[tuple[int, ...], ...] = ()
         """Exchanged markers in the last examined frame, as `find_exchanged_labels` returns them."""
         self._rms: Array = np.full(len(self._names), np.nan)
 
     def begin(self, t_ns: int, measured: Array) -> None:
-        """Search the labels of a frame, if a search is due and none is under way.
+        """Search the labels of a frame, if a search is due and no search is running.
 
         Parameters
         ----------

@@ -34,8 +34,8 @@ INTERVAL_NS = 100_000_000
 POSTURE_NS = 1_000_000_000
 """Time between retained frames of the same posture, ns."""
 POSTURE_COSINE = 0.99985
-"""Cosine of half of 2°, the rotation of a segment since the last retained frame below which the
-subject holds a posture."""
+"""Cosine of half of 2°. If every segment has rotated by less than 2° since the last retained frame,
+the subject holds a posture."""
 MAX_GAP_NS = 60_000_000
 """Longest time between two sensor frames that is interpolated, ns."""
 MAX_FRAMES = 3000
@@ -43,7 +43,7 @@ MAX_FRAMES = 3000
 MIN_FRAMES = 600
 """Number of frames that trigger a refit: one minute of movement."""
 REFIT_NS = 180_000_000_000
-"""Time between two refits, and before the first one once there are enough frames, ns."""
+"""Time between two refits, and from enough frames to the first refit, ns."""
 _FAULTS = {
     FrameFlag.STUCK: "sensor repeats its value",
     FrameFlag.SLIPPED: "sensor slipped",
@@ -59,7 +59,7 @@ _RECENT, _WAITING = 64, 16
 
 class _TrainingFrame(NamedTuple):
     sensors: list[Quaternion]
-    """q_optical_segment from each sensor, in the order of the chain."""
+    """Segment orientation q_optical_segment from each sensor, in the order of the chain."""
     mocap: list[Array]
     """Markers, shape (k, 3), or orientation of the rigid body, shape (4,), of each segment."""
 
@@ -122,7 +122,7 @@ class OnlineFrameCollector:
         if frame.layout is not self._layout:
             self._layout = frame.layout
 
-            # The markers or the rigid body of every cluster in the new layout.
+            # Find the markers or the rigid body of every cluster in the new layout.
             columns, missing = [], []
             for markers, body in self._clusters:
                 known, names = (
@@ -148,7 +148,7 @@ class OnlineFrameCollector:
             for columns, (_, body) in zip(self._columns, self._clusters, strict=True)
         ]
 
-        # Markers and bodies that are not visible; mostly none.
+        # Find the markers and bodies that are not visible; usually there are none.
         invisible = []
         for x, (markers, body) in zip(mocap, self._clusters, strict=True):
             if np.isfinite(x).all():
@@ -224,7 +224,7 @@ class OnlineFrameCollector:
             after = before
         else:
             return
-        if after is None:  # equal instants
+        if after is None:  # both frames have the same instant
             after = before
 
         sensors = self._sensors_at(t_ns, before, after)

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 _NS = 1_000_000_000
 REPORT_NS = 60 * _NS
-"""Duration after which an obstacle is reported, ns: most occlusions are shorter."""
+"""Duration after which an obstacle is reported, ns. Most occlusions are shorter."""
 MOCAP_SILENT_NS = 2 * _NS
-"""Silence after which the mocap system is regarded as off, ns."""
+"""Time without frames after which the mocap system is regarded as off, ns."""
 MAX_NAMES = 4
-"""Number of markers that a text lists by name."""
+"""Maximum number of markers that a text lists by name."""
 
 
 class LearningMonitor:
@@ -30,7 +30,8 @@ class LearningMonitor:
     Parameters
     ----------
     off : str or None
-        Reason why the configuration or calibration excludes online learning; None if it does not.
+        Reason why the configuration or calibration excludes online learning; None if learning is
+        possible.
     """
 
     def __init__(self, off: str | None = None) -> None:
@@ -50,7 +51,7 @@ class LearningMonitor:
     def add_obstacle(self, now_ns: int, reason: str, *, in_view: bool = True) -> None:
         """Add a frame that cannot be used; `in_view`: whether any marker is visible."""
         self._mocap_ns, self._obstacle, self._in_view = now_ns, reason, in_view
-        if self._usable_ns is None or not in_view:  # absence does not count as obstacle
+        if self._usable_ns is None or not in_view:  # an absent subject is no obstacle
             self._usable_ns = now_ns
 
     def notices(self, now_ns: int) -> list[Notice]:

@@ -19,18 +19,18 @@ class RefitOutcome(NamedTuple):
     """Outcome of a refit."""
 
     calibration: Calibration | None
-    """Calibration with the new models; None if they are not used."""
+    """Calibration with the new models; None if the new models are rejected."""
     notice: Notice
 
 
 @dataclass(slots=True)
 class OnlineRefits:
-    """Refits since the last functional calibration."""
+    """Tracks the refits since the last functional calibration."""
 
     job: int | None = None
     """Number of the running refit."""
     original: Calibration | None = None
-    """Calibration before the first refit that was used: the target of a reversal."""
+    """Calibration before the first accepted refit; a reversal restores this calibration."""
     paused: bool = False
     """Whether online learning waits for the next functional calibration, after a reversal."""
 
@@ -42,7 +42,7 @@ class OnlineRefits:
             text = f"models unchanged: {event.failure}"
             return RefitOutcome(None, Notice(event.t_ns, kind, "online", text, NoticeLevel.WARNING))
 
-        # The data of the notice: errors in degrees, to four digits.
+        # The notice contains errors in degrees, with four digits.
         quality = result.quality.get("online", {})
         data: dict[str, object] = {
             key: quality[key] for key in ("frames", "judged") if key in quality
@@ -70,7 +70,7 @@ class OnlineRefits:
         return found
 
     def revert(self, calibration: Calibration) -> Calibration | None:
-        """Return the calibration with its original models; None if no refit was used."""
+        """Return the calibration with its original models; None without an accepted refit."""
         old, self.original = self.original, None
         if old is None:
             return None

@@ -1,8 +1,8 @@
 """The plane of a movement, from the positions of all markers.
 
-Each marker of a planar movement stays in a plane of its own, and these planes are parallel. The
-pooled scatter of the markers about their own means therefore has its smallest eigenvalue along the
-common normal.
+Each marker of a planar movement moves in its own plane, and these planes are parallel. The pooled
+scatter of the markers about their own means therefore has its smallest eigenvalue along the common
+normal.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 FEWEST_FRAMES = 40
-"""Frames before a plane is estimated: 2 s at 20 Hz."""
+"""Number of frames before a plane is estimated: 2 s at 20 Hz."""
 LEAST_MOVEMENT_M = 0.01
-"""RMS movement along the smaller direction in the plane, m, below which it is not determined."""
+"""RMS movement along the smaller principal direction in the plane, m, below which the plane is not
+determined."""
 MOST_OFF_M = 0.02
 """RMS distance of the markers from their planes, m, above which the movement is not planar."""
 MOST_RATIO = 0.5
-"""Ratio of the movement out of the plane to the smaller one in it, above which the movement is not
-planar."""
+"""Ratio of the movement out of the plane to the smaller principal movement in the plane, above
+which the movement is not planar."""
 
 
 class MovementPlane(NamedTuple):
@@ -40,7 +41,8 @@ class MovementPlane(NamedTuple):
 class PlaneEstimator:
     r"""Estimates the plane of a stream of frames.
 
-    With the weights w of the frames t, which decrease with age, and the weighted mean of marker m,
+    The position of marker m in frame t is x_tm, its weighted mean x̄_m. The weight w_t of a frame
+    decreases with age. The scatter is
 
     .. math:: S = \sum_m \sum_t w_t (x_{tm} - \bar x_m)(x_{tm} - \bar x_m)^T
 
@@ -96,5 +98,5 @@ class PlaneEstimator:
             )
             return MovementPlane(None, out, reason)
         normal = vectors[:, 0]
-        sign = np.sign(normal[np.abs(normal).argmax()])  # the same sign for similar planes
+        sign = np.sign(normal[np.abs(normal).argmax()])  # Use the same sign for similar planes.
         return MovementPlane(np.asarray(sign * normal), out, None)

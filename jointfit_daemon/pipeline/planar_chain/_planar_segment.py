@@ -17,18 +17,18 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LOOSE_M = 0.012
-"""RMS residual above which markers are not at their mutual places, m: two markers whose distance
-changed by 24 mm, more than soft-tissue artefact does."""
+"""RMS residual above which markers are not at their mutual places, m. Two markers reach it if their
+distance changes by 24 mm, which exceeds soft-tissue artefact."""
 LEAST_MARKERS = 2
-"""Markers that define a pose in a plane."""
+"""Number of markers that define a pose in a plane."""
 _EXCHANGE_RAD = 2.5
 """Rotation between two frames, rad, above which the labels must have been exchanged."""
 _EXCHANGE_NS = 200_000_000
-"""Longest time between these two frames, ns."""
+"""Longest time between two frames that are checked for exchanged labels, ns."""
 _MEMORY = 0.02
 """Weight of a new frame in the mean square of the residuals and in the share of loose frames."""
 _MOST_LOOSE = 0.1
-"""Largest share of frames with displaced markers of a segment."""
+"""Share of frames with displaced markers above which a segment has no pose."""
 
 
 class PlanarPose(NamedTuple):
@@ -50,7 +50,7 @@ class MissingPose(NamedTuple):
 
 @dataclass(slots=True)
 class PlanarSegment:
-    """Tracks one segment."""
+    """Tracks the pose of one segment in the plane."""
 
     markers: tuple[str, ...]
     template: NDArray[np.complex128] | None = None
@@ -121,5 +121,5 @@ class PlanarSegment:
             return False
         exchanged = abs(phase(exp(1j * (angle - before)))) > _EXCHANGE_RAD
         if exchanged:
-            self._angle = phase(-exp(1j * angle))  # that of the segment with correct labels
+            self._angle = phase(-exp(1j * angle))  # the rotation of the segment with correct labels
         return exchanged

@@ -1,9 +1,9 @@
 """Joint positions and stick figure of a planar chain in operation.
 
-Every joint lies between two body parts. Seen from a part with two markers, each marker of its
-neighbor moves on a circle about the joint; a running fit with forgetting gives the center and its
-predicted error. One marker suffices on a part at an end of the chain. Source: Akbarifar et al.,
-Iranian Journal of Biomedical Engineering 15 (2021), 1-11.
+Every joint lies between two body parts. In the coordinates of a part with two markers, each marker
+of the neighboring part moves on a circle about the joint. A running fit with forgetting gives the
+center and its predicted error. One marker suffices on a part at an end of the chain. Source:
+Akbarifar et al., Iranian Journal of Biomedical Engineering 15 (2021), 1-11.
 
 Invariant: nothing here depends on an IMU or on a calibration.
 """
@@ -48,24 +48,25 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 LEARNED_HZ = 20.0
-"""Frames per second of the running fits: joints turn by a few degrees between two of them."""
+"""Frames per second of the running fits. Joints turn by a few degrees between two of these
+frames."""
 FITTED_HZ = 2.0
-"""Estimates of the centers per second."""
+"""Number of estimates of the centers per second."""
 OTHER_PLANE_COS = 0.9962
-"""Cosine of the angle between two planes, 5°, beyond which the centers are estimated again: the
-circles of a plane that is 5° off are compressed by 0.4 %."""
+"""Cosine of 5°, the angle between two planes above which the centers are estimated again. In a
+plane that is 5° off, the circles are compressed by 0.4 %."""
 FARTHEST_M = 1000.0
 """Distance from the origin beyond which a marker counts as missing, m."""
 
 
 @dataclass(slots=True)
 class _Side:
-    """Center of a joint in the coordinates of one of its parts."""
+    """Estimator of the center of a joint in the coordinates of one of its body parts."""
 
     parent: str
     child: str
     circles: list[RunningCircle]
-    """One for each marker of the child."""
+    """One circle fit for each marker of the child."""
     estimate: CenterEstimate | None = None
 
     def feed(self, pose: PlanarPose | None, child: NDArray[np.complex128]) -> None:
@@ -134,7 +135,7 @@ class PlanarTracker:
         self._columns: list[int] = []
 
     def serves(self, chain: Chain, rate_hz: float, memory_s: float) -> bool:
-        """Return whether this tracker has these settings; its markers are those of the cameras."""
+        """Return whether this tracker was created with these settings."""
         return self._given == (chain, rate_hz, memory_s)
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
@@ -143,7 +144,7 @@ class PlanarTracker:
         if not (learned or shown):
             return []
 
-        # The markers of every part, m, shape (m, 3); NaN where missing.
+        # Find the markers of every part, m, shape (m, 3); NaN where missing.
         if frame.layout is not self._layout:
             self._layout = frame.layout
             column = {name: k for k, name in enumerate(frame.layout.markers)}
@@ -162,7 +163,7 @@ class PlanarTracker:
         if fitted:
             notices = self._update_plane(t_ns)
 
-        # The pose of every part with two markers, or the reason why there is none.
+        # Estimate the pose of every part with two markers, or find the reason why there is none.
         poses: dict[str, PlanarPose | MissingPose] = {}
         if self._basis is not None:
             poses = {
@@ -175,7 +176,7 @@ class PlanarTracker:
         return [*notices, self._figure(t_ns, frame, measured, poses)] if shown else notices
 
     def _update_plane(self, t_ns: int) -> list[Output]:
-        """Use the first plane, and another one if the movement has changed its plane."""
+        """Use the first plane; use a new plane if the plane of the movement has changed."""
         self._plane = plane = self._estimator.estimate()
         if plane.normal is None:
             return []
@@ -248,7 +249,7 @@ class PlanarTracker:
         measured: Mapping[str, Array],
         poses: Mapping[str, PlanarPose | MissingPose],
     ) -> PlanarJoint:
-        """Return the joint in this frame, from each part that has a pose and a center."""
+        """Return the joint's position in this frame, from each part with a pose and a center."""
         basis = self._basis
         if basis is None:
             return PlanarJoint(joint.name, None, None, None, self._plane.refused)
@@ -262,7 +263,7 @@ class PlanarTracker:
                 why = "no center yet" if estimate is None else estimate.refused
                 reasons.append(f"{side.child} about {joint.name}, seen from {side.parent}: {why}")
             else:
-                # The position along the normal is that of the markers.
+                # The position along the normal is taken from the markers.
                 part, along = self._parts[side.parent], measured[side.parent] @ normal
                 t = basis @ (pose.origin.real, pose.origin.imag) + normal * np.nanmean(along)
                 q = rotation.exp(np.angle(pose.turn) * normal[None])
@@ -276,7 +277,7 @@ class PlanarTracker:
         return PlanarJoint(joint.name, position, error, arc, None)
 
     def _stick(self, part: str, seen: Array, joints: Mapping[str, PlanarJoint]) -> Stick:
-        """Return the ends of a segment: its joints; at an end of the chain a marker and a joint."""
+        """Return the ends of a segment: two joints, or marker and joint at an end of the chain."""
         ends: list[Vector | None] = [
             joints[joint.name].position for joint in self._joints if part in joint.parts
         ]

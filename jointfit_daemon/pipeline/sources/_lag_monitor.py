@@ -1,9 +1,9 @@
 """Lag of every sensor behind the mocap system during operation, and notices of its changes.
 
-The monitor is fed with stamped samples and mocap frames and retains the last window of each. It
+The monitor receives stamped samples and mocap frames, and retains the last window of both. It
 estimates the lag of one window at a time in small steps, so acquisition never waits for a whole
-fit, and a replay takes the same steps. It only observes: the lags in use come from calibration or
-``rig.toml``.
+fit. A replay takes the same steps. The monitor changes no lag: the lags in use come from
+calibration or ``rig.toml``.
 """
 
 from __future__ import annotations
@@ -42,21 +42,24 @@ HOP_NS = 2_500_000_000
 MARGIN_NS = 300_000_000
 """Samples of a sensor before and after the window, ns: for the lag and the ends of the filter."""
 DRIFT_FAULT = 2e-6
-"""Drift of the lag between two synchronized clocks above which a clock fit must be wrong."""
+"""Drift of the lag between two synchronized clocks, ns/ns, above which a clock fit must be
+wrong."""
 STEP_FAULT_NS = 1_000_000.0
 """Step of the lag above which the calibration is no longer valid, ns."""
 CONTRADICTION_SIGMA = 4.0
-"""Difference of configured and estimated lag, in standard deviations, at which one is wrong."""
+"""Difference between configured and estimated lag, in standard deviations, at which one of the two
+lags is wrong."""
 RESTART_SD_NS = 1_000_000.0
 """Standard deviation of the change of the lag when a clock restarts, ns."""
 MAX_SAMPLES = 6_000
-"""Samples per sensor and mocap frames that are retained: a window at 500 Hz."""
+"""Number of retained samples per sensor and of retained mocap frames: a window at 500 Hz."""
 _FRAMES_PER_STEP = 150
 _MIN_FRAMES = 100
 
 
 _LOW_R2 = "no lag from this movement; normal on soft tissue, the lag in force stays"
-"""Cause of a low R² while tracking: the sensor moves on the skin, which is not a fault."""
+"""Cause of a low coefficient of determination R² during tracking. The sensor moves on the skin,
+which is no fault."""
 
 
 class KnownLag(NamedTuple):
@@ -184,7 +187,7 @@ class LagMonitor:
         if not self._clusters:
             return
         frames = self._frames
-        if self._mocap_epoch not in (None, epoch):  # their clock restarted
+        if self._mocap_epoch not in (None, epoch):  # the clock of the frames restarted
             frames.clear()
             self._tracks.clear()
             self._next_ns = None
@@ -209,7 +212,7 @@ class LagMonitor:
     # --- estimation --------------------------------------------------------------------------
 
     def step(self, now_ns: int) -> list[Notice]:
-        """Compute for a few milliseconds at most, and return the notices that result."""
+        """Compute for a few milliseconds at most, and return the resulting notices."""
         window = self._window
         if window is None:
             if self._waiting:
@@ -233,7 +236,7 @@ class LagMonitor:
                 f"the calibration has no markers on {segment}: calibrate with motion capture"
             )
 
-        # Orientations of the segment, shared by its sensors.
+        # Compute the orientations of the segment, which all its sensors share.
         track = self._tracks.get(segment)
         if track is None or track.end_ns != end_ns:
             rows = [row for row in self._frames if start_ns <= row[0] <= end_ns]
@@ -243,7 +246,7 @@ class LagMonitor:
             track = _SegmentTrack(end_ns, t_ref, q_ref)
             self._tracks[segment] = track
 
-        # Samples of the sensor, with a margin for the lag.
+        # Select the samples of the sensor, with a margin for the lag.
         low, high = start_ns - MARGIN_NS, end_ns + MARGIN_NS
         samples = [row for row in self.sensors[sensor].samples if low <= row[0] <= high]
         if len(samples) < _MIN_FRAMES:
@@ -276,7 +279,7 @@ class LagMonitor:
             data = {"step_ms": round(step_ns * 1e-6, 3)}
             notices.append(Notice(now_ns, kind, name, text, level, data))
 
-        # Drift between synchronized clocks, reported once.
+        # Drift between synchronized clocks is reported once.
         excess = abs(tracked.drift) - DRIFT_FAULT
         drifts = excess > 2.0 * tracked.drift_sigma
         if drifts and not lag.drifted:
@@ -289,7 +292,7 @@ class LagMonitor:
             notices.append(Notice(now_ns, NoticeKind.CLOCK, name, text, warning, data))
         lag.drifted = drifts or (lag.drifted and excess > 0.0)
 
-        # Contradiction of a configured lag, reported once.
+        # A contradiction between configured and estimated lag is reported once.
         if (known := self._known.get(name)) is None:
             return notices
         difference = tracked.lag_ns - known.lag_ns

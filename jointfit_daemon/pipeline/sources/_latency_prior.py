@@ -31,7 +31,7 @@ class LatencyPrior(NamedTuple):
 
 
 def latency_prior(source: Source) -> LatencyPrior:
-    """Return the prior of a source: as configured, as declared by its driver, or by transport.
+    """Return the prior of a source from its configuration, its driver, or else its transport.
 
     A driver declares a class attribute ``least_delay_ms``, or its settings a property
     ``usual_delay_ms`` if the delay depends on them: mean and standard deviation, ms.

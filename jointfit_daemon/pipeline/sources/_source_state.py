@@ -1,7 +1,7 @@
 """State of one source in the core: decoder, clock and counters.
 
-Converts chunks to stamped samples and counts losses and errors. The state is independent of frames,
-calibration and other sources.
+The state converts chunks to stamped samples and counts losses and errors. The state is independent
+of frames, calibration and other sources.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ WITHHELD = ("unpublished", "duplicates", "late")
 
 
 KEPT_SAMPLES = 1000
-"""Samples and events after a reopening for which the time base of the previous decoder is used."""
+"""Number of samples and events after a reopening for which the time base of the previous decoder is
+used."""
 
 
 class StampedMeasurement(NamedTuple):
@@ -59,11 +60,11 @@ class SourceState:
     _withheld: dict[str, int] = field(default_factory=lambda: dict.fromkeys(WITHHELD, 0))
     _decoder: Decoder | None = None
     _tick_clock: TickClock | None = None
-    """Time base of the previous decoder. It is used until the present decoder has determined its
-    own, for at most `KEPT_SAMPLES` samples. A restart also ends its use, because the device may be
-    another one."""
+    """Time base of the previous decoder. It is used until the present decoder has determined a time
+    base, for at most `KEPT_SAMPLES` samples. A restart also ends the use, because the device may
+    have been exchanged."""
     _kept: int = 0
-    """Samples left for which `_tick_clock` is used."""
+    """Number of further samples for which `_tick_clock` is used."""
 
     @classmethod
     def create(
@@ -105,7 +106,7 @@ class SourceState:
         self.counts.opened += 1
 
     def stop(self) -> list[StampedMeasurement | Corrupt | DeviceEvent]:
-        """Return the rest of the decoder's output, and drop the decoder."""
+        """Return the remaining output of the decoder, and discard the decoder."""
         decoder, self._decoder = self._decoder, None
         self.open = self.online = False
         if decoder is None:
@@ -178,8 +179,8 @@ class SourceState:
         self, decoded: list[Decoded], decoder: Decoder
     ) -> list[StampedMeasurement | Corrupt | DeviceEvent]:
         items: list[StampedMeasurement | Corrupt | DeviceEvent] = []
-        # A new decoder may need seconds to determine the unit of device time. Samples numbered by
-        # their counter meanwhile would look like another clock, that is, a restart.
+        # A new decoder may need seconds to determine the unit of device time. If samples were
+        # numbered by their counter meanwhile, the change would look like a restart of the clock.
         clock, tick_clock = self.clock, decoder.tick_clock
         if tick_clock is None and self._kept > 0:
             tick_clock = self._tick_clock
@@ -187,7 +188,7 @@ class SourceState:
         for item in decoded:
             if isinstance(item, _MEASUREMENTS):
                 stamped = self._stamp(item, tick_clock)
-                if clock.news:  # an event that a sample reveals comes before the sample
+                if clock.news:  # an event found from a sample precedes the sample
                     items += self._clock_events()
                 items.append(stamped)
                 continue
@@ -229,7 +230,7 @@ class SourceState:
         return StampedMeasurement(item, stamp)
 
     def _clock_events(self) -> list[DeviceEvent]:
-        """Return the events of the clock, and count its restarts."""
+        """Return the events of the clock, and count clock restarts."""
         events = [DeviceEvent(news.kind, news.text, dict(news.data)) for news in self.clock.news]
         self.clock.news.clear()
         restarts = sum(event.kind == "restart" for event in events)

@@ -1,8 +1,8 @@
 """Sync lines of a rig: assignment of the edges of different sources to common instants.
 
 The reference of a line is the mocap source whose table names the line (``sync_line``: one edge per
-exposure), else the first source whose edge arrived. The clocks of all other sources on the line are
-tied to the reference.
+exposure), or else the first source whose edge arrived. The clocks of all other sources on the line
+are synchronized to the clock of the reference.
 
 Invariant: the result depends only on the edges and clocks, in order of arrival.
 """
@@ -40,7 +40,7 @@ class SyncLines:
         self._add_reference_edge(number, source, clock, edge)
 
     def add_edge(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
-        """Add an edge on line `number` that `source` time-stamped."""
+        """Add an edge on line `number` with a time stamp of `source`."""
         line = self._lines.setdefault(number, _Line())
         silent = edge.t_ns - line.last_ns > SYNC_STALE_NS
         if line.reference is None or (silent and number not in self._mocap_lines):
