@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 TOLERATED = 2.5
-"""Threshold of Huber's weight: Mahalanobis distance of an estimate, divided by the root of the
+"""Threshold κ of Huber's weight: Mahalanobis distance of an estimate, divided by the root of the
 dimension, above which its weight is reduced."""
 _PASSES = 50
 
@@ -32,10 +32,11 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
     .. math:: I_k = C_k^{-1}, \qquad C = \Big(\sum_k w_k I_k\Big)^{-1}, \qquad
               c = C \sum_k w_k I_k c_k
 
-    with :math:`C_k` the covariance of estimate k and w_k = min(1, κ/D_k). D_k is the Mahalanobis
-    distance of estimate k from the center fused from the other estimates, κ is `TOLERATED` times
-    the root of the dimension. The information :math:`I_k` is zero along unobserved directions. If
-    the estimates differ by more than their covariances predict, C is increased accordingly.
+    with :math:`C_k` the covariance of estimate k and w_k = min(1, κ/D_k)². κ is `TOLERATED`, and
+    D_k the Mahalanobis distance of estimate k from the center fused from the other estimates,
+    divided by the root of the dimension. The information :math:`I_k` is zero along unobserved
+    directions. If the estimates differ by more than their covariances predict, C is increased
+    accordingly.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Marker errors of inverse kinematics that the field accepts.
 
 Source: OpenSim documentation, "Simulation with OpenSim: Best Practices", checklist of inverse
-kinematics: RMS error below about 2 cm, largest marker error below 4 cm, of bony landmarks below
-2 cm. Hicks et al. 2015, doi 10.1115/1.4029304, describe the same practice.
+kinematics. The limits are an RMS error of about 2 cm, a marker error of 4 cm, and a landmark error
+of 2 cm. Hicks et al. 2015, doi 10.1115/1.4029304, describe the same practice.
 """
 
 from __future__ import annotations

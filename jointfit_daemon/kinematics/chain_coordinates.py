@@ -1,12 +1,13 @@
 r"""Named joint coordinates of a chain, such as ``hip_flexion_r``: values and standard deviations.
 
-The state of a chain consists of rotation matrices. The coordinates of a joint parametrize them: the
-pose of the joint is a function f(q) of its coordinates q. This module inverts that function by
-Gauss-Newton steps on the manifold,
+The state of a chain consists of rotation matrices. The coordinates of a joint parametrize its
+rotation matrix A: the pose of the joint is a function f(q) of the coordinates q. This module
+inverts f by Gauss-Newton steps on the manifold,
 
 .. math:: q \leftarrow q + G^{+}\,\log(f(q)^{-1} A), \qquad G = \partial\log / \partial q
 
-The standard deviations follow from the covariance C of a step by :math:`G^{+} C G^{+T}`.
+:math:`G^{+}` is the pseudo-inverse of G. The standard deviations follow from the covariance C of a
+step as :math:`G^{+} C G^{+T}`.
 """
 
 from __future__ import annotations
@@ -34,13 +35,14 @@ _LARGEST_STEP = 0.2
 _CONVERGED = 1e-10
 """Largest step of a converged inversion, rad and m."""
 _DIFFERENCE = 1e-5
-"""Half the interval of a central difference, rad and m; its error is about 1e-10."""
+"""Half the interval of a central difference, rad and m; the derivative has an error of about
+1e-10."""
 _RIDGE = 1e-12
-"""Added to G^T G, so that a gimbal lock yields finite angles."""
+"""Regularization added to G^T G, so that a gimbal lock yields finite angles."""
 _TRIED = 24
-"""Angles tried per coordinate for the start of an inversion, 15 degrees apart."""
+"""Number of start angles per coordinate that an inversion tries, 15 degrees apart."""
 _TOGETHER = 250
-"""Instants that are compared with the tried poses at once, which bounds the memory."""
+"""Number of instants that are compared with the tried poses at once; it limits the memory."""
 _THREE_ANGLES = 3
 
 
@@ -51,7 +53,7 @@ class JointCoordinates:
     segment: str
     names: tuple[str, ...]
     is_angle: tuple[bool, ...]
-    """Angle, rad, or else translation, m."""
+    """Whether each coordinate is an angle, rad, or a translation, m."""
     pose: Callable[[Array], tuple[Array, Array]] | None
     """Maps values, shape (n, k), to A_i of the chain, shape (n, 3, 3), and the world origin of a
     free segment, m, shape (n, 3). None: the coordinate of a coupled joint.
@@ -144,7 +146,7 @@ def coordinate_table(
         One entry for each segment, in the order of the model.
     known
         Values that the measurement determines, shape (T, K); None: all. Angles are continuous over
-        these instants, because the others are arbitrary.
+        the determined values, because undetermined values are arbitrary.
     """
     values, sd, misfit, coupled, column = [], [], {}, 0, 0
     count = sum(len(joint.names) for joint in coordinates)
@@ -165,7 +167,7 @@ def coordinate_table(
         found, G, left = _inverted(joint, state.rotations[:, i], origin, is_free=is_free)
         values.append(_continuous(found, joint.is_angle, determined))
 
-        # a hinge steps about its axis, a ball about three axes, a free joint also along three
+        # a hinge has one step, a ball joint three rotations, a free joint also three translations
         step = np.asarray(segment.joint.axis)[:, None] if segment.joint.kind == "hinge" else None
         P = _pseudo_inverse(G) if step is None else _pseudo_inverse(G) @ step
         sd.append(np.sqrt(np.einsum("tkj,tjl,tkl->tk", P, block, P)))
@@ -183,7 +185,7 @@ def coordinate_table(
 def _inverted(
     joint: JointCoordinates, A: Array, origin: Array, *, is_free: bool
 ) -> tuple[Array, Array, float]:
-    """Return the values, shape (T, k), their derivative G, (T, 3 or 6, k), and the misfit, rad."""
+    """Return the values, shape (T, k), the derivative G, (T, 3 or 6, k), and the misfit, rad."""
     rows = 6 if is_free else 3
     values, turning = _start(joint, A), np.flatnonzero(joint.is_angle)
     for _ in range(_ITERATIONS):
@@ -207,7 +209,7 @@ def _pose(joint: JointCoordinates, values: Array) -> tuple[Array, Array]:
 
 
 def _start(joint: JointCoordinates, A: Array) -> Array:
-    """Return the tried angles whose rotation is nearest to A; translations are zero."""
+    """Return the start angles whose rotation is nearest to A, and zero for translations."""
     turn = np.arange(_TRIED) * (2.0 * np.pi / _TRIED) - np.pi
     turning = np.flatnonzero(joint.is_angle)
     if not turning.size:

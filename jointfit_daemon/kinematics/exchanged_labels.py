@@ -1,4 +1,4 @@
-"""Detection of exchanged marker labels from measured positions and places in a model."""
+"""Detection of exchanged marker labels from measured positions and model positions."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 EXCHANGE_GAIN = 0.2
-"""Ratio of the squared distances after and before an exchange of labels, below which they are
-exchanged."""
+"""Ratio of the summed squared distances after and before an exchange of labels, below which the
+labels count as exchanged."""
 
 
 def find_exchanged_labels(
     places: Array, measured: Array, far: NDArray[np.bool_]
 ) -> list[tuple[int, ...]]:
-    """Return groups of far markers that fit much better with each other's labels.
+    """Return groups of far markers that fit the model much better after an exchange of labels.
 
     Parameters
     ----------
@@ -29,16 +29,17 @@ def find_exchanged_labels(
     measured
         Measured positions, m, shape (M, 3).
     far
-        Markers that are measured far from their places, shape (M,).
+        Mask of the markers whose measured position is far from the model position, shape (M,).
 
     Returns
     -------
     list of tuple of int
-        Each marker of a group is at the place of the next one, and the last at that of the first.
+        Each marker of a group is at the model position of the next marker, the last marker at the
+        model position of the first.
     """
     rows = np.flatnonzero(far)
     square = ((places[rows, None] - measured[None, rows]) ** 2).sum(axis=-1)
-    # the marker at each place if all labels are reassigned
+    # the marker at each model position if all labels are reassigned
     nearest = linear_sum_assignment(square)[1]
     place_of = np.argsort(nearest)
 
@@ -54,7 +55,7 @@ def find_exchanged_labels(
             groups.append(tuple(rows[group].tolist()))
             left -= set(group)
 
-    # A misplaced marker may have spoiled the assignment of two others.
+    # One misplaced marker may have caused a wrong assignment of two other markers.
     own = square.diagonal()
     better = square + square.T < EXCHANGE_GAIN * (own[:, None] + own[None])
     for i, j in np.argwhere(np.triu(better, 1)).tolist():

@@ -2,10 +2,11 @@ r"""Joint angles from the rotation between two segments.
 
 .. math:: q_j = q_{proximal}^* \otimes q_{distal}
 
-with matrix R, indices from 0. Segment axes and signs are those of CONVENTIONS.md (x to the right, y
-anterior, z proximal); angles in rad; q and -q give the same result. `AngleConvention` selects the
-three angles of a joint. Where two axes of a sequence coincide, one of the two angles is 0, the
-other one contains the whole rotation, and the frame is flagged as gimbal-locked.
+R is the matrix of this quaternion, with indices from 0. CONVENTIONS.md defines segment axes (x to
+the right, y anterior, z proximal) and signs. Angles are in rad; q and -q give the same result.
+`AngleConvention` selects the three angles of a joint. Where two axes of a sequence coincide, one of
+the two angles is 0 and the other angle contains the whole rotation. The frame is then flagged as
+gimbal-locked.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 GIMBAL_SINE = 0.9999
-"""Sine of the middle angle above which the outer two are not separated."""
+"""Sine of the middle angle above which the two outer angles are not separated."""
 LOCKED_SINE = sqrt(1.0 - GIMBAL_SINE**2)
 """Sine of the elevation below which plane and axial rotation are not separated: within 0.8°."""
 _SMALL_TILT = 1e-6
-"""Sine of half the tilt below which the tilt is twice that sine."""
+"""Sine of half the tilt below which the tilt is computed as twice this sine."""
 
 
 def joint_rotation(q_proximal: ArrayLike, q_distal: ArrayLike) -> Array:
@@ -66,7 +67,7 @@ def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
 def functional_axis(q_joint: ArrayLike) -> Array:
     """Return the principal rotation axis of a joint: unit, shape (3,), pointing to the right.
 
-    First right singular vector of the joint's rotation vectors; input shape (n, 4).
+    The axis is the first right singular vector of the rotation vectors of `q_joint`, shape (n, 4).
     """
     axis: Array = np.linalg.svd(rotation.log(q_joint), full_matrices=False)[2][0]
     return -axis if axis[0] < 0.0 else axis
@@ -80,7 +81,8 @@ class JointReading(NamedTuple):
     """Angle between the segments, rad: pi when straight."""
     gimbal: bool
     sd_factor: float
-    """Standard deviation of the main angle over that of the rotation per axis, to first order.
+    """Ratio of the standard deviation of the main angle to the standard deviation of the rotation
+    per axis.
 
     The main angle is elevation in the convention ``elevation``, otherwise flexion. Infinite where
     the main angle is not defined."""
@@ -113,8 +115,8 @@ def read_joint(
     flexion_sign : float
         +1 for hip and ankle, -1 for the knee, where flexion moves the heel back.
     left : bool
-        Left limb: it is mirrored at its sagittal plane, so that both sides agree. Not used for the
-        trunk.
+        Whether the limb is a left limb. A left limb is mirrored at its sagittal plane, so that both
+        sides agree. Not used for the trunk.
     convention : AngleConvention
         Definition of the three angles.
     """
@@ -152,21 +154,22 @@ def _flexion(w: float, x: float, y: float, z: float, sign: float) -> JointReadin
 def _trunk(q_lower_upper: Quaternion) -> JointReading:
     """Return forward flexion, bending to the right and rotation to the left of the upper segment.
 
-    The sequence is that of flexion, of the upper segment relative to the lower one. Chains list the
-    upper segment first.
+    The sequence of rotations equals the sequence of the convention ``flexion``, for the upper
+    segment relative to the lower segment. Chains list the upper segment first.
     """
     return _flexion(*q_lower_upper, -1.0)
 
 
 def _elevation(w: float, x: float, y: float, z: float) -> JointReading:
-    r"""Return plane of elevation, elevation and axial rotation of the ISB (Y-X-Y in its axes).
+    r"""Return plane of elevation, elevation and axial rotation (Y-X-Y in ISB axes).
 
     .. math:: R = R_z(\gamma) R_y(-\epsilon) R_z(\psi), \quad
               \epsilon = 2\,\mathrm{atan2}(\sqrt{x^2 + y^2}, \sqrt{w^2 + z^2}), \quad
               \gamma, \psi = \mathrm{atan2}(z, w) \pm \mathrm{atan2}(x, -y)
 
-    The plane is 0 in abduction and 90 degrees in forward flexion. Plane and axial rotation are not
-    separable where the elevation is 0 or 180 degrees: the plane is then 0.
+    γ is the plane, ε the elevation, ψ the axial rotation. The plane is 0 in abduction and 90
+    degrees in forward flexion. Plane and axial rotation are not separable where the elevation is 0
+    or 180 degrees: the plane is then 0.
     """
     swing, twist = hypot(x, y), hypot(w, z)
     elevation = 2.0 * atan2(swing, twist)
@@ -182,7 +185,7 @@ def _elevation(w: float, x: float, y: float, z: float) -> JointReading:
 
 
 def _tilt_torsion(w: float, x: float, y: float, z: float, sign: float) -> JointReading:
-    r"""Return the tilt of the long axis as flexion and adduction, and the torsion about it.
+    r"""Return the tilt of the long axis as flexion and adduction, and the torsion about this axis.
 
     .. math:: R = \exp(v_x, v_y, 0)\, R_z(\tau), \quad \tau = 2\,\mathrm{atan2}(z, w)
 
@@ -220,7 +223,8 @@ class PatentReading(NamedTuple):
     joint: float
     """pi - abs(alpha), rad: the patent's joint angle."""
     gimbal: bool
-    """Whether beta is close to 90 degrees, so that alpha contains the whole rotation."""
+    """Whether the frame is gimbal-locked: beta is close to 90 degrees, and alpha contains the
+    rotation."""
 
 
 def read_patent(q_proximal: Quaternion, q_distal: Quaternion) -> PatentReading:

@@ -23,7 +23,7 @@ IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
 IDENTITY.setflags(write=False)
 
 _CONJUGATE: Array = np.array([1.0, -1.0, -1.0, -1.0])
-_SMALL_ANGLE = 1e-6  # rad; below it the series of sin(x/2)/x is exact to rounding
+_SMALL_ANGLE = 1e-6  # rad; for smaller x the series of sin(x/2)/x is exact to rounding
 _SMALL_SINE = 1e-9
 
 
@@ -72,14 +72,14 @@ def normalize(q: ArrayLike) -> Array:
 
 
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
-    r"""Turn vectors: v + w t + q_v x t, with t = 2 q_v x v.
+    r"""Rotate vectors: v + w t + q_v x t, with t = 2 q_v x v and q = (w, q_v).
 
     Parameters
     ----------
     q : array_like, shape (..., 4)
         Unit quaternion ``q_a_b``.
     v : array_like, shape (..., 3)
-        b-coordinates.
+        Vectors in b-coordinates.
 
     Returns
     -------
@@ -105,8 +105,8 @@ def exp(r: ArrayLike) -> Array:
 def log(q: ArrayLike) -> Array:
     """Return the shortest rotation vector of unit quaternions, rad, shape (..., 4) to (..., 3).
 
-    Its length is at most pi; q and -q give the same. The angle is computed by atan2; acos loses all
-    digits near the identity.
+    The length of the vector is at most pi; q and -q give the same vector. The angle is computed by
+    atan2, because acos loses all digits near the identity.
     """
     q = _floats(q)
     q = np.where(q[..., :1] < 0.0, -q, q)
@@ -140,8 +140,8 @@ def to_matrix(q: ArrayLike) -> Array:
 def from_matrix(R: ArrayLike) -> Array:
     """Return unit quaternions with w >= 0, shape (..., 4), of rotation matrices, shape (..., 3, 3).
 
-    The largest of the four squared components is computed by square root and the others are divided
-    by it, which is accurate at all angles. Source: Shepperd 1978.
+    The largest of the four components is computed by a square root. The other components follow by
+    division, which is accurate at all angles. Source: Shepperd 1978.
     """
     R = _floats(R)
     trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
@@ -169,7 +169,7 @@ def heading(angle: ArrayLike) -> Array:
 def heading_of(q: ArrayLike) -> Array:
     """Return the rotation about the vertical, rad in (-pi, pi], shape (...).
 
-    It is the heading closest to q: ``2 atan2(z, w)``, 0 where both vanish.
+    The result is the heading closest to q, ``2 atan2(z, w)``, and 0 if z and w are zero.
     """
     q = _floats(q)
     twice = 2.0 * np.arctan2(q[..., 3], q[..., 0])
@@ -186,20 +186,20 @@ def interpolate(q0: ArrayLike, q1: ArrayLike, a: ArrayLike) -> Array:
 def average(q: ArrayLike, weights: ArrayLike | None = None) -> Array:
     """Return the mean rotation, the dominant eigenvector of the weighted sum of q q^T.
 
-    It minimizes the weighted squared chordal distance and does not depend on signs. Source: Markley
-    et al. 2007, doi 10.2514/1.28949, eq. 12.
+    The mean minimizes the weighted squared chordal distance and does not depend on the signs of q.
+    Source: Markley et al. 2007, doi 10.2514/1.28949, eq. 12.
 
     Parameters
     ----------
     q : array_like, shape (..., n, 4)
         Rotations to average over axis -2, without NaN.
     weights : array_like, shape (..., n), optional
-        Non-negative; equal if None.
+        Weights of the rotations, non-negative; equal weights if None.
 
     Returns
     -------
     ndarray, shape (..., 4)
-        Unit, w >= 0.
+        Mean as unit quaternion with w >= 0.
 
     Raises
     ------
@@ -215,14 +215,14 @@ def average(q: ArrayLike, weights: ArrayLike | None = None) -> Array:
 
 
 def align_hemisphere(q: ArrayLike, ref: ArrayLike) -> Array:
-    """Return q or -q, with a non-negative product with `ref`; shape (..., 4)."""
+    """Return q or -q, whichever has a non-negative dot product with `ref`; shape (..., 4)."""
     q = _floats(q)
     product = np.sum(q * _floats(ref), axis=-1, keepdims=True)
     return np.where(product < 0.0, -q, q)
 
 
 def continuous(q: ArrayLike) -> Array:
-    """Return a series, shape (n, 4), with non-negative products of successive quaternions.
+    """Return a series, shape (n, 4), with non-negative dot products of successive quaternions.
 
     Rows with NaN stay NaN; continuity extends across them.
     """

@@ -1,7 +1,7 @@
 """Unit quaternions as plain tuples, for code that runs once per sample or frame.
 
-Same conventions and formulas as ``rotation``. The overhead of one numpy call, about a microsecond,
-exceeds the cost of a whole product here.
+Conventions and formulas are those of ``rotation``. The overhead of one numpy call, about a
+microsecond, exceeds the time of a whole product of plain floats.
 """
 
 from __future__ import annotations
@@ -152,7 +152,7 @@ def as_quaternion(q: Iterable[float]) -> Quaternion:
 def from_matrix_one(rows: Sequence[Sequence[float]]) -> Quaternion:
     """Return the unit quaternion with w >= 0 of a rotation matrix (Shepperd 1978)."""
     (a, b, c), (d, e, f), (g, h, i) = rows
-    # Each column of 4 q q^T gives q up to its length; the longest one has the smallest rounding
+    # Each column of 4 q q^T is proportional to q; the longest column has the smallest rounding
     # error.
     q: Quaternion = (1.0 + a + e + i, h - f, c - g, d - b)
     if a + e + i < 0.0:

@@ -1,12 +1,13 @@
 r"""Coupled joints: rotation and translation as functions of one coordinate, as in a knee.
 
-Between samples of the pose each component p of (quaternion, shift) is a cubic spline; the
-quaternion is normalized afterwards. Per unit of the coordinate q the segment rotates and
-translates, in its own axes, by
+The pose consists of a quaternion p and a shift s. Each component is a cubic spline of the
+coordinate q between samples; the quaternion is normalized afterwards. Per unit of q the segment
+rotates by ω and translates by v, both in segment axes:
 
 .. math:: \omega = 2\,vec(\bar p\, p') / |p|^2, \qquad v = R^T s'
 
-which are the exact derivatives of that curve. Beyond the samples p is extrapolated linearly.
+These are the exact derivatives of the spline. Beyond the samples, p and s are extrapolated
+linearly.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _GUESSES = 91
-"""Coordinates tried by ``CoupledCurve.nearest``."""
+"""Number of start coordinates that ``CoupledCurve.nearest`` tries."""
 _NEXT, _LAST = [1, 2, 0], [2, 0, 1]
 COLUMNS = 10
-"""Numbers per coupling: q, shift (3), omega (3), v (3)."""
+"""Number of values per coupling: coordinate q, shift (3), omega (3), v (3)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +42,9 @@ class CoupledCurve:
     pieces: Array
     """Cubic coefficients, highest first, of (w, x, y, z) and the shift; shape (4, n - 1, 7)."""
     starts: list[float]
-    """The knots as plain floats."""
+    """The values of `knots` as plain floats."""
     rows: list[list[list[float]]]
-    """The coefficients as plain floats, by piece, then by component."""
+    """The coefficients in `pieces` as plain floats, by piece, then by component."""
 
     @classmethod
     def through(cls, path: Sequence[Sequence[float]]) -> CoupledCurve:
@@ -90,7 +91,7 @@ class CoupledCurve:
         return R, found
 
     def _at_one(self, amount: float) -> tuple[Array, Array]:
-        """Return ``at`` for one instant: plain floats are ten times faster there."""
+        """Return ``at`` of one instant; plain floats are ten times faster than arrays."""
         starts = self.starts
         inside = min(max(amount, starts[0]), starts[-1])
         piece = min(max(bisect_left(starts, inside) - 1, 0), len(starts) - 2)

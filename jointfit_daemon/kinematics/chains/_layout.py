@@ -31,9 +31,10 @@ class ChainLayout:
     levels: tuple[tuple[Index | slice, Index | slice], ...]
     """Segments with a parent, grouped by depth, and their parents."""
     free: Index | slice
-    """Numbers of the free segments."""
+    """Indices of the free segments."""
     corners: Array
-    """Transforms to the parent without rotations and own centers, shape (S, 4, 4)."""
+    """Transforms to the parent at zero rotation, without the joint centers in segment axes; shape
+    (S, 4, 4)."""
     has_own_centers: bool
     """Whether a joint center differs from the origin of its segment."""
     center: Array
@@ -41,24 +42,24 @@ class ChainLayout:
     segment_of: Index
     """Segment of each degree of freedom, shape (nq,)."""
     columns: tuple[tuple[int, slice], ...]
-    """Each segment and its degrees of freedom."""
+    """Index and degrees of freedom of each segment."""
     turns: Array
     """Axis (x, y, z, 0) of each rotational degree of freedom and a point (x, y, z, 1) on it, in
     segment axes; zero axis for translations. Shape (nq, 4, 2).
     """
     shifts: Index
-    """Columns that translate a free segment."""
+    """Indices of the degrees of freedom that translate a free segment."""
     shift_twists: Array
-    """Their twists, shape (len(shifts), 6)."""
+    """Twists of the translations in `shifts`, shape (len(shifts), 6)."""
     spread: Array
     """Maps a step to the rotation vectors of all segments; shape (nq, 3 S)."""
     below: Array
-    """Matrix with 1 where segment j is i or a descendant of it, shape (S, S)."""
+    """Matrix with 1 where segment j is segment i or a descendant of segment i, shape (S, S)."""
     moves: Array
     """Matrix with 1 where a degree of freedom moves a segment, shape (S, nq)."""
     lower: Array
-    """Matrix with 1 where the column's segment is the row's or an ancestor of it, and the column is
-    not after the row; shape (nq, nq)."""
+    """Matrix with 1 where the segment of the column is the segment of the row or one of its
+    ancestors, and the column is not after the row; shape (nq, nq)."""
     strictly_lower: Array
     """Matrix `lower` without its diagonal."""
     coupled: tuple[tuple[int, int, CoupledCurve], ...]

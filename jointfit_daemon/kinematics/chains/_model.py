@@ -1,12 +1,15 @@
 r"""Chain models: a tree of rigid segments on joints, with markers fixed to the segments.
 
-Immutable data; parents precede children. The pose of a segment follows from that of its parent,
+The data are immutable, and parents precede children. The pose of segment i follows from the pose of
+its parent p,
 
 .. math:: R_i = R_p A_i, \qquad t_i = t_p + R_p\, c_p - R_i\, c_i
 
-with the joint rotation :math:`A_i`: arbitrary (``ball``), :math:`A_{rest}\exp(a\theta)`
-(``hinge``), or arbitrary with a free origin (``free``). One coordinate of a ``coupled`` joint moves
-:math:`A_i` and :math:`c_p` along a path. Axes and centers are in segment axes, in metres.
+R is a rotation to the world, t an origin, and c the joint center in parent (p) and segment (i). The
+joint rotation :math:`A_i` is arbitrary (``ball``), :math:`A_{rest}\exp(a\theta)` with axis a and
+angle θ (``hinge``), or arbitrary with a free origin (``free``). One coordinate of a ``coupled``
+joint moves :math:`A_i` and :math:`c_p` along a path. Axes and centers are in segment axes, in
+metres.
 """
 
 from __future__ import annotations
@@ -53,13 +56,15 @@ class Joint:
     axis: Vector = (1.0, 0.0, 0.0)
     """Unit axis of a hinge in own axes; positive rotations are right-handed about it."""
     rest: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """q_parent_segment of a hinge at angle zero; of a ball, the start of a search without data."""
+    """Rotation q_parent_segment of a hinge at angle zero. For a ball joint, the start of a search
+    without data."""
     limits: tuple[float, float] | None = None
     """Least and greatest angle of a hinge or coordinate of a coupled joint, rad; None: unlimited.
     """
     path: tuple[Sample, ...] = ()
     """Samples of a coupled joint: coordinate, rad, q_parent_segment, and the shift added to
-    ``center_in_parent`` in the parent's axes, m. Interpolated by cubic splines.
+    ``center_in_parent`` in the parent's axes, m. Poses between samples are interpolated by cubic
+    splines.
     """
 
 
@@ -82,16 +87,16 @@ class Marker:
     position: Vector
     """Position in segment axes, m."""
     weight: float = 1.0
-    """Weight of its squared error; 0 excludes the marker."""
+    """Weight of the squared marker error; 0 excludes the marker."""
     locked: tuple[bool, bool, bool] = (False, False, False)
     """Coordinates in segment axes that a refinement must not change."""
 
 
 @dataclass(frozen=True)
 class ChainModel:
-    """Segments, parents first, and markers.
+    """Segments, parents first, and the markers of the segments.
 
-    Without slots: derived arrays are cached properties.
+    The class has no slots, because derived arrays are cached properties.
 
     Raises
     ------
@@ -124,12 +129,12 @@ class ChainModel:
 
     @cached_property
     def segment_names(self) -> tuple[str, ...]:
-        """Names in the order of every array over segments."""
+        """Names of the segments, in the order of all arrays over segments."""
         return tuple(s.name for s in self.segments)
 
     @cached_property
     def marker_names(self) -> tuple[str, ...]:
-        """Names in the order of every array over markers."""
+        """Names of the markers, in the order of all arrays over markers."""
         return tuple(m.name for m in self.markers)
 
     @cached_property
@@ -146,7 +151,7 @@ class ChainModel:
 
     @cached_property
     def positions(self) -> Array:
-        """Markers in their segments' axes, m; shape (M, 3)."""
+        """Marker positions in segment axes, m; shape (M, 3)."""
         return np.array([m.position for m in self.markers], dtype=np.float64).reshape(-1, 3)
 
     @cached_property
@@ -156,12 +161,12 @@ class ChainModel:
 
     @cached_property
     def locked(self) -> NDArray[np.bool_]:
-        """Coordinates that a refinement must not change; shape (M, 3)."""
+        """Marker coordinates that a refinement must not change; shape (M, 3)."""
         return np.array([m.locked for m in self.markers], dtype=np.bool_).reshape(-1, 3)
 
     @cached_property
     def columns(self) -> tuple[slice, ...]:
-        """Columns of each segment; of a free one three rotations, then three translations."""
+        """Columns of each segment; a free segment has three rotations, then three translations."""
         ends = np.cumsum([0, *(DEGREES_OF_FREEDOM[s.joint.kind] for s in self.segments)]).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
@@ -185,7 +190,8 @@ class ChainModel:
     def scaled(self, factors: Mapping[str, ArrayLike]) -> ChainModel:
         """Return the model with scaled segments: one factor or one per axis, by segment name.
 
-        Markers, the segment's own joint center and those of its children are scaled with it.
+        Scaling applies to the markers, the joint center of the segment, and the joint centers of
+        its children.
         """
         unknown = set(factors) - set(self.segment_names)
         if unknown:

@@ -1,6 +1,6 @@
 r"""Poses of a chain: segments and markers in the world, their Jacobian, and steps.
 
-All arrays have the T instants first. A step moves a state on its manifold,
+The first axis of all arrays is the T instants. A step moves a state on its manifold,
 
 .. math:: A_i \leftarrow A_i \exp(\delta_i), \qquad t_{root} \leftarrow t_{root} + \delta_t
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 
-_TINY = 1e-30  # rad^2: keeps sin(x)/x from 0/0, far below rounding
+_TINY = 1e-30  # rad^2, far below rounding: avoids 0/0 in sin(x)/x
 _EYE = np.eye(3)
 
 
@@ -49,12 +49,12 @@ class ChainState:
         return len(self.rotations)
 
     def take(self, instants: NDArray[np.intp] | NDArray[np.bool_] | slice) -> ChainState:
-        """Return the state at some instants."""
+        """Return the state at the selected instants."""
         some = None if self.couplings is None else self.couplings[instants]
         return ChainState(self.rotations[instants], self.origins[instants], some)
 
     def put(self, instants: NDArray[np.intp], other: ChainState) -> None:
-        """Overwrite the state at some instants, in place."""
+        """Overwrite the state at the selected instants, in place."""
         self.rotations[instants], self.origins[instants] = other.rotations, other.origins
         if self.couplings is not None:
             self.couplings[instants] = other.couplings
@@ -65,7 +65,7 @@ class ChainState:
 
 
 def rest_state(model: ChainModel, count: int = 1) -> ChainState:
-    """Return the chain at rest, free origins at the world origin, at `count` instants."""
+    """Return the chain at rest at `count` instants, with free origins at the world origin."""
     free = sum(s.joint.kind == "free" for s in model.segments)
     rest = np.broadcast_to(rest_rotations(model), (count, len(model.segments), 3, 3))
     return place_coupled(layout_of(model), rest.copy(), np.zeros((count, free, 3)), None)
@@ -87,7 +87,7 @@ def transforms(layout: ChainLayout, state: ChainState) -> Array:
         local[..., :3, 3] -= (rotations @ layout.center[:, :, None])[..., 0]
     local[..., :3, 3][:, layout.free] = state.origins
 
-    # paths of coupled joints, then from the root outwards
+    # apply the paths of coupled joints, then multiply from the root outwards
     if state.couplings is not None:
         for c, (segment, _, _) in enumerate(layout.coupled):
             local[:, segment, :3, 3] += state.couplings[:, c, 1:4]
@@ -107,9 +107,9 @@ def marker_positions(model: ChainModel, state: ChainState) -> Array:
 def twists(layout: ChainLayout, world: Array, couplings: Array | None = None) -> Array:
     r"""Return the twist of each degree of freedom, shape (T, nq, 6).
 
-    A point x moves by :math:`\alpha\times x + \beta`; the row is :math:`(\alpha, \beta)`. For a
-    rotation about the world axis :math:`\alpha` through C, :math:`\beta = C \times \alpha`; a
-    coupled joint adds its translation.
+    The row is :math:`(\alpha, \beta)`: a point x moves by :math:`\alpha\times x + \beta`. For a
+    rotation about the world axis :math:`\alpha` through C, :math:`\beta = C \times \alpha`. A
+    coupled joint adds its translation to :math:`\beta`.
     """
     found = np.empty((len(world), layout.nq, 6))
 
@@ -139,8 +139,9 @@ def jacobian(model: ChainModel, state: ChainState) -> Array:
 
     .. math:: \partial x_m/\partial q_k = \alpha_k \times (x_m - C_k)
 
-    for the rotations of all joints between the world and the marker's segment, the identity for the
-    translations of its root, zero otherwise.
+    with α the world axis of the rotation and C a point on this axis. The equation applies to the
+    rotations of all joints between the world and the marker's segment. The derivative is the
+    identity for translations of the root of the chain, and zero for all other degrees of freedom.
     """
     layout = layout_of(model)
     world = transforms(layout, state)
@@ -185,7 +186,7 @@ def place_coupled(
     rotations, origins
         As in `ChainState`; rotations of coupled joints are overwritten in place.
     amounts
-        Coordinates, rad, shape (T, C); None: at rest.
+        Coordinates of the coupled joints, rad, shape (T, C); None: coordinates at rest.
     """
     if not layout.coupled:
         return ChainState(rotations, origins)
@@ -230,8 +231,8 @@ def _exp_of_few(r: Array) -> Array:
 def step_between(model: ChainModel, a: ChainState, b: ChainState) -> Array:
     """Return the step, shape (T, nq), that takes state a to state b by `apply_step`.
 
-    Rotations give log(A_a^T A_b), hinges its part about the axis, coupled joints the difference of
-    their coordinates.
+    The step of a joint is log(A_a^T A_b), for a hinge the component about the hinge axis. The step
+    of a coupled joint is the difference of the coordinates.
     """
     layout = layout_of(model)
     between = rotation.from_matrix(np.swapaxes(a.rotations, -1, -2) @ b.rotations)

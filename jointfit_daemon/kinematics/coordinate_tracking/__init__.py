@@ -1,4 +1,4 @@
-"""Named coordinates of a chain at one instant after the other, as the daemon publishes them."""
+"""Named coordinates of a chain, computed instant by instant, as the daemon publishes them."""
 
 from jointfit_daemon.kinematics.coordinate_tracking._tracker import CoordinateTracker
 

@@ -5,11 +5,13 @@ A joint of three successive rotations about perpendicular axes is
 .. math:: A = A_0 \exp(q_1 b_1) \exp(q_2 b_2) \exp(q_3 b_3), \qquad
           B^T A_0^T A B = R_x(q_1) R_y(q_2) R_z(\pm q_3)
 
-with the axes as columns of B, the third one reversed if that makes B right-handed. A hinge has the
-first rotation only. A free joint also has an origin :math:`t = t_0 + D q_t + A c`. These constants
-are read from the function of the joint, so that they apply to the joints of every file format.
+with the axes b as columns of B and the angles q. The third axis is reversed if B would be
+left-handed otherwise. A hinge has the first rotation only. A free joint also has an origin :math:`t
+= t_0 + D q_t + A c` with translations :math:`q_t` and center c. All constants are computed from the
+pose function of the joint, so that they apply to every file format.
 
-Invariant: a joint has a closed form only if it reproduces the function at all probes.
+Invariant: a joint has a closed form only if the closed form reproduces the pose function at all
+probes.
 """
 
 from __future__ import annotations
@@ -30,17 +32,19 @@ if TYPE_CHECKING:
 
 _PROBES = 8
 _GOLDEN = 0.6180339887498949
-"""Multiples of it, modulo 1, are evenly distributed: probes without a random generator."""
+"""Golden ratio minus 1. Its multiples modulo 1 are evenly distributed, and give probes without a
+random generator."""
 _SMALL = 0.1
-"""Angle from which an axis is read, rad."""
+"""Rotation angle at which an axis is computed, rad."""
 _EXACT = 1e-9
-"""Greatest difference of a closed form and the function of its joint, rad and m."""
+"""Largest accepted difference between a closed form and the pose function of the joint, rad and
+m."""
 _ANGLES = 3
 
 
 @dataclass(frozen=True, slots=True)
 class ClosedForm:
-    """Constants of one joint."""
+    """Constants of the closed form of one joint."""
 
     angles: tuple[int, ...]
     """Indices of the angles among the coordinates of the joint, in the order of the rotations."""
@@ -48,17 +52,17 @@ class ClosedForm:
     """Sign of each angle: -1 where a positive angle is a negative rotation about the column of
     B."""
     left: Array
-    """B^T A_0^T, shape (3, 3)."""
+    """Matrix B^T A_0^T, shape (3, 3)."""
     basis: Array
-    """B, right-handed and orthonormal, shape (3, 3)."""
+    """Matrix B of the rotation axes, right-handed and orthonormal, shape (3, 3)."""
     shifts: tuple[int, ...] = ()
-    """Indices of the translations of a free joint; none for others."""
+    """Indices of the translations of a free joint; empty for other joints."""
     shift_inverse: Array | None = None
-    """D^-1, shape (3, 3)."""
+    """Inverse of the matrix D of translation directions, shape (3, 3)."""
     start: Array | None = None
-    """t_0, m, shape (3,)."""
+    """Origin t_0 at zero translations, m, shape (3,)."""
     center: Array | None = None
-    """c, m, shape (3,)."""
+    """Center c of the rotations, m, shape (3,)."""
 
     def pose(self, values: Array) -> tuple[Array, Array]:
         """Return rotations, shape (n, 3, 3), and origins, m, shape (n, 3), of values (n, k)."""
@@ -73,12 +77,12 @@ class ClosedForm:
 
 
 def closed_form(joint: JointCoordinates, kind: JointKind) -> ClosedForm | None:
-    """Return the closed form of a joint; None if it has none.
+    """Return the closed form of a joint; None if the joint has no closed form.
 
     Parameters
     ----------
     joint
-        Coordinates of the joint, and its pose as their function.
+        Coordinates of the joint, and the pose of the joint as a function of these coordinates.
     kind
         Joint of the chain.
     """
@@ -99,7 +103,7 @@ def closed_form(joint: JointCoordinates, kind: JointKind) -> ClosedForm | None:
             continue
         A, t = found.pose(probes)
         off = float(np.abs(A - expected[0]).max())
-        if shifts:  # the origin of other joints follows from the parent
+        if shifts:  # the origin of a joint that is not free follows from the parent
             off = max(off, float(np.abs(t - expected[1]).max()))
         second = order[1] if len(order) == _ANGLES else None
         if off < _EXACT and joint.middle in (None, second):
@@ -114,7 +118,7 @@ def _candidate(
     if joint.pose is None:
         return None
 
-    # Each coordinate alone gives its axis.
+    # Change one coordinate at a time to compute its axis.
     at = np.zeros((1 + len(joint.names), len(joint.names)))
     at[1:] = np.diag(np.where(joint.is_angle, _SMALL, 1.0))
     A, t = joint.pose(at)

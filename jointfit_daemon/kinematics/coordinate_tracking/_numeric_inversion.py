@@ -1,10 +1,11 @@
 r"""Coordinates of joints without a closed form, by Gauss-Newton steps with numerical derivatives.
 
-Where a joint has fewer coordinates than degrees of freedom, the sine of the rotation that they
-leave is minimized instead of the rotation.
+If a joint has fewer coordinates than degrees of freedom, a rotation remains that the coordinates
+cannot describe. In this case the steps minimize the sine of the remaining rotation, not its angle.
 
-Invariant: an instant takes at most `STEPS_PER_JOINT` steps per joint and `SPARE_STEPS` in total. An
-inversion that needs more continues in the next instant, and its joint is unknown until it ends.
+Invariant: an instant takes at most `STEPS_PER_JOINT` steps per joint, plus `SPARE_STEPS` in total.
+An inversion that needs more steps continues in the next instant. Until the inversion ends, the
+coordinates of the joint are unknown.
 """
 
 from __future__ import annotations
@@ -21,34 +22,38 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chain_coordinates import JointCoordinates
 
 STEPS_PER_JOINT = 2
-"""Steps of a joint that follows its coordinates from instant to instant."""
+"""Number of steps per instant of a joint with known coordinates at the preceding instant."""
 SPARE_STEPS = 6
-"""Steps for joints that move fast, or whose coordinates are searched."""
+"""Number of additional steps per instant, for joints that move fast or have unknown coordinates."""
 _DIFFERENCE = 1e-5
-"""Half the interval of a central difference, rad and m; its error is about 1e-10."""
+"""Half the interval of a central difference, rad and m; the derivative has an error of about
+1e-10."""
 _RIDGE = 1e-12
-"""Added to G^T G, so that a gimbal lock yields finite angles."""
+"""Regularization added to G^T G, so that a gimbal lock yields finite angles. G is the derivative of
+a step by the coordinates."""
 _MOST_ITERATIONS = 8
-"""Iterations from one start; two are typical from the instant before."""
+"""Largest number of iterations from one start; from the values of the preceding instant two are
+typical."""
 _FARTHEST_STEP = 0.8
 """Largest step of an angle, rad: most inversions begin close to the solution."""
 _CLOSE = 1e-3
-"""Distance, rad and m, from which one more step leads to the solution: the remaining error is about
-its square."""
+"""Distance to the pose, rad and m, below which one more step is the last: the remaining error is
+about the square of the distance."""
 _SETTLED = 1e-4
-"""Largest step, rad and m, of a joint that its coordinates describe in part only."""
+"""Largest last step, rad and m, of a joint whose coordinates describe only a part of the pose."""
 _FARTHEST_MISFIT = 0.5
-"""Largest rotation that its coordinates may leave undescribed, rad; more is another solution."""
+"""Largest rotation that the coordinates of a joint may leave undescribed, rad. A larger rotation
+indicates a wrong solution."""
 _SMALLEST_STEP = 1e-10
 _QUARTERS = (0.0, 0.5 * np.pi, -0.5 * np.pi, np.pi)
-"""Angles from which an inversion begins without an instant before, rad."""
+"""Start angles of an inversion without values of a preceding instant, rad."""
 _STEEP = 0.87
-"""Angle of the second of three rotations from which an inversion begins: 50 degrees."""
+"""Start angle of the second of three rotations, rad: 50 degrees."""
 _MOST_ANGLES = 3
 
 
 class NumericInversion:
-    """Inverts the poses of some joints, instant by instant.
+    """Numerical inversion of the poses of several joints, instant by instant.
 
     Parameters
     ----------
@@ -59,26 +64,26 @@ class NumericInversion:
     def __init__(self, joints: Mapping[int, JointCoordinates]) -> None:
         self._joints = dict(joints)
         self._starts = {i: _starts(joint) for i, joint in self._joints.items()}
-        """Values to begin from, and their rotations."""
+        """Start values of each joint, and the rotations at these values."""
         self._open: dict[int, Array] = {}
-        """Values of inversions that have not ended."""
+        """Current values of inversions that have not ended."""
         self._iterations = dict.fromkeys(self._joints, 0)
-        """Iterations from the present start."""
+        """Number of iterations from the current start of each joint."""
         self._attempts = dict.fromkeys(self._joints, 0)
-        """Starts that did not lead to the pose, since the last success."""
+        """Number of failed starts of each joint since the last success."""
         self._turn = 0
 
     def invert(
         self, poses: Mapping[int, tuple[Array, Array]], last: Mapping[int, Array]
     ) -> dict[int, tuple[Array, Array]]:
-        """Return values, shape (k,), and their derivative, (3 or 6, k), of joints that have them.
+        """Return values, shape (k,), and derivative, (3 or 6, k), of each joint with a solution.
 
         Parameters
         ----------
         poses
             Rotation, shape (3, 3), and origin of a free segment, m, (3,) or (0,), of each joint.
         last
-            Values at the instant before, of joints that had some.
+            Values at the preceding instant of each joint that had a solution.
         """
         # Known joints come first. The others take turns with the rest of the steps.
         self._turn += 1
@@ -101,7 +106,7 @@ class NumericInversion:
     def _step(
         self, i: int, A: Array, origin: Array, last: Array | None
     ) -> tuple[Array, Array] | None:
-        """Take one step, and return values and derivative if it leads to the pose."""
+        """Take one step, and return values and derivative if the step leads to the pose."""
         joint = self._joints[i]
         values = self._open.get(i)
         if values is None:
@@ -110,7 +115,7 @@ class NumericInversion:
         self._iterations[i] += 1
         values, G, is_found = _stepped(joint, values, A, origin)
         if is_found:
-            # within half a turn, and the second of three rotations within a quarter
+            # limit angles to half a turn, and the second of three rotations to a quarter turn
             values = values - 2.0 * np.pi * np.round(values / (2.0 * np.pi)) * joint.is_angle
             if joint.middle is None or abs(values[joint.middle]) <= 0.5 * np.pi + _CLOSE:
                 self._open.pop(i, None)
@@ -125,7 +130,7 @@ class NumericInversion:
         return None
 
     def _start(self, i: int, A: Array) -> Array:
-        """Return the values whose rotation is nearest to A, the next one after every failure."""
+        """Return the start values nearest to A; after each failure, the next nearest values."""
         values, rotations = self._starts[i]
         nearest = np.argsort(-(rotations @ A.ravel()), kind="stable")
         return np.asarray(values[nearest[max(self._attempts[i] - 1, 0) % len(values)]])
@@ -138,7 +143,7 @@ def spread(G: Array) -> Array:
 
 
 def _starts(joint: JointCoordinates) -> tuple[Array, Array]:
-    """Return values from which an inversion can begin, and their rotations, shape (n, 9)."""
+    """Return start values of an inversion and the rotations at these values, shape (n, 9)."""
     turning = [k for k, is_angle in enumerate(joint.is_angle) if is_angle]
     tried = []
     for quarters in product(*[_QUARTERS] * min(len(turning), _MOST_ANGLES)):
@@ -167,7 +172,7 @@ def _stepped(
     to_R = np.concatenate((A[None], R[1 + count :]))
     between = R[: 1 + count].swapaxes(-1, -2) @ to_R
 
-    # sin(x) instead of x: exact for the small rotations at the end
+    # sin(x) instead of x, which is exact for the small rotations of the last steps
     steps = np.zeros((1 + count, 6))
     steps[:, :3] = 0.5 * (between[:, (2, 0, 1), (1, 2, 0)] - between[:, (1, 2, 0), (2, 0, 1)])
     if len(origin):

@@ -1,6 +1,6 @@
-"""Coordinates of one state after the other.
+"""Tracker that computes the coordinates of a chain state by state.
 
-Invariant: the number of numerical steps of an instant is bounded, whatever the poses.
+Invariant: the number of numerical steps per instant is bounded for any poses.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.coordinate_tracking._closed_form import ClosedForm
 
 _LOCKED = 1e-3
-"""Cosine of the second of three rotations below which the other two are hardly distinguished: there
-the values at the instant before decide."""
+"""Cosine of the second of three rotations below which the other two are almost indistinguishable.
+Below this cosine the values of the preceding instant decide."""
 _NO_OFFSET_M = 1e-12
 _Row = tuple[float, float, float]
 _Angles = tuple[_Row, tuple[_Row, _Row, _Row]]
-"""Three angles and their rates."""
+"""Three angles, and the derivatives (rates) of the angles by a step of the state."""
 
 
 class CoordinateTracker:
-    """Coordinates of one state after the other, each joint in closed form if it has one.
+    """Tracker of the coordinates of a chain, state by state.
 
-    The result is that of `coordinate_table`. Joints without closed form are inverted from the
-    values before, and are unknown while a search for them lasts.
+    The result equals the result of `coordinate_table`. Joints with a closed form use the closed
+    form. Other joints are inverted numerically from the preceding values; during a search their
+    coordinates are unknown.
 
     Parameters
     ----------
@@ -118,14 +119,14 @@ class CoordinateTracker:
         Returns
         -------
         values, sd
-            NaN for a joint whose pose its coordinates do not describe.
+            Arrays with NaN for a joint whose pose the coordinates do not describe.
         """
         values, rates = np.full(len(self._last), np.nan), self._rates.copy()
         for i, c in zip(self._coupled, self._couplings, strict=True):
             if state.couplings is not None:
                 values[self._rows[i]] = state.couplings[0, c, 0]
 
-        # Hinges first, as in `_closed`.
+        # Process hinges first, in the order of `_closed`.
         turned = (self._left @ state.rotations[0, self._closed] @ self._right).tolist()
         count = len(self._hinges)
         if count:
@@ -147,7 +148,7 @@ class CoordinateTracker:
         return values, np.where(np.isnan(values), np.nan, np.sqrt(variances))
 
     def _invert(self, numbers: list[int], state: ChainState, values: Array, rates: Array) -> None:
-        """Write the values of joints without closed form, and their rates; NaN if unknown."""
+        """Write values and rates of joints without closed form; NaN if the values are unknown."""
         poses = {
             i: (
                 state.rotations[0, i],
@@ -175,9 +176,9 @@ class _Rotations(NamedTuple):
     signs: Array
     """Sign of each angle, shape (J, 3)."""
     basis: Array
-    """B^T, shape (J, 3, 3)."""
+    """Transposed axis matrices B^T, shape (J, 3, 3)."""
     cells: NDArray[np.intp]
-    """Flat indices of the rates in an array (K, nq), shape (J, 3, 3)."""
+    """Flat indices of the rates in an array of shape (K, nq); shape (J, 3, 3)."""
 
     @classmethod
     def of(
@@ -195,7 +196,7 @@ class _Rotations(NamedTuple):
         )
 
     def write(self, found: list[_Angles], values: Array, rates: Array) -> None:
-        """Write angles and their rates."""
+        """Write the angles in `found` to `values`, and the derivatives of the angles to `rates`."""
         values[self.rows] = self.signs * [angles for angles, _ in found]
         by_step = np.array([rate for _, rate in found]) @ self.basis
         rates.ravel()[self.cells] = self.signs[..., None] * by_step
@@ -220,7 +221,7 @@ class _Shift(NamedTuple):
     def of(
         cls, form: ClosedForm, segment: int, free: list[int], first: int, column: int
     ) -> _Shift | None:
-        """Return the translations of a joint, whose coordinates begin at `first`, if it is free."""
+        """Return the translations of a free joint, from coordinate `first` on; otherwise None."""
         if form.shift_inverse is None or form.start is None or form.center is None:
             return None
         center = form.center if np.abs(form.center).max() > _NO_OFFSET_M else None
@@ -229,7 +230,7 @@ class _Shift(NamedTuple):
         return cls(segment, number, rows, column, form.shift_inverse, form.start, center)
 
     def write(self, state: ChainState, values: Array, rates: Array) -> None:
-        """Write the values, and their rates of change by rotations of the segment."""
+        """Write the translations, and the derivatives of the translations by segment rotations."""
         moved = state.origins[0, self.number] - self.start
         if self.center is not None:
             # d(A c) = A (w x c) = -A [c]x w
@@ -244,9 +245,9 @@ _NONE = np.zeros(0)
 
 
 def _three_angles(M: list[list[float]]) -> _Angles:
-    """Return the angles of Rx Ry Rz, and their rates by a step in the axes of the last one.
+    """Return the angles of M = Rx Ry Rz, and their derivatives by a step in the axes after Rz.
 
-    NaN where the second rotation is a quarter turn.
+    The result is NaN where the second rotation is a quarter turn.
     """
     (m00, m01, sine), (_, _, m12), (_, _, m22) = M
     cosine = hypot(m00, m01)

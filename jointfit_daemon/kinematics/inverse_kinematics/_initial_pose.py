@@ -1,8 +1,9 @@
 """Initial pose of a search: each segment aligned with its own markers.
 
-From the root outwards, a segment takes the rotation that best maps its markers, and the joint
-center given by its parent, to the measured ones (Wahba's problem). A hinge takes the rotation about
-its axis only, a coupled joint the nearest pose on its curve.
+Segments are aligned from the root outwards. The rotation of a segment best maps its markers to the
+measured markers, and its joint center to the joint center given by the parent (Wahba's problem).
+For a hinge only the rotation about the hinge axis is used, for a coupled joint the nearest pose on
+the curve.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _THIN_M2 = 1e-4
 """Second largest moment of a marker cloud, m², below which its rotation is undetermined: (1 cm)².
 """
 _PULL_TO_REST = 1e-9
-"""Relative weight of the rest rotation; decides only undetermined directions."""
+"""Relative weight of the rest rotation; this weight matters only along undetermined directions."""
 
 
 def start_from_markers(
@@ -42,7 +43,7 @@ def start_from_markers(
     measured
         Marker positions, m, shape (T, S, 3, K), finite.
     weights
-        Shape (T, S, K), zero where markers are missing.
+        Marker weights, shape (T, S, K), zero where markers are missing.
     """
     slots, count = marker_slots(model), len(measured)
     rest = rest_state(model).rotations[0]
@@ -107,7 +108,7 @@ def _with_center(
 def _laid(
     points: Array, measured: Array, weights: Array, rest: Array
 ) -> tuple[Array, Array, Array]:
-    """Return rotation (T, 3, 3), origin (T, 3) and second moment, m^2, (T,) of one cloud."""
+    """Return rotation (T, 3, 3), origin (T, 3) and second moment, m^2, (T,) of a marker cloud."""
     total = np.maximum(weights.sum(axis=-1), 1e-12)[:, None]
     middle_p = (points @ weights[..., None])[..., 0] / total
     middle_y = (measured @ weights[..., None])[..., 0] / total
@@ -118,7 +119,7 @@ def _laid(
     B = (y * weights[:, None]) @ np.swapaxes(p, -1, -2)
     R = _nearest_rotation(B + (_PULL_TO_REST * size + 1e-12)[:, None, None] * rest)
     minors = 0.5 * (size**2 - np.einsum("tij,tij->t", moments, moments))
-    second = minors / np.maximum(size, 1e-12)  # a little more than it, never much
+    second = minors / np.maximum(size, 1e-12)  # slightly larger than the eigenvalue
     return R, middle_y - (R @ middle_p[..., None])[..., 0], second
 
 

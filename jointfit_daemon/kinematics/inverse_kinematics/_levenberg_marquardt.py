@@ -1,12 +1,14 @@
 r"""Levenberg-Marquardt search over many instants, each with its own damping.
 
-Invariant: a step is accepted only where it lowers the cost; elsewhere the damping grows. Converged
-instants are excluded. In addition to the marker errors the cost contains bands,
+Invariant: a step is accepted only at instants where the step lowers the cost; at other instants the
+damping grows. Converged instants are excluded. In addition to the marker errors the cost contains
+bands,
 
 .. math:: \sum_k w_k \left(v_k - clip(v_k, low_k, high_k)\right)^2, \qquad
           v = \log(A_{ref}^T A)
 
-which restrict undetermined joints to the pose at the instant before (a band of zero width), or
+with the rotation v of each joint from the reference :math:`A_{ref}` and the weight w. A band of
+zero width restricts undetermined joints to the pose at the preceding instant. Other bands restrict
 joints to their limits.
 """
 
@@ -66,7 +68,7 @@ class Band:
 
     @classmethod
     def holding(cls, model: ChainModel, reference: ChainState, weights: Array) -> Band:
-        """Return a band that restricts all joints except free ones to `reference`; weights (T,)."""
+        """Return a band of zero width at `reference` for all joints except free ones."""
         layout = layout_of(model)
         joint = np.array([s.joint.kind != "free" for s in model.segments])[layout.segment_of]
         zero = np.zeros(layout.nq)
@@ -108,7 +110,7 @@ def log_matrix(R: Array) -> Array:
         axis=-1,
     )
 
-    # v has the length of the sine; near zero the angle over the sine is 1
+    # the length of v is the sine of the angle; near zero, angle over sine is 1
     sine = np.sqrt(np.einsum("...i,...i->...", v, v))
     cosine = 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0)
     small = sine < 1e-9
@@ -169,7 +171,7 @@ class PoseProblem:
 
 @dataclass(frozen=True, slots=True)
 class PoseSolution:
-    """Minimum that `find_poses` reached."""
+    """Result of `find_poses`: the minimum at each instant."""
 
     state: ChainState
     weights: Array
@@ -239,7 +241,7 @@ def _descend(problem: PoseProblem, start: ChainState) -> PoseSolution:
 def _kept(
     better: NDArray[np.bool_], new: tuple[ChainState, MarkerFit], old: tuple[ChainState, MarkerFit]
 ) -> tuple[ChainState, MarkerFit]:
-    """Return the new state and fit where they are better, else the old ones."""
+    """Return the new state and fit at instants with a lower cost, else the old state and fit."""
     keep = better[:, None, None]
     (onward, there), (state, at) = new, old
     couplings = (

@@ -1,9 +1,9 @@
 """Detection of local minima of inverse kinematics, and restarts from other poses.
 
 Every instant is solved from its own markers, so single instants, or a whole trial, may end in a
-local minimum. Two kinds of instants are solved again from perturbed poses: those with an error well
-above that of their surroundings, and some evenly spaced ones. An improvement spreads to the
-neighbors, which start from the improved pose, as long as it reduces their error.
+local minimum. Two kinds of instants are solved again from perturbed poses: instants with an error
+well above the error of neighboring instants, and some evenly spaced instants. After an improvement,
+the neighbors are solved from the improved pose, as long as this reduces their error.
 
 Invariant: the cost of an instant never increases.
 """
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _SURROUNDINGS = 31
 """Instants in the running median of the error."""
 _JUMP = 1.5
-"""Ratio of the error to its running median that counts as a jump."""
+"""Smallest ratio of the error to its running median that counts as a jump."""
 _JUMP_M = 0.003
 """Smallest excess of the error over its running median that counts as a jump, m."""
 _PROBES = 24
@@ -45,10 +45,11 @@ _POSES = 6
 _PERTURBATION = 1.0
 """Largest perturbation of a rotation, rad."""
 _GOLDEN = 0.6180339887498949
-"""Multiples of it, modulo 1, are evenly distributed: perturbations without a random generator."""
+"""Golden ratio minus 1. Its multiples modulo 1 are evenly distributed, and give perturbations
+without a random generator."""
 _GAIN = 0.99
-"""Ratio of the new cost to the old one that counts as an improvement; smaller differences are
-rounding and the tolerance of the solver."""
+"""Largest ratio of the new cost to the old cost that counts as an improvement. Smaller differences
+are rounding and the tolerance of the solver."""
 _PASSES = 400
 """Largest number of instants over which an improvement spreads in one direction."""
 
@@ -60,28 +61,28 @@ def restart_local_minima(
     found: IkResult,
     options: IkOptions | None = None,
 ) -> tuple[IkResult, NDArray[np.bool_]]:
-    """Return a solution without the local minima that were found, and the improved instants.
+    """Return a solution without the detected local minima, and the improved instants.
 
     Parameters
     ----------
     model, markers, weights, options
         As in `solve_frames`.
     found
-        Its result.
+        Result of `solve_frames`.
 
     Returns
     -------
     result
-        The same as `found`, except for the improved instants.
+        Poses that equal `found` except at the improved instants.
     improved
-        Shape (T,).
+        Mask of the improved instants, shape (T,).
     """
     measured = np.asarray(markers, dtype=np.float64)
     seen: NDArray[np.bool_] = np.asarray(np.isfinite(measured).all(axis=-1))
     trial = _Trial(model, measured, checked_weights(model, weights, seen), options or IkOptions())
     best = _Best(trial, deepcopy(found))
 
-    # The instants with an error well above that of their surroundings.
+    # Find the instants with an error well above the running median.
     rms = np.sqrt(best.cost / np.maximum(trial.weights.sum(axis=1), 1e-12))
     usual = median_filter(rms, size=min(_SURROUNDINGS, max(len(rms), 1)), mode="nearest")
     probes = np.union1d(
@@ -99,7 +100,7 @@ def restart_local_minima(
         )
         best.try_from(probes, start)
 
-    # the wave ends where the start from the neighbor is not an improvement
+    # stop where a start from the neighbor does not reduce the cost
     last = np.flatnonzero(best.improved)
     for _ in range(_PASSES):
         ahead = [(last + s, last) for s in (-1, 1)]

@@ -6,12 +6,13 @@ With the twists :math:`S_k=(\alpha_k,\beta_k)` of the degrees of freedom, a mark
 .. math:: I = \sum_m w_m \begin{pmatrix} |x|^2 1 - x x^T & [x]_\times \\ -[x]_\times & 1
           \end{pmatrix}
 
-over all markers moved by both k and l. The cost is one sum over markers per instant, then
-operations on segments and degrees of freedom only: the composite rigid body algorithm with markers
-as masses. Source: Featherstone, Rigid Body Dynamics Algorithms, 2008, section 6.2.
+with the position x and the weight w of each marker m that both k and l move. One sum over markers
+per instant is needed. All other operations are on segments and degrees of freedom only, as in the
+composite rigid body algorithm with markers as masses. Source: Featherstone, Rigid Body Dynamics
+Algorithms, 2008, section 6.2.
 
-Internally the markers of each segment are padded to K slots, empty ones with weight zero: shape (T,
-S, 3, K).
+Internally the markers of each segment are padded to K slots, shape (T, S, 3, K). Empty slots have
+weight zero.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ class MarkerSlots:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """S and K."""
+        """Number of segments S and of slots K."""
         return self.points.shape[0], self.points.shape[2]
 
     def filled(self, values: Array) -> Array:
@@ -90,9 +91,10 @@ class MarkerFit:
     world: Array
     """Transforms of the segments, shape (T, S, 4, 4)."""
     cloud: Array
-    """Rows x, y, z, 1 of each marker of the model, then its three errors; shape (T, S, 7, K)."""
+    """Rows x, y, z, 1 of each model marker, then the three errors of the marker; shape (T, S, 7,
+    K)."""
     weighted: Array
-    """``cloud`` times the weights."""
+    """Array ``cloud`` multiplied by the marker weights."""
     couplings: Array | None = None
     """Couplings of the state."""
 
@@ -120,7 +122,7 @@ class MarkerFit:
 
 
 def marker_fit(slots: MarkerSlots, state: ChainState, measured: Array, weights: Array) -> MarkerFit:
-    """Return the marker errors of a state.
+    """Return the fit with the marker errors of a state.
 
     Parameters
     ----------
@@ -176,7 +178,7 @@ def lower_equations(slots: MarkerSlots, at: MarkerFit) -> tuple[Array, Array]:
     bodies = (beyond @ _INERTIA).reshape(count, -1, 6, 7)
     motion = twists(layout, at.world, at.couplings)
 
-    # By segment: gathering the inertia of every degree of freedom would need more memory.
+    # Loop over segments: the inertia of all degrees of freedom at once would need more memory.
     pushed = np.empty((*motion.shape[:2], 7))
     for s, columns in layout.columns:
         np.matmul(motion[:, columns], bodies[:, s], out=pushed[:, columns])

@@ -6,8 +6,9 @@ is
 .. math:: C_t = s^2 (J_t^T W_t J_t)^{-1}, \qquad
           s^2 = \frac{\sum_{tm} w_{tm} |e_{tm}|^2}{\sum_t (3 n_t - n_q)}
 
-with n_t the number of markers at an instant. It assumes marker errors that are independent of each
-other. Errors of the model (scale, joint centers) are not included.
+with :math:`n_t` the number of markers at instant t, :math:`n_q` the degrees of freedom, and e the
+marker errors. The covariance assumes independent marker errors. Errors of the model (scale, joint
+centers) are not included.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ def pose_covariance(model: ChainModel, found: IkResult) -> tuple[Array, NDArray[
     covariance
         Covariance of a step from the true state, rad^2 and m^2, shape (T, nq, nq).
     determined
-        Shape (T, nq). False where the information about a degree of freedom, with all others
-        free, is less than that of one marker at a distance of 2 cm from its axis.
+        Mask, shape (T, nq). False if the information about a degree of freedom, with all others
+        free, is less than the information of one marker 2 cm from the axis.
     """
     w = found.weights
     seen = np.where(np.isfinite(found.residuals).all(axis=-1), w, 0.0) > 0.0

@@ -1,14 +1,14 @@
 r"""Sequential inverse kinematics: one instant at a time, with the covariance of each pose.
 
-Each instant starts from the last pose extrapolated by its own motion and takes one or a few
-safeguarded Gauss-Newton steps. If the marker errors remain large, it restarts from the markers
-alone (`start_from_markers`). The covariance of a pose, in the columns of a step, is
+The solver extrapolates the last pose to the next instant, and takes one or a few safeguarded
+Gauss-Newton steps. If the marker errors remain large, the solver restarts from the markers alone
+(`start_from_markers`). The covariance of a pose, in the columns of a step, is
 
 .. math:: \Sigma = \sigma^2 \left(\sum_m w_m J_m^T J_m\right)^{-1}
 
-with :math:`\sigma` the marker error per axis, given or estimated from the residuals. Degrees of
-freedom that the markers leave undetermined are held at the last instant; :math:`\Sigma` is large
-there, but finite.
+with :math:`\sigma` the marker error per axis, given or estimated from the residuals. J is the
+Jacobian and w the weight of marker m. Degrees of freedom that the markers leave undetermined keep
+their last values; their variance in :math:`\Sigma` is large, but finite.
 
 Invariant: an instant evaluates the marker errors at most `MOST_EVALUATIONS` times, whatever the
 markers.
@@ -42,10 +42,10 @@ if TYPE_CHECKING:
 MOST_EVALUATIONS = 16
 """Largest number of evaluations of the marker errors in one instant."""
 _MOST_FOLLOWING = 8
-"""Largest number of evaluations without a restart. A search that reaches it continues in the next
-instant."""
+"""Largest number of evaluations in an instant without a restart. A search that reaches this number
+continues in the next instant."""
 _TRIES = 6
-"""Attempts of a step, each with more damping."""
+"""Largest number of attempts of a step, each with more damping."""
 _RESTART_STEPS = 10
 """Largest number of steps after a restart."""
 _LAST_STEP = 3e-3
@@ -53,11 +53,11 @@ _LAST_STEP = 3e-3
 _DAMPING = 1e-2
 _RIDGE = 1e-9
 _ROUNDING = 1e-9
-_OPEN_SLACK = 1e-2  # the regularization may raise the marker cost slightly
+_OPEN_SLACK = 1e-2  # tolerance, because the regularization may raise the marker cost slightly
 _FORGETTING = 0.02
 _FIRST_SD_M = 0.003
 _FIRST_INSTANTS = 5
-"""Weight of the initial standard deviation, in instants."""
+"""Weight of the initial standard deviation in the estimate of the marker error, in instants."""
 _MOST_PATIENCE = 32
 """Most restart intervals between two restarts of a chain that does not fit its markers."""
 _STRAIGHTEN = 32
@@ -69,7 +69,8 @@ class LiveOptions:
     """Options of the sequential solver; the defaults are for skin-mounted markers at 100 Hz."""
 
     steps: int = 2
-    """Largest number of steps per instant; two are within 0.1 % of the minimum at 100 Hz."""
+    """Largest number of steps per instant; after two steps the cost is within 0.1 % of the minimum
+    at 100 Hz."""
     huber_m: float | None = None
     """Huber threshold c of the marker error, m: larger errors have weight c/|e|; None: least
     squares.
@@ -89,7 +90,7 @@ class LivePose:
     """Chain at one instant."""
 
     state: ChainState
-    """Joint positions, one instant."""
+    """State of the chain at this instant."""
     rotations: Array
     """R_world_segment, shape (S, 3, 3)."""
     origins: Array
@@ -103,9 +104,9 @@ class LivePose:
     the axis, while all others are free; shape (nq,).
     """
     underdetermined: bool
-    """The markers left a degree of freedom undetermined, which was held at the last instant."""
+    """Whether the markers left a degree of freedom undetermined, which then kept its last value."""
     restarted: bool
-    """The instant did not start from the last one."""
+    """Whether the solver restarted from the markers instead of the last pose."""
     evaluations: int
     """Number of evaluations of the marker errors."""
 
@@ -132,7 +133,8 @@ class LiveInverseKinematics:
         self._fed = 0
         self._restarted_at = 0
         self._patience = 1
-        """Restart intervals to wait: doubled by every restart that does not help."""
+        """Number of restart intervals to wait; every restart without improvement doubles this
+        number."""
         self._learned = 0
         self._still = np.zeros(model.nq)
         self._lead = self._still
@@ -145,12 +147,12 @@ class LiveInverseKinematics:
         Parameters
         ----------
         markers : array_like, shape (M, 3)
-            Measured, in the order of the model's, world, m; NaN where missing.
+            Measured marker positions in the world, in the order of the model, m; NaN where missing.
 
         Raises
         ------
         ValueError
-            Another shape.
+            The array has another shape.
         """
         given = np.asarray(markers, dtype=np.float64)
         if given.shape != (len(self._model.markers), 3):
@@ -166,7 +168,7 @@ class LiveInverseKinematics:
         self._lead = self._still if place.is_open or restarted else place.moved
         self._state = place.state
         if self._fed % _STRAIGHTEN == 0:
-            # Orthonormal rotations: one Newton step to A^T A = 1.
+            # Make the rotations orthonormal by one Newton step to A^T A = 1.
             A = place.state.rotations
             turned = 1.5 * A - 0.5 * (A @ (A.swapaxes(-1, -2) @ A))
             self._state = replace(place.state, rotations=turned)
@@ -211,9 +213,9 @@ class LiveInverseKinematics:
     ) -> _Place:
         """Take the steps of one instant, starting from the last state extrapolated by `lead`.
 
-        `limits` are those of the steps, and of all evaluations in the instant. The returned
-        Cholesky factor was computed at the start of the last step. Its difference from that at the
-        final state is far below the accuracy of a covariance.
+        `limits` are the largest numbers of steps and of evaluations in the instant. The returned
+        Cholesky factor was computed at the start of the last step. The difference from the factor
+        at the final state is far below the accuracy of a covariance.
         """
         steps, most = limits
         place, w = self._moved(last, lead, measured, weights), weights
@@ -239,13 +241,13 @@ class LiveInverseKinematics:
         return _Place(state, at, float(at.cost[0]))
 
     def _robust(self, at: MarkerFit, weights: Array) -> Array:
-        """Return the robust weights; the given ones if no error exceeds the threshold."""
+        """Return the robust weights, which equal `weights` if no error exceeds the threshold."""
         limit = self._options.huber_m
         if limit is None:
             return weights
         errors = at.errors
         square = np.einsum("tsik,tsik->tsk", errors, errors)
-        # errors of missing markers are meaningless, but rarely small
+        # ignore the meaningless, often large errors of missing markers
         square *= weights > 0.0
         if square.max() <= (limit - _ROUNDING) ** 2:
             return weights
@@ -254,7 +256,7 @@ class LiveInverseKinematics:
     def _equations(self, place: _Place, reference: ChainState) -> _Equations:
         """Return normal matrix and gradient.
 
-        They are regularized toward `reference` where markers leave a degree of freedom
+        Both are regularized toward `reference` where markers leave a degree of freedom
         undetermined.
         """
         lower, gradient = lower_equations(self._slots, place.at)
@@ -274,7 +276,7 @@ class LiveInverseKinematics:
     def _one_step(
         self, place: _Place, equations: _Equations, measured: Array, weights: Array, tries: int
     ) -> tuple[Array, _Place]:
-        """Return a step that does not raise the cost, and the state it leads to."""
+        """Return a step that does not raise the cost, and the state after this step."""
         factor, damping = equations.factor, 0.0
         most = place.cost * (1.0 + (_OPEN_SLACK if equations.is_open else _ROUNDING))
         for _ in range(tries):
@@ -319,7 +321,7 @@ _ZERO = np.zeros(1)
 
 
 class _Equations(NamedTuple):
-    """Quantities of one step."""
+    """Normal equations of one step."""
 
     H: Array
     """Lower triangle of H, shape (nq, nq)."""
@@ -337,9 +339,9 @@ class _Place:
     at: MarkerFit
     cost: float
     moved: Array = field(default_factory=lambda: _ZERO)
-    """Step from the last instant."""
+    """Step from the state at the last instant to this state."""
     equations: _Equations | None = None
-    """Values of the last step."""
+    """Normal equations of the last step; None before the first step."""
 
     @property
     def factor(self) -> Array:

@@ -4,10 +4,11 @@ At every instant
 
 .. math:: q_t = \arg\min_q \sum_m w_{tm} |x_m(q) - y_{tm}|^2
 
-is solved by the Levenberg-Marquardt method, all instants in parallel, each with its own damping.
-Missing markers (NaN) have no weight. Instants at which the markers leave a degree of freedom
-undetermined are reported. A second pass solves them in order, starting from the instant before and
-regularized toward it.
+is solved by the Levenberg-Marquardt method, with marker positions x of the model, measured
+positions y and weights w. All instants are solved in parallel, each with its own damping. Missing
+markers (NaN) have no weight. Instants at which the markers leave a degree of freedom undetermined
+are reported. A second pass solves these instants in order, each starting from the preceding pose
+and regularized toward this pose.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class IkOptions:
     """Options of the solver; the defaults are for skin-mounted markers."""
 
     iterations: int = 60
-    """Largest number per instant and weighting."""
+    """Largest number of iterations per instant and per set of robust weights."""
     tolerance: float = 1e-7
     """Relative decrease of the squared error at which an instant has converged."""
     huber_m: float | None = None
@@ -55,7 +56,7 @@ class IkOptions:
     squares.
     """
     reweightings: int = 2
-    """Passes with updated robust weights."""
+    """Number of passes with updated robust weights."""
     hold_m2: float = 1e-4
     """Weight, m^2/rad^2, toward the instant before where the markers leave a joint undetermined."""
     limit_m2: float = 0.0
@@ -100,7 +101,7 @@ def solve_frames(
     markers : array_like, shape (T, M, 3)
         Measured positions in the world, m, in the order of ``model.markers``; NaN where missing.
     weights : array_like, shape (M,) or (T, M), optional
-        Weights of squared errors; those of the model by default.
+        Weights of squared errors; the weights of the model by default.
     start
         Initial state of length T; computed from the markers by default.
     options
@@ -177,8 +178,8 @@ class _Solution:
     def is_open(self) -> NDArray[np.bool_]:
         """Return the instants at which the markers leave a degree of freedom undetermined.
 
-        There a Cholesky pivot of the normal matrix is small. A pivot is the information about one
-        degree of freedom while the later ones are free.
+        At these instants a Cholesky pivot of the normal matrix is small. A pivot is the information
+        about one degree of freedom while all later degrees of freedom are free.
         """
         slots = marker_slots(self.problem.model)
         at = marker_fit(slots, self.state, self.problem.measured, self.weights)
@@ -187,10 +188,11 @@ class _Solution:
     def follow(
         self, doubtful: NDArray[np.bool_], is_open: NDArray[np.bool_], hold_m2: float
     ) -> None:
-        """Solve the doubtful instants again, each from the one before it (at the start: after it).
+        """Solve the undetermined instants again, each from the preceding instant.
 
-        Runs of doubtful instants are independent: their first instants are solved together, then
-        their second ones, and so on.
+        At the start of the trial, the following instant is used. Runs of undetermined instants are
+        independent: the first instants of all runs are solved together, then the second instants,
+        and so on.
         """
         for instants, before in _waves(doubtful):
             last = self.state.take(before)
@@ -225,7 +227,7 @@ def open_instants(H: Array) -> NDArray[np.bool_]:
 
 
 def _waves(doubtful: NDArray[np.bool_]) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Return groups of instants to solve together, with the solved instants they start from."""
+    """Return groups of instants to solve together, with the solved instants as start."""
     good = np.flatnonzero(~doubtful)
     bad = np.flatnonzero(doubtful)
     if not good.size:
