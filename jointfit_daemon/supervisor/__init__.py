@@ -2,5 +2,5 @@
 
 The shell moves events and makes no decisions about measurements. This package exports nothing: its
 public modules are the entry points `daemon`, `worker`, `process_exit` and `state_directory`, and a
-worker process imports its own module only.
+worker process imports only the module `worker`.
 """

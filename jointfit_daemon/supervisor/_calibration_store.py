@@ -1,8 +1,8 @@
 """Stored calibrations of the running rig: loading, and writing in the background.
 
-Invariant: an unreadable calibration file does not stop the daemon. The calibration that the
-core uses and the one that a reload finds are the same, even while a write is pending or has failed.
-A calibration that could not be written is written again.
+Invariant: an unreadable calibration file does not stop the daemon. The core and a reload use the
+same calibration, even while a write is pending or has failed. A calibration that could not be
+written is written again.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class LoadedCalibration(NamedTuple):
     """The stored calibration of a rig."""
 
     calibration: Calibration | None
-    """Newest stored calibration; None if the store has none that can be used."""
+    """Newest stored calibration; None if the store contains no usable calibration."""
     version: int | None
     """Number of the calibration in the store."""
     warnings: tuple[str, ...]
@@ -55,7 +55,7 @@ def store_directory(rig: Rig) -> Path:
 
 
 def load_latest(rig: Rig) -> LoadedCalibration:
-    """Return the newest calibration for the chain and sensors of the rig; report faults in it."""
+    """Return the newest calibration for the chain and sensors of the rig; report its faults."""
     try:
         latest = store_of(rig).latest()
     except (CalibrationFileError, OSError) as error:
@@ -109,9 +109,9 @@ class CalibrationWriter:
     tasks : asyncio.TaskGroup
         Owner of the task of every write.
     deliver : callable
-        Feeds one event to the core.
+        Function that feeds one event to the core.
     report : callable
-        Reports a failure to write; called once per reason.
+        Function that reports a failed write; called once per reason.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class CalibrationWriter:
         self._next_try: asyncio.TimerHandle | None = None
         self._store = ""
         self.fault: str | None = None
-        """Reason for which the calibration in force is not stored; None if there is none."""
+        """Reason why the calibration in force is not stored; None if it is stored."""
 
     def start(self, rig: Rig, calibration: Calibration, *, keep_date: bool = False) -> None:
         """Write a new version to the store of the rig; `keep_date` as for `save`."""
@@ -174,7 +174,8 @@ class CalibrationWriter:
             if newest:
                 self._unwritten = self.fault = None
 
-        # A newer calibration is in force, or a reload selected another store: not its version.
+        # If a newer calibration is in force or a reload selected another store, the number is not
+        # the version of the calibration in force.
         if newest and rig.calibration_store == self._store:
             self._deliver(CalibrationStored(time.monotonic_ns(), version, dated.created_utc))
 
@@ -184,7 +185,7 @@ class CalibrationWriter:
             await asyncio.wait(set(self._writing))
 
     def load(self, rig: Rig) -> LoadedCalibration:
-        """Return the calibration to use: the newest in the store, or an unwritten newer one."""
+        """Return the calibration to use: the newest in the store, or a newer unwritten one."""
         self._store = rig.calibration_store
         if self._unwritten is not None:
             asked, calibration, _ = self._unwritten

@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 LONGEST_TICK_INTERVAL_NS = 100_000_000
 """Longest time without an event for the core, ns."""
 _SHORTEST_WAIT_NS = 1_000_000
-"""Shortest wait for a deadline, ns: otherwise a deadline that stays in the past would block the
+"""Shortest wait for a deadline, ns: without it, a deadline that remains in the past would block the
 loop."""
 _NS_PER_S = 1e9
 
 
 class CoreInterface(Protocol):
-    """The methods of the core that the shell uses."""
+    """Interface of the core: the methods that the shell uses."""
 
     stages: StageObserver | None
     """Observer of the stages of every frame."""
@@ -88,7 +88,8 @@ class CoreRunner:
     def _arm(self) -> None:
         """Set the timer for the next tick.
 
-        A timer that is due earlier than necessary stays: at its end the deadline is checked again.
+        A timer that is due earlier than necessary is not changed. When it ends, the deadline is
+        checked again.
         """
         due_ns = self._fed_ns + LONGEST_TICK_INTERVAL_NS
         deadline_ns = self.core.next_deadline_ns
@@ -124,7 +125,7 @@ class CoreRunner:
             self.feed(UnixOffset(time.monotonic_ns(), offset_ns))
 
     async def run(self) -> None:
-        """Feed ticks until cancelled; raise what the core raises on one."""
+        """Feed ticks until cancelled; raise exceptions of the core."""
         self._feed_unix_offset()
         self._arm()
         try:

@@ -1,7 +1,7 @@
 """Runs fits in a worker process, so that a calibration fit does not delay acquisition.
 
-Invariant: one job runs at a time, and its process is killed when it is cancelled or the daemon
-ends. Results pass through JSON, so a replay of a recording uses the same values.
+Invariant: one job runs at a time. The process of the job is killed when the job is cancelled or the
+daemon ends. Results pass through JSON, so a replay of a recording uses the same values.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FIT_TIMEOUT_S = 300.0
-"""Longest duration of a fit, s: after it the subject has probably removed the sensors."""
+"""Longest duration of a fit, s. After this time the subject has probably removed the sensors."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-"""Environment of the worker; numpy reads it on import. Threads would use the CPU core of the
-sensors, and slow down on small matrices: 11 s instead of 1 s."""
+"""Environment of the worker, which numpy reads on import. More threads would use the CPU core that
+processes the sensors. They are also slower on small matrices: 11 s instead of 1 s."""
 _LONGEST_LINE = 256 * 1024 * 1024
-"""Bytes of the longest result; a calibration of four sensors has about 1 MB."""
+"""Size of the longest result, bytes; a calibration of four sensors has about 1 MB."""
 _STDERR_TAIL = 4000
-"""Bytes of the worker's standard error that are logged."""
+"""Number of logged bytes of the worker's standard error."""
 
 
 class FitRunner:
@@ -47,7 +47,7 @@ class FitRunner:
     tasks
         Owner of the task of every job.
     deliver
-        Feeds one event to the core.
+        Function that feeds one event to the core.
     """
 
     def __init__(self, tasks: asyncio.TaskGroup, deliver: Callable[[Event], None]) -> None:
@@ -101,8 +101,8 @@ async def _in_worker(job: FitJob, report: Callable[[dict[str, Any]], None]) -> d
         async with asyncio.TaskGroup() as pipes:
             answer = pipes.create_task(_answer(worker.stdout, report), name="fit result")
             printed = pipes.create_task(_read(worker.stderr), name="fit output")
-            # The pipe stays open: the worker exits when it closes. If the worker ended early, its
-            # missing answer is reported.
+            # The pipe remains open, because the worker exits when the pipe closes. If the worker
+            # ended early, the missing answer is reported.
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):
                 if worker.stdin is not None:
                     worker.stdin.write(HEADER.pack(len(data)) + data)
@@ -123,7 +123,7 @@ async def _in_worker(job: FitJob, report: Callable[[dict[str, Any]], None]) -> d
 async def _answer(
     pipe: asyncio.StreamReader | None, report: Callable[[dict[str, Any]], None]
 ) -> dict[str, Any]:
-    """Return the last line of the worker, and report those before it; empty without a result."""
+    """Return the worker's last line, and report earlier lines as progress; empty if none."""
     found: dict[str, Any] = {}
     while pipe is not None and (line := await pipe.readline()):
         content = orjson.loads(line)

@@ -55,7 +55,7 @@ class NoticeLog:
         self.online: set[str] = set()
 
     def configure(self, rig: Rig) -> None:
-        """Use another rig; sources that it lacks are no longer online."""
+        """Use another rig; sources that are not in this rig are no longer online."""
         self._rig = rig
         self.online &= {source.id for source in rig.sources}
 
@@ -63,7 +63,7 @@ class NoticeLog:
         """Ignore the inputs of the core."""
 
     def output(self, output: Output) -> None:
-        """Write the lines of one output."""
+        """Write the log lines of one output."""
         match output:
             case Notice():
                 wait_s = self._closes_within(output.id)
@@ -76,7 +76,7 @@ class NoticeLog:
                 (self.online.add if online else self.online.discard)(name)
 
     def write_due(self, now_s: float, *, stalled: bool) -> None:
-        """Write the lines that were held until `now_s`; `stalled` postpones them."""
+        """Write the delayed lines that are due at `now_s`; `stalled` postpones them."""
         if stalled:
             self._outages.postpone(now_s)
         for notice in self._outages.due(now_s):
@@ -86,7 +86,7 @@ class NoticeLog:
         """Write the line of a change of the calibration, with the file in which it is stored."""
         phase, text, version = status.phase, status.text, status.version
         if phase == CalibrationPhase.FITTING:
-            text = text.partition("; ")[0]  # its remarks are notices, with lines of their own
+            text = text.partition("; ")[0]  # the remarks are notices with their own lines
         if version is not None and version != self._version:
             path = store_of(self._rig).path(version)
             named = f"version {version}"

@@ -1,6 +1,6 @@
-"""Sinks that rig.toml or a request switches on: the recording, the metrics, streams of LSL.
+"""Sinks that rig.toml or a request enables: recording, metrics, Lab Streaming Layer (LSL).
 
-Invariant: one that cannot start is reported, and the daemon runs without it.
+Invariant: a sink that cannot start is reported, and the daemon runs without this sink.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ log = logging.getLogger(__name__)
 
 
 class Report(Protocol):
-    """Reports a state of the daemon."""
+    """Interface of the function that reports a state of the daemon."""
 
     def __call__(self, kind: NoticeKind, text: str, level: NoticeLevel) -> None:
-        """Publish and log it."""
+        """Publish and log the state."""
 
 
 def create_recorder(rig: Rig, core: CoreRunner, tasks: TaskGroup, report: Report) -> Recorder:
@@ -66,7 +66,7 @@ def create_spool(rig: Rig, link: Callable[[], MqttPublisher]) -> Spool | None:
 
 
 def report_changes(before: Rig, rig: Rig, report: Report) -> None:
-    """Report the sinks whose settings a reload has changed in vain."""
+    """Report the sinks whose changed settings need a restart of the daemon."""
     for key in ("recording", "metrics", "lsl", "mqtt.spool"):
         if attrgetter(key)(before) != attrgetter(key)(rig):
             text = f"a change of [{key}] requires a restart"
@@ -102,7 +102,7 @@ def start_metrics(
 
 
 def start_lsl(rig: Rig, core: CoreRunner, report: Report) -> None:
-    """Offer streams of the Lab Streaming Layer, if rig.toml has the table ``[lsl]``."""
+    """Create streams of the Lab Streaming Layer, if rig.toml has the table ``[lsl]``."""
     if rig.lsl is None:
         return
     from jointfit_daemon.outputs.lsl import LslError, LslOutlet  # noqa: PLC0415 - rarely used

@@ -1,12 +1,12 @@
-"""Log lines on sensors without data: one for each sensor and outage.
+"""Log lines about sensors without data: one line for each sensor and outage.
 
-A source that is closed has a line with the reason. Fusion detects missing data earlier, so the line
-on the sensor would come first. It is therefore held until this silence can no longer close the
-source. A source that still sends something is not closed. After a stall of this host, which has a
-line of its own, the lines are held until the sensors may have recovered.
+When a silent source is closed, a log line gives the reason. Fusion detects missing data earlier, so
+the line about the sensor would be the first. This line is therefore delayed until the silence can
+no longer close the source. A source that still sends data is not closed. A stall of this host has
+its own line; after a stall, the lines are delayed until the sensors may have recovered.
 
-Invariant: the line on a sensor that remains lost comes within `LONGEST_S`, also if the host stalls
-all the time.
+Invariant: the line about a lost sensor is written within `LONGEST_S`, even if the host stalls
+continuously.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from math import inf
 from jointfit_daemon.pipeline.events import Notice, NoticeKind
 
 RECOVERY_S = 4.0
-"""Time after a stall of the event loop in which sensors recover, s: 2 s without a fault, and 2 s
-to process the data that had to wait."""
+"""Time after a stall of the event loop in which sensors recover, s: 2 s without a fault, and 2 s to
+process the delayed data."""
 LONGEST_S = 30.0
 """Longest time for which stalls postpone a line, s."""
 
@@ -27,19 +27,19 @@ LONGEST_S = 30.0
 class _HeldLine:
     due_s: float
     latest_s: float
-    """Time at which stalls postpone the line no longer."""
+    """Time from which stalls no longer postpone the line."""
     notice: Notice
 
 
 class OutageLines:
-    """Holds the notices on lost sensors that need no line of their own."""
+    """Delays the notices about lost sensors that may need no line."""
 
     def __init__(self) -> None:
         self._held: dict[str, _HeldLine] = {}
         self._stalled_s = -inf
 
     def holds(self, notice: Notice, now_s: float, wait_s: float | None) -> bool:
-        """Return whether `notice` gets no line now.
+        """Return whether no line is written for `notice` now.
 
         Parameters
         ----------
@@ -61,11 +61,11 @@ class OutageLines:
         return self._held.pop(notice.id, None) is not None and notice.data.get("state") == "ok"
 
     def close(self, source: str) -> None:
-        """Drop the line on the sensor of a source that is closed, and so has a line."""
+        """Drop the line about the sensor of a closed source, because the closing has a line."""
         self._held.pop(source, None)
 
     def postpone(self, now_s: float) -> None:
-        """Note a stall of the host at `now_s`: its sensors were lost for this reason."""
+        """Process a stall of the host at `now_s`, which is the reason for the lost sensors."""
         self._stalled_s = now_s
         for line in self._held.values():
             recovered_s = min(now_s + RECOVERY_S, line.latest_s)

@@ -1,7 +1,7 @@
 """Detects that the daemon has less processor time or bandwidth than its outputs need.
 
 Invariant: one cause has one warning. Messages that are dropped because the event loop was delayed
-do not have another one.
+cause no second warning.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ STALL_REPEAT_S = 60.0
 DROPPED_SHARE = 0.2
 """Share of dropped MQTT messages in one health interval above which the daemon is overloaded."""
 FEWEST = 20
-"""Messages in one health interval below which the share is not evaluated."""
+"""Number of messages in one health interval below which the share is not evaluated."""
 REPEAT_S = 300.0
 """Shortest interval between two warnings of dropped messages, s."""
 _LIGHTEN = "lower output_rate_hz, sensors_hz or chain_hz, "
@@ -35,7 +35,7 @@ class OverloadMonitor:
         self._counts = (0, 0, 0)  # connections, sent and dropped messages at the last report
 
     def stall_warning(self, delay_s: float, now_s: float) -> str | None:
-        """Return the warning of an event loop that was delayed by `delay_s`, or None."""
+        """Return the warning about an event loop delayed by `delay_s`, or None."""
         if delay_s <= STALL_S:
             return None
         self._stalled = True
@@ -57,7 +57,7 @@ class OverloadMonitor:
         return text
 
     def drop_warning(self, link: LinkHealth, now_s: float) -> str | None:
-        """Return the warning of dropped messages, or None; call once for each health report.
+        """Return the warning about dropped messages, or None; call once for each health report.
 
         An interval with a stall, or in which the connection to the broker was lost, is not
         evaluated.

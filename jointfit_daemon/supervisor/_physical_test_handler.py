@@ -1,7 +1,7 @@
 """The request `physical-test`: the guided test of one sensor, during its normal operation.
 
-Invariant: a test that is not completed, or not asked for its state any more, ends by itself, so
-that its chunks do not accumulate.
+Invariant: a test ends by itself if it is not completed, or if no client requests its state. Its
+chunks therefore do not accumulate.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output, Reply, Request
 
 ABANDONED_S = 30.0
-"""Time without a request after which a test ends, s: a page asks every second."""
+"""Time without a request after which a test ends, s. A page requests the state every second."""
 LONGEST_S = 300.0
-"""Longest duration of a test, s: a page may stay open in the middle of one."""
+"""Longest duration of a test, s. A page may remain open during a test."""
 OPEN_S = 20.0
 """Longest time from opening to the first orientation, s; a search at other speeds is included."""
 RUNNING_PHASES = ("align", "static", "functional", "fitting")
-"""Phases that a restart of a device would spoil."""
+"""Calibration phases that a restart of a device would spoil."""
 
 
 class TestedDaemon(Protocol):
@@ -49,7 +49,7 @@ class TestedDaemon(Protocol):
         """End the subscription of `sink`."""
 
     async def restart_device(self, name: str) -> None:
-        """Close the port of one device, and open it again."""
+        """Close the port of one device, and open the port again."""
 
 
 class RunningPhysicalTest:
@@ -62,7 +62,7 @@ class RunningPhysicalTest:
         self._began_ns: int | None = None
 
     def event(self, event: Event) -> None:
-        """Take the chunks of the sensor; its loss ends the test."""
+        """Store the chunks of the sensor; the loss of the sensor ends the test."""
         name = self.test.source.id
         if isinstance(event, ChunkArrived) and event.source == name and self.failure is None:
             if self._began_ns is None:
@@ -78,7 +78,7 @@ class RunningPhysicalTest:
             self.failure = self.failure or event.text
 
     def _end_incomplete(self) -> None:
-        """End a test that takes too long, and release its chunks."""
+        """End a test that exceeds its time limit, and discard its chunks."""
         if len(self.test.rests) < len(STEPS):
             self.failure = f"not completed within {LONGEST_S / 60:g} minutes: start the test again"
             self.test = PhysicalTest(self.test.source)
@@ -87,7 +87,7 @@ class RunningPhysicalTest:
         """Ignore the outputs of the core."""
 
     async def state(self) -> dict[str, object]:
-        """Return the data of an answer; the judgement of a complete test runs in a thread."""
+        """Return the data of an answer; a complete test is evaluated in a thread."""
         test, step = self.test, len(self.test.rests)
         if step == len(STEPS) and self.result is None:
             result = await asyncio.to_thread(test.result)
@@ -159,10 +159,10 @@ class PhysicalTestHandler:
         return request.reply("ok", await running.state())
 
     async def _start(self, source: Source) -> None:
-        """Open the sensor again, so that the test receives its replies to the driver."""
+        """Open the sensor again, so that the test receives the sensor's replies to the driver."""
         self._stop()
         await self._daemon.restart_device(source.id)
-        self._stop()  # of a start at the same time
+        self._stop()  # events of a start at the same time
         self._running = RunningPhysicalTest(source)
         self._daemon.subscribe(self._running)
         self._too_late = asyncio.get_running_loop().call_later(OPEN_S, self._note_silence)

@@ -31,7 +31,7 @@ class ProcessStatistics:
         self._delays_s.append(seconds)
 
     def health(self) -> ProcessHealth:
-        """Return CPU share, memory and event loop delay."""
+        """Return CPU share, memory and event loop delay since the last call."""
         wall_s, cpu_s = time.monotonic(), time.process_time()
         share = (cpu_s - self._cpu_s) / max(1e-9, wall_s - self._wall_s)
         self._wall_s, self._cpu_s = wall_s, cpu_s

@@ -1,7 +1,7 @@
 """Progress of the core, the condition for the watchdog of systemd.
 
-Invariant: only samples that should produce limb states, and do not, stop the watchdog signal.
-Missing or stuck devices do not trip the watchdog, since a restart would not help.
+Invariant: the watchdog signal stops only if samples that should produce limb states do not produce
+any. Missing or stuck devices do not trip the watchdog, since a restart would not help.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class ProgressMonitor:
         self._states = self._expected = 0
 
     def has_progressed(self, health: CoreHealth) -> bool:
-        """Return whether limb states were produced since the last call, or none was expected."""
+        """Return whether limb states were produced since the last call, or none were expected."""
         states = health.frames.sent - health.frames.empty
         expected = sum(
             device.samples["received"]

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class DaemonInterface(TestedDaemon, Protocol):
-    """The operations of the daemon that the handlers use."""
+    """Interface of the daemon: the operations that the handlers use."""
 
     def feed(self, event: Event) -> None:
         """Pass one event to the core."""
@@ -44,7 +44,7 @@ class DaemonInterface(TestedDaemon, Protocol):
         """The recorder."""
 
     async def reload(self, before_move: Callable[[Rig], None] | None = None) -> Rig | None:
-        """Load rig.toml again and apply it; raise `ConfigError` for a faulty one."""
+        """Load rig.toml again and apply it; raise `ConfigError` for a faulty file."""
 
     async def set_output_rate(self, rate_hz: float) -> None:
         """Apply the rig in force with another output rate."""
@@ -59,9 +59,9 @@ class RequestHandlers:
     Parameters
     ----------
     daemon
-        Executes the changes.
+        Daemon that executes the changes.
     publish
-        Publishes an answer before its handler ends.
+        Function that publishes an answer before its handler ends.
     """
 
     def __init__(self, daemon: DaemonInterface, publish: Callable[[Reply], None]) -> None:
@@ -102,7 +102,7 @@ class RequestHandlers:
         return None if rig is None else request.reply("ok", data(rig))
 
     async def restart_device(self, request: Request) -> Reply:
-        """Close and open the port of one device; its availability reports the result."""
+        """Close and open the port of one device; the topic ``availability`` reports the result."""
         name = str(request.arguments["device"])
         known = [source.id for source in self._daemon.rig.sources]
         if name not in known:
@@ -113,7 +113,7 @@ class RequestHandlers:
         return request.reply("accepted", {"device": name})
 
     async def rate(self, request: Request) -> Reply:
-        """Change the output rate; a rate above that of every sensor is refused."""
+        """Change the output rate; refuse a rate above the rates of all sensors."""
         rig, rate_hz = self._daemon.rig, float(str(request.arguments["hz"]))
         fastest_hz = max(s.rate_hz for s in rig.sources if s.kind == "imu")
         fault = None
@@ -145,8 +145,9 @@ class RequestHandlers:
 
     async def use_calibration(self, request: Request) -> Reply | None:
         """Load a stored version and pass it to the core, which answers."""
-        # Until its file is written, the calibration in force has no number: a revert would find
-        # that file as the newest stored version, and choose the calibration it should replace.
+        # Until the file of the calibration in force is written, this calibration has no number. A
+        # revert would find this file as the newest stored version, and would select the calibration
+        # that it should replace.
         await self._daemon.settle_store()
         rig, in_force = self._daemon.rig, self._daemon.health().core.version
         version = request.arguments.get("version")
@@ -168,7 +169,7 @@ class RequestHandlers:
         return None
 
     async def record(self, request: Request) -> Reply:
-        """Start or stop to record, or return the state; repetitions change nothing."""
+        """Start or stop the recording, or return its state; repeated requests change nothing."""
         recorder, action = self._daemon.recorder, request.arguments["action"]
         try:
             if action == "start":

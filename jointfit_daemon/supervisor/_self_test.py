@@ -26,16 +26,17 @@ if TYPE_CHECKING:
 LEAST_RATE = 0.95
 """Share of the configured sample rate below which a device is reported."""
 MOST_DROPPED = 0.05
-"""Dropped messages per message sent above which the link is reported: before the connection is
-made, poses are dropped at every start."""
+"""Ratio of dropped to sent messages above which the link is reported. At every start, poses are
+dropped before the connection is made."""
 CLOCK_SIGMA_NS = 2e6
 """Standard deviation of a stamp above which a clock is reported, ns."""
 LOOP_DELAY_MS = 20.0
 """Delay of the event loop above which the process is reported, ms."""
 LOW_DISK_BYTES, LEAST_DISK_BYTES = 1_000_000_000, 50_000_000
-"""Free space below which the disk is reported, as a warning and as an error, bytes."""
+"""Free space below which the disk is reported as a warning and as an error, bytes."""
 HOT_C = 80.0
-"""Processor temperature above which the host is reported, °C: a Raspberry Pi slows down at 80."""
+"""Processor temperature above which the host is reported, °C. A Raspberry Pi reduces its clock rate
+at 80 °C."""
 _THERMAL = Path("/sys/class/thermal")
 
 
@@ -63,7 +64,7 @@ def read_host(folder: Path) -> HostState:
         try:
             found.append(int(path.read_text(encoding="ascii")) / 1000.0)
         except (OSError, ValueError):
-            continue  # a zone that is switched off
+            continue  # a thermal zone that is switched off
     return HostState(fault, free, max(found, default=None))
 
 

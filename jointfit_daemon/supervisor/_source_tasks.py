@@ -1,8 +1,8 @@
 """One task per source: retries a lost device, pauses a misconfigured one, propagates bugs.
 
 Invariant: a source is opened in the core with its first chunk and closed when its driver ends. No
-source stops permanently: a misconfigured one is retried with another device on its port, after at
-most one minute, or at a reload. Any other exception of a driver is a bug and ends the daemon.
+source stops permanently: a misconfigured source is retried when its port has another device, after
+at most one minute, or at a reload. Any other exception of a driver is a bug and ends the daemon.
 """
 
 from __future__ import annotations
@@ -30,28 +30,29 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event
 
 FIRST_RETRY_S = 0.1
-"""Wait before the first retry, s: a device that was plugged in again is available at once."""
+"""Wait before the first retry, s. A device that was plugged in again is available at once."""
 LAST_RETRY_S = 1.0
 """Longest wait before a retry, s: operation resumes within two seconds of plugging in."""
 SERVER_RETRY_S = 0.25
-"""Longest wait before a retry of a source without a port, s: no file shows that its server is back,
-and an attempt costs a few datagrams."""
+"""Longest wait before a retry of a source without a port, s. No file shows that the server is
+available again, and an attempt costs only a few datagrams."""
 WORKED_S = 1.0
 """Duration of data after which the waits and pauses of a source start at their first values, s."""
 PAUSE_S = 60.0
 """Longest pause of a misconfigured source, s: a device may be reconfigured without being unplugged.
 """
 PLUGGED_S = 0.05
-"""Interval between checks whether an absent port is back before the next retry, s."""
+"""Interval between checks whether an absent port exists again before the next retry, s."""
 SERVER_PAUSE_S = 5.0
-"""First pause of a misconfigured source without a port, s: no file shows that its server was
-changed. Each further pause is twice as long, up to `PAUSE_S`, until the source has worked."""
+"""First pause of a misconfigured source without a port, s. No file shows that the configuration of
+the server was changed. Each further pause is twice as long, up to `PAUSE_S`, until the source has
+worked."""
 CHECK_S = 0.5
-"""Interval between checks of the port of a paused source, s; each is one stat(2)."""
+"""Interval between checks of the port of a paused source, s; each check is one call of stat(2)."""
 
 
 class _SourceReporter:
-    """Reports one source to the core: opened with its first chunk, closed once."""
+    """Reports the state of one source to the core: opened with its first chunk, closed once."""
 
     def __init__(self, source: str, deliver: Callable[[Event], None], known: asyncio.Event) -> None:
         self._source, self._deliver, self._known = source, deliver, known
@@ -76,7 +77,7 @@ class _SourceReporter:
     def closed(
         self, reason: Literal["lost", "misconfigured"], text: str, *, absent: bool = False
     ) -> None:
-        """Report the end of the source; skip a repetition of the last report.
+        """Report the end of the source; do not repeat the last report.
 
         The first report of an `absent` device remains true for all of its next attempts.
         """
@@ -95,7 +96,7 @@ class _SourceReporter:
 
 
 class _RunningSource:
-    """One source and its task.
+    """State of one source, with its task.
 
     Attributes
     ----------
@@ -122,13 +123,13 @@ async def run_source(
     source
         The source.
     deliver
-        Feeds one event to the core.
+        Function that feeds one event to the core.
     state
-        Receives the state of the source.
+        Object that receives the state of the source.
     """
     state = state or _RunningSource(source)
     reporter = _SourceReporter(source.id, deliver, state.known)
-    # one object for all attempts, which may store findings of failed ones
+    # one object for all attempts: it may store findings of failed attempts
     driver = source.driver_class(source.settings)
     path = device_path(source.settings)
     longest_s, first_pause_s = LAST_RETRY_S, PAUSE_S
@@ -153,7 +154,8 @@ async def run_source(
 
         if reporter.worked:
             delay_s, pause_s = FIRST_RETRY_S, first_pause_s
-        # The core logs the fault. The text contains no pause, so that a repetition is recognized.
+        # The core logs the fault. The text does not contain the duration of the pause, so that a
+        # repetition is recognized.
         reporter.closed("misconfigured" if misconfigured else "lost", text, absent=absent)
         if misconfigured:
             state.paused = True
@@ -161,13 +163,13 @@ async def run_source(
             state.paused, delay_s = False, FIRST_RETRY_S
             pause_s = min(2 * pause_s, PAUSE_S)
 
-        # Full jitter: sources that are lost together do not retry together.
+        # Full jitter prevents sources that are lost together from retrying together.
         await _wait_for_retry(path, random.uniform(0, delay_s))  # noqa: S311 - not security-relevant
         delay_s = min(2 * delay_s, longest_s)
 
 
 async def _wait_for_retry(path: str | None, delay_s: float) -> None:
-    """Wait for `delay_s`, or until a device is plugged in at `path` if there is none."""
+    """Wait for `delay_s`, or until a device appears at `path` if there is none."""
     absent = path is not None and _device_identity(path) is None
     loop = asyncio.get_running_loop()
     until_s = loop.time() + delay_s
@@ -188,7 +190,7 @@ async def _wait_for_change(path: str | None, device: object, pause_s: float) -> 
 def _device_identity(path: str | None) -> object:
     """Return a value that differs between devices plugged in one after another.
 
-    None without a device. A name without a slash is a network interface (``can0``).
+    The value is None without a device. A name without a slash is a network interface (``can0``).
     """
     if path is None:
         return None
@@ -205,9 +207,9 @@ class SourceTasks:
     Parameters
     ----------
     tasks : asyncio.TaskGroup
-        The root group: a bug in a driver ends it.
+        The root group. A bug in a driver ends this group.
     deliver : callable
-        Feeds one event to the core.
+        Function that feeds one event to the core.
     """
 
     def __init__(self, tasks: asyncio.TaskGroup, deliver: Callable[[Event], None]) -> None:
@@ -215,7 +217,7 @@ class SourceTasks:
         self._running: dict[str, _RunningSource] = {}
 
     async def retire(self, sources: Iterable[Source]) -> None:
-        """Stop the sources that are not among `sources`; unchanged ones keep running.
+        """Stop the sources that are not among `sources`; unchanged sources continue.
 
         Paused sources are stopped, too: the cause may have been removed outside rig.toml.
         """
@@ -228,7 +230,7 @@ class SourceTasks:
         await stop(each.task for each in removed if each.task is not None)
 
     async def apply(self, sources: Iterable[Source]) -> None:
-        """Run exactly `sources`."""
+        """Start and stop sources so that exactly `sources` run."""
         wanted = {source.id: source for source in sources}
         await self.retire(wanted.values())
         for name, source in wanted.items():
@@ -242,7 +244,7 @@ class SourceTasks:
         )
 
     async def restart(self, name: str) -> None:
-        """Close the port of a running source, and open it again with a new driver.
+        """Close the port of a running source, and open the port again with a new driver.
 
         Raises
         ------

@@ -1,7 +1,7 @@
 """Summaries of the stored calibrations, for the request ``calibrations``.
 
-A summary reads the file without the checks of a calibration that comes into use, so that a list
-costs the daemon milliseconds.
+A summary reads the file without the checks that precede the use of a calibration, so that a list
+costs only milliseconds.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
 
 _ONLINE = ("rounds", "from_version", "before_deg", "after_deg")
-"""Figures of the last refit by online learning."""
+"""Names of the figures of the last refit by online learning."""
 _UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, MalformedFileError)
 
 
 @dataclass(frozen=True, slots=True)
 class VersionSummary:
-    """One stored calibration."""
+    """Summary of one stored calibration."""
 
     version: int
     created_utc: str | None = None
@@ -35,20 +35,20 @@ class VersionSummary:
     method: str | None = None
     procedure: str | None = None
     restored_from: int | None = None
-    """Version of which this one is a copy."""
+    """Version of which this version is a copy."""
     online: dict[str, Any] | None = None
-    """Last refit by online learning that its models contain: number of refits since the functional
-    phase, version before it, and errors before and after; None without one."""
+    """Last refit by online learning in the models of this version: number of refits since the
+    functional phase, version before it, and errors before and after; None without one."""
     functional: bool | None = None
-    """Whether a movement in view of cameras determined it."""
+    """Whether the calibration was determined from a movement in view of the cameras."""
     usable: bool = False
-    """Whether it belongs to the limb and the sensors of the rig."""
+    """Whether the calibration belongs to the limb and the sensors of the rig."""
     segments_deg: dict[str, float | None] = field(default_factory=dict)
     """RMS orientation error of each segment on held-out movement, by the method in use."""
     flexion_deg: dict[str, float | None] = field(default_factory=dict)
     """RMS flexion error of each joint on held-out movement, by the method in use."""
     fault: str | None = None
-    """Reason for which the file cannot be read."""
+    """Reason why the file cannot be read."""
 
 
 class StoredVersions:
@@ -59,7 +59,7 @@ class StoredVersions:
         """Summary and layout of files that were read: a stored version never changes."""
 
     def list(self, rig: Rig, count: int) -> dict[str, Any]:
-        """Return the newest `count` versions, the newest first, and the number of the others."""
+        """Return the newest `count` versions, the newest first, and the number of older ones."""
         store = store_of(rig)
         numbers = store.versions()[::-1]
         found = [asdict(self._summary(rig, number)) for number in numbers[:count]]

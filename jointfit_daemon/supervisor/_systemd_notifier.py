@@ -1,6 +1,6 @@
 """Notification of systemd: readiness, reload, stop, watchdog and status line.
 
-Invariant: no method raises, and without systemd each has no effect.
+Invariant: no method raises, and without systemd the methods have no effect.
 
 Source: sd_notify(3): datagrams of ``KEY=VALUE`` lines to $NOTIFY_SOCKET; a leading ``@`` denotes an
 abstract socket.
@@ -14,7 +14,7 @@ import socket
 import time
 
 TIMEOUT_S = 0.1
-"""Longest wait for a manager that does not read its socket, s."""
+"""Longest wait for a service manager that does not read its socket, s."""
 
 
 class SystemdNotifier:

@@ -1,4 +1,4 @@
-"""The daemon: one TaskGroup around the core, with events as input and outputs to the sinks.
+"""The daemon: one TaskGroup that passes events to the core and its outputs to the sinks.
 
 Invariant: the daemon ends by cancellation or by a bug only.
 
@@ -109,7 +109,8 @@ KNOWN_S = 2.0
 FAREWELL_S = 0.5
 """Longest wait for the broker to accept the last messages, s."""
 _STORING = ("calibrate", "static", "use-calibration")
-"""Requests whose results are stored: the state directory is checked at once."""
+"""Names of requests whose results are stored. For these requests the state directory is checked at
+once."""
 STOP_S = 4.8
 """Longest duration of a stop, s; the documentation promises five seconds."""
 
@@ -122,7 +123,7 @@ class Daemon:
     config
         Path of rig.toml, read again at every reload.
     rig
-        Its present content.
+        Present content of rig.toml.
     core
         The pure core.
     """
@@ -142,7 +143,7 @@ class Daemon:
         self._overload = OverloadMonitor()
         self._recorder: Recorder | None = None
         self._state_fault: str | None = None
-        self._state_lock: int | None = None  # set if the directory was not writable at the start
+        self._state_lock: int | None = None  # None if it was writable at the start
         self._calibration: CalibrationStatus | None = None
         self._health_due_s = 0.0
         self._reload_requested = asyncio.Event()
@@ -172,7 +173,7 @@ class Daemon:
 
     async def _move_to_broker(self, before: Rig, rig: Rig) -> None:
         """Disconnect from the old broker, and send all retained messages to the new one."""
-        await self._link.emptied(FAREWELL_S)  # messages that clear a topic, among others
+        await self._link.emptied(FAREWELL_S)  # includes messages that clear a topic
         await stop([self._mqtt])
         known = self._outbox.retained
         self._core.unsubscribe(self._topics)
@@ -201,7 +202,7 @@ class Daemon:
                     self._systemd.stopping()
                     self._calibrations.stop()
                     await self._sources.stop()
-                    await self._link.emptied(FAREWELL_S)  # "offline" of the devices, among others
+                    await self._link.emptied(FAREWELL_S)  # includes "offline" of the devices
         finally:
             logging.getLogger().removeHandler(warnings)
             loop.remove_signal_handler(signal.SIGHUP)
@@ -273,7 +274,7 @@ class Daemon:
         self._topics.publish_log_line(level, name, text, suppressed)
 
     def _report(self, kind: NoticeKind, text: str, level: NoticeLevel = NoticeLevel.INFO) -> None:
-        """Report a state of the shell on the log and on ``bridge/event``."""
+        """Report a state of the shell in the log and on ``bridge/event``."""
         log.log(LEVELS[level], "%s: %s", kind, text, extra=journal_fields(kind, self._rig.name))
         notice = Notice(time.monotonic_ns(), kind, self._rig.name, text, level)
         self._topics.publish_notice(notice)
@@ -358,7 +359,7 @@ class Daemon:
         return self._recorder
 
     async def restart_device(self, name: str) -> None:
-        """Close the port of one device, and open it again."""
+        """Close the port of one device, and open the port again."""
         async with self._changes:
             if name in {source.id for source in self._rig.sources}:  # a reload may have removed it
                 await self._sources.restart(name)
@@ -435,7 +436,7 @@ class Daemon:
         while True:
             await self._reload_requested.wait()
             self._reload_requested.clear()
-            with suppress(ConfigError):  # it is reported
+            with suppress(ConfigError):  # the fault is reported
                 await self.reload()
 
     async def reload(self, before_move: Callable[[Rig], None] | None = None) -> Rig | None:
@@ -455,7 +456,7 @@ class Daemon:
         Raises
         ------
         ConfigError
-            It is faulty; the running configuration stays in force.
+            The file is faulty; the running configuration remains in force.
         """
         async with self._changes:
             self._systemd.reloading()
@@ -491,13 +492,13 @@ class Daemon:
         await self._sources.retire(rig.sources)
 
         self._notices.configure(rig)
-        self._topics.configure(rig)  # clears topics of removed devices before any are moved
+        self._topics.configure(rig)  # clears topics of removed devices before the move
         if before.mqtt != rig.mqtt:
             await self._move_to_broker(before, rig)
         else:
             self._read_request_key(rig)  # the file may contain a new key
 
-        await self._calibrations.settle()  # otherwise the store lacks the calibration in force
+        await self._calibrations.settle()  # otherwise the calibration in force is not in the store
         self._configure(rig)
         await self._check_state()
         await self._sources.apply(rig.sources)
@@ -516,9 +517,9 @@ async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreInterface] =
     config
         Path of rig.toml, read again on SIGHUP.
     rig
-        Its present content.
+        Present content of rig.toml.
     core
-        Creates the core.
+        Function that creates the core.
     """
     main = asyncio.current_task()
     loop = asyncio.get_running_loop()
@@ -533,8 +534,8 @@ async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreInterface] =
 
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop_once)
-        # The loop may hang, and calls no handler then. This one runs in any state, and the loop
-        # still learns of the signal by its wake-up descriptor.
+        # If the event loop hangs, it calls no handler. This handler runs in any state, and the loop
+        # still receives the signal by its wake-up descriptor.
         signal.signal(number, lambda *_: limit.start())
     try:
         await Daemon(config, rig, core()).run()

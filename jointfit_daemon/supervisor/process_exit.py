@@ -16,11 +16,11 @@ _REPORT_S = 0.15
 
 
 class ExitLimit:
-    """Ends the process with an exit code if it is still running some time after `start`.
+    """Ends the process with an exit code if it still runs `seconds` after `start`.
 
-    A thread that resolves a host name, or a driver that does not return, cannot be interrupted.
-    The limit runs in a thread of its own, since the event loop may be the part that hangs. That
-    thread runs from the beginning: none can be started safely in a signal handler.
+    A thread that resolves a host name, or a driver that does not return, cannot be interrupted. The
+    time limit runs in its own thread, since the event loop may be the part that hangs. This thread
+    is started first, because no thread can be started safely in a signal handler.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class ExitLimit:
         self._started.put(True)
 
     def cancel(self) -> None:
-        """End the thread, unless the time limit was started."""
+        """End the thread of the time limit, unless the limit was started."""
         self._started.put(False)
 
     def _run(self) -> None:

@@ -21,11 +21,12 @@ PRIVATE_UMASK = 0o077
 """Umask of the daemon: calibrations and recordings are personal data."""
 _DIRECTORY_MODE, _FILE_MODE = 0o700, 0o600
 _OWNED = ("calibrations", "recordings")
-"""Folders written by the daemon; others in the state directory may belong to other programs."""
+"""Folders written by the daemon; other folders in the state directory may belong to other
+programs."""
 WRITE_REMEDY = "check mount, permissions and free space, or set STATE_DIRECTORY"
 """Remedy for a directory that cannot be written."""
 _PROBE_BYTES = bytes(4096)
-"""Content of the probe file: a full disk accepts an empty file."""
+"""Content of the probe file. It is not empty, because a full disk accepts an empty file."""
 _HELD = (errno.EWOULDBLOCK, errno.EACCES)
 
 
@@ -41,8 +42,8 @@ def state_directory() -> Path:
 def lock_state(directory: Path) -> int | None:
     """Lock `directory` for this process and return the descriptor that holds the lock.
 
-    Returns None if no lock file can be created: a directory without write access has no state to
-    protect. Some network file systems have no locks.
+    Returns None if no lock file can be created, because a directory without write access has no
+    state to protect. Some network file systems have no locks.
 
     Raises
     ------
@@ -77,7 +78,7 @@ def lock_state(directory: Path) -> int | None:
 def lock_again(directory: Path) -> int | None:
     """Lock `directory` as `lock_state` does, unless this process holds its lock (None).
 
-    For a directory that could not be written, and so not be locked, at the start.
+    The function is for a directory that was not writable at the start and therefore was not locked.
     """
     try:
         holder = (directory / LOCK).read_text(encoding="ascii", errors="replace").strip()
@@ -112,7 +113,7 @@ def _written(directory: Path) -> Iterator[Path]:
 
 
 def write_fault(directory: Path) -> str | None:
-    """Return the reason why no file can be written to `directory`; None if one can."""
+    """Return the reason why no file can be written to `directory`; None if writing succeeds."""
     probe = directory / f".probe-{os.getpid()}"
     try:
         directory.mkdir(mode=_DIRECTORY_MODE, parents=True, exist_ok=True)
@@ -126,5 +127,5 @@ def write_fault(directory: Path) -> str | None:
 
 
 def describe_write_error(error: OSError, directory: Path) -> str:
-    """Return the directory and the reason for which it cannot be written."""
+    """Return a text with the directory and the reason why it cannot be written."""
     return f"{directory.absolute()}: {error.strerror or error}"

@@ -1,9 +1,9 @@
 """The worker process: one fit, started as ``python -m jointfit_daemon.supervisor.worker``.
 
-The worker reads a pickled job from standard input and writes JSON objects, one a line: any number
+The worker reads a pickled job from standard input and writes JSON objects, one per line: any number
 of ``{"progress": …, "text": …}``, at most five a second, then ``{"result": …}`` or ``{"error":
-text}``. Everything else that a fit prints is redirected to standard error. The parent
-keeps its end of the input open: when that closes, the worker exits.
+text}``. Everything else that a fit prints is redirected to standard error. The parent process
+leaves the input open; the worker exits when the input is closed.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration import JobControl
 
 HEADER = struct.Struct("<Q")
-"""Length of the pickled job, bytes."""
+"""Format of the length of the pickled job, bytes."""
 _REPORT_S = 0.2
 """Shortest time between two reports of progress, s."""
 _NICE = 10
-"""Decrease of the priority: acquisition comes first."""
+"""Decrease of the priority, because acquisition has precedence."""
 
 
 def main() -> int:
     """Run the one job that the parent sends."""
-    with contextlib.suppress(OSError):  # refused under a system-call filter
+    with contextlib.suppress(OSError):  # a system-call filter may refuse this
         os.nice(_NICE)
     answer_fd = os.dup(sys.stdout.fileno())
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())

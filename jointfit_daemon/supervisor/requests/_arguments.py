@@ -14,9 +14,9 @@ LONGEST_MARK = 200
 LEAST_RATE_HZ, GREATEST_RATE_HZ = 1.0, 1000.0
 """Limits of a requested output rate, Hz."""
 MOST_VERSIONS = 50
-"""Largest number of stored calibrations in one answer; each takes some 500 bytes."""
+"""Largest number of stored calibrations in one answer; each takes about 500 bytes."""
 LAST_VERSION = 999_999_999
-"""Largest version number of a store."""
+"""Largest version number in a calibration store."""
 
 
 class RequestArguments(BaseModel):

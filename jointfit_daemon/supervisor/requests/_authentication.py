@@ -1,8 +1,8 @@
 """Authentication of requests by signature and nonce.
 
 Invariant: without a usable key every request is refused, each signed request passes once, and the
-memory of nonces is limited. Without ``[mqtt] request_key_file`` all requests pass: then the
-broker's access list decides.
+memory of nonces is limited. Without ``[mqtt] request_key_file`` all requests pass; the access list
+of the broker then decides.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 NONCE_CAPACITY = 4096
-"""Largest number of signed requests per minute; only owners of the key can fill it."""
+"""Largest number of signed requests per minute; only owners of the key can reach this number."""
 _NONCE_LIFETIME_NS = 2 * SIGNATURE_LIFETIME_US * 1000
-"""Time for which a nonce is stored, ns: a signature is valid that long at most."""
+"""Time for which a nonce is stored, ns. A signature is valid for at most this time."""
 
 
 class RequestAuthenticator:
@@ -47,7 +47,7 @@ class RequestAuthenticator:
     def __init__(self, settings: MqttSettings) -> None:
         self._key: bytes | None = None
         self.fault = ""
-        """Reason for which every request is refused; empty if there is none."""
+        """Reason why every request is refused; empty if requests are accepted."""
         try:
             self._key = request_key_of(settings)
         except RequestKeyError as missing:
@@ -61,7 +61,7 @@ class RequestAuthenticator:
         Raises
         ------
         SignatureRejectedError
-            A valid signature is required, and missing or wrong; or the request has expired.
+            A required signature is missing or wrong, or the request has expired.
         """
         if self.fault:
             raise SignatureRejectedError(

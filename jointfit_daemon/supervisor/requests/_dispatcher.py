@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Reply, ReplyAddress, Request
 
 Handler: TypeAlias = "Callable[[Request], Awaitable[Reply | None]]"
-"""Executes one request; returns None if the core answers it."""
+"""Function that executes one request; it returns None if the core answers the request."""
 
 log = logging.getLogger(__name__)
 
 MEMORY_NS = 60_000_000_000
-"""Time for which an answer is stored, ns: a broker repeats a message within seconds."""
+"""Time for which an answer is stored, ns. A broker repeats a message within seconds."""
 MEMORY_CAPACITY = 256
-"""Largest number of stored answers; the oldest is dropped for a new one."""
+"""Largest number of stored answers; a new answer replaces the oldest answer."""
 MOST_RUNNING = 16
 """Largest number of requests that wait for their answer."""
 
@@ -52,9 +52,9 @@ class RequestDispatcher:
     tasks : asyncio.TaskGroup
         Owner of the task of every handler.
     feed
-        Passes a request to the core, which answers it at once through its outputs.
+        Function that passes a request to the core, which answers at once through its outputs.
     publish
-        Publishes one answer.
+        Function that publishes one answer.
     handlers
         Handler by name; the core processes all other requests of `REQUESTS`.
 
@@ -96,7 +96,7 @@ class RequestDispatcher:
             self._tasks.create_task(self._run(handler, request), name=name)
 
     def note_reply(self, reply: Reply) -> None:
-        """Store an answer that was published, and publish it for repetitions that wait."""
+        """Store a published answer, and publish it for waiting repetitions of the request."""
         known = self._known.get(reply.transaction)
         if known is None or known.reply is not None or known.request.command != reply.command:
             return

@@ -28,17 +28,18 @@ if TYPE_CHECKING:
 LONGEST_BYTES = 4096
 """Largest payload, bytes; a signed request with a long transaction takes a quarter of it."""
 MOST_KEYS = 16
-"""Largest number of keys; `calibrate` has seven, those of the signature included."""
+"""Largest number of keys; `calibrate` has seven keys, including the keys of the signature."""
 LONGEST_TEXT = 256
 """Longest `transaction` and response topic, characters."""
 LONGEST_CORRELATION_BYTES = 256
 """Longest correlation data, bytes."""
 _MOST_BRACKETS = 64
-"""Largest number of opening brackets: a request is flat, and has one outside of its texts."""
+"""Largest number of opening brackets. A request is flat, and has one bracket outside of its
+texts."""
 _MOST_FAULTS = 8
-"""Faults listed in a reply; further ones are counted."""
+"""Number of faults that a reply lists; further faults are counted."""
 _LONGEST_KEY, _LONGEST_MESSAGE = 80, 400
-"""Longest texts in a reply, characters."""
+"""Lengths of the longest texts in a reply, characters."""
 _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
 """Permitted command names: other names are not repeated on a topic."""
 _RESPONSE_LEVELS = re.compile(r"[\w.:~-]{1,64}(/[\w.:~-]{1,64}){0,3}", re.ASCII)
@@ -55,7 +56,7 @@ def parse_request(
     message
         The received message.
     authenticator
-        Checks the signature before the arguments are read; None: all signatures are accepted.
+        Object that checks the signature before the arguments are read. None accepts all requests.
 
     Returns
     -------
@@ -95,7 +96,7 @@ def parse_request(
 
 
 def _parse_table(payload: bytes) -> tuple[dict[str, Any], Fault | None]:
-    """Return the flat JSON object in `payload`, or an empty one and the fault."""
+    """Return the flat JSON object in `payload`, or an empty object and the fault."""
     if len(payload) > LONGEST_BYTES:
         text = f"has {len(payload)} bytes, expected at most {LONGEST_BYTES}"
         return {}, Fault("payload", text)
@@ -134,7 +135,7 @@ def _property_fault(message: Incoming) -> Fault | None:
 
 
 def _reply_address(message: Incoming) -> ReplyAddress:
-    """Return the requested topic and correlation data, each None if it is not permitted.
+    """Return requested topic and correlation data, with None for values that are not permitted.
 
     Only topics below ``bridge/response/`` are permitted: otherwise a client could write to `pose`.
     """
@@ -164,7 +165,7 @@ def _refusal(command: str, transaction: str, faults: list[Fault], reply_to: Repl
 
 
 def error_of(faults: Sequence[Fault]) -> dict[str, Any]:
-    """Return the ``error`` of an answer: the first faults, and the number of the others."""
+    """Return the ``error`` of an answer: the first faults, and the number of further faults."""
     lines = [
         {"key": _cut(fault.key, _LONGEST_KEY), "message": _cut(fault.text(), _LONGEST_MESSAGE)}
         for fault in faults[:_MOST_FAULTS]
