@@ -1,6 +1,7 @@
 """Check that serial lines and CAN buses have the bit rate that their sensors need.
 
-Worst case: all sensors of a bus send at their rate, with the largest number of stuff bits.
+The check assumes the worst case: all sensors of a bus send at their rate, with the largest number
+of stuff bits.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ _ADAPTERS: dict[str, tuple[str, int, Callable[[int, bool], int]]] = {
 
 
 def _adapter_line(bus: CanBusSettings) -> tuple[str, int, Callable[[int, bool], int]] | None:
-    """Return key and speed, baud, of an adapter's serial line, and the bits of a frame on it."""
+    """Return key and speed, baud, of an adapter's serial line, and the bits of a CAN frame."""
     if bus.interface == "slcan" and bus.transport == "uart":
         return "baud", bus.baud, lambda size, ext: slcan_bits(size, extended=ext)
     if bus.interface not in _ADAPTERS:
@@ -66,17 +67,17 @@ def _adapter_line(bus: CanBusSettings) -> tuple[str, int, Callable[[int, bool], 
 
 
 def least_load(settings: Any, unknown: Iterable[str]) -> Any:
-    """Return the settings of a sensor with its smallest possible load; None if that is unknown.
+    """Return a sensor's settings with the smallest possible load; None if unknown.
 
     The load with a faulty choice, such as a misspelled orientation, is at least the smallest of all
-    choices. If even this one is too large, the line is too slow in any case.
+    choices. If even this load is too large, the line is too slow in any case.
 
     Parameters
     ----------
     settings
-        Its table; faulty keys are None.
+        Table of the sensor; faulty keys are None.
     unknown
-        Keys that do not exist: each is probably a misspelling of the one that it resembles.
+        Keys that do not exist: each is probably a misspelling of the key that it resembles.
     """
     fields = type(settings).model_fields
     faulty = {
@@ -103,7 +104,7 @@ def least_load(settings: Any, unknown: Iterable[str]) -> Any:
 
 
 def _choices(field: FieldInfo) -> list[Any]:
-    """Return all values of a key with few of them; identifiers do not change the load."""
+    """Return all values of a key with few values; identifiers do not change the load."""
     annotation: Any = field.annotation
     if annotation is bool:
         return [False, True]

@@ -1,7 +1,7 @@
-"""Limb of ``[[chain.joint]]`` tables: a tree whose first segment has a right and a left branch.
+"""Limb from ``[[chain.joint]]`` tables: a tree with a right and a left branch.
 
-Invariant: `branched_limb` orders joints and segments so that a segment follows the one that carries
-it, and joint i is the proximal joint of segment i.
+Invariant: `branched_limb` orders joints and segments so that a segment follows the segment that
+carries it, and joint i is the proximal joint of segment i.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _KEY = "chain.joint"
 _BRANCHES = 2
-"""Joints at the distal end of the first segment."""
+"""Number of joints at the distal end of the first segment."""
 
 
 class BranchedLimb(NamedTuple):
@@ -35,7 +35,8 @@ class BranchedLimb(NamedTuple):
 def branched_limb(table: ChainTable) -> BranchedLimb:
     """Return the limb of a table without faults.
 
-    The position of the first segment is that of ``NAME_origin``, the midpoint of its two joints.
+    The position of the first segment is the position of ``NAME_origin``, the midpoint of its two
+    joints.
     """
     joints, segments = table.joint, set(table.segments)
     carried = {j.child: j for j in joints if j.child is not None and j.child in segments}
@@ -70,7 +71,7 @@ def origin_name(root: str) -> str:
 
 
 def _side_of(joint: JointTable, carried: Mapping[str, JointTable]) -> str | None:
-    """Return the side of a joint: its own, or that of the nearest joint above it with one."""
+    """Return the configured side of a joint, or the side of the nearest joint above it."""
     above: JointTable | None = joint
     while above is not None:
         if above.side is not None:
@@ -162,7 +163,7 @@ def _check_connection(table: ChainTable) -> Iterator[Fault]:
 
 
 def _check_shape(table: ChainTable) -> Iterator[Fault]:
-    """Check that the root has two joints and every other segment one."""
+    """Check that the root has two joints and every other segment exactly one."""
     root = _roots(table)[0]
     for segment in table.segments:
         names = [joint.name for joint in table.joint if joint.parent == segment]

@@ -1,4 +1,4 @@
-"""Replacement of wrong keys in a ``[can.NAME]`` table, so that its other faults are found, too."""
+"""Replacement of wrong keys in a ``[can.NAME]`` table, so that further faults are found."""
 
 from __future__ import annotations
 
@@ -20,14 +20,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 _CLOSE = 0.8
-"""Least similarity, 0 to 1, at which a misspelled interface is checked as the one it resembles."""
+"""Smallest similarity, 0 to 1, at which a misspelled interface is checked as the interface that it
+resembles."""
 
 
 def unusable_keys(table: Mapping[str, Any], in_use: Iterable[str]) -> dict[str, str]:
     """Return the faults by key if all drivers for CAN refuse the bus of `table`.
 
-    Drivers know the interfaces that can be opened. The drivers `in_use` are asked first, so that
-    no other is imported for a valid bus. The others are for a bus that no sensor names.
+    Drivers know the interfaces that can be opened. The drivers `in_use` are asked first, so that no
+    other is imported for a valid bus. The other drivers are used for a bus that no sensor names.
     """
     bus = readable_part({"channel": "can0", **table}, CanBusSettings, [])
     defaults = dict(CanBusSettings(channel="can0"))

@@ -1,6 +1,6 @@
 """The chain model of ``[chain] model``, and its agreement with the rig.
 
-The names of a model's segments are those of its file. A body part of the rig is therefore the
+The segment names of a model come from its file. A body part of the rig therefore corresponds to the
 segment that carries its markers.
 """
 
@@ -70,7 +70,7 @@ def load_chain_model(
 ) -> tuple[LoadedModel | None, list[Fault]]:
     """Return the chain model and its faults; keys of the tables that had faults are None.
 
-    The remarks of the model contain the markers of the rig that it lacks.
+    The remarks of the model name the markers of the rig that are missing in the model.
     """
     try:
         loaded = read_chain_model(given)
@@ -84,7 +84,7 @@ def load_chain_model(
 
     named: Any = mocap.markers
     if named is None or None in named.values():
-        return loaded, []  # markers that cannot be read may be those of the model
+        return loaded, []  # Unreadable markers may be markers of the model.
 
     parts = body_parts_of(table)
     markers = {part: names for part in parts if (names := (mocap.markers or {}).get(part))}
@@ -112,7 +112,7 @@ def load_refinement(
 ) -> tuple[ChainRefinement | None, dict[str, float], list[Fault]]:
     """Return the refinement of a chain model, the weights of markers, and faults.
 
-    Keys of `table` that had faults are None; there is no refinement then.
+    Keys of `table` that had faults are None; in this case there is no refinement.
     """
     faults: list[Fault] = []
 

@@ -1,4 +1,4 @@
-"""Checks across the tables of rig.toml, and of names.
+"""Checks of names, and of values in several tables of rig.toml.
 
 Invariant: every check returns all its faults.
 """
@@ -129,7 +129,7 @@ def check_chain(table: ChainTable) -> Iterator[Fault]:
             list(table.joints),
         )
 
-    # Adjacent body parts, and configured lengths.
+    # Check adjacent body parts and configured lengths.
     for key in ("proximal", "distal"):
         if (name := getattr(table, key)) is not None:
             yield from check_topic_name(f"chain.{key}", name)
@@ -189,7 +189,7 @@ def check_procedure(
 def check_known_name(
     key: str, name: str, known: Collection[str], what: str, taken: Collection[str] = ()
 ) -> list[Fault]:
-    """Check that `name` is one of `known`; the proposal is not one of `taken`."""
+    """Check that `name` is one of `known`; a proposed name is never one of `taken`."""
     if name in known:
         return []
     choices = ", ".join(known) or "none"
@@ -220,7 +220,7 @@ def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -
             key = f"imu[{imu_name(imu, at)}].segment"
             yield from check_known_name(key, imu["segment"], table.segments, "segment")
     if any(not isinstance(imu.get("segment"), str) for imu in imus):
-        return  # reported; it may be the segment without sensor
+        return  # already reported; may be the segment without sensor
     for segment in table.segments:
         if segment not in worn and table.motion != "planar":
             yield Fault("imu", f"segment {segment!r} has no sensor, expected at least one")
@@ -235,7 +235,7 @@ def body_parts_of(table: ChainTable) -> list[str]:
 
 def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator[Fault]:
     """Check the markers and rigid bodies of ``[mocap]``; keys that had faults are None."""
-    # A value of another type than a table has its fault already.
+    # If the value is no table, its fault is already reported.
     given: dict[str, dict[str, Any]] = {
         kind: value if isinstance(value := getattr(settings, kind), dict) else {}
         for kind in ("markers", "rigid_body")
@@ -308,7 +308,7 @@ def _check_planar_markers(table: ChainTable, cameras: MocapSettings) -> Iterator
 def check_center_methods(
     table: CalibrationTable, chain: ChainTable | None, mocap: MocapSettings | None
 ) -> Iterator[Fault]:
-    """Check that the joints with an estimator of their own exist and can be measured.
+    """Check that joints with their own estimator exist and can be measured.
 
     Keys of `table` and `chain` that had faults are None; `mocap` is None without cameras.
     """
@@ -340,7 +340,7 @@ def check_center_methods(
 
 
 def _sides_of_joints(chain: ChainTable) -> dict[str, list[tuple[str | None, str]]]:
-    """Return the body parts of each joint, None if missing, each with the key that names it."""
+    """Return the two body parts of each joint (None if missing), each with its key."""
     if chain.joint:
         return {
             joint.name: [(joint.parent, ""), (joint.child, f"chain.joint[{joint.name}].child")]
@@ -364,7 +364,7 @@ def check_ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) 
 
     taken: dict[str, str] = {}
     for key, port in users:
-        if isinstance(port, str):  # a link and its target are the same port
+        if isinstance(port, str):  # A link and its target are the same port.
             owner = taken.setdefault(os.path.realpath(port), key)
             if owner != key:
                 yield Fault(key, f"is the port of {owner.rpartition('.')[0]} already", port)
@@ -398,7 +398,7 @@ def check_can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
 def missing_files(mqtt: MqttSettings) -> list[str]:
     """Return a warning for every configured file that does not exist.
 
-    It is not a fault: the files may be created after the check, or by another user.
+    A missing file is not a fault, because it may be created later or by another user.
     """
     tls = mqtt.tls
     files = {"password_file": mqtt.password_file, "request_key_file": mqtt.request_key_file}
@@ -418,7 +418,7 @@ def drifting_imus(sources: Sequence[Source]) -> frozenset[str]:
 
 
 def _on_gateway(sources: Sequence[Source]) -> dict[bool, list[str]]:
-    """Return the IMUs whose heading the gateway computes, by whether it drifts."""
+    """Return the IMUs whose heading the gateway computes, by whether the heading drifts."""
     drifts: dict[bool, list[str]] = {True: [], False: []}
     for source in sources:
         if getattr(source.settings, "orientation", None) == "gateway":
@@ -427,7 +427,7 @@ def _on_gateway(sources: Sequence[Source]) -> dict[bool, list[str]]:
 
 
 def heading_warning(sources: Sequence[Source]) -> str | None:
-    """Return a warning if the gateway uses the magnetometer of some IMUs only; None otherwise.
+    """Return a warning if the gateway uses the magnetometer of only some IMUs; else None.
 
     The configuration is permitted. Devices that compute their own orientation are not considered,
     since their use of a magnetometer is unknown.
@@ -445,7 +445,7 @@ def heading_warning(sources: Sequence[Source]) -> str | None:
 def binding_warning(sources: Sequence[Source]) -> str | None:
     """Return a warning if the cameras measure no segment; None otherwise.
 
-    The configuration is permitted: a plate alone measures the axes of the sensors.
+    The configuration is permitted, because a plate alone measures the axes of the sensors.
     """
     for source in sources:
         settings = source.settings
@@ -465,7 +465,7 @@ def binding_warning(sources: Sequence[Source]) -> str | None:
 
 
 def rig_warnings(rig: Rig) -> list[str]:
-    """Return the warnings about a rig that is permitted."""
+    """Return the warnings about a valid rig."""
     found = (heading_warning(rig.sources), binding_warning(rig.sources))
     return [*missing_files(rig.mqtt), *filter(None, found)]
 
@@ -480,7 +480,7 @@ def _numbers(ids: object) -> Iterator[tuple[str, int]]:
     faulty = any(
         field.default is not None and getattr(ids, name) is None for name, field in fields.items()
     )
-    if callable(resolved) and not faulty:  # nothing is derived from an identifier that is wrong
+    if callable(resolved) and not faulty:  # no identifier is derived from a wrong one
         ids = resolved()
     if isinstance(ids, BaseModel):
         ids = dict(ids)

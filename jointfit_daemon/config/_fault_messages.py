@@ -32,7 +32,7 @@ class Fault:
     """One fault of a rig.toml."""
 
     key: str
-    """Path of the key, as ``imu[S1].rate_hz``."""
+    """Path of the key, such as ``imu[S1].rate_hz``."""
     expected: str
     """Description of a valid value, or of the fault."""
     value: Any = _NO_VALUE
@@ -81,8 +81,8 @@ class ConfigError(Exception):
 def faults_of(error: ValidationError, model: type[BaseModel], key: str) -> list[Fault]:
     """Return the faults that pydantic found in the table at `key`.
 
-    Omitted are contradictions, which `_readable.contradictions` finds completely, and the faults of
-    a bus, which are those of its own table.
+    Two kinds of faults are omitted: contradictions, which `_readable.contradictions` finds
+    completely, and faults of a bus, which are reported for the table of the bus.
     """
     return [
         _fault(detail, model, key)
@@ -126,7 +126,7 @@ def _fault(detail: ErrorDetails, model: type[BaseModel], key: str) -> Fault:
             why = f" ({about})" if (about := _described(fields, name)) else ""
             text = detail["msg"].removeprefix("Value error, ").removeprefix("Input ")
             expected = f"{text[:1].lower()}{text[1:]}{why}"
-            # A check of a whole table names the keys; the table itself would be cut.
+            # A check of a whole table names the keys; the printed table itself would be truncated.
             whole = detail["type"] == "value_error" and isinstance(detail["input"], dict)
             return Fault(path, expected, _NO_VALUE if whole else detail["input"])
 

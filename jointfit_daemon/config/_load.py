@@ -127,13 +127,13 @@ class _RigReader:
     def __init__(self, table: dict[str, Any]) -> None:
         self.table, self.faults = fill_open_places(table)
         self.partial: dict[str, Any] = {}
-        """Tables with faults, by key, as partial models for the checks across tables."""
+        """Tables with faults, by key, as partial models for checks of several tables."""
         self.cameras: MocapSettings | None = None
         """The table of the cameras, even with faults."""
         self.imus_read: list[Source] = []
         """All IMUs whose tables could be read, even with faults."""
         self.imus_with_load: list[Source] = []
-        """IMUs of `imus_read` whose bit rate is known: their faults concern names only."""
+        """IMUs of `imus_read` with known bit rate, because their faults concern only names."""
         for key in table:
             if key not in SECTIONS:
                 known = f"unknown table; known: {', '.join(SECTIONS)}"
@@ -154,10 +154,10 @@ class _RigReader:
         sources = self._imus(limb, buses)
         mocap = self._mocap(limb, head)
 
-        # Checks across tables, even if some of them have faults.
+        # Check values across tables, even if some tables have faults.
         self.faults += _checks.check_ports(self.imus_read, buses)
         self.faults += _checks.check_can_ids(with_known_ids(self.imus_read, self.faults))
-        # A load that was computed from a faulty key says nothing.
+        # A load that was computed from a faulty key is meaningless.
         reported = {fault.key for fault in self.faults}
         loads = [
             *_bandwidth.check_serial_lines(self.imus_with_load),
@@ -202,7 +202,7 @@ class _RigReader:
         calibration: CalibrationTable | None,
         cameras: MocapSettings | None,
     ) -> None:
-        """Check the limb and its calibration; tables with faults are partial."""
+        """Check the limb and its calibration; tables with faults are partial models."""
         limb = chain or self.partial.get("chain")
         if limb is not None:
             self.faults += _checks.check_chain(limb)
@@ -216,7 +216,7 @@ class _RigReader:
             self.faults += _checks.check_center_methods(table, limb, cameras)
 
     def _chain_model(self, chain: ChainTable, cameras: MocapSettings | None) -> LoadedModel | None:
-        """Return the chain model, and put its content in the place of the file name.
+        """Return the chain model, and replace the file name by its content.
 
         A recording of the table is then sufficient for a replay.
         """
@@ -259,7 +259,7 @@ class _RigReader:
         return refinement
 
     def _names(self) -> list[Fault]:
-        """Check the names of topics and folders, even if another key of their table is wrong."""
+        """Check the names of topics and folders, even if other keys of the same table are wrong."""
         faults: list[Fault] = []
         for section, key, check in (
             ("rig", "name", _checks.check_topic_name),
@@ -279,7 +279,7 @@ class _RigReader:
         return self._validate(key, self.table.get(key, {}), model)
 
     def _optional_section(self, key: str, model: type[Model]) -> Model | None:
-        """Return a table; None if it is absent, which switches its feature off."""
+        """Return a table; None if the table is absent."""
         return self._section(key, model) if key in self.table else None
 
     def _validate(self, key: str, table: object, model: type[Model]) -> Model | None:
@@ -361,7 +361,7 @@ class _RigReader:
         return found
 
     def _imu_tables(self) -> list[dict[str, Any]]:
-        """Return the readable tables of sensors; report all others."""
+        """Return the readable tables of sensors; report the unreadable tables."""
         found = self.table.get("imu", [])
         if not isinstance(found, list) or not all(isinstance(imu, dict) for imu in found):
             single = "; write [[imu]] in place of [imu]" if isinstance(found, dict) else ""
@@ -388,7 +388,7 @@ class _RigReader:
         elif isinstance(named, dict) and name not in named:
             text = f"no table [can.{name}]; known: {', '.join(named) or 'none'}"
             self.faults.append(Fault(f"{key}.can", text, name, nearest_name(name, named)))
-        # The fault is already reported: the sensor gets a virtual bus, so that its other keys are
+        # The fault is already reported. The sensor gets a virtual bus, so that its other keys are
         # checked.
         bus = CanBusSettings(interface="virtual", channel=f"unknown {name}")
         return imu | {"can": bus.model_dump()}
@@ -397,7 +397,7 @@ class _RigReader:
         self, key: str, table: dict[str, Any], base: type[BaseModel]
     ) -> type[Driver] | None:
         name = table.get("driver")
-        if not isinstance(name, str):  # the settings model reports it
+        if not isinstance(name, str):  # the settings model reports the fault
             return _likely_driver(None, table, base)
 
         try:
@@ -454,8 +454,8 @@ def _likely_driver(
 ) -> type[Driver] | None:
     """Return the driver that is probably meant, to check the other keys of its table.
 
-    It is the one that a misspelled name resembles (`near`), otherwise the one that knows more than
-    any other of the keys which not all drivers have.
+    This is the driver with a name similar to the misspelled name (`near`). Otherwise it is the
+    driver that accepts the most of the keys that not all drivers have.
     """
     drivers = _drivers(base)
     if near in drivers:
@@ -466,7 +466,7 @@ def _likely_driver(
     most = [name for name in known if known[name] == max(known.values())]
     if len(most) != 1:
         return None
-    # A name that resembles no driver may be one that is not installed, with keys of its own.
+    # A name that resembles no driver may be a driver that is not installed and has its own keys.
     return drivers[most[0]] if known[most[0]] or "driver" not in table else None
 
 

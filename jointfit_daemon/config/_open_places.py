@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.config._rig import Source
 
 LATER = "later"
-"""Word in place of a device, identifiers or names that are not known yet."""
+"""Word that replaces a device, identifiers or names that are not known yet."""
 _FEW = 4
-"""Number of markers in an open place: more than every check asks for."""
+"""Number of markers in an open place. Every check requires fewer markers."""
 _AGAIN = "`jointfit init FOLDER --force` asks for the open places only"
 _PORT = (
     "not filled in yet: connect the sensor and enter its serial port, which `jointfit probe` lists;"
@@ -57,7 +57,8 @@ def fill_open_places(table: Mapping[str, Any]) -> tuple[dict[str, Any], list[Fau
                 filled["imu"][at] = imu | {"port": f"/dev/{LATER}-{at}"}
                 faults.append(Fault(f"{key}.port", _PORT, LATER))
             if imu.get("ids") == LATER:
-                # The defaults of the driver may be those of another sensor: see `with_known_ids`.
+                # The default identifiers of the driver may belong to another sensor; see
+                # `with_known_ids`.
                 filled["imu"][at] = {name: value for name, value in imu.items() if name != "ids"}
                 faults.append(Fault(f"{key}.ids", _IDS, LATER))
 

@@ -28,15 +28,15 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
     table
         The table; keys that its model refuses are omitted.
     model
-        Its model.
+        Model of the table.
     wrong
-        Locations of its faults, as pydantic returns them.
+        Locations of the faults in the table, as returned by pydantic.
 
     Returns
     -------
     Model
-        None are required keys that are missing, keys that are probably misspelled in the table, and
-        values that cannot be read. In arrays of texts a number is the text of its digits.
+        These keys are None: missing required keys, keys that are probably misspelled in the table,
+        and keys with unreadable values. In arrays of texts a number is the text of its digits.
     """
     fields = model.model_fields
     unknown = table.keys() - fields.keys()
@@ -56,7 +56,7 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
 
 
 def _readable(value: Any, annotation: Any, wrong: _Locations) -> Any:
-    """Return the readable part of `value`; None without one."""
+    """Return the readable part of `value`; None if there is none."""
     if isinstance(value, dict) and get_origin(annotation) is tuple:
         value = [value]  # a driver that accepts one table instead of an array of tables
     if not wrong:
@@ -64,7 +64,7 @@ def _readable(value: Any, annotation: Any, wrong: _Locations) -> Any:
     if isinstance(value, dict) and UNREADABLE in value:
         return None
 
-    choices = [annotation, *get_args(annotation)]  # of X | None: X
+    choices = [annotation, *get_args(annotation)]  # for X | None: X
     for choice in choices:
         if isinstance(choice, type) and issubclass(choice, BaseModel) and isinstance(value, dict):
             return readable_part(value, choice, wrong)
@@ -85,7 +85,7 @@ def _valid(value: Any, annotation: Any) -> Any:
     try:
         return _adapter(annotation).validate_json(json.dumps(value, default=str), strict=True)
     except ValidationError:
-        return None  # a driver's validator of several keys raised at another one
+        return None  # the driver's validator raised because of another key
 
 
 @cache
@@ -118,7 +118,7 @@ def contradictions(settings: BaseModel, key: str) -> Iterator[Fault]:
     settings
         A table; values that cannot be read are None.
     key
-        Its path.
+        Path of the table.
     """
     for name, value in settings:
         if isinstance(value, BaseModel):

@@ -1,4 +1,7 @@
-"""The contents of a rig.toml in SI: frozen, so that equal sources can share a running driver."""
+"""Contents of a rig.toml in SI units.
+
+The data are frozen, so that equal sources can share a running driver.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +23,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain
 
 MOCAP = "mocap"
-"""Id of the one optical source."""
+"""Id of the only optical source."""
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """One device, with its driver and settings."""
+    """One device of the rig, with its driver and settings."""
 
     id: str
     kind: Literal["imu", "mocap"]

@@ -40,7 +40,7 @@ def rig_schema() -> dict[str, Any]:
         except Exception:  # noqa: BLE001, S112 - a broken plug-in must not hide the others
             continue
 
-    # Definitions of all models, adapted to the file.
+    # Adapt the definitions of all models to the file.
     models: list[type[BaseModel]] = [*_SECTIONS.values(), CanBusSettings, *drivers.values()]
     refs, definitions = models_json_schema(
         [(model, "validation") for model in models], ref_template="#/$defs/{model}"
@@ -50,7 +50,7 @@ def rig_schema() -> dict[str, Any]:
     for name, model in drivers.items():
         properties = defs[at[model]["$ref"].rpartition("/")[2]]["properties"]
         properties["driver"] = {"const": name, "description": "driver name"}
-        if "can" in properties:  # a name in the file, a table for the driver
+        if "can" in properties:  # a name in the file; a table for the driver
             properties["can"] = {"type": "string", "description": "name of a [can.NAME] table"}
 
     imus = [at[model] for model in drivers.values() if issubclass(model, ImuSettings)]

@@ -1,8 +1,8 @@
 """Parsing of rig.toml, with all syntax errors.
 
 A file with errors is read statement by statement. A statement that cannot be read is replaced by a
-wrong value of the same key, so that the rest is checked as well. A removed key would cause faults
-of its own, such as a missing key, or a default value that contradicts other tables.
+wrong value of the same key, so that the other statements are checked as well. A removed key would
+cause further faults, such as a missing key, or a default value that contradicts other tables.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ _MOST_BYTES = 256 * 1024
 _MOST_ERRORS = 50
 """Largest number of syntax errors that are reported."""
 _MOST_REPEATED = 20
-"""Largest number of tables and keys that occur twice; each is found by parsing the whole file."""
+"""Largest number of tables and keys that occur twice; finding each of them requires parsing the
+whole file."""
 _MOST_LINES = 200
 """Largest number of lines of one value in a file with syntax errors."""
 UNREADABLE = "unreadable-line"
@@ -57,7 +58,7 @@ _REMEDIES = (
     ("Illegal character", "remove it, or write it as an escape sequence such as \\t"),
     ("Duplicate inline table key", "remove one of the two"),
 )
-"""Beginning of an error message of tomllib, and its remedy."""
+"""Beginnings of error messages of tomllib, each with a remedy."""
 
 
 def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
@@ -84,7 +85,7 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
 
 
 def _parse(text: str) -> tuple[dict[str, Any] | None, list[Fault]]:
-    """Return the table and the syntax errors; no table if the repaired text is not TOML either."""
+    """Return the table and the syntax errors; no table if the repaired text is no TOML."""
     try:
         return parse_toml(text), []
     except (ValueError, RecursionError):
@@ -119,7 +120,7 @@ def _with_remedy(text: str, line: str) -> str:
 
 
 class _Repair:
-    """Lines of a file, in which statements with errors are replaced."""
+    """Lines of a rig.toml; statements with errors are replaced by valid statements."""
 
     def __init__(self, lines: list[str]) -> None:
         self.lines, self.faults = list(lines), list[Fault]()
@@ -127,10 +128,11 @@ class _Repair:
         self._starts: list[int] = []
         """Places of the first lines of all statements."""
         self._repeated: dict[str, list[str]] = {}
-        """Tables that occur again: temporary name, and path of the first."""
+        """Repeated tables: temporary name of each, and path of the first table with the same
+        name."""
 
     def replace_statements(self) -> None:
-        """Replace every statement that is not TOML by itself."""
+        """Replace every statement that is invalid TOML when parsed alone."""
         at = 0
         while at < len(self.lines):
             self._starts.append(at)
@@ -172,7 +174,7 @@ class _Repair:
         opened = is_value and any(mark in line for mark in ("[", "{", '"""', "'''"))
         end = at + 1
         while opened and end < len(self.lines):
-            # A statement begins here, as seen from within an unclosed value.
+            # Within an unclosed value, this line looks like the start of a statement.
             if _ASSIGNED.match(self.lines[end]) or _WHOLE_HEADER.fullmatch(self.lines[end]):
                 break
             end += 1
@@ -184,7 +186,7 @@ class _Repair:
         return end - at
 
     def _remove_repeated(self, text: str, number: int | None) -> None:
-        """Report and remove the statement of an error that other statements cause."""
+        """Report and remove a statement that is wrong only because of other statements."""
         last = len(self.lines) if number is None else number
         at = max(start for start in self._starts if start < last)
         line = self.lines[at].strip()
@@ -205,7 +207,7 @@ class _Repair:
         self._report(at, text)
 
     def _replace_single_imus(self) -> None:
-        """Make every ``[imu]`` an ``[[imu]]``."""
+        """Change every header ``[imu]`` to ``[[imu]]``."""
         for at in self._starts:
             header = _WHOLE_HEADER.fullmatch(self.lines[at].strip())
             if header and header[1] == "imu" and not self.lines[at].strip().startswith("[["):
@@ -228,11 +230,11 @@ class _Repair:
 
 
 def _replacement(line: str, at: int) -> str:
-    """Return a valid line for a wrong one: the header that it resembles, or an unreadable value."""
+    """Return a valid line for a wrong line: a similar header, or an unreadable value."""
     if line.startswith("["):
         header = _HEADER.match(line)
         if header is None:
-            return f"[{UNREADABLE}-{at}]"  # its keys belong to no other table
+            return f"[{UNREADABLE}-{at}]"  # the keys after it belong to no other table
         return f"[[{header[1]}]]" if header[1] == "imu" else f"[{header[1]}]"
     key = _KEY.match(line)
     if key is None:
@@ -244,7 +246,7 @@ def _replacement(line: str, at: int) -> str:
 def without_unreadable(fault: Fault) -> Fault | None:
     """Return the fault of a value, or None if its line is reported as a syntax error already.
 
-    An unknown key on such a line is a fault of its own, and returned without its value.
+    An unknown key on such a line is a separate fault, which is returned without the value.
     """
     shown = f"{fault.key} {fault.value!r}" if fault.has_value else fault.key
     if UNREADABLE not in f"{shown} {fault.expected}":

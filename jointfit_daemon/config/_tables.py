@@ -11,7 +11,7 @@ import math
 from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
-from typing_extensions import override  # typing has it from Python 3.12
+from typing_extensions import override  # typing contains it from Python 3.12
 
 from jointfit_daemon.calibration import (  # noqa: TC001 - pydantic reads them
     CenterMethod,
