@@ -144,8 +144,8 @@ class JointQuality:
 class CenterCoordinates:
     """One center of rotation in coordinates of one body part.
 
-    The origin is the mean of its markers in the static pose. The axes are those of the segment; a
-    part without IMU has those of the optical world in the static pose.
+    The origin is the mean of the part's markers in the static pose. The axes are the segment axes.
+    A part without IMU has the axes of the optical world in the static pose.
     """
 
     center_m: Vector
@@ -168,7 +168,7 @@ class CenterQuality:
     predicted_error_m: float
     """Root mean variance of the observed directions, with soft-tissue artefact."""
     noise_error_m: float
-    """The part of it that decreases with more movement."""
+    """Part of the predicted error that decreases with more movement."""
     bound_m: float | None
     """Cramér-Rao bound of the RMS error; None if a direction is unobserved."""
     residual_rms_m: float

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 CenterMethod = Literal["sphere", "score", "sara", "geometric", "oriented", "grid", "three_frames"]
 """Estimators of the joint centers that rig.toml can name, see ``center_of_rotation.METHODS``.
 
-``sphere`` is the fit for skin markers of `calibration.anatomy`, the others are those of the
-library."""
+``sphere`` is the fit for skin markers of `calibration.anatomy`. All other names are estimators of
+`center_of_rotation`."""
 ONE_AXIS: frozenset[CenterMethod] = frozenset(
     ("sara", "geometric", "oriented", "grid", "three_frames")
 )
@@ -96,7 +96,7 @@ class CalibrationSettings:
     center_target_m: float = 0.003
     """Random error of the joint centers, m, below which the movement is sufficient.
 
-    It is the part of the predicted error that decreases with more movement."""
+    The random error is the part of the predicted error that decreases with more movement."""
     center_method: CenterMethod = "sphere"
     """Estimator of the joint centers."""
     joint_center_methods: Mapping[str, CenterMethod] = field(default_factory=dict)

@@ -1,7 +1,7 @@
 """Joint centers by an estimator that rig.toml names instead of the default sphere fit.
 
-Invariant: the coordinates are those of the static world, and the unobserved directions and the
-leverage have the same meaning as in `joint_center`.
+Invariant: all coordinates are in the static world. Unobserved directions and leverage have the same
+meaning as in `joint_center`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CenterChoice:
-    """Estimators of the joint centers, and the orientations that some of them need."""
+    """Estimators of the joint centers, and the segment orientations that some estimators need."""
 
     methods: Mapping[str, CenterMethod] = field(default_factory=dict)
     """Estimator by joint; ``sphere`` where missing."""
@@ -56,9 +56,9 @@ def chosen_center(
 ) -> CenterEstimate:
     r"""Estimate the center between two body parts by any method of `METHODS`.
 
-    Planar methods use the plane across the axis of the joint, which is estimated from the poses of
-    both parts. A movement about several axes is refused. With the orientation of an IMU, the angle
-    of a part about the axis a is that of the rotation against its neighbor,
+    Planar methods use the plane normal to the joint axis, which is estimated from the poses of both
+    parts. A movement about several axes is refused. With the orientation of an IMU, the angle θ of
+    a part about the axis a is computed from the rotation q relative to the neighbor,
 
     .. math:: q = q_{neighbor}^* \otimes q_{IMU}, \qquad
               \theta = 2\, \mathrm{atan2}(q_{xyz} \cdot a, q_w).
@@ -89,8 +89,8 @@ def chosen_center(
         reason = f"{frames} frames show both sides of it, at least {MIN_FRAMES} are needed"
         return refusal(method, 3, frames, reason)
 
-    # Coordinates of both parts begin at the start, which is near the joint: the poses of a distant
-    # origin would multiply the noise of the rotations.
+    # The origin of both parts is `start`, which is near the joint: the poses of a distant origin
+    # would multiply the noise of the rotations.
     step = max(1, -(-len(parent.t_ns) // MAX_FRAMES))
     above, below = (
         BodyPoses(part.q[::step], part.carry(start)[::step]) for part in (parent, child)

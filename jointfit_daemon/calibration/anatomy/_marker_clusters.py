@@ -223,8 +223,8 @@ def exchanged_labels(
 def moving_template(positions: Array) -> Array:
     """Return marker positions on a rigid body, m, (k, 3), from a recorded movement (m, k, 3).
 
-    The first frame with all markers is the initial template; all frames are then averaged on it
-    twice (generalized Procrustes analysis). The centroid is zero.
+    The first frame with all markers is the initial template. All frames are then aligned with the
+    template and averaged, twice (generalized Procrustes analysis). The centroid is zero.
 
     Raises
     ------

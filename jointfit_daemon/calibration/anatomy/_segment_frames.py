@@ -2,11 +2,11 @@
 
 All coordinates are in the static world: the optical world during the static pose, common to all
 body parts. The z axis of a segment points from its distal to its proximal joint center, x to the
-right of the subject along the flexion axis, and y = z × x. A segment with two distal joints (the
-pelvis of both legs) has its x axis through them, from left to right, and its origin between them.
-With static axes, all segments have the axes of the world in the static pose. The origin of other
-segments is the proximal joint center. Quantities that could
-not be determined are None and described in `notes`.
+right of the subject along the flexion axis, and y = z × x. For a segment with two distal joints
+(the pelvis of both legs), the x axis passes through both joints, from left to right, and the origin
+is between the joints. With static axes, all segments have the axes of the world in the static pose.
+The origin of other segments is the proximal joint center. Quantities that could not be determined
+are None and described in `notes`.
 """
 
 from __future__ import annotations
@@ -271,7 +271,7 @@ def place_unobserved(
     """
     whole = [joint for joint, fit in found.items() if len(fit.unseen) == 0]
     settled = {joint: found[joint] for joint in whole}
-    place = {  # run of joints above each other, and place in it
+    place = {  # run of joints above each other, and position of the joint in the run
         chain.joints[i]: (k, at)
         for k, run in enumerate(branch_runs(chain))
         for at, i in enumerate(run)
@@ -382,7 +382,7 @@ def flexion_axis(
     rms = float(np.sqrt((angle**2).mean()))
     if rms < MIN_FLEXION_RAD:
         return None
-    # Large rotations determine the sign, not small ones about the static pose.
+    # Large rotations determine the sign; small rotations about the static pose do not.
     bend = float((angle * np.abs(angle)).mean())
     flip = sign * (1.0 if bend > 0 else -1.0)
     return FlexionAxis(x * flip, rms, float(s[2] / np.sqrt(len(swung))), abs(bend))
@@ -399,7 +399,8 @@ def _flexion_axes(
     axes = {joint: axis for joint, axis in found.items() if axis is not None}
 
     # In the static pose all axes point to the right. A joint that moved to both sides alike, such
-    # as a wrist or an ankle, does not determine its sign: it takes that of the most bent joint.
+    # as a wrist or an ankle, does not determine the sign of its axis, and takes the sign of the
+    # most bent joint.
     hinges = [axis for joint, axis in axes.items() if joint not in _shoulders(chain)]
     if not hinges:
         return axes
@@ -420,7 +421,7 @@ def _shoulders(chain: Chain) -> set[str]:
 
 
 def _axis_joints(chain: Chain, i: int, axes: Mapping[str, FlexionAxis]) -> list[str]:
-    """Return the joints that determine the flexion axis of a segment: inner ones if possible.
+    """Return the joints that determine the flexion axis of a segment: inner joints if possible.
 
     Beside a shoulder the axes of elbow and wrist are preferred, also for the thorax.
     """
@@ -464,7 +465,7 @@ def _shoulder_note(chain: Chain, flags: Sequence[str]) -> list[str]:
 
 
 def _direction(end: JointCenter | None, begin: JointCenter | None) -> Array | None:
-    """Return the unit vector from `begin` to `end`; None if one of them is unknown."""
+    """Return the unit vector from `begin` to `end`; None if either joint center is unknown."""
     if end is None or begin is None:
         return None
     between = end.center - begin.center

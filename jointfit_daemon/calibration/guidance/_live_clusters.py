@@ -122,7 +122,7 @@ class LiveClusters:
         self.placed = ok & ~wrong
         self._good += self.placed
         for i in np.flatnonzero(wrong).tolist():
-            # The marker whose distances to the others changed most.
+            # Find the marker whose distances to the other markers changed most.
             known = np.where(seen[i, :, None], y[i], 0.0)
             now, then = (
                 np.linalg.norm(x[:, None] - x[None], axis=2) for x in (known, self._template[i])

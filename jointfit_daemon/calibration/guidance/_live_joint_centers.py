@@ -9,10 +9,10 @@ through the leverage
           \frac{\mathrm{Cov}(v_j)}{R_j^2} \Big]^{-1} + \sigma_s^2 I
 
 with :math:`v_j` marker j in coordinates of the proximal part at distance :math:`R_j` from the
-center, :math:`n_j` its number of frames and :math:`\sigma_r, \sigma_s` the standard deviations of
-the soft-tissue artefact, which are those of `calibration.anatomy`. So the final fit predicts the
-same soft-tissue error. It compares both body parts instead of spheres, and has a smaller random
-error.
+center, and :math:`n_j` the number of frames of the marker. :math:`\sigma_r, \sigma_s` are the
+standard deviations of the soft-tissue artefact in `calibration.anatomy`. The final fit therefore
+predicts the same soft-tissue error. The final fit compares both body parts instead of spheres, and
+has a smaller random error.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ class LiveJointCenter:
     noise: float
     """Random error, m: root mean variance of the observed directions; inf without any."""
     noise_across: float
-    """Random error without the least certain direction, m; a hinge determines the others only."""
+    """Random error without the least certain direction, m; a hinge determines only the other
+    directions."""
     total: float
     """Total error: standard deviation per axis, m, with soft-tissue artefact, and with the prior of
     the static pose in unobserved directions. A calibration stores this value."""

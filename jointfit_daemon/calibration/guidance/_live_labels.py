@@ -20,7 +20,7 @@ _INTERVAL = 24
 _RECENT = 12
 """Examined frames on which a decision is based: 2 to 3 s at 100 to 120 Hz."""
 _CONFIRMED = 0.6
-"""Share of them that a fault explains."""
+"""Smallest share of the examined frames that a fault must explain."""
 
 
 class LiveLabels:

@@ -88,7 +88,7 @@ class MovementGuide:
     settings : CalibrationSettings
         Target accuracy and markers.
     standing : CalibrationTrial or None
-        The static pose; without cameras in it, only the sensors are evaluated.
+        Trial of the static pose. If the trial has no camera data, only the sensors are evaluated.
     """
 
     def __init__(
@@ -276,6 +276,6 @@ def _mm(length: float | None) -> float | None:
 
 
 def most_urgent(missing: Sequence[str]) -> str:
-    """Return the most urgent condition and the number of the others."""
+    """Return the most urgent condition and the number of other conditions."""
     rest = f" (and {len(missing) - 1} more)" if len(missing) > 1 else ""
     return f"{missing[0]}{rest}" if missing else ""

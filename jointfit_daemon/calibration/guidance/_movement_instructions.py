@@ -19,7 +19,7 @@ class JointInstructions(NamedTuple):
     arc: float = radians(40.0)
     """Smallest arc, rad, that a joint must cover to train the soft-tissue models.
 
-    It applies to joints whose two segments carry sensors."""
+    The limit applies to joints whose two segments carry sensors."""
 
 
 _GENERAL_INSTRUCTIONS = JointInstructions("bend and stretch it as far as it goes", "circle it")

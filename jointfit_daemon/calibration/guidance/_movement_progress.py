@@ -60,7 +60,7 @@ class _RotationRange:
 
 @dataclass(slots=True)
 class MovementProgress:
-    """Arc and flexion count of each inner joint, from the sensors on either side of it.
+    """Arc and flexion count of each inner joint, from the sensors on both segments of the joint.
 
     For joints without markers, the arc predicts the error of the center by the Cramér-Rao bound of
     a circle of unknown radius over an arc φ, ``26.8 σ / (√n φ²)``, at least the full-circle value.
@@ -69,11 +69,11 @@ class MovementProgress:
 
     chain: Chain
     standing: Mapping[str, Quaternion] = field(default_factory=dict)
-    """Orientation of each sensor in the static pose, the zero of flexion; for other sensors the
-    first orientation."""
+    """Orientation of each sensor in the static pose, which defines zero flexion. For missing
+    sensors the first orientation defines zero."""
     _seen: dict[tuple[str, str, str], _RotationRange] = field(default_factory=dict)
-    """Range for each joint and pair of sensors; each pair has its own sensor-to-segment alignments,
-    and therefore its own zero."""
+    """Range for each joint and pair of sensors. The zero of a pair depends on the sensor-to-segment
+    alignments of both sensors."""
 
     def update(self, latest: Mapping[str, Quaternion]) -> None:
         """Process the newest orientation of each available sensor."""

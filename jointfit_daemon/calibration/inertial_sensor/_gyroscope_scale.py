@@ -50,7 +50,7 @@ _SPARE = 6
 _SATURATED = radians(100.0)
 """Rate, rad/s, below which no gyroscope saturates."""
 _EQUAL_READINGS = 3
-"""Readings at the end of the range that show saturation."""
+"""Number of equal readings at the end of the range that indicates saturation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,8 @@ class GyroscopeScaleEstimate:
     """Parameters of a gyroscope: the corrected rate is `matrix` (rate - bias)."""
 
     matrix: Array
-    """Inverse scale factors, and axes relative to those of the accelerometer, shape (3, 3)."""
+    """Inverse scale factors, and gyroscope axes relative to the accelerometer axes, shape (3,
+    3)."""
     matrix_sd: Array
     """Standard deviations of its elements; NaN where they are not estimated."""
     covariance: Array

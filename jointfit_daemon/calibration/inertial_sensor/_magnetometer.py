@@ -55,7 +55,7 @@ NOISE_SHARE = 0.3
 """Standard deviation of the distances from the center, relative to their mean, above which readings
 are noise about a point; soft iron causes less."""
 FEWEST_ON_SPHERE = 20
-"""Readings from which the center is estimated."""
+"""Smallest number of readings from which the center is estimated."""
 _EVERY = 20
 """Kept readings between two computations of the missing directions."""
 _MOST_NAMES = 6
@@ -143,7 +143,7 @@ def fit_magnetometer(fields: Array) -> MagnetometerEstimate:
 
 
 def _scaled_covariance(covariance: Array, matrix: Array, ratio: float, unit: float) -> Array:
-    """Return the covariance of b and M = r S from that of (b - origin) / unit and S."""
+    """Return the covariance of b and M = r S from the covariance of (b - origin) / unit and S."""
     # dr = -r/3 tr(S^-1 dS), dM = r dS + S dr
     inverse = np.linalg.inv(matrix)
     rows, columns = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
@@ -176,7 +176,7 @@ def _fit_sphere(fields: Array) -> tuple[Array, float]:
 def _missing(fields: Array) -> set[int]:
     """Return the indices of directions of the field that no reading has.
 
-    All of them if the readings are noise about one point, and not on a sphere.
+    If the readings are noise about one point, and not on a sphere, all directions are returned.
     """
     every = set(range(len(DIRECTIONS)))
     if len(fields) < FEWEST_ON_SPHERE:

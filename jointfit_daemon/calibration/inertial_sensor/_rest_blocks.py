@@ -27,7 +27,7 @@ FORCE_STEP = 0.06
 LONGEST_PAUSE_NS = 200_000_000
 """Longest pause between two readings of a block, ns."""
 _FEWEST = 3
-"""Readings that a block needs."""
+"""Smallest number of readings in a block."""
 
 
 class SensorReading(NamedTuple):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class StepProgress(NamedTuple):
-    """Readings that a step has collected, and those that it still needs."""
+    """Readings that a step has collected, and readings that the step still needs."""
 
     share: float
     """Share of the required readings, 0 to 1."""

@@ -32,7 +32,7 @@ class Rest(NamedTuple):
     force: Array
     """Specific force, m/s^2, shape (3,)."""
     rate: Array
-    """Angular rate, which is the bias, rad/s, shape (3,)."""
+    """Angular rate at rest, which equals the gyroscope bias, rad/s, shape (3,)."""
 
 
 @dataclass(frozen=True, slots=True)

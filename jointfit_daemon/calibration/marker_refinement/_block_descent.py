@@ -1,8 +1,8 @@
 r"""Block-coordinate descent: marker positions and poses are optimized in turns.
 
-The symbols are those of the objective F in `_objective`. The poses of a turn are computed by any
-inverse kinematics for given marker positions. With fixed poses, F is minimized by a weighted mean
-of the measured positions in segment axes and the nominal positions,
+The module `_objective` defines the objective F and the symbols. The poses of a turn are computed by
+any inverse kinematics for given marker positions. With fixed poses, F is minimized by a weighted
+mean of the measured positions in segment axes and the nominal positions,
 
 .. math::
 
@@ -11,7 +11,7 @@ of the measured positions in segment axes and the nominal positions,
 
 With Huber's loss, :math:`w_{tm}` is multiplied by the robust weight at the errors of the turn
 before. The pose step and the position step each decrease F. Anderson acceleration proposes a
-further step, which is accepted only if it decreases F, too.
+further step, which is accepted only if this step also decreases F.
 """
 
 from __future__ import annotations

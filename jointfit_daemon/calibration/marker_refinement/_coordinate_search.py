@@ -1,7 +1,7 @@
 r"""Published coordinate search: one marker coordinate at a time, scored by inverse kinematics.
 
 The search needs only the tracking error of a set of marker positions, so it runs on any model,
-including a model in another program. Every unlocked coordinate has a step of its own::
+including a model in another program. Every unlocked coordinate has a separate step length::
 
     while any step is at or above the threshold:
         for every marker, for x, y, z whose step is:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _ZERO = 1e-6
 """Eigenvalues of S/T are squared metres per squared metre, 1 for a marker that is independent of
-all others. Values below this are attributed to rounding."""
+all others. Smaller eigenvalues are attributed to rounding."""
 _WEAK = 0.01
 """Eigenvalue below which a displacement of 10 mm increases the error by less than 1 mm."""
 _NAMED = 0.1

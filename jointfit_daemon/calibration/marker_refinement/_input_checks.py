@@ -142,7 +142,7 @@ def _stretch(model: ChainModel, trial: MotionTrial) -> float:
 def _movable(
     model: ChainModel, trials: Sequence[MotionTrial]
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """Return the coordinates that the trials determine, and why others are locked."""
+    """Return the coordinates that the trials determine, and why other coordinates are locked."""
     seen = np.zeros(len(model.markers), dtype=np.bool_)
     for trial in trials:
         seen |= np.isfinite(trial.targets).all(axis=-1).any(axis=0)
@@ -166,7 +166,7 @@ def _movable(
 
 
 def _gaps(model: ChainModel, trials: Sequence[MotionTrial]) -> list[str]:
-    """List markers that are only in some of the trials."""
+    """List the markers that are missing in some of the trials."""
     present: NDArray[np.bool_] = np.array(
         [np.isfinite(t.targets).all(axis=-1).any(axis=0) for t in trials]
     )
@@ -212,9 +212,10 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
 
 
 def exchanged_markers(residuals: Array, targets: Array) -> dict[tuple[int, ...], NDArray[np.bool_]]:
-    """Return groups of markers that fit far better with each other's labels, and when.
+    """Return groups of markers that fit far better after an exchange of labels, and the frames.
 
-    Each marker of a group is at the place of the next one, and the last at that of the first.
+    Each marker of a group is at the position of the next marker, the last marker at the position of
+    the first.
     """
     places = targets + residuals  # positions in the model
     own = np.einsum("tmi,tmi->tm", residuals, residuals)

@@ -10,9 +10,9 @@ With the markers' errors :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and weigh
 
 where :math:`\rho` is the Huber loss: :math:`r^2/2`, and :math:`c (r - c/2)` beyond c. The prior
 grows with the number of frames in which a marker is visible, so decimating frames does not change
-its meaning. Poses q are free in every frame, positions p are the same in all of them; x is the
-excess of hinge angles over their limits, rad. Without this term, a program with joint limits could
-not follow the refined markers.
+the relative weight of the prior. Poses q are free in every frame, positions p are the same in all
+frames. x is the excess of hinge angles over their limits, rad. Without this term, a program with
+joint limits could not follow the refined markers.
 """
 
 from __future__ import annotations

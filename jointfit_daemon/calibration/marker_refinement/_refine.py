@@ -78,8 +78,8 @@ def refine_markers(
     progress
         Called after every step.
     stop
-        Called after every step, and by ``search`` before every coordinate; the result is that of
-        the steps so far if it returns true.
+        Called after every step, and by ``search`` before every coordinate. If the function returns
+        true, the refinement stops and returns the result of the steps so far.
 
     Raises
     ------
@@ -203,7 +203,7 @@ class _HoldOut:
     def enough(self, positions: Array) -> bool:
         """Record the hold-out error at new positions; return whether the iteration shall stop.
 
-        It stops after `_RISES` consecutive steps without a new minimum.
+        The iteration stops after `_RISES` consecutive steps without a new minimum.
         """
         model = self._model.with_markers(positions)
         self._last = solve_frames(

@@ -31,12 +31,12 @@ class TrackingStatistics:
     variance: float
     """Variance over time of the RMS over the markers of each frame, m²."""
     by_marker: Array
-    """RMS of every marker, m, shape (M,); NaN if it is never visible."""
+    """RMS error of every marker, m, shape (M,); NaN if a marker is never visible."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrialOutcome:
-    """One trial before and after the refinement."""
+    """Errors of one trial before and after the refinement."""
 
     name: str
     trained: bool
@@ -51,7 +51,7 @@ class TrialOutcome:
 
 @dataclass(frozen=True, slots=True)
 class MarkerOutcome:
-    """One marker before and after the refinement."""
+    """Result of the refinement for one marker."""
 
     name: str
     segment: str

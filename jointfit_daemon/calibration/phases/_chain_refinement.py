@@ -156,7 +156,7 @@ def _outcome(wanted: ChainRefinement, found: Refinement, unseen: MotionTrial) ->
 def _select(
     wanted: ChainRefinement, found: Refinement, unseen: MotionTrial, refused: set[str]
 ) -> tuple[TrialOutcome, dict[str, PartQuality]]:
-    """Return the errors with the selected segments, and those of every segment that moved.
+    """Return the trial errors with the selected segments, and the errors of every moved segment.
 
     The errors of a segment depend on its neighbors, so each selection is judged as a whole.
     """

@@ -89,7 +89,7 @@ if TYPE_CHECKING:
 MIN_SEEN = 0.5
 """Smallest share of frames in which a body part is visible."""
 PLATE_SD_NS = 500_000.0
-"""Standard deviation of a lag from the align phase that has none of its own, ns."""
+"""Standard deviation of a lag from the align phase if the phase reports none, ns."""
 STORED_SD_NS = 3e6
 """Standard deviation of a lag of the calibration in force, ns; it may contain soft-tissue
 artefact."""
@@ -121,7 +121,7 @@ def fit_calibration(
     previous : Calibration, optional
         Source of lags that this movement does not determine.
     lag_ns : mapping, optional
-        Configured lags, ns; the others are estimated.
+        Configured lags, ns; missing lags are estimated.
     tracked : mapping, optional
         Lag and standard deviation, ns, tracked at run time; used if this movement determines none.
 

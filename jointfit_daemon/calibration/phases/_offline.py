@@ -141,7 +141,7 @@ def fit_offline(
     mounts : mapping
         ``q_sensor_segment`` of each sensor, shape (4,).
     lengths : mapping, optional
-        Length of each segment and its standard deviation, m; others remain unknown.
+        Length of each segment and its standard deviation, m; missing lengths remain unknown.
 
     Raises
     ------

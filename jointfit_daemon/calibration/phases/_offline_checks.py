@@ -102,7 +102,7 @@ def _turned_worlds(chain: Chain, trials: Sequence[OfflineTrial]) -> Iterator[str
 def _streams(
     chain: Chain, trials: Sequence[OfflineTrial]
 ) -> Iterator[tuple[str, str, Array, Array]]:
-    """Yield segment, sensor, its orientations and those of the reference, over all trials."""
+    """Yield segment, sensor, sensor orientations and reference orientations, over all trials."""
     for i, segment in enumerate(chain.segments):
         reference = np.concatenate([trial.reference[segment] for trial in trials])
         for sensor in chain.sensors[i]:

@@ -1,9 +1,9 @@
 """Online learning: refits of the segment models to new frames with cameras.
 
 Only models change; sensor-to-segment alignments, joint centers and lags do not. A candidate is
-fitted to the training frames of the calibration and the older part of the new frames. It is
-compared with the models in force on the newest part, which is held out. The models in force are
-retained, with a reason, if the candidate is not better, is much worse on the earlier training
+fitted to the training frames of the calibration and the older part of the new frames. The candidate
+is compared with the models in force on the newest frames, which are held out. The models in force
+are retained, with a reason, if the candidate is not better, is much worse on the earlier training
 frames, differs too much, or if cameras and sensors are inconsistent.
 """
 

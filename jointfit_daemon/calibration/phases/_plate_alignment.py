@@ -118,11 +118,11 @@ def fit_plate_alignment(
     Parameters
     ----------
     trial : CalibrationTrial
-        Movement of the plate; every sensor in it is assumed to be on the plate.
+        Movement of the plate; all sensors of the trial are assumed to be on the plate.
     settings : CalibrationSettings
         `plate` names the rigid body, or ``markers["plate"]`` the markers.
     lag_ns : mapping, optional
-        Known lags (sensor minus optical time stamp), ns. The others are estimated, or 0 if the
+        Known lags (sensor minus optical time stamp), ns. Missing lags are estimated, or 0 if the
         estimate is rejected.
 
     Raises

@@ -61,7 +61,7 @@ class StaticPose:
     """Mean orientations over one static pose."""
 
     sensors: Mapping[str, RobustMean]
-    """q_world_sensor of each sensor, in its own world."""
+    """Mean q_world_sensor of each sensor, in the world of the sensor."""
     still_s: float
     clusters: Mapping[str, MarkerCluster] = field(default_factory=dict)
     """Body parts that are visible to cameras; empty without cameras."""

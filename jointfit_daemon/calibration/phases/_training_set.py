@@ -46,7 +46,7 @@ class TrainingSet(NamedTuple):
     raw: dict[str, Array]
     """q_world_sensor of every sensor at the same instants, shape (n, 4)."""
     notes: list[str]
-    """Sentences for the operator."""
+    """Notes for the operator, as complete sentences."""
 
 
 def limb_training(

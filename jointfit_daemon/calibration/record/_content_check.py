@@ -179,7 +179,7 @@ def _model(model: SegmentModel, count: int, *, has_other: bool) -> str | None:
 
 
 def _quality(quality: Mapping[str, Any]) -> Iterator[str]:
-    """Check the figures that the program evaluates; the others are published unchanged."""
+    """Check the figures that the program evaluates; other figures are published unchanged."""
     for key, section in quality.items():
         if not (section is None or isinstance(section, dict)):
             yield f"quality.{key}: expected a table"

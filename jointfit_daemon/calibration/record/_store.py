@@ -5,9 +5,9 @@ written to a temporary file, flushed to the medium and linked under its number; 
 number exists. The directory is flushed last. After an interruption at any point the previous
 version is in force.
 
-A file is ``{"sha256": …, "calibration": {…}}``; the checksum is that of the calibration as JSON
-with sorted keys and without whitespace. A file with unusable content is renamed to ``….bad``, so
-that its number stays reserved, and is never deleted.
+A file is ``{"sha256": …, "calibration": {…}}``; the checksum is computed from the calibration as
+JSON with sorted keys and without whitespace. A file with unusable content is renamed to ``….bad``,
+so that its number stays reserved, and is never deleted.
 """
 
 from __future__ import annotations

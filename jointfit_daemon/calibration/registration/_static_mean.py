@@ -171,8 +171,8 @@ def redonning_notes(
 ) -> tuple[str, ...]:
     """Return the sensors of one segment that moved differently between two static poses.
 
-    The change of a mount in segment axes is ``before* after``. Sensors that were not taken off have
-    the same change, that of the pose.
+    The change of a mount in segment axes is ``before* after``. For sensors that were not taken off,
+    this change equals the change of the pose.
 
     Parameters
     ----------

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     Masks = Sequence[NDArray[np.bool_]]
 
 PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Ridge penalties that are stacked."""
+"""Ridge penalties of the fits whose weighted sum is the model."""
 RATIOS = (1.0, 0.1, 10.0)
-"""Penalty of bumps over that of smooth terms."""
+"""Ratios of the penalty of bumps to the penalty of smooth terms."""
 PASSES = 3
 """Number of reweighting iterations."""
 SMALLEST_SCALE = 1e-3
@@ -57,7 +57,7 @@ class Basis:
     smooth: int
     """Number of smooth terms."""
     back: Array
-    """Transformation of coefficients c to those of raw regressors, ``back @ c``, shape (p, p)."""
+    """Matrix from coefficients c to coefficients of raw regressors, ``back @ c``, shape (p, p)."""
 
     @staticmethod
     def of(smooth: Array, raw_bumps: Array, at_centers: Array) -> Basis:

@@ -53,8 +53,9 @@ def hull(smooth: Array) -> Array:
 def measure_spread(ratios_of: Sequence[Array], residuals: Sequence[Array]) -> LeverageVariance:
     """Fit the variance as a function of the leverage ratio over all held-out frames.
 
-    Every grouping contributes: blocks of a trial are close to the rest of it, whole trials are far.
-    A prior observation (`FAR`, `FAR_FACTOR`) represents movements absent from all trials.
+    Every grouping contributes: blocks of a trial are close to the rest of the trial, whole trials
+    are far from other trials. A prior observation (`FAR`, `FAR_FACTOR`) represents movements absent
+    from all trials.
 
     Parameters
     ----------

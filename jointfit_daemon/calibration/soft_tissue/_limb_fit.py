@@ -44,7 +44,7 @@ METHODS: tuple[Method, ...] = get_args(Method)
 """All fusion methods."""
 MAX_SUBSET_SENSORS = 3
 """Largest number of sensors on a segment for which every subset gets a model. With more sensors,
-only all of them, all but one, and each alone get one."""
+only three kinds of subsets get a model: all sensors, all but one sensor, and each single sensor."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ def evaluate_methods(
     Parameters
     ----------
     method, procedure
-        Those of the calibration; they are named in the result.
+        Method and procedure of the calibration; the result contains both names.
     """
     first, last = _parts(training, share)
     truth = [last.reference[segment] for segment in chain.segments]
@@ -193,9 +193,9 @@ def regression_quality(
 ) -> dict[str, RegressionQuality] | None:
     """Return the coefficients of every segment for all its sensors; None for other methods.
 
-    The patent fits one part of the data and verifies the coefficients on the rest. These verified
-    coefficients are those of `evaluate_methods`; the stored ones are fitted to all data, except in
-    the procedure of the patent.
+    The patent fits one part of the data and verifies the coefficients on the rest. The verified
+    coefficients equal the coefficients of `evaluate_methods`. The stored coefficients are fitted to
+    all data, except in the procedure of the patent.
 
     Parameters
     ----------
@@ -220,13 +220,13 @@ def regression_quality(
 
 
 def _parts(training: LimbTraining, share: float) -> tuple[LimbTraining, LimbTraining]:
-    """Return the first part of a trial, and the last `share` of it."""
+    """Return the first part of a trial, and the last part with the given `share`."""
     cut = round(len(training) * (1.0 - share))
     return training.rows(slice(None, cut)), training.rows(slice(cut, None))
 
 
 def fit_all_sensors(chain: Chain, i: int, method: Method, training: LimbTraining) -> SegmentModel:
-    """Return the model of segment i for all its sensors and those of its neighbor."""
+    """Return the model of segment i for all sensors of the segment and of its neighbor."""
     return fit_segment(
         method,
         [training.sensors[s] for s in chain.sensors[i]],

@@ -50,7 +50,7 @@ def plain_mean(training: SegmentTraining) -> MeanModel:
 
 
 def best_single(training: SegmentTraining) -> MeanModel:
-    """Return the sensor with the smallest error in training: weight 1, all others 0."""
+    """Return the model of the sensor with the smallest training error: weight 1, all others 0."""
 
     def best(part: SegmentTraining) -> int:
         errors = [rotation.angle_between(q, part.q_reference) for q in part.sensors]

@@ -1,4 +1,4 @@
-"""Fits of both readings of the patent regression."""
+"""Fits of the patent regression, in two interpretations of its text."""
 
 from __future__ import annotations
 
