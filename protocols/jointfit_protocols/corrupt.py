@@ -38,9 +38,9 @@ class CorruptRun:
         self._no_start = no_start
         self._reason = ""
         self.count = 0
-        """Bytes of the run so far."""
+        """Length of the current run so far, bytes."""
         self.discarded = 0
-        """Bytes of all runs so far."""
+        """Total length of all runs so far, bytes."""
 
     def add(self, count: int, reason: str, found: list[Any]) -> None:
         """Add bytes; the first fault inside a candidate names the run."""

@@ -25,7 +25,7 @@ class StreamMessage(Protocol):
 
     @property
     def end(self) -> int:
-        """Bytes fed to the codec up to and including its last one."""
+        """Number of bytes fed to the codec up to and including the last byte of the message."""
 
 
 M = TypeVar("M", bound=StreamMessage)
@@ -47,7 +47,7 @@ class ResynchronizingCodec(Generic[M]):
     start : re.Pattern
         Matches every place where `read` does not return the reason `no_start`.
     longest_run : int
-        Bytes without a message after which they are reported.
+        Number of bytes without a message after which these bytes are reported.
     no_start : str
         Reason of bytes outside all candidates.
     shortest : int
@@ -69,7 +69,7 @@ class ResynchronizingCodec(Generic[M]):
         self._run = CorruptRun(longest_run, no_start)
         self._pending = b""  # under one message between calls
         self.fed = 0
-        """Bytes fed so far."""
+        """Number of bytes fed so far."""
         self.messages = 0
         """Messages so far."""
         self.checksum_failures = 0
@@ -77,12 +77,12 @@ class ResynchronizingCodec(Generic[M]):
 
     @property
     def pending(self) -> int:
-        """Bytes of an incomplete message."""
+        """Number of bytes of the incomplete message in the buffer."""
         return len(self._pending)
 
     @property
     def discarded(self) -> int:
-        """Bytes without a message so far."""
+        """Number of bytes so far that belong to no message."""
         return self._run.discarded
 
     def feed(self, data: bytes) -> list[M | CorruptBytes]:

@@ -84,7 +84,7 @@ _LENGTHS: dict[int, int] = {
     0x2E: 12,
     0xEF: 2, 0xF1: 16, 0xF3: 16, 0xF5: 4, 0xF8: 16, 0xFA: 5, 0xFB: 5, 0xFC: 17,
 }  # fmt: skip
-"""Bytes of each report."""
+"""Length of each report, bytes."""
 _FORMATS = {kind: struct.Struct(f"<{len(scales)}h") for kind, scales in _SCALES.items()}
 _BASE = struct.Struct("<Bi")
 _FEATURE = struct.Struct("<BBBHIII")
@@ -177,7 +177,7 @@ def feature_request(report_id: int) -> bytes:
 
 
 def encode_feature(report_id: int, interval_us: int, *, response: bool = False) -> bytes:
-    """Return the command that sets the interval of a report, us, or the response with it.
+    """Return the command that sets the interval of a report, us, or the response with the interval.
 
     An interval of 0 turns the report off. The settings are lost at a reset.
     """

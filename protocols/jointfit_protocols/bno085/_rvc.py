@@ -20,13 +20,14 @@ from jointfit_protocols.corrupt import CHECKSUM, CorruptBytes
 from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 
 RVC_BYTES = 19
-"""Bytes of a frame."""
+"""Length of a frame, bytes."""
 _MARK = 0xAA
 _MARKS = b"\xaa\xaa"
 _BODY = struct.Struct("<B6h3s")
 _unpack, _new_tuple = _BODY.unpack_from, tuple.__new__
 _RUN = 1024
-"""Bytes of noise after which a run is reported, so that the sum of corrupt bytes is up to date."""
+"""Number of noise bytes after which a run is reported, so that the sum of corrupt bytes is
+current."""
 _START = re.compile(b"\xaa")
 _NO_START = CorruptBytes(1, "no frame starts here")
 _CHECKSUM = CorruptBytes(1, CHECKSUM)
@@ -45,11 +46,12 @@ class RvcFrame(NamedTuple):
     """Specific force along x, y, z, 1/1000 g."""
     reserved: bytes = bytes(3)
     end: int = 0
-    """Bytes fed to the codec up to and including the checksum, for back-dating."""
+    """Number of bytes fed to the codec up to and including the checksum, for back-dating of the
+    message."""
 
     @property
     def size(self) -> int:
-        """Bytes on the wire."""
+        """Length on the wire, bytes."""
         return RVC_BYTES
 
 

@@ -6,7 +6,8 @@
 
 7E and 7D inside are sent as 7D and the byte with bit 5 inverted. The length includes its own four
 bytes of header; bit 15 marks a continuation. There is no checksum: a packet is valid if its length
-is that of its frame. Adjacent frames may share a flag. Numbers are little-endian.
+field agrees with the length of the frame. Adjacent frames may share a flag. Numbers are
+little-endian.
 
 Sources: BNO08X data sheet 1000-3927, section 1.3.1; SH-2 SHTP reference manual 1000-3600; the
 vendor's host library (sh2, Apache-2.0), for the control protocol.
@@ -52,16 +53,17 @@ class ShtpChannel(IntEnum):
 
 
 class ShtpPacket(NamedTuple):
-    """One packet whose length is that of its frame."""
+    """One packet whose length field agrees with the length of the frame."""
 
     channel: int
     sequence: int
     """Number of the packet on its channel and direction, modulo 256."""
     payload: bytes
     size: int = 0
-    """Bytes on the wire, both flags included."""
+    """Length on the wire including both flags, bytes."""
     end: int = 0
-    """Bytes fed to the codec up to and including the closing flag, for back-dating."""
+    """Number of bytes fed to the codec up to and including the closing flag, for back-dating of the
+    message."""
 
 
 class ShtpBufferStatus(NamedTuple):
@@ -112,7 +114,7 @@ class ShtpCodec:
         self._lost_flag = False  # the rest up to the next flag belongs to a frame that is too long
         self._started = False
         self.fed = 0
-        """Bytes fed so far."""
+        """Number of bytes fed so far."""
         self.messages = 0
         """Packets so far."""
         self.statuses = 0
@@ -120,11 +122,11 @@ class ShtpCodec:
         self.flags = 0
         """Flags so far."""
         self.discarded = 0
-        """Bytes that belong to no packet so far."""
+        """Number of bytes so far that belong to no packet."""
 
     @property
     def pending(self) -> int:
-        """Bytes of an incomplete frame."""
+        """Number of bytes of the incomplete frame in the buffer."""
         return len(self._pending)
 
     def feed(self, data: bytes) -> list[Shtp]:

@@ -130,9 +130,10 @@ class SlcanCodec:
     def feed(self, data: bytes, t_ns: int) -> list[CanFrame | SlcanLine | CorruptBytes]:
         """Return the content that `data` completed, in wire order.
 
-        The ``t_ns`` of a frame is the start of its line: the arrival `t_ns` minus the duration
-        of the characters from the line's start on (on USB: of the frames from it on, on the
-        bus). A line that lies completely in `data` is never stamped before the previous call.
+        The ``t_ns`` of a frame is the start of its line: the arrival `t_ns` minus the duration of
+        all characters from the start of the line on. On USB, the duration of the frames on the bus
+        is subtracted instead. A line that lies completely in `data` is never stamped before the
+        previous call.
         """
         found: list[CanFrame | SlcanLine | CorruptBytes] = []
         *lines, rest = (self._pending + data).replace(b"\n", b"").split(b"\r")

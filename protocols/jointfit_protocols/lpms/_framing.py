@@ -24,7 +24,7 @@ from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 MAX_DATA = 1024
 """Maximum number of bytes of data. It bounds the wait after a corrupt length."""
 OVERHEAD = 11
-"""Bytes of a message besides its data."""
+"""Length of a message without its data, bytes."""
 MAX_MESSAGE = MAX_DATA + OVERHEAD
 _START = 0x3A
 _END = b"\r\n"
@@ -43,11 +43,12 @@ class LpBusMessage(NamedTuple):
     command: int
     data: bytes
     end: int = 0
-    """Bytes fed to the decoder up to and including the message, for back-dating."""
+    """Number of bytes fed to the decoder up to and including the message, for back-dating of the
+    message."""
 
     @property
     def size(self) -> int:
-        """Bytes on the wire."""
+        """Length on the wire, bytes."""
         return len(self.data) + OVERHEAD
 
 

@@ -76,7 +76,7 @@ class ChannelIds(NamedTuple):
 
 
 class ChannelQuaternion(NamedTuple):
-    """One quaternion, as sent."""
+    """One quaternion with the values as sent."""
 
     t_ns: int
     """Stamp of its first frame."""

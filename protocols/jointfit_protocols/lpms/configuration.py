@@ -42,7 +42,7 @@ SECONDS_UP_TO = (1, 3, 4)
 
 
 class LpmsCommand(IntEnum):
-    """Commands of both generations."""
+    """Command numbers of sensors of generation 1 and of generation 3."""
 
     ACK = 0x00
     NACK = 0x01
@@ -50,7 +50,7 @@ class LpmsCommand(IntEnum):
     STREAM_MODE = 0x07
     DATA = 0x09
     IDENTIFY = 0x5B
-    """Device name of generation 1, filter mode of generation 3: a read of both."""
+    """Read command: returns the device name in generation 1, the filter mode in generation 3."""
 
 
 class LpmsOutput(NamedTuple):

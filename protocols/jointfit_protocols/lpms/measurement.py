@@ -58,7 +58,7 @@ class PacketLayout:
         """Lengths of a packet with 32-bit and with 16-bit values, bytes."""
 
     def decode(self, data: bytes) -> LpmsMeasurement | None:
-        """Return the content of a data packet; None if its length is not that of these outputs."""
+        """Return the content of a data packet; None if the length does not match these outputs."""
         size = len(data)
         if size == self._floats.size:
             tick, *values = self._floats.unpack(data)
@@ -74,7 +74,7 @@ class PacketLayout:
         Raises
         ------
         ValueError
-            The number of values is not that of these outputs.
+            The number of values does not match these outputs.
         """
         if len(values) != self.values:
             raise ValueError(f"{len(values)} values: these outputs have {self.values}")

@@ -41,7 +41,7 @@ class Samples(NamedTuple):
 
 
 class RoundTrip(NamedTuple):
-    """One comparison of the clock of the sender with that of this host."""
+    """One comparison of the sender's clock with the clock of this host."""
 
     sent_ns: int
     """Request, CLOCK_MONOTONIC, ns."""
@@ -69,7 +69,7 @@ class LslCodec:
         self.messages = 0
         """Samples and other well-formed chunks so far."""
         self.discarded = 0
-        """Bytes that belong to no chunk so far."""
+        """Number of bytes so far that belong to no chunk."""
         self.undescribed = 0
         """Chunks with samples before a description so far."""
 

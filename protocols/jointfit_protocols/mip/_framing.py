@@ -44,9 +44,10 @@ class MipPacket(NamedTuple):
     descriptor_set: int
     fields: tuple[MipField, ...]
     size: int
-    """Bytes on the wire."""
+    """Length on the wire, bytes."""
     end: int = 0
-    """Bytes fed to the decoder up to and including the checksum, for back-dating."""
+    """Number of bytes fed to the decoder up to and including the checksum, for back-dating of the
+    message."""
 
 
 def encode(descriptor_set: int, fields: Iterable[MipField]) -> bytes:

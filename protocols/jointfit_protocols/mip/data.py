@@ -118,7 +118,7 @@ _KNOWN_SETS = frozenset((0x80, 0x81, 0x82, 0x90, 0x91, 0x92, 0x93, 0x94, 0x95, 0
 def known_fields(descriptor_set: int) -> frozenset[int] | None:
     """Return the documented fields of a data set; None if the set itself is not documented.
 
-    Those of sets without orientations are not listed: every field counts as documented.
+    Fields of sets without orientations are not listed: each of these fields counts as documented.
     """
     if descriptor_set not in _KNOWN_SETS:
         return None

@@ -97,7 +97,7 @@ class Cursor:
         return found.decode("utf-8", "replace")
 
     def texts(self) -> tuple[str, ...]:
-        """Read a count and that many names."""
+        """Read a count, then as many names as the count states."""
         return tuple(self.text() for _ in range(self.count(1)))
 
     def window(self, size: int, read: Callable[[], Any]) -> Any:

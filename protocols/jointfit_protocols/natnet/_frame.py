@@ -23,7 +23,7 @@ Version = tuple[int, int]
 Position = tuple[float, float, float]
 
 SectionReader = Callable[[Cursor, int], tuple[Any, ...]]
-"""Reads the items of one section; the number of items is the argument."""
+"""Function that reads the items of one section; its second argument is the number of items."""
 
 OLDEST: Version = (2, 5)
 TICKED: Version = (3, 0)
@@ -68,7 +68,7 @@ class Body(NamedTuple):
 
 
 class LabeledMarker(NamedTuple):
-    """One labeled marker (26 bytes); id is ``model << 16 | member``, model 0 if it has none."""
+    """One labeled marker (26 bytes); id is ``model << 16 | member``, model 0 without a model."""
 
     id: int
     x: float
@@ -111,7 +111,7 @@ class Analog(NamedTuple):
 
 
 class FrameOfData(NamedTuple):
-    """One camera frame as sent."""
+    """One camera frame with the values as sent."""
 
     number: int
     timestamp: float
@@ -179,7 +179,7 @@ def _read_section(
     read: SectionReader,
     skipped: list[str] | None,
 ) -> tuple[Any, ...]:
-    """Read one section; with sizes (`skipped` given), skip one that does not fit its size."""
+    """Read one section; if `skipped` is given, skip a section that does not fit its stated size."""
     n = cursor.integer()
     if skipped is None:
         cursor.check(n, smallest)

@@ -56,7 +56,7 @@ _FLOAT, _DOUBLE = struct.Struct("<f"), struct.Struct("<d")
 
 
 def read_frame_2x(cursor: Cursor, version: Version) -> FrameOfData:
-    """Read one frame; raises `BREAKS`, as other readers do."""
+    """Read one frame; like all readers, raise one of the exceptions in `BREAKS`."""
     number = cursor.integer()
     n = cursor.count(5)
     sets = tuple(

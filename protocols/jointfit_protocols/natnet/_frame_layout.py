@@ -3,8 +3,8 @@
 A server repeats its model in every frame: the counts and names of one frame give the place of every
 number in the next one. A frame with any other count or name has another layout.
 
-Invariant: the result equals that of `decode_frame`, or is None. A layout for selected marker sets
-leaves out the other sets and the unlabeled markers.
+Invariant: the result equals the result of `decode_frame`, or is None. A layout for selected marker
+sets leaves out the other sets and the unlabeled markers.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
 """Times of other clocks than the server's in a NatNet frame: precision timestamp and timecode.
 
-The precision timestamp, two u32, is that of a PTP clock: seconds, and a fraction whose unit the
-vendor does not document. A fraction of 10^9 or more implies units of 2^-32 s. Without one in twenty
-frames the unit is nanoseconds: of twenty uniformly distributed fractions in 2^-32 s, one would be
-that large with probability 1 - 0.23^20. Zeros mean that there is no such clock.
+The precision timestamp, two u32, comes from a PTP clock: seconds, and a fraction whose unit the
+vendor does not document. A fraction of 10^9 or more implies units of 2^-32 s. If twenty frames
+contain no such fraction, the unit is nanoseconds. Of twenty uniformly distributed fractions in
+2^-32 s, at least one would be 10^9 or more with probability 1 - 0.23^20. Two zeros indicate that
+the server has no PTP clock.
 
 The timecode (SMPTE, LTC) has hours, minutes, seconds and frames in its bytes 3 to 0, and a separate
 subframe; zeros mean that there is none.

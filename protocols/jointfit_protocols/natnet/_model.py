@@ -68,7 +68,8 @@ class BodyDescription(NamedTuple):
     markers: tuple[str, ...] = ()
     """Marker names, from 4.0."""
     rotation: tuple[float, float, float, float] | None = None
-    """Offset quaternion x, y, z, w if the server sends one (some 4.2)."""
+    """Offset quaternion x, y, z, w if the server sends an offset, as some servers of version 4.2
+    do."""
 
 
 class SkeletonDescription(NamedTuple):
@@ -80,7 +81,7 @@ class SkeletonDescription(NamedTuple):
 
 
 class PlateDescription(NamedTuple):
-    """One force plate, its numbers as sent."""
+    """One force plate with the numbers as sent."""
 
     id: int
     serial: str

@@ -33,7 +33,7 @@ def encode_model(model: ModelDefinition, version: Version) -> bytes:
     Raises
     ------
     ValueError
-        The bitstream is older than 2.5, or a description does not exist in it.
+        The bitstream version is older than 2.5, or does not contain one of the descriptions.
     """
     if not supported(version):
         raise ValueError(f"bitstream {version[0]}.{version[1]} is not written")

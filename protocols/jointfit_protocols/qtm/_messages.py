@@ -86,7 +86,7 @@ class SettingsReply(NamedTuple):
 
 
 class DataFrame(NamedTuple):
-    """One camera frame, or over UDP a part of it."""
+    """One camera frame, or over UDP a part of a camera frame."""
 
     timestamp_us: int
     """Time since the measurement began, µs."""

@@ -1,9 +1,10 @@
 """CAN frames of one device, described by a table, joined to samples.
 
-The frames of a sample arrive in a known order, usually that of their identifiers. The last one
-completes the sample. A frame that repeats or precedes an earlier one begins the next sample; so
-does one that arrives more than `longest_ns` after the first. Samples without all their
-measurements are incomplete and dropped; time, counter and validity may be missing.
+The frames of a sample arrive in a known order, usually the order of the identifiers. The last frame
+completes the sample. A frame that repeats or precedes an earlier frame begins the next sample. A
+frame that arrives more than `longest_ns` after the first frame also begins the next sample. Samples
+without all their measurements are incomplete and dropped; time, counter and validity may be
+missing.
 
 Invariant: frames in, samples out; no bus, no clock.
 """
@@ -150,7 +151,7 @@ def encode_can_frames(
     values : sequence of float
         The record, as sent, in the order of its slots.
     sizes : sequence of int, optional
-        Data bytes of each frame; default: those of its fields.
+        Number of data bytes of each frame; by default the bytes that the fields occupy.
 
     Raises
     ------

@@ -32,7 +32,7 @@ ChecksumKind = Literal["sum8", "sum16", "xor8", "fletcher16", "crc8", "crc16", "
 WIDTHS: dict[ChecksumKind, int] = {
     "sum8": 1, "sum16": 2, "xor8": 1, "fletcher16": 2, "crc8": 1, "crc16": 2, "crc32": 4,
 }  # fmt: skip
-"""Bytes of each checksum."""
+"""Length of each checksum, bytes."""
 _CCITT = 0x1021
 """Polynomial of CRC-16 for which the standard library has a function."""
 _CRC32 = 0x04C11DB7
@@ -45,14 +45,17 @@ class Checksum(NamedTuple):
 
     kind: ChecksumKind
     first: int = 0
-    """First byte of the frame that it includes; it includes all bytes from there up to itself."""
+    """First byte of the frame that the checksum includes; the last included byte precedes the
+    checksum."""
     byte_order: ByteOrder = "little"
-    """Order of its bytes in the frame; of fletcher16, little: the plain sum first."""
+    """Byte order of the checksum in the frame. For fletcher16, ``little`` places the plain sum
+    first."""
     polynomial: int | None = None
-    """Without the highest bit and not reflected; None: 0x07, 0x1021 or 0x04C11DB7."""
+    """CRC polynomial without the highest bit and not reflected; None: 0x07, 0x1021 or
+    0x04C11DB7."""
     init: int = 0
     reflected: bool = False
-    """Whether bits are taken from the least significant one on."""
+    """Whether the CRC processes each byte from the least significant bit on."""
     xor_out: int = 0
     modulus: int = 256
     """Modulus of fletcher16, 256 or 255."""

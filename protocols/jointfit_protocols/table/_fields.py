@@ -6,9 +6,9 @@ A record is the tuple of all numbers of one sample, as sent, in the order of the
            quaternion  rate   acceleration  magnetic  time  counter  valid
            w x y z     x y z  x y z         x y z
 
-A record contains the slots that the device sends, and no others. The place of a number is its first
-byte and the bit in it, counted in the direction in which the number grows: from the least
-significant bit of that byte if it is little-endian, from the most significant one if big-endian.
+A record contains only the slots that the device sends. The place of a number is its first byte and
+the first bit in this byte. Bits count from the least significant bit for little-endian numbers,
+from the most significant bit for big-endian numbers.
 
 Invariant: every frame of at least `FieldReader.size` bytes is read; nothing is interpreted for each
 sample.
@@ -75,7 +75,7 @@ class TableField(NamedTuple):
 
     @property
     def end(self) -> int:
-        """Bytes from the start of the frame to the last one of this number."""
+        """Number of bytes from the start of the frame to the last byte of this number."""
         return self.offset + (self.bit + self.bits + 7) // 8
 
     @property
@@ -116,17 +116,17 @@ def overlaps(fields: Mapping[str, TableField]) -> list[tuple[str, str]]:
 
 
 class FieldReader:
-    """Reads numbers from frames, in the given order.
+    """Reader of numbers in frames, in the given order.
 
     Parameters
     ----------
     fields : sequence of TableField
-        Numbers of one frame; they may not overlap.
+        Numbers of one frame, which must not overlap.
     """
 
     def __init__(self, fields: Sequence[TableField]) -> None:
         self.size = max((field.end for field in fields), default=0)
-        """Bytes that a frame must have."""
+        """Smallest length of a frame, bytes."""
         orders: tuple[ByteOrder, ByteOrder] = ("little", "big")
         whole = [
             [at for at in _by_place(fields) if _is_whole(fields[at], order)] for order in orders
@@ -179,7 +179,7 @@ class FieldReader:
         Raises
         ------
         struct.error, ValueError, OverflowError
-            A number does not fit its place, or there is a wrong number of them.
+            A value does not fit its field, or the number of values is wrong.
         """
         rest = iter([values[at] for at in self._wire_order])
         for each in self._structs:

@@ -41,9 +41,9 @@ class FrameFormat(NamedTuple):
     fields: Mapping[int, TableField]
     """Place of each slot of the record."""
     length: int | TableField
-    """Bytes of a frame, or the field with a length."""
+    """Length of a frame, bytes, or the field that contains a length."""
     length_adds: int = 0
-    """Bytes of a frame minus its length field."""
+    """Length of a frame minus the value of its length field, bytes."""
     longest: int = LONGEST_FRAME
     """Maximum size of a frame with a length field in bytes."""
     checksum: Checksum | None = None

@@ -59,7 +59,7 @@ class LineCodec:
         self._joined = False  # whether the pending line lost its beginning
         self._run = CorruptRun(LONGEST_LINE)
         self.fed = 0
-        """Bytes fed so far."""
+        """Number of bytes fed so far."""
         self.messages = 0
         """Lines so far, those with another prefix included."""
         self.skipped = 0
@@ -69,12 +69,12 @@ class LineCodec:
 
     @property
     def discarded(self) -> int:
-        """Bytes without a message so far."""
+        """Number of bytes so far that belong to no message."""
         return self._run.discarded
 
     @property
     def pending(self) -> int:
-        """Bytes of an incomplete line."""
+        """Number of bytes of the incomplete line in the buffer."""
         return len(self._pending)
 
     @property

@@ -13,13 +13,14 @@ class TableMessage(NamedTuple):
     values: tuple[float, ...]
     """Record of the sample: counts of binary frames, numbers of text lines."""
     data: bytes
-    """Bytes of the message on the wire."""
+    """Length of the message on the wire, bytes."""
     end: int
-    """Bytes fed to the codec up to and including its last one, for back-dating."""
+    """Number of bytes fed to the codec up to and including the last byte of the message, for
+    back-dating of the message."""
 
     @property
     def size(self) -> int:
-        """Bytes on the wire."""
+        """Length on the wire, bytes."""
         return len(self.data)
 
 

@@ -60,9 +60,10 @@ class BinaryPacket(NamedTuple):
     values: tuple[Any, ...]
     """Values of all fields; `BinaryLayout.places` has their places."""
     size: int
-    """Bytes on the wire."""
+    """Length on the wire, bytes."""
     end: int = 0
-    """Bytes fed to the codec up to and including the CRC, for back-dating."""
+    """Number of bytes fed to the codec up to and including the CRC, for back-dating of the
+    message."""
 
 
 VectorNavMessage = BinaryPacket | TextMessage

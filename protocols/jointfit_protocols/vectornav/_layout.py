@@ -4,8 +4,8 @@
 
 Bit k of ``groups`` announces group k + 1, bit k of the fields of a group announces its field k.
 The payload contains the announced fields in ascending order, little-endian, without padding.
-Firmware from 2023 on announces further groups by bit 7 of ``groups`` and further fields by bit 15;
-a header with one of them, or with a field of unknown size, has no layout here.
+Firmware from 2023 on announces further groups by bit 7 of ``groups`` and further fields by bit 15.
+This module has no layout for a header with either bit, or with a field of unknown size.
 
 Source: VN-100 user manual (UM001), section 5, "binary output messages"; field sizes compared with
 the vendor's programming library (MIT).
@@ -75,7 +75,7 @@ class BinaryLayout:
     Parameters
     ----------
     fields : iterable of int
-        Its fields, in any order.
+        Fields of the header, in any order.
 
     Raises
     ------
@@ -105,7 +105,7 @@ class BinaryLayout:
 
         self.struct = struct.Struct(written)
         self.header = header_of(masks)
-        """Bytes from ``groups`` to the payload."""
+        """Number of bytes from ``groups`` to the payload."""
 
 
 def header_of(masks: Mapping[int, int]) -> bytes:
@@ -116,7 +116,7 @@ def header_of(masks: Mapping[int, int]) -> bytes:
 
 
 def header_bytes(groups: int) -> int | None:
-    """Return the size of a header by its first byte; None if no supported one begins with it."""
+    """Return the size of a header by its first byte; None if no supported header has this byte."""
     return None if groups == 0 or groups & _UNKNOWN else 1 + 2 * groups.bit_count()
 
 

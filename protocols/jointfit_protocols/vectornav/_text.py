@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 START, END = b"$", b"\r\n"
 MAX_TEXT = 512
-"""Longest message, bytes; those of the manual have up to 200."""
+"""Longest message, bytes; messages in the manual have up to 200 bytes."""
 _TEXT = re.compile(rb"\$(VN[A-Z]{3}[ -)+-~]*)\*([0-9A-Fa-f]{4}|[0-9A-Fa-f]{2})\r\n")
 """A whole message; its content has printable characters except the asterisk."""
 PLAUSIBLE = re.compile(rb"\$(V(N[ -~]*(\r(\n)?)?)?)?")
@@ -54,9 +54,9 @@ class TextMessage(NamedTuple):
     values: tuple[str, ...]
     """Values behind the command."""
     size: int
-    """Bytes on the wire."""
+    """Length on the wire, bytes."""
     end: int = 0
-    """Bytes fed to the codec up to and including the last one."""
+    """Number of bytes fed to the codec up to and including the last byte of the message."""
 
     @property
     def register(self) -> int | None:

@@ -42,7 +42,7 @@ class Register(IntEnum):
 
 
 BOTH_PORTS = 3
-"""Ports of a binary output: 0 none, 1 and 2 one of them, 3 both."""
+"""Ports of a binary output: 0 no port, 1 the first port, 2 the second port, 3 both ports."""
 _MATRIX_VALUES = 9
 
 
@@ -51,7 +51,7 @@ class BinaryOutput(NamedTuple):
 
     ports: int
     divisor: int
-    """Rate of the IMU divided by that of the output."""
+    """Rate of the IMU divided by the rate of the output."""
     fields: Fields
 
 

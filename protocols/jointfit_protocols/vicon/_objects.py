@@ -56,7 +56,7 @@ _QUALITY = Struct("<Id")
 _F64 = Struct("<d")
 _NO_COVARIANCE = (0.0,) * 9
 _EMPTY_STRING = 4
-"""Bytes of a string without text."""
+"""Length of a string without text, bytes."""
 
 OPTIONAL = frozenset((
     ObjectId.STREAM_INFO, ObjectId.TIMECODE, ObjectId.LATENCY_INFO, ObjectId.HARDWARE_FRAME,
@@ -104,7 +104,7 @@ class _Cursor:
         return layout.iter_unpack(self._data[begin : self._at])
 
     def text(self) -> str:
-        """Return a string, at most `_LONGEST_NAME` bytes of it."""
+        """Return a string, cut after `_LONGEST_NAME` bytes."""
         size = self.count(1)
         begin, self._at = self._at, self._at + size
         raw = bytes(self._data[begin : min(self._at, begin + _LONGEST_NAME)])

@@ -51,7 +51,7 @@ _FIRST = int.from_bytes(_MAGIC[:4], "big")
 _US = 1_000_000
 _POSE_BYTES = HEADER_BYTES + POSE_LAYOUT.size
 _RUN = 4096
-"""Bytes without a message after which they are reported."""
+"""Number of bytes without a message after which these bytes are reported."""
 
 
 class _Kind(IntEnum):
@@ -80,7 +80,7 @@ class VrpnCodec:
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._needed = HEADER_BYTES
-        """Bytes in the buffer from which the next message can be decoded."""
+        """Number of bytes in the buffer at which the next message can be decoded."""
         self._lost = False
         self._run = 0
         self._kinds: dict[int, _Kind] = {}
@@ -91,11 +91,11 @@ class VrpnCodec:
         self.messages = 0
         """Messages so far; cookies count."""
         self.discarded = 0
-        """Bytes without a message so far."""
+        """Number of bytes so far that belong to no message."""
 
     @property
     def pending(self) -> int:
-        """Bytes of an incomplete message."""
+        """Number of bytes of the incomplete message in the buffer."""
         return len(self._buffer)
 
     @property

@@ -59,7 +59,7 @@ def encode(
     ValueError
         The message is longer than 64 000 bytes.
     KeyError
-        Its type is not in `types`.
+        The type of the message is not in `types`.
     """
     if isinstance(message, Cookie):
         text = f"vrpn: ver. {message.major:02d}.{message.minor:02d}  {message.log_mode}"

@@ -21,14 +21,15 @@ from jointfit_protocols.corrupt import CHECKSUM, CorruptBytes
 from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 
 FRAME_BYTES = 11
-"""Bytes of every frame."""
+"""Length of every frame, bytes."""
 _START = 0x55
 _FIRST_KIND, _LAST_KIND = 0x50, 0x5F
 _OTHER_KIND = 0x61
 _OTHER_SIZES = (20, 28)
 """Distances between the starts of 55 61 frames, bytes."""
 _RUN = 1024
-"""Bytes of noise after which a run is reported, so that the sum of corrupt bytes is up to date."""
+"""Number of noise bytes after which a run is reported, so that the sum of corrupt bytes is
+current."""
 _AT_START = re.compile(b"\x55")
 _NO_START = CorruptBytes(1, "no frame starts here")
 _CHECKSUM = CorruptBytes(1, CHECKSUM)
@@ -59,7 +60,8 @@ class WitMotionFrame(NamedTuple):
     data: bytes
     """Eight bytes of data."""
     end: int = 0
-    """Bytes fed to the codec up to and including the checksum, for back-dating."""
+    """Number of bytes fed to the codec up to and including the checksum, for back-dating of the
+    message."""
 
 
 def encode(kind: int, data: bytes) -> bytes:

@@ -15,7 +15,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 COMMAND_BYTES = 5
-"""Bytes of every command."""
+"""Length of every command, bytes."""
 _COMMAND = struct.Struct("<BBBH")
 _HEAD = (0xFF, 0xAA)
 _FIRST_KIND = 0x50

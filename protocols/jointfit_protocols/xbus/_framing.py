@@ -91,11 +91,12 @@ class XbusMessage(NamedTuple):
     data: bytes
     bid: int = MASTER
     end: int = 0
-    """Bytes fed to the decoder up to and including the checksum, for back-dating."""
+    """Number of bytes fed to the decoder up to and including the checksum, for back-dating of the
+    message."""
 
     @property
     def size(self) -> int:
-        """Bytes on the wire."""
+        """Length on the wire, bytes."""
         return len(self.data) + (5 if len(self.data) < _EXTENDED else 7)
 
 

@@ -3,7 +3,7 @@
 A device repeats its configured items. The item heads of one message therefore give the place of
 every value in the next one. A message with any other head has another layout.
 
-Invariant: the result equals that of `split` and `decode_item`, or is None.
+Invariant: the result equals the result of `split` and `decode_item`, or is None.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ class Output(NamedTuple):
 
 
 class SyncSetting(NamedTuple):
-    """One entry of the synchronisation settings; a list that is sent replaces the old one."""
+    """One entry of the list of synchronisation settings, which replaces the old list."""
 
     function: int
     """Function of the line: 3 trigger indication, 4 SyncOut, 8 send latest, 9 clock bias, 11 start

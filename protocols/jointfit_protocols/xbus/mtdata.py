@@ -1,9 +1,9 @@
 """MTData, the measurement message of older devices: MTi and MTx of the first generations.
 
-It has no item heads. The output mode and the output settings of the device define its fields, in
-this order: raw inertial, raw GNSS, temperature, calibrated data, orientation, auxiliary inputs,
-position, velocity, status, sample counter, UTC time. A message whose length is not that of its mode
-is refused.
+An MTData message has no item heads. The output mode and the output settings of the device define
+the fields of the message, in this order: raw inertial, raw GNSS, temperature, calibrated data,
+orientation, auxiliary inputs, position, velocity, status, sample counter, UTC time. A message is
+refused if its length does not match the mode.
 
 | output settings | meaning                                                        |
 |-----------------|----------------------------------------------------------------|
@@ -151,7 +151,7 @@ class MTDataLayout:
         return {field.item for field in self.fields}
 
     def read(self, data: bytes) -> dict[int, Value] | None:
-        """Return the values by identifier; None if the length is not that of the mode."""
+        """Return the values by identifier; None if the length does not match the mode."""
         if len(data) != self.size:
             return None
         values: dict[int, Value] = {}

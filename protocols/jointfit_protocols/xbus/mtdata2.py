@@ -133,9 +133,9 @@ COUNT_BYTES: dict[int, int] = {
     Item.STATUS_BYTE: 1,
     Item.STATUS_WORD: 4,
 }
-"""Bytes of the unsigned integer in an item."""
+"""Length of the unsigned integer in an item, bytes."""
 _BYTES = (4, 4, 6, 8)
-"""Bytes of one real, by precision."""
+"""Length of one real number by precision, bytes."""
 _UTC = struct.Struct(">IHBBBBBB")
 _TRIGGER = struct.Struct(">BBIH")
 _TRIGGERS = {int(Item.TRIGGER_IN1), int(Item.TRIGGER_IN2)}

@@ -145,10 +145,11 @@ def id_block(base: int, *, extended: bool = False) -> XcdiIds:
 
 
 class XcdiGroup(NamedTuple):
-    """One orientation and the values of its group, as sent."""
+    """One orientation and the other values of its group, as sent."""
 
     t_ns: int
-    """Stamp of the group's first frame; of the Quaternion itself if SampleTime is missing."""
+    """Stamp of the first frame of the group, or of the Quaternion frame if SampleTime is
+    missing."""
     ticks: int | None
     """SampleTime; None if no group was open."""
     counter: int | None

@@ -62,11 +62,11 @@ class TickUnit:
         Parameters
         ----------
         ticks : int
-            Its SampleTime.
+            SampleTime of the group.
         counter : int, optional
-            Its GroupCounter.
+            GroupCounter of the group.
         t_ns : int
-            Its arrival, ns.
+            Arrival time of the group, ns.
 
         Returns
         -------

@@ -60,15 +60,15 @@ class XImu3Codec:
         self._usual = _QUATERNION
         self._too_long = False  # whether the pending line lost its beginning
         self.fed = 0
-        """Bytes fed so far."""
+        """Number of bytes fed so far."""
         self.messages = 0
         """Messages so far."""
         self.discarded = 0
-        """Bytes without a message so far."""
+        """Number of bytes so far that belong to no message."""
 
     @property
     def pending(self) -> int:
-        """Bytes of an incomplete message; fewer than 4352."""
+        """Number of bytes of the incomplete message in the buffer, fewer than 4352."""
         return len(self._pending)
 
     def feed(self, data: bytes) -> list[Found]:

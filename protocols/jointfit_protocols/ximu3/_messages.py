@@ -74,7 +74,7 @@ class DataKind(StrEnum):
     NOTIFICATION = "N"
     ERROR = "F"
     ACCESSORY = "S"
-    """Bytes of an accessory on the serial port."""
+    """Bytes sent by an accessory on the serial port of the device."""
     TIMECODE = "C"
     """Linear timecode, as text."""
 
@@ -114,7 +114,7 @@ class XImu3Data(NamedTuple):
     text: bytes = b""
     binary: bool = True
     size: int = 0
-    """Bytes on the wire."""
+    """Length on the wire, bytes."""
     end: int = 0
     """Bytes fed to the codec up to and including the terminator, for back-dating."""
     channel: int | None = None
