@@ -1,9 +1,9 @@
 """Pose of a marker cluster, and of points fixed to it, in single mocap frames.
 
-The fit is that of ``limb_model.rigid_fit``, to rounding. Quantities that do not change
-from frame to frame are computed once for each set of visible markers. The fit of a frame uses plain
-floats: a matrix of NumPy costs more than its arithmetic here, and several times as much where the
-caches of the processor no longer contain the code of the library.
+The fit equals the fit of ``limb_model.rigid_fit``, except for rounding. Quantities that do not
+change from frame to frame are computed once for each set of visible markers. The fit of a frame
+uses plain floats: a matrix of NumPy costs more than its arithmetic here, and several times as much
+where the caches of the processor no longer contain the code of the library.
 """
 
 from __future__ import annotations

@@ -81,10 +81,10 @@ def joint_positions(
     .. math:: P_j = P_i - L\,R_i e_z, \qquad
               \mathrm{tr}\,\Sigma_j = \mathrm{tr}\,\Sigma_i + 2 L^2 \sigma_i^2 + \sigma_L^2
 
-    Joints to the right or left of the origin of a segment have
-    :math:`P_j = P_i \pm \frac{L}{2} R_i e_x`, and half the length and half its standard deviation
-    in the variance. First-order propagation with isotropic orientation errors. Both values are None
-    below a segment of unknown orientation or length.
+    For joints to the right or left of the origin of a segment, :math:`P_j = P_i \pm \frac{L}{2} R_i
+    e_x`; their variance contains half the length and half the standard deviation of the length. The
+    propagation is of first order, with isotropic orientation errors. Both values are None below a
+    segment of unknown orientation or length.
     """
     traces = [0.0]
     out: list[tuple[Vector | None, float | None]] = [(origin, 0.0)]
@@ -118,8 +118,8 @@ def joint_angle_estimate(
     r"""Return the angles of one joint, or None if an orientation is unknown.
 
     With isotropic errors, :math:`\Sigma_{angles} = (\sigma_1^2 + \sigma_2^2)(E^T E)^{-1}`, where E
-    maps the rates of the angles to angular velocity. Its entry of the main angle gives the standard
-    deviation :math:`f \sqrt{\sigma_1^2 + \sigma_2^2}`, to first order. The factor f is
+    maps the rates of the angles to angular velocity. To first order, the diagonal entry of the main
+    angle gives the standard deviation :math:`f \sqrt{\sigma_1^2 + \sigma_2^2}`. The factor f is
     :math:`1 / \cos\theta` for flexion with adduction (or bending) :math:`\theta`, 1 for elevation,
     and that of ``read_joint`` for a tilt.
 

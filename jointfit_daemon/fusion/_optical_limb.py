@@ -45,10 +45,10 @@ class OpticalReading(NamedTuple):
 class OpticalLimb:
     r"""Computes the optical reference from the marker clusters of a calibration.
 
-    With the rigid motion (R, t) of a body part since the static pose, its segment has the
-    orientation :math:`R\,R_{static}`, and the joint center c fixed in it moves to :math:`R c + t`.
-    The centers fixed in the two parts of a joint differ by the gap, which soft-tissue artefact and
-    errors of the center cause.
+    Let (R, t) be the rigid motion of a body part since the static pose. The segment of the part has
+    the orientation :math:`R\,R_{static}`, and a joint center c fixed in the part moves to :math:`R
+    c + t`. The centers fixed in the two parts of a joint differ by the gap, which soft-tissue
+    artefact and errors of the center cause.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ class OpticalLimb:
     def __init__(self, chain: Chain, calibration: Calibration) -> None:
         self._chain = chain
         self._parts: list[tuple[MarkerCluster, list[int]] | None] = []
-        """Cluster of each body part, from proximal to distal, with the joints fixed in it."""
+        """Cluster of each body part, from proximal to distal, with the joints fixed in the part."""
         self._static = [calibration.segment[name].q_static for name in chain.segments]
         self._signs = [flexion_sign(joint) for joint in chain.joints]
         self._conventions = [angle_convention(chain, i) for i in range(len(chain.joints))]

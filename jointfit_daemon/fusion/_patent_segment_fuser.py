@@ -1,7 +1,7 @@
 """Orientation of one segment by the regression of the patent alone.
 
-Invariant: the orientation of a frame depends on the sensors of that frame only. It is the
-regression of all sensors of the segment, or None.
+Invariant: the orientation of a frame depends only on the sensors of this frame. The orientation is
+the regression of all sensors of the segment, or None.
 """
 
 from __future__ import annotations

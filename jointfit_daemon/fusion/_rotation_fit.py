@@ -7,7 +7,7 @@ The rotation is the unit quaternion q that maximizes :math:`q^T N q` (Horn 1987,
 .. math:: p(\lambda) = (\lambda^2 - F)^2 - 8 D \lambda - 4 C, \quad
           F = |S|^2, \quad D = \det S, \quad C = |\mathrm{cof}\, S|^2
 
-Its roots are real, so Newton's method from above converges to the largest one (Theobald 2005, Acta
+All roots are real, so Newton's method from above converges to the largest root (Theobald 2005, Acta
 Cryst. A 61:478). The eigenvector is a column of the adjugate of :math:`N - \lambda I`.
 
 Invariant: every operation is a scalar one, so that compiled and interpreted code agree bit for bit.

@@ -40,7 +40,7 @@ MIN_SD = 0.0005
 HEADING_SD = radians(2.0)
 """Standard deviation of the heading of a sensor's world just after calibration, rad. The error is
 common to the sensors of a segment, so it is not observable in the training data (measured on
-simulated subjects one minute after calibration). It hardly affects flexion."""
+simulated subjects one minute after calibration). The error hardly affects flexion."""
 HEADING_WALK = radians(0.3)
 """Random walk of that heading, rad per square root of a minute.
 
@@ -52,7 +52,7 @@ MODEL_FADE_NS = 1_000_000_000
 """Fade time after a change of the models by online learning, ns."""
 OUTLIER = radians(3.0)
 """Change of the difference between two sets of sensors within three frames above which the last
-frame counts as wrong, rad. Soft-tissue artefact reaches a third of it."""
+frame counts as wrong, rad. Soft-tissue artefact reaches a third of this threshold."""
 _HISTORY = 5
 """Number of stored frames; with two wrong frames the median is still correct."""
 HOLD_NS = 200_000_000
@@ -214,7 +214,7 @@ class SegmentFuser:
         return model.predict_one(sensors, mean_one([inputs[s] for s in others]))
 
     def _start_model_fade(self, t_ns: int, alive: Names, near: Names, inputs: Inputs) -> None:
-        """Start a fade from the prediction of the replaced models to that of the new ones."""
+        """Start a fade from predictions of the old models to those of the new models."""
         new, old = self._models, self._replaced_models
         self._replaced_models = None
         if old is None or self._last is None or t_ns - self._last[0] > HOLD_NS:
@@ -237,7 +237,7 @@ class SegmentFuser:
         inputs: Inputs,
         target: Quaternion,
     ) -> None:
-        """Start a blend or a fade if the set of sensors differs from that of the frame before."""
+        """Start a blend or a fade if the set of sensors changed since the preceding frame."""
         if self._last is None or t_ns - self._last[0] > HOLD_NS or self._before is None:
             self._stop_fading()
             return
@@ -256,8 +256,8 @@ class SegmentFuser:
     def _offset_before(self, alive: Names, near: Names) -> Vector:
         """Return the rotation from a set of sensors to the output, in the frames before its use.
 
-        The rotation is that of the last frame, unless it differs too much from the median of the
-        last frames.
+        The result is the rotation of the last frame, unless this rotation differs too much from the
+        median of the last frames.
         """
         offsets = [
             difference_one(self._predict(alive, near, inputs).q, q)

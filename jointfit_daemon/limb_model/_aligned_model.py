@@ -3,9 +3,9 @@ r"""Weighted mean of sensors that are aligned with the reference by constant rot
 .. math:: \hat q = \operatorname{mean}_\omega \left( q_{W,m} \otimes q_m \otimes q_{B,m} \right)
 
 The model has constants only: for each sensor a rotation of its world about the vertical, a
-sensor-to-segment alignment and a weight. It has no posture-dependent term. The fitted heading
-absorbs soft-tissue artefact that correlates with flexion, so the model is valid only at the heading
-of the training movement.
+sensor-to-segment alignment and a weight. No term of the model depends on posture. The fitted
+heading absorbs soft-tissue artefact that correlates with flexion, so the model is valid only at the
+heading of the training movement.
 """
 
 from __future__ import annotations

@@ -114,7 +114,7 @@ class Calibration:
     flags: tuple[str, ...] = ()
     """Flags repeated in every LimbState: ``headings_from_static``, ``facing_unknown``, …"""
     notes: tuple[str, ...] = ()
-    """Sentences for the operator: missing quantities and remedies."""
+    """Notes for the operator on missing quantities, with remedies."""
     quality: Mapping[str, Any] = field(default_factory=dict)
     digest: str = ""
     """SHA-256 of the arrays of the trials."""
@@ -143,7 +143,7 @@ class Calibration:
         return {name: sensor.lag_ns for name, sensor in self.sensor.items()}
 
     def fits(self, chain: Chain) -> bool:
-        """Return whether segments, joints, sensors and branches equal those of a chain."""
+        """Return whether segments, joints, sensors and branches agree with a chain."""
         mine = (self.joints, self.segments, self.chain_sensors, self.parents, self.left_joints)
         other = (chain.joints, chain.segments, chain.sensors, chain.parents, chain.left_joints)
         return mine == other

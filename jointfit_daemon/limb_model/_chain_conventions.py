@@ -24,7 +24,7 @@ Knees and joints with other names flex with a negative rotation."""
 
 
 def angle_convention(chain: Chain, i: int) -> AngleConvention:
-    """Return the angle convention of joint i: the configured one, or that of its name."""
+    """Return the angle convention of joint i, from the configuration or the joint name."""
     configured = chain.conventions[i] if i < len(chain.conventions) else None
     if configured is not None:
         return configured

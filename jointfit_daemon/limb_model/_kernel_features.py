@@ -1,14 +1,15 @@
 """Regressors of the kernel model: joint rotation, sensor disagreement, tilt, and Gaussian bumps.
 
 Relative rotations are invariant to any constant rotation of the world, tilts to a rotation about
-the vertical. Both are therefore invariant to the heading of the subject. All regressors vanish if
-the sensors agree, the joint is straight and the segment is upright. This holds approximately in the
-static pose, where the correction must be zero, so the regression has no intercept.
+the vertical. Relative rotations and tilts are therefore invariant to the heading of the subject.
+All regressors vanish if the sensors agree, the joint is straight and the segment is upright. This
+holds approximately in the static pose, where the correction must be zero, so the regression has no
+intercept.
 
 .. math:: a_z(x) = e^{-|x - z|^2 / 2} - e^{-|x|^2 / 2} - e^{-|z|^2 / 2} + 1
 
-is the Gaussian kernel between x and a center z, minus the terms that do not vanish at x = 0. It is
-the kernel of all functions f(x) - f(0) for which f has the Gaussian kernel.
+is the Gaussian kernel between x and a center z, minus the terms that do not vanish at x = 0. This
+is the kernel of all functions f(x) - f(0) for which f has the Gaussian kernel.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 PAIR_SHARE = 0.4
-"""Kernel width of sensor disagreement over that of joint rotation: soft tissue moves less than
-joints."""
+"""Ratio of the kernel width of sensor disagreement to the kernel width of joint rotation: soft
+tissue moves less than joints."""
 TILTS = 3
 """Number of tilt components."""
 
@@ -46,7 +47,7 @@ def relative_rotations(sensors: Sequence[Array], mean: Array, q_other: Array) ->
     sensors : sequence of ndarray, shape (n, 4)
         Bone-aligned sensors of the segment.
     mean : ndarray, shape (n, 4)
-        Their mean.
+        Mean of the sensors.
     q_other : ndarray, shape (n, 4)
         The neighbouring segment, bone-aligned.
     """

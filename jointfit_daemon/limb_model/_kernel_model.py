@@ -7,10 +7,10 @@ r"""The recommended model: mean of the sensors with a posture-dependent soft-tis
 :math:`c_b` are two fits (`KernelExpert`) of :math:`\rho = \log(\bar q^* \otimes q_{ref})`. Expert a
 uses relative rotations only and generalizes to other movements. Expert b also uses the tilt of the
 segment and has smaller errors on the trained movements. Inside the training range both have equal
-weight. Outside, their corrections fade (:math:`\eta`) into the linear trend T of `_kernel_trend`,
+weight. Outside, both corrections fade (:math:`\eta`) into the linear trend T of `_kernel_trend`,
 which extrapolates best. Expert b fades at the limit of the training range, expert a at a larger
-distance. The trend has no component about the long axis: there the correction of b fades to that of
-a, and the correction of a fades to zero.
+distance. The trend has no component about the long axis. About this axis the correction of b fades
+to the correction of a, and the correction of a fades to zero.
 
 Invariants: the correction is zero if the segment is upright, the joint is straight and the sensors
 agree. A rotation of the world about the vertical does not change the correction.
@@ -80,7 +80,7 @@ class KernelModel(SegmentModel):
     mean_sd: float
     """Standard deviation of the uncorrected mean in training, rad per axis.
 
-    It is the standard deviation of the output without a neighboring segment."""
+    This value is the standard deviation of the output without a neighboring segment."""
     _tables: KernelTables = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:

@@ -1,6 +1,6 @@
-"""Search for exchanged labels in one frame, spread over the frames after it.
+"""Search for exchanged labels in one frame, spread over the following frames.
 
-Invariant: the result is that of `LabelSearch.explain`, whatever the frames between.
+Invariant: the result equals the result of `LabelSearch.explain`, for any frames during the search.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ class LabelExamination:
         self._parts = search.parts(points)
 
     def advance(self, t_ns: int) -> LabelFinding | None:
-        """Do the next parts of the search in a frame, and return the result of the last one.
+        """Do the next parts of the search in a frame, and return the result of the last part.
 
-        Their number depends on the time since the frame before, because some cameras are slow.
+        The number of parts depends on the time since the preceding frame, because some cameras are
+        slow.
         """
         count = min(1 + (t_ns - self._last_ns) // _PART_NS, _MOST_PARTS)
         self._last_ns = t_ns

@@ -2,11 +2,11 @@
 
 A hypothesis assigns a measured label to every marker of a cluster. Its cost is the negative
 logarithm of its likelihood: marker errors are Gaussian, an exchanged label is less probable than a
-correct one, and a marker that is somewhere else is less probable still. If a cluster looks the same
-after an exchange, the exchange turns it: its joint centers then leave those of the adjacent
-clusters.
+correct one, and a marker at any other place is still less probable. If a cluster looks the same
+after an exchange, the exchange rotates the cluster. The joint centers of the cluster then differ
+from the joint centers of the adjacent clusters.
 
-Invariant: an explanation is unique. Every hypothesis that disagrees with it has a higher cost by
+Invariant: an explanation is unique. The cost of every other hypothesis is higher by at least
 `_MARGIN`. A search consists of short parts, which `LabelExamination` spreads over frames.
 """
 
@@ -39,8 +39,8 @@ DISPLACED_M = 0.02
 """RMS residual of a cluster above which a single marker may be displaced, m: the accepted RMS error
 of markers, which soft-tissue artefact does not exceed for seconds."""
 _SYMMETRY = 0.6
-"""RMS residual above which labels are searched, as a share of that of the least conspicuous
-exchange within the cluster."""
+"""RMS residual above which labels are searched, relative to the RMS residual of the least
+conspicuous exchange within the cluster."""
 _MARKER_SD_M = 0.006
 """Standard deviation of a marker's error, soft-tissue artefact included, m."""
 _EXCHANGED_COST = 2.0
@@ -50,7 +50,7 @@ _ELSEWHERE_COST = 12.0
 _MARGIN = 2.5
 """Least difference in cost of two explanations."""
 _GAIN = 0.55
-"""Largest RMS residual of an explanation, as a share of that of the labels as they are."""
+"""Largest RMS residual of an explanation, relative to the RMS residual of the unchanged labels."""
 _SMALL_M = 0.008
 """RMS residual of an explanation that is always small enough, m."""
 _LARGE_M = 0.02
@@ -60,7 +60,7 @@ GAP_M = 0.08
 _GAP_SD_M = 0.03
 """Standard deviation of this distance, soft-tissue artefact and error of the center included, m."""
 _MOST_GAP_COST = 12.0
-"""Largest cost of the distance at one joint: as much as that of a marker elsewhere."""
+"""Largest cost of the distance at one joint, which equals the cost of a marker elsewhere."""
 _NEAR_M = 0.025
 """RMS residual up to which a label is at the place of a hidden marker, m."""
 _TOLERANCE_M = 0.03
@@ -72,7 +72,7 @@ its nearest one only."""
 _MOST_CHANGED = 4
 """Largest number of changed labels in one cluster."""
 _BEST = 16
-"""Number of assignments of one cluster that are combined with those of the others."""
+"""Number of assignments of one cluster that are combined with the assignments of other clusters."""
 _MOST_COMBINED = 2000
 """Largest number of partial combinations: none of a healthy limb has more than a few."""
 _COMBINED_AT_ONCE = 150
@@ -87,8 +87,8 @@ class LabelFault(NamedTuple):
     """Labels of one frame that are not at their own places."""
 
     markers: tuple[str, ...]
-    """Each is at the place of the next one, and the last at that of the first. A single marker is
-    at no place of a cluster."""
+    """Each marker is at the place of the next marker, the last marker at the place of the first. A
+    single marker is at no place of a cluster."""
     parts: tuple[str, ...]
     """Body parts of these markers, sorted."""
     cycle: bool = True
@@ -227,7 +227,7 @@ class LabelSearch:
         fits = _fit(self._template, padded[self._columns], seen[self._columns])
         rms, centers = fits.rms, fits.carry(self._centers)
 
-        # The visible markers of the others determine no pose.
+        # The visible markers of other clusters determine no pose.
         fitted = np.array(
             [
                 seen[own].sum() >= MIN_MARKERS and not self._is_line(p, seen[own])
@@ -426,7 +426,7 @@ def explain_trial(search: LabelSearch, positions: Array) -> tuple[LabelFault, ..
 def _suspicious_rms(template: Array) -> float:
     """Return the residual above which the labels of a cluster are searched, m.
 
-    It is smaller for a cluster that looks almost the same after an exchange of its labels.
+    This threshold is smaller for a cluster that looks almost the same after an exchange of labels.
     """
     count = len(template)
     if count <= _MOST_COMPARED:

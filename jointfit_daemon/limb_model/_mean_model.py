@@ -1,4 +1,4 @@
-"""Weighted mean of the sensors without a correction. It needs no neighboring segment."""
+"""Weighted mean of the sensors without a correction. The mean needs no neighboring segment."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Interface of the models that estimate the orientation of one segment from its sensors.
 
-A model is frozen plain data with an exact JSON form. It is trained for one ordered set of sensors.
-A segment has one model for each set of sensors that can be available. The inputs are bone-aligned
-orientations ``q_world_segment``, one for each sensor, computed with its
+A model is frozen plain data with an exact JSON form. Each model is trained for one ordered set of
+sensors. A segment has one model for each set of sensors that can be available. The inputs are
+bone-aligned orientations ``q_world_segment``, one for each sensor, computed with its
 sensor-to-segment alignment from the static pose.
 """
 

@@ -6,9 +6,9 @@ quantities are relative to the static pose, so links stay valid after sensors ar
 There are two kinds of links. A pair consists of two sensors of one segment; its quantity is the
 rotation :math:`d = \log(q_a^* q_b)`. A joint consists of two sensors of neighboring segments; its
 quantity is the angle about the vertical between their flexion axes, which on a hinge is small and
-depends on posture. Both are linear in ten polynomials :math:`\phi` of the tilts of the two
-segments, :math:`d = W\phi`. Within the range of the movement the standard deviation of a component
-is the residual :math:`\sigma_0` of the movement, beyond it
+depends on posture. Both quantities are linear in ten polynomials :math:`\phi` of the tilts of the
+two segments, :math:`d = W\phi`. Within the range of the movement the standard deviation of a
+component is the residual :math:`\sigma_0` of the movement, beyond it
 
 .. math::
 
@@ -123,7 +123,7 @@ def posture_one(u: Vector, v: Vector) -> tuple[float, ...]:
 
 
 def axis_heading_one(a: Quaternion, b: Quaternion) -> float | None:
-    """Return the heading of the flexion axis (x) of b relative to that of a, rad.
+    """Return the heading of the flexion axis (x) of b relative to the flexion axis of a, rad.
 
     None if either axis is too steep for a heading.
     """

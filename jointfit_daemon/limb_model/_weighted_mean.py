@@ -1,7 +1,7 @@
 """Weighted mean of several orientations of one segment.
 
-The mean is the eigenvector mean of Markley et al. 2007. It does not depend on quaternion signs and
-is equivariant to any rotation of the world.
+The mean is the eigenvector mean of Markley et al. 2007. This mean does not depend on quaternion
+signs and is equivariant to any rotation of the world.
 """
 
 from __future__ import annotations

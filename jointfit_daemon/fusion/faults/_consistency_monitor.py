@@ -92,7 +92,7 @@ class ConsistencyMonitor:
     chain : Chain
         Sensors by segment.
     calibration : Calibration
-        Its links predict the relations between sensors.
+        Calibration whose links predict the relations between sensors.
     drifting : collection of str
         Sensors without heading reference. Where no hinge makes their headings observable, the
         standard deviation grows without limit; for other sensors the drift is assumed to be
@@ -128,7 +128,7 @@ class ConsistencyMonitor:
         self._sensor_drift: dict[str, float] = dict.fromkeys(calibration.sensor, 0.0)
         """Heading drift that is removed from each sensor, rad."""
         self._segment_drift = [0.0] * len(chain.segments)
-        """Part of it that is common to all sensors of a segment, rad."""
+        """Part of the heading drift that is common to all sensors of a segment, rad."""
         self._half_turns: dict[str, tuple[float, float]] = {}
         """cos and sin of half the heading correction, for corrected sensors."""
         self._disturbances = MagneticDisturbanceDetector(chain.sensors)

@@ -76,7 +76,7 @@ class JointHeadingMonitor:
         return 0.5 * drift2 + excess * excess + self._corrected * self._sd * self._sd
 
     def update(self, t_ns: int, residual: float, uncorrected: float, sd: float) -> bool:
-        """Add one measurement; return whether the inconsistency began or ended with it.
+        """Add one measurement; return whether this measurement began or ended the inconsistency.
 
         Parameters
         ----------

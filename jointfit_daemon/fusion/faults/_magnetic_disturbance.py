@@ -9,8 +9,9 @@ is corrected; every segment has the same weight:
           \text{correction: } o_i \cdot \mathrm{clip}\bigl((|o_i| - s_0) / (s_1 - s_0), 0, 1\bigr)
 
 One disturbed sensor of four is thus identified and corrected, and the others are unchanged. If two
-halves of the sensors contradict each other, the median is an interval. Its middle is used, which
-preserves joint angles, and half its width is the uncertainty of all headings.
+halves of the sensors contradict each other, the median is an interval. The middle of the interval
+is used, which preserves joint angles. Half the width of the interval is the uncertainty of all
+headings.
 
 Only differences are observable: a disturbance that turns all sensors alike is not detected.
 """
@@ -95,8 +96,8 @@ class MagneticDisturbanceDetector:
         t_ns : int
             Instant of the frame.
         differences : iterable of HeadingDifference
-            Within segments and across hinges. They must form a forest: at most one path leads from
-            one sensor to another.
+            Differences within segments and across hinges. The differences must form a forest: at
+            most one path leads from one sensor to another.
         """
         edges = []
         total, max_sd = 0.0, MIN_SD
@@ -115,7 +116,7 @@ class MagneticDisturbanceDetector:
         return self._follow(t_ns, targets, ambiguity)
 
     def outlier(self, a: str, b: str) -> tuple[str, float] | None:
-        """Return the corrected sensor of a pair and its deviation, if the other one agrees.
+        """Return the corrected sensor of a pair and its deviation, if the other sensor agrees.
 
         The other sensor agrees if it deviates by less than half as much.
         """

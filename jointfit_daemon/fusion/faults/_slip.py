@@ -81,11 +81,11 @@ class FaultDebouncer:
         self._since_ns: int | None = None
 
     def restart(self) -> None:
-        """Restart the time measurement; the state stays."""
+        """Restart the time measurement; the fault state is unchanged."""
         self._since_ns = None
 
     def update(self, t_ns: int, difference: float, limit: float) -> bool:
-        """Add a difference; return whether the fault began or ended with it."""
+        """Add a difference; return whether this difference began or ended the fault."""
         pending = difference < RELEASE_SHARE * limit if self.active else difference > limit
         if not pending:
             self._since_ns = None
@@ -169,7 +169,7 @@ class SlipDetector:
         a, b : Quaternion
             q_world_segment of either sensor.
         verticals : tuple of Vector
-            The vertical in the frame of `a` and in that of the neighboring segment.
+            The vertical in the frame of `a` and in the frame of the neighboring segment.
         correction : float
             Heading correction, b against a, that `a` and `b` already contain, rad.
         """

@@ -41,8 +41,8 @@ NATURAL_LIMIT_NS = 150_000_000
 PARTNER_ROTATION = radians(1.0)
 """Rotation of a sensor on the same segment that a healthy sensor always follows, rad."""
 OTHER_ROTATION = radians(10.0)
-"""Rotation of a sensor on another segment that a healthy sensor always follows, rad. It is larger,
-because joints allow segments to move alone."""
+"""Rotation of a sensor on another segment that a healthy sensor always follows, rad. This rotation
+is larger, because joints allow segments to move alone."""
 OTHER_REPEAT_NS = 300_000_000
 """Shortest repetition that the rotation of another segment can confirm, ns."""
 WINDOW_NS = 150_000_000
@@ -79,7 +79,7 @@ class _SensorHistory:
         """Last instant at which the sensor repeated itself."""
 
     def update(self, t_ns: int, q: Quaternion, orientations: Orientations) -> bool:
-        """Add one orientation; return whether it repeats the one before."""
+        """Add one orientation; return whether it equals the preceding orientation."""
         since_ns = self.since_ns
         if since_ns is not None:
             # One component mostly decides whether the two orientations differ by rounding only.

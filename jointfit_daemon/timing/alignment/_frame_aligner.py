@@ -4,10 +4,10 @@ Time advances with samples and with ``advance``; memory is bounded. Frames are e
 each once. Every sample has exactly one outcome.
 
 Frame k has the instant ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid does not depend on
-the start time. It is emitted when every active stream has a sample at or after t_k, or at its
-deadline: the next sample of each stream is expected at its usual delay, plus at most 1.5 of its
-periods. Missing samples are extrapolated by up to 2.5 periods; after that the stream is missing
-from the frame.
+the start time. The frame is emitted when every active stream has a sample at or after t_k, or at
+the deadline of the frame: the next sample of each stream is expected at its usual delay, plus at
+most 1.5 of its periods. Missing samples are extrapolated by up to 2.5 periods; after that the
+stream is missing from the frame.
 
 Invariant: frames never stop. While no stream has samples, frames are emitted without orientations,
 first when every stream counts as lost, then at the usual delay. Only frames that were not requested
@@ -69,7 +69,8 @@ class FrameAligner:
     mode : {"smooth", "fast"}
         Whether to wait for samples.
     begin_ns : int, optional
-        Instant of the first frame, with or without samples, ns; default: that of the first sample.
+        Instant of the first frame, with or without samples, ns; by default the instant of the first
+        sample.
 
     Raises
     ------

@@ -1,9 +1,9 @@
 r"""Interpolation and short extrapolation of the orientations of one stream.
 
-Tuples of floats; a few microseconds per call. All computations use the tangent space of the newest
-sample *a* at or before the instant, :math:`r(t) = \log(q_a^* q(t))`, where the other samples are
-plain vectors. Angular rates are those of the body in its own frame: :math:`\dot q = q \otimes (0,
-\omega/2)`.
+Quaternions are tuples of floats; a call takes a few microseconds. All computations use the tangent
+space of the newest sample *a* at or before the instant, :math:`r(t) = \log(q_a^* q(t))`. Other
+samples are plain vectors in this space. Angular rates are rates of the body in body coordinates:
+:math:`\dot q = q \otimes (0, \omega/2)`.
 """
 
 from __future__ import annotations
@@ -82,8 +82,8 @@ def extrapolate_orientation(
 ) -> Quaternion:
     r"""Return the orientation at `t_ns`, after the last sample `a`.
 
-    The motion continues at the last rate (measured, or that of the last interval), with a fraction
-    of the measured angular acceleration for the duration of that interval:
+    The motion continues at the last rate, measured or computed from the last interval. A fraction
+    of the measured angular acceleration acts for the duration of this interval:
 
     .. math:: r(x) = v x + \tfrac12 \beta\, a\, (x_c (x_c + h_0) + (2 x_c + h_0)(x - x_c)),
               \quad x_c = \min(x, h_0)

@@ -58,13 +58,14 @@ class SampleOutcome(StrEnum):
     DECIMATED = "decimated"
     """Skipped: the stream is faster than the frames."""
     LATE = "late"
-    """Arrived after the frames that needed it; no later frame needed it."""
+    """Sample that arrived after all frames that needed it."""
     DUPLICATE = "duplicate"
-    """Same time as another sample."""
+    """Sample with the same time as another sample."""
     DROPPED = "dropped"
-    """Discarded: overflow, reset, close, or a timestamp in the future."""
+    """Sample discarded because of overflow, reset, close, or a timestamp in the future."""
     IDLE = "idle"
-    """Not needed: motion capture outside of a calibration; never a sample of a stream."""
+    """Motion-capture frame that is not needed outside of a calibration; never a sample of a
+    stream."""
 
 
 class _Sample:

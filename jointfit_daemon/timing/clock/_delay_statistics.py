@@ -1,8 +1,8 @@
 """Delay percentiles and sample rate of the last minute.
 
-Constant memory and time per sample. Two half-minute histograms alternate; results cover the running
-one and the one before. Bins are an eighth of an octave wide, so percentiles are accurate to 5 %.
-The maximum is exact.
+Memory and time per sample are constant. Two half-minute histograms alternate; results cover the
+running histogram and the preceding histogram. Bins are an eighth of an octave wide, so percentiles
+are accurate to 5 %. The maximum is exact.
 """
 
 from __future__ import annotations

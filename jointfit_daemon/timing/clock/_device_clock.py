@@ -8,8 +8,8 @@ is used:
 1. sync edges, or a clock declared to be the host's (``_direct_time``);
 2. echoes (``_echo_fit``), which leave half the path asymmetry in c;
 3. the minimum-delay filter on arrivals (``_minimum_delay``), which leaves the minimum delay D_min
-in c. Its prior mean, `latency_ns`, is subtracted; the rest is part of the lag estimated from motion
-(``timing.lag``).
+in c. The prior mean of D_min, `latency_ns`, is subtracted; the rest is part of the lag estimated
+from motion (``timing.lag``).
 
 Timestamps never run backwards and are slewed (``_stamps``). An error too large to be slewed starts
 a new epoch: samples of different epochs must not be combined.

@@ -1,8 +1,8 @@
 """Device time in nanoseconds from ticks, a sample counter, or arrivals.
 
-One reader lives from one restart of a device to the next. ``feed`` returns the device time u of a
-sample in ns; a reordered sample gets a smaller one. It returns None if the device must have
-restarted; a new reader must then read the sample again.
+One reader is used from one restart of a device to the next. ``feed`` returns the device time u of a
+sample in ns; a reordered sample has a smaller device time. If the device must have restarted,
+``feed`` returns None, and a new reader must read the sample again.
 """
 
 from __future__ import annotations

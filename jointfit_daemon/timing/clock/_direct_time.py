@@ -5,8 +5,8 @@ Direct time takes precedence over estimates from arrivals. If an estimate contra
 
 A sync edge is one instant with two timestamps: u on the device clock, v on the reference clock. The
 line ``v(u)`` through the edges of the last minute relates the two clocks to microseconds. The
-mapping of v to host time then applies to u. Its uncertainty is common to both and cancels in
-differences between them, including the minimum delay.
+mapping of v to host time then applies to u. The uncertainty of this mapping, including the minimum
+delay, is common to both clocks and cancels in differences between the clocks.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class SyncEdgeFit:
     Parameters
     ----------
     reference : HostTime
-        The other clock.
+        Clock to which the device clock is related.
     grain_ns : float
         Tick lengths of both clocks, ns, combined as root sum of squares.
     """

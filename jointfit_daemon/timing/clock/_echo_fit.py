@@ -7,7 +7,7 @@ Huber weights and a prior on s, which keeps the slope small in the first seconds
 asymmetry remains in theta_0; ``bound_ns`` is its limit.
 
 Invariant: a single wrong or forged echo changes nothing. An echo that contradicts the fit is not
-used. If the next echo agrees with it, the server clock was restarted.
+used. If the next echo agrees with the contradicting echo, the server clock was restarted.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class EchoFit:
         return abs(u - self.device_ns(middle)) > (received_ns - sent_ns) / 2 + JUMP_NS
 
     def confirms_restart(self, u: int, sent_ns: int, received_ns: int) -> bool:
-        """Set a contradicting echo aside; return whether it agrees with the one before."""
+        """Store a contradicting echo; return whether the preceding one agrees with this echo."""
         middle = (sent_ns + received_ns) // 2
         before = self._doubtful
         self._doubtful = now = _Echo(middle, u - middle, received_ns - sent_ns)

@@ -3,8 +3,9 @@
 For points ``y = c + s u + D`` with delays D >= 0, a line (c, s) is *feasible* if it lies above no
 point. Near the minimum delay the points have a constant density G per nanosecond of height,
 whatever the shape of the delay distribution. The likelihood of a feasible line is then ``exp(G
-sum_mean)`` with ``sum_mean = c + s mean(u)``. Its maximum is the edge of the lower convex hull that
-straddles the mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu, Xia, INFOCOM 2002).
+sum_mean)`` with ``sum_mean = c + s mean(u)``. The maximum of the likelihood is the edge of the
+lower convex hull that straddles the mean of u (Moon, Skelly, Towsley, INFOCOM 1999; Zhang, Liu,
+Xia, INFOCOM 2002).
 
 The posterior mean under a normal prior on s has a smaller error than the maximum, and a covariance.
 Given s, c is at most ``h(s) = min(y - s u)`` and exponentially distributed below, with mean ``h(s)
@@ -34,7 +35,7 @@ _FINEST_NS = 1_000.0
 _JAM_NS = 25_000_000.0
 """Height above which a point is attributed to a starved host or a full queue, ns."""
 _LEAST = 5
-"""Least number of points below ``_JAM_NS`` before the others are excluded."""
+"""Smallest number of points below ``_JAM_NS`` for which higher points are excluded."""
 _LEAP = 20.0
 """Ratio of consecutive ranked heights that separates congestion from jitter."""
 _LEAP_NS = 3_000_000.0

@@ -2,8 +2,8 @@
 
 With device time u and arrival A, the difference ``y = A - u = c + s u + D`` contains a delay ``D >=
 D_min`` of unknown distribution. The filter fits the line below all points (``mean_feasible_line``).
-It depends on the fastest samples only, so jitter of any distribution leaves it unbiased, except for
-the constant D_min, which one-way measurements cannot observe.
+This line depends on the fastest samples only. Jitter of any distribution therefore causes no bias
+other than the constant D_min, which one-way measurements cannot observe.
 
 Integer inputs, constant memory, constant time per sample except for the periodic refit.
 """

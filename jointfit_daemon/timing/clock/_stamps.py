@@ -28,7 +28,7 @@ class Stamp(NamedTuple):
     epoch: int
     """Incremented when earlier and later times must not be combined."""
     duplicate: bool = False
-    """The sample has the same device time as the one before."""
+    """Whether the sample has the same device time as the preceding sample."""
 
 
 Estimate = tuple[int, float, bool, float, float]

@@ -1,4 +1,4 @@
-"""Lag of an IMU behind motion capture, estimated from the angular rates of both."""
+"""Lag of an IMU behind motion capture, estimated from the angular rates of both systems."""
 
 from jointfit_daemon.timing.lag._angular_rates import Rates, rates_from_orientations
 from jointfit_daemon.timing.lag._estimate import (

@@ -1,16 +1,17 @@
 r"""Lag of an IMU behind motion capture, estimated from angular rates.
 
 The estimate needs no world frame, heading, gravity or sensor-to-segment alignment, so it precedes
-all other fits. It has a standard deviation and is rejected where the data do not determine it.
+all other fits. The lag has a standard deviation, and is rejected if the data do not determine the
+lag.
 
 Two rigidly connected bodies have the same angular rate up to a constant rotation and a gyro bias,
 
 .. math:: g(t + \tau) = R\,\omega(t) + b + n ,
 
-with g and omega each in its own body frame. The lag tau is **IMU timestamp minus mocap timestamp of
-the same event**: positive when the IMU is later; subtract it from IMU timestamps. It contains what
-the clocks cannot observe: constant transport delay, filters in both systems, and exposure
-conventions.
+with g and omega in their respective body frames. The lag tau is **IMU timestamp minus mocap
+timestamp of the same event**: positive when the IMU is later. Subtract the lag from IMU timestamps.
+The lag contains all delays that the clocks cannot observe: constant transport delay, filters in
+both systems, and exposure conventions.
 """
 
 from __future__ import annotations
@@ -86,8 +87,8 @@ class LagSettings:
     min_acceleration: float = radians(300.0)
     """Least RMS angular acceleration of the reference, rad/s²."""
     max_sigma_ns: float = 700_000.0
-    """Largest standard deviation, ns; well above that of ordinary motion, so that the threshold
-    does not select windows by chance.
+    """Largest standard deviation, ns. The threshold is well above the standard deviation of
+    ordinary motion, so that windows are not selected by chance.
     """
     min_r2: float = 0.98
     """Least R²: correct data on one rigid body reach 0.998, sensors on soft tissue less."""
@@ -143,7 +144,8 @@ def estimate_lag(
     """Estimate the lag between two tracks of orientations.
 
     The lag of filtered orientations differs from the lag of the gyro: an orientation filter leads
-    its gyro by half its internal period. It applies to the quantity it was estimated from.
+    its gyro by half its internal period. Each lag applies only to the quantity from which it was
+    estimated.
 
     Parameters
     ----------

@@ -5,9 +5,10 @@ systems disagree (soft tissue, lens, gyro scale), they are correlated over whole
 variance is therefore estimated in several ways, and the largest is used:
 
 * the delete-a-block jackknife (Tukey; Künsch 1989): the lag without each block of the window, with
-at most 20 blocks, none shorter than the filter, then with half as many blocks repeatedly while five
-remain. It needs no model of the residuals, and it detects a single block that determines the
-result; * Newey and West (1987), with residuals correlated over the shortest of these blocks.
+  at most 20 blocks, none shorter than the filter, then with half as many blocks repeatedly while
+  five remain. The jackknife needs no model of the residuals, and detects a single block that
+  determines the result;
+* Newey and West (1987), with residuals correlated over the shortest of these blocks.
 
 A variance from few blocks is uncertain itself. :math:`\nu + 1 = (\sum h)^2/\sum h^2` is the
 effective number of blocks that carry the information h about the lag. The finest scale is widened
@@ -18,8 +19,9 @@ infinite.
 
 Residuals cannot reveal an error of the stamps that is common to all samples that carry the
 information. Devices sample on ticks of an internal clock. The rounding error of their stamps is a
-sawtooth: it drifts through one tick and jumps back. Its mean over time is part of the lag, but a
-short passage of fast motion sees only one part of it. For a random phase the variance is
+sawtooth: the error drifts through one tick and jumps back. The mean error over time is part of the
+lag, but a short passage of fast motion contains only a part of the sawtooth. For a random phase the
+variance is
 
 .. math:: \sigma_s^2 G, \quad G = \frac{6}{\pi^2} \sum_{k=1}^{3} \frac{|H(k/P)|^2}{k^2}, \quad
           H(f) = \frac{\sum h_j e^{2\pi i f t_j}}{\sum h_j},
@@ -124,7 +126,8 @@ def lag_sigma(solved: LinearizedLag, memory_s: float, stamp_sd_s: float = 0.0) -
 def _unobserved_sawtooth(t_s: Floats, information: Floats, memory_s: float) -> float:
     """Return the standard deviation of the lag due to a sawtooth error of the stamps.
 
-    The sawtooth has unit standard deviation. Its scatter between blocks is not included.
+    The sawtooth has unit standard deviation. The scatter of the sawtooth between blocks is not
+    included.
     """
     share = information / information.sum()
     cycles = np.multiply.outer(np.divide.outer(_HARMONICS, STAMP_PERIODS_S), t_s - t_s[0])
