@@ -1,8 +1,8 @@
-"""Conversion between the axes of files and those of the project, where z is up.
+"""Conversion between the axes of files and the axes of the project, where z is up.
 
 Axes are renamed cyclically, so they remain right-handed: a vector (x, y, z) of a file with y up, as
-in OpenSim (x forward, y up, z right), becomes (z, x, y). Segment axes, which are named like those
-of the world, are renamed as well.
+in OpenSim (x forward, y up, z right), becomes (z, x, y). Segment axes have the same names as world
+axes, and are renamed as well.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""``candump -L`` text as CAN chunks; every line is accounted for.
+"""``candump -L`` text as CAN chunks; every line is counted.
 
     (1436509052.249713) can0 105#2A366C2B       eight identifier digits: 29 bits; #R: remote
 
 A chunk is one record of `jointfit_protocols.can_frame` (24 bytes: i64 time in ns, u32 identifier,
 u8 flags, u8 size, two zeros, eight data bytes). The record is packed here again because the daemon
-does not import wire formats; a test compares the two. A line that is not a classic CAN frame
-becomes that format's record of lost bytes, so that the decoder counts it.
+does not import wire formats; a test compares both implementations. A line that is not a classic CAN
+frame becomes a record of lost bytes of the same format, so that the decoder counts it.
 """
 
 from __future__ import annotations
@@ -68,8 +68,7 @@ def pack_can_frame(t_ns: int, number: int, data: bytes, *, extended: bool = Fals
 def frame_sizes(records: bytes) -> dict[tuple[int, bool], int]:
     """Return the number of data bytes of each identifier in consecutive records.
 
-    The keys are the number of an identifier and whether it has 29 bits; error and remote frames are
-    left out.
+    A key is an identifier and whether it has 29 bits. Error and remote frames are left out.
     """
     whole = len(records) // RECORD_BYTES * RECORD_BYTES
     return {
@@ -86,7 +85,7 @@ def _record(line: bytes) -> tuple[int, bytes] | None:
         return None
     seconds, fraction, digits, remote, body = match.groups()
     t_ns = int(seconds) * 10**9 + int((fraction or b"0").ljust(9, b"0"))
-    if t_ns >= 2**63:  # no time that a record can hold
+    if t_ns >= 2**63:  # the time does not fit into a record
         return None
     number, extended = int(digits, 16), len(digits) > _STANDARD_DIGITS
     error = bool(extended and number & _ERROR_BIT)

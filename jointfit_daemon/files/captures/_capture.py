@@ -13,7 +13,7 @@ The file type is determined from the first bytes, not from the name:
 | raw bytes | datagram | messages ``u16 id, u16 length, …`` that fit exactly, else one datagram |
 | raw bytes | can | consecutive records of `jointfit_protocols.can_frame` |
 
-*Split* are the drivers with a `packet_stream`, whose chunks are packets of a connection.
+*Split* means a driver with a `packet_stream`, whose chunks are packets of a connection.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ if TYPE_CHECKING:
     from jointfit_daemon.files.captures._tcp_streams import Splitter
 
     Rating = Callable[[Iterable[Chunk]], int]
-    """Number of messages that a decoder finds in some chunks."""
+    """Function that returns the number of messages that a decoder finds in some chunks."""
 
 PIECE = 4096
-"""Bytes per chunk of a raw stream."""
+"""Number of bytes per chunk of a raw stream."""
 
 NS_PER_BYTE = 10 * 10**9 // 921_600
 """Assumed duration of a byte in a raw stream, ns: ten bits at 921 600 baud."""
 
 _RATED = 2000
-"""Chunks of each direction of TCP by which the best direction is chosen."""
+"""Number of chunks of each TCP direction from which the best direction is chosen."""
 
 
 class UnreadableCaptureError(ValueError):
@@ -90,9 +90,10 @@ def read_capture(
     port : int, optional
         Select UDP datagrams from or to this port.
     split : callable, optional
-        Returns a new splitter of a connection into the driver's chunks.
+        Function that returns a new splitter of a connection into the driver's chunks.
     rate : callable, optional
-        Rates the directions of TCP connections; without it, those are not read.
+        Function that rates the directions of TCP connections. Without this function, TCP
+        connections are not read.
 
     Raises
     ------
@@ -166,7 +167,7 @@ def _require_wire(path: Path, found: str, recorded: Wire, expected: Wire) -> Non
 
 
 def _walk(data: bytes) -> Iterator[Chunk]:
-    """Yield messages ``u16 id, u16 length, …`` if they fill the file exactly; else all of it."""
+    """Yield messages ``u16 id, u16 length, …`` if they fill the file exactly; else all bytes."""
     cuts = [0]
     while cuts[-1] + 4 <= len(data):
         (size,) = struct.unpack_from("<H", data, cuts[-1] + 2)

@@ -4,8 +4,8 @@ A truncated file yields the packets before the cut.
 
 Supported: little- and big-endian files, several sections and interfaces, microsecond to nanosecond
 timestamps, Ethernet (with VLAN tags), Linux cooked, loopback and raw IP links, IPv4 and IPv6 with
-reassembly of fragments. Everything else in the file is skipped. Time stamps are those of the file,
-ns since 1970.
+reassembly of fragments. Everything else in the file is skipped. Time stamps are the time stamps in
+the file, ns since 1970.
 
 Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791; RFC 8200; RFC 9293.
 """
@@ -30,7 +30,7 @@ bytes of a pcap file."""
 
 _SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
 _LITTLE_MAGIC = b"\x4d\x3c\x2b\x1a"
-_RESOLUTION, _OFFSET = 9, 14  # options if_tsresol, if_tsoffset
+_RESOLUTION, _OFFSET = 9, 14  # numbers of the options if_tsresol, if_tsoffset
 _LINK_HEADS = {
     0: (4, None),
     108: (4, None),
@@ -40,15 +40,15 @@ _LINK_HEADS = {
     113: (16, 14),
     276: (20, 0),
 }
-"""Number of bytes before the IP header, and offset of the EtherType in them (None: the link has
-none), by link type."""
+"""Number of bytes before the IP header and offset of the EtherType in these bytes, by link type.
+The offset is None if the link has no EtherType."""
 _ETHERNET = 1
 _IP, _VLAN = (b"\x08\x00", b"\x86\xdd"), (0x8100, 0x88A8)
 _TCP, _UDP = 6, 17
 _IPV4_HEAD, _IPV6_HEAD = 20, 40
 _HOP_OPTIONS, _ROUTING, _FRAGMENT, _TARGET_OPTIONS = 0, 43, 44, 60
 _EXTENSIONS = frozenset((_HOP_OPTIONS, _ROUTING, _FRAGMENT, _TARGET_OPTIONS))
-"""Headers of IPv6 between its own and that of the segment."""
+"""Extension headers of IPv6, between the IPv6 header and the header of the segment."""
 _UDP_HEAD = struct.Struct(">HHHH")
 _TCP_HEAD = struct.Struct(">HHIIBB6x")
 _SYN = 0x02
@@ -107,7 +107,7 @@ def read_packets(data: bytes) -> Iterator[UdpPacket | TcpSegment]:
 
 
 def _tcp_segment(t_ns: int, addresses: bytes, segment: bytes) -> TcpSegment | None:
-    """Return the TCP segment of an IP packet between two addresses; None if it is cut off."""
+    """Return the TCP segment of an IP packet between two addresses; None if truncated."""
     if len(segment) < _TCP_HEAD.size:
         return None
     source, target, sequence, _, size, flags = _TCP_HEAD.unpack_from(segment)
@@ -117,7 +117,7 @@ def _tcp_segment(t_ns: int, addresses: bytes, segment: bytes) -> TcpSegment | No
         t_ns,
         (addresses[:half], source),
         (addresses[half:], target),
-        sequence + begins & 0xFFFFFFFF,  # a SYN takes one number
+        sequence + begins & 0xFFFFFFFF,  # a SYN takes one sequence number
         begins,
         segment[max(size >> 4, 5) * 4 :],
     )
@@ -216,16 +216,16 @@ class _IpPacket(NamedTuple):
     addresses: bytes
     """Source and target."""
     number: int
-    """Identification of its fragments."""
+    """Identification that the fragments of one datagram share."""
     more: bool
-    """Whether fragments follow this one."""
+    """Whether further fragments follow."""
     offset: int
-    """Place in the segment, bytes."""
+    """Position of the payload in the segment, bytes."""
     body: bytes
 
 
 def _ip_packet(packet: bytes) -> _IpPacket | None:
-    """Return a packet of UDP or TCP; None for others, and if the header is cut off."""
+    """Return an IPv4 packet of UDP or TCP; None for others, or if the header is truncated."""
     version = packet[0] >> 4 if packet else 0
     found = None
     if version == 4 and len(packet) >= _IPV4_HEAD:  # noqa: PLR2004 - IPv4
@@ -239,7 +239,7 @@ def _ip_packet(packet: bytes) -> _IpPacket | None:
 
 
 def _ipv6_packet(packet: bytes) -> _IpPacket | None:
-    """Return an IPv6 packet without its extension headers; None if one of them is cut off."""
+    """Return an IPv6 packet without its extension headers; None if one is truncated."""
     size, kind = struct.unpack_from(">HB", packet, 4)
     at, end = _IPV6_HEAD, _IPV6_HEAD + size if size else len(packet)
     number = fields = 0

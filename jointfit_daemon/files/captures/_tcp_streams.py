@@ -1,10 +1,11 @@
-"""TCP segments of a capture to the bytes of each direction of a connection, and to packets.
+"""Conversion of TCP segments to the bytes of each direction of a connection, and to packets.
 
-Segments that are sent again are used once, and late ones are put in order. A capture may begin
-inside a connection, or lack segments: the bytes after such a hole begin a new run. Most servers
-begin a packet with a segment; therefore packets are searched again at the next segment.
+Retransmitted segments are used once, and late segments are put in order. A capture may begin inside
+a connection, or lack segments: the bytes after such a hole begin a new run. Most servers begin a
+packet with a segment; therefore packets are searched again at the next segment.
 
-Invariant: pure; at most `_MOST_WAITING` segments of a direction wait for an earlier one.
+Invariant: all functions are pure; at most `_MOST_WAITING` segments of a direction wait for an
+earlier one.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
 
 _NUMBERS = 1 << 32
 _MOST_WAITING = 256
-"""Segments that wait for an earlier one; with more of them, that one is lost."""
+"""Largest number of segments that wait for an earlier segment. With more waiting segments, the
+earlier segment counts as lost."""
 
 
 class LostBytes(Protocol):
@@ -28,7 +30,7 @@ class LostBytes(Protocol):
 
     @property
     def discarded(self) -> int:
-        """Their number."""
+        """Number of bytes."""
 
 
 class Splitter(Protocol):
@@ -76,7 +78,7 @@ def split_pieces(pieces: Iterable[Piece], split: Callable[[], Splitter]) -> Iter
 
 
 class _Direction:
-    """One direction of a connection."""
+    """Bytes of one direction of a connection."""
 
     def __init__(self) -> None:
         self.pieces: list[Piece] = []
@@ -102,7 +104,7 @@ class _Direction:
         self._use_waiting()
 
     def end(self) -> None:
-        """Use the segments that wait, in order, with holes between them."""
+        """Use the waiting segments in order, with holes between them."""
         while self._waiting:
             self._skip_hole()
             self._use_waiting()
@@ -118,7 +120,7 @@ class _Direction:
         self._use(self._waiting.pop(first), continues=(first - known) % _NUMBERS >= _NUMBERS // 2)
 
     def _use(self, segment: TcpSegment, *, continues: bool) -> None:
-        """Append the bytes of a segment without those that are known."""
+        """Append the bytes of a segment without the bytes that are already known."""
         self._broken |= not continues
         start = self._next if continues and self._next is not None else segment.sequence
         data = segment.payload[(start - segment.sequence) % _NUMBERS :]

@@ -1,8 +1,8 @@
 """C3D files: marker trials, read with the optional package ``c3d``.
 
 Positions are returned in metres, in the file's own axes. A point with a negative residual is
-missing (NaN), whatever its coordinates; a positive one is that of the cameras. Times follow the
-frame numbers: frame 1 is at 0 s, as in a TRC file of the same trial.
+missing (NaN), for any coordinates. A positive residual is the residual of the cameras. Times follow
+the frame numbers: frame 1 is at 0 s, as in a TRC file of the same trial.
 """
 
 from __future__ import annotations

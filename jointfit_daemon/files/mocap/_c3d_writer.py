@@ -33,13 +33,13 @@ _POINT, _TRIAL, _EVENT, _OWN = 1, 2, 3, 4
 _MISSING = -1.0
 """Residual of a missing point."""
 _MOST_WORD = 0xFFFF
-"""Largest 16-bit number: later frames are counted in TRIAL only."""
+"""Largest 16-bit number. Only the group TRIAL counts frames above this number."""
 MOST_ITEMS = 255
-"""Most entries of a list parameter: events, and labels before LABELS2."""
+"""Maximum number of entries of a list parameter: events, and labels before LABELS2."""
 _MOST_BYTES = 255
 """Maximum size of a text in a list parameter in bytes."""
 _MOST_BLOCKS = 255
-"""Most blocks of all parameters."""
+"""Maximum number of blocks of all parameters."""
 
 
 class C3dEvent(NamedTuple):
@@ -50,7 +50,7 @@ class C3dEvent(NamedTuple):
     label: str
     """Kind of event, for example ``Foot Strike``."""
     context: str = ""
-    """Side or subject concerned."""
+    """Side or subject to which the event belongs."""
     text: str = ""
 
 
@@ -91,7 +91,8 @@ def c3d_bytes(
     frames, points = positions.shape[:2]
     last_frame = first_frame + frames - 1
 
-    # the number of the first data block is part of the parameters, whose length is constant
+    # The number of the first data block is part of the parameters. The length of the parameters
+    # does not depend on it.
     entries = _entries(names, frames, first_frame, rate_hz, up)
     entries += _event_entries(events)
     if own_texts:
@@ -172,7 +173,7 @@ def _words(number: int) -> bytes:
 
 
 def _texts(group: int, name: str, texts: Sequence[str]) -> bytes:
-    """Return a list of texts, padded with blanks to one width; longer ones are cut off."""
+    """Return a list of texts, padded with blanks to one width; longer texts are truncated."""
     cut = [text.encode()[:_MOST_BYTES].decode(errors="ignore").encode() for text in texts]
     width = max(1, *map(len, cut))
     data = b"".join(text.ljust(width) for text in cut)

@@ -1,8 +1,7 @@
 """Marker trials from TRC or C3D files, in metres with z up.
 
 The source of the vertical axis (file, caller or convention of the format) is part of the result. A
-marker exactly at the origin is missing (NaN): programs without another representation of missing
-markers write it so.
+marker exactly at the origin is missing (NaN): some programs write missing markers in this way.
 """
 
 from __future__ import annotations
@@ -55,8 +54,8 @@ class MarkerTrial:
         if not unknown:
             return self.trajectories.positions[:, [at for at in wanted if at is not None]]
 
-        # Propose markers similar to each unknown name, then list all. None that was requested is
-        # proposed.
+        # Propose markers similar to each unknown name, then list all markers. Requested markers are
+        # not proposed.
         taken = set(names)
         free = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
         spellings = [*free, *map(_bare, free)]
@@ -71,7 +70,7 @@ class MarkerTrial:
     def residuals(self, names: Sequence[str]) -> NDArray[np.float64] | None:
         """Return the residuals of the cameras by known names, m, shape (n, len(names)).
 
-        None if the file contains no residuals; NaN where one is missing.
+        The result is None if the file contains no residuals. Missing residuals are NaN.
         """
         found = self.trajectories.residuals
         wanted = [self._index(name) for name in names]

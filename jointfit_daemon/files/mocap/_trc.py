@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 _HEADER_ROWS = 5
 _SHOWN = 40
-"""Characters of a wrong cell in a message."""
+"""Maximum number of characters of a wrong cell in a message."""
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
 """Metres per unit of length in marker files."""
 _KEYS = (
@@ -64,12 +64,12 @@ class MarkerTrajectories:
     warnings: tuple[str, ...] = ()
     """Contradictions between header and rows."""
     residuals: NDArray[np.float64] | None = None
-    """Residual of the cameras for every position, m, shape (n, len(names)); NaN where the file
-    states none. None: the format has none."""
+    """Residual of the cameras for every position, m, shape (n, len(names)); NaN where the residual
+    is unknown. None if the format has no residuals."""
 
 
 _MOST_FRAMES = 2.0**53
-"""A frame number beyond it has lost its last digit."""
+"""Largest exact frame number; larger numbers lose their last digit."""
 
 
 def read_trc(path: Path) -> MarkerTrajectories:
@@ -89,7 +89,7 @@ def read_trc(path: Path) -> MarkerTrajectories:
             f"{path}, line 4: no marker names after Frame# and Time: export it again"
         )
 
-    # OpenSim refuses equal names, too.
+    # OpenSim also refuses equal names.
     for name, times in Counter(filter(None, names)).items():
         if times > 1:
             columns = [str(3 + 3 * at) for at, other in enumerate(names) if other == name]

@@ -1,7 +1,7 @@
 """Chain models in TOML (for editing) and JSON (for programs), with the same keys.
 
-Metres and radians, z up, as in the program; keys with a default may be omitted. All errors of a
-file are reported at once. The format is described in docs/kinematics.md.
+Files use metres, radians and z up, as the program does. Keys with a default may be omitted. All
+errors of a file are reported at once. The format is described in docs/kinematics.md.
 """
 
 from __future__ import annotations
@@ -69,9 +69,9 @@ def model_of(data: Any, source: str, name: str = "chain") -> ChainModel:
     data
         Content of a file, or a table of another file.
     source
-        Its name in error messages.
+        Name of the source in error messages.
     name
-        Name of a model that has none.
+        Name of the model if the data contain no name.
 
     Raises
     ------

@@ -21,7 +21,8 @@ class LoadedModel:
 
     chain: ChainModel
     coordinates: tuple[JointCoordinates, ...]
-    """Coordinates of each segment; named by an OpenSim model, else by the segment."""
+    """Names of the coordinates of each segment, from an OpenSim model or else from the segment
+    name."""
     remarks: tuple[str, ...] = ()
     """Differences from an OpenSim model."""
 

@@ -1,7 +1,7 @@
 """OpenSim models as chain models: the joints of selected bodies, and their markers.
 
 OpenSim's world and bodies have y up, x forward, z right; chain models have z up, y forward, x
-right. Every vector (x, y, z) becomes (z, x, y), axes of bodies included, so segment frames
+right. Every vector (x, y, z) becomes (z, x, y), including the axes of bodies, so segment frames
 correspond. Differences between the models are reported as remarks; unsupported elements are
 rejected.
 """
@@ -110,7 +110,7 @@ def read_osim(path: Path, *, markers: Collection[str] | None = None) -> Imported
 
 
 class _Tree:
-    """Bodies on joints, parents first; welded bodies are merged."""
+    """Tree of bodies and joints, parents first; welded bodies are merged."""
 
     def __init__(self, document: OsimDocument) -> None:
         self.remarks = [
@@ -144,7 +144,7 @@ class _Tree:
                 self._add(GROUND, body, None)
 
     def _add(self, parent_body: str, body: str, joint: NearestJoint | None) -> None:
-        """Attach a body to its parent; without a `joint` it moves freely."""
+        """Attach a body to its parent; without a `joint` the body moves freely."""
         parent, placed = self._at[parent_body]
         if joint is not None and joint.kind is None:
             self._at[body] = (parent, placed @ joint.rest)
@@ -187,7 +187,7 @@ class _Tree:
         return Marker(marker.name, segment, _vector(at), locked=(fixed, fixed, fixed))
 
     def needed(self, marked: set[str]) -> set[str]:
-        """Return the segments that connect the marked ones, including those."""
+        """Return the segments with markers and the segments that connect them."""
         paths = {name: self._path(name) for name in marked}
         keep = {above for path in paths.values() for above in path}
         for root in [name for name in keep if self.segments[name].parent is None]:
@@ -208,7 +208,7 @@ class _Tree:
         return path
 
     def kept(self, keep: set[str]) -> list[Segment]:
-        """Return these segments; roots without their parents move freely."""
+        """Return the segments to keep; roots without their parents move freely."""
         left = [name for name in self.segments if name not in keep]
         if left:
             self.remarks.append(f"left out, no marker needs them: {', '.join(left)}")
@@ -221,7 +221,7 @@ class _Tree:
         return found
 
     def coordinates(self, segment: Segment) -> JointCoordinates:
-        """Return the coordinates of a kept segment; general ones for a root without its parent."""
+        """Return the coordinates of a kept segment; six free ones for a root without parent."""
         was_cut = segment.parent is None and (
             segment.name not in self._joints
             or self._at[self._joints[segment.name][0].parent.body][0] is not None

@@ -1,6 +1,6 @@
 """Coordinates of OpenSim joints as functions of the pose of a chain model.
 
-Values have OpenSim's names, signs and axes: the pose is evaluated by the functions of the file.
+Values have OpenSim's names, signs and axes, because the functions of the file are evaluated.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ def joint_coordinates(segment: Segment, joint: OsimJoint, placed: Array) -> Join
     joint
         Joint as written.
     placed
-        Pose of the joint's parent body in the segment that contains it, OpenSim's axes, (4, 4).
+        Pose of the joint's parent body in the segment that contains this body, OpenSim's axes,
+        shape (4, 4).
     """
     motion = JointMotion(joint)
     is_free = segment.joint.kind == "free"

@@ -54,7 +54,7 @@ class OsimJoint:
 
     name: str
     kind: str
-    """XML tag: CustomJoint, PinJoint, …"""
+    """XML tag of the joint: CustomJoint, PinJoint, ……"""
     parent: OffsetFrame
     child: OffsetFrame
     coordinates: tuple[Coordinate, ...]
@@ -174,7 +174,7 @@ def read_xml(path: Path) -> ET.Element:
         ) from error
     except MalformedFileError:
         raise
-    except (ValueError, LookupError) as error:  # an encoding that Python does not know
+    except (ValueError, LookupError) as error:  # the encoding is unknown to Python
         raise MalformedFileError(
             f"{path}: unknown text encoding: save the file as UTF-8"
         ) from error
@@ -198,7 +198,7 @@ def text_of(element: ET.Element, tag: str, default: str = "") -> str:
 
 
 def numbers_of(element: ET.Element, tag: str, count: int | None = None) -> Array:
-    """Return the numbers in a child's text; `ValueError` if there are not `count` of them."""
+    """Return the numbers in a child's text; raise `ValueError` unless there are `count`."""
     try:
         values = np.array([float(cell) for cell in text_of(element, tag).split()])
     except ValueError:
@@ -221,7 +221,7 @@ def body_of(socket: str) -> str:
 
 
 def fixed_xyz(angles: Array) -> Array:
-    """Return the matrix (3, 3) of rotations, rad, shape (3,): about x, the new y and the new z."""
+    """Return the matrix (3, 3) of rotations, rad, shape (3,): about x, new y and new z."""
     turns = []
     for axis, angle in enumerate(angles):
         j, k = (axis + 1) % 3, (axis + 2) % 3

@@ -1,8 +1,10 @@
 r"""Approximation of an OpenSim joint by a joint of the chain model.
 
-A rotation by one coordinate becomes a hinge if it has a fixed axis, else a coupled joint with
-samples of its motion. A rotation by two or three coordinates becomes a ball. Axis and centers
-minimize the error over the range of the coordinates:
+A rotation by one coordinate becomes a hinge if the axis is fixed, or else a coupled joint with
+samples of the motion. A rotation by two or three coordinates becomes a ball joint. A_i and t_i are
+rotation and translation of sample i, φ_i is its angle, and A_rest is the rotation at zero angle.
+The axis a, and the centers c in the child and C in the parent, minimize the error over the range of
+the coordinates:
 
 .. math:: A_i \approx A_{rest}\exp(a\varphi_i), \qquad
           \min_{c, C} \sum_i |t_i + A_i c - C|^2
@@ -36,9 +38,10 @@ _AT_HOME = 0.05
 error.
 """
 _WIDEST = np.pi / 2
-"""Range evaluated to either side of the default of a coordinate with a wider range, rad."""
+"""Range that is evaluated on both sides of the default of a coordinate with a wider range, rad."""
 _BEYOND = 0.3
-"""Extension of the samples of a coupled joint beyond its range, rad: not all programs clamp it."""
+"""Extension of the samples of a coupled joint beyond its range, rad. It is necessary because not
+all programs clamp coordinates to their range."""
 _TELL_M, _TELL_RAD = 1e-4, 1e-3
 
 
@@ -119,8 +122,8 @@ def sampled_joint(
 def _centers(joint: OsimJoint, turns: Array, shifts: Array) -> tuple[Array, Array, float]:
     """Return the center in the parent and in the child, m, and the largest error.
 
-    Where the motion does not determine it (along an axis), the center is nearest to the joint's own
-    frame.
+    Where the motion does not determine the center, for example along an axis, the point nearest to
+    the joint's own frame is chosen.
     """
     own = joint.child.transform[:3, 3]
     seen = shifts + turns @ own
@@ -187,7 +190,7 @@ def _about_one(
 def _coupled(
     joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
 ) -> NearestJoint:
-    """Return the joint as samples of its motion, extended beyond its range, with its errors."""
+    """Return a joint as samples of its motion, extended beyond the range, with the errors."""
     low, high = _span(coordinate)
     zero = min(max(0.0, low), high)
     values = np.linspace(low - _BEYOND, high + _BEYOND, 2 * _SAMPLES - 1)
@@ -197,7 +200,7 @@ def _coupled(
     above = seen[-1]
     path = np.column_stack((values, rotation.from_matrix(turns[:-1]), seen[:-1] - above))
 
-    # Every second sample defines the curve; those in between measure its error.
+    # Every second sample defines the curve; the samples in between measure the error of the curve.
     turned, found = CoupledCurve.through(path[::2].tolist()).at(values)
     missed = float(np.linalg.norm(found[:, 1:4] - path[:, 5:], axis=1).max())
     bent = float(np.linalg.norm(turned - turns[:-1], axis=(1, 2)).max() / np.sqrt(2.0))
@@ -219,8 +222,8 @@ def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
     """Return rest, axis, angles and largest deviation from the axis, of rotations (n, 3, 3).
 
     Rest and axis are computed alternately: the mean of the part that the hinge does not explain,
-    then the principal direction of the rotations from there. The angle of the first rotation is
-    zero.
+    then the principal direction of the rotations relative to this rest. The angle of the first
+    rotation is zero.
     """
     q = rotation.from_matrix(turns)
     rest = q[0]

@@ -1,6 +1,7 @@
 """Motion of OpenSim joints: evaluation of their functions and transforms.
 
-As defined by OpenSim, for several coordinate values at once, one per row.
+Functions and transforms are evaluated as OpenSim defines them, for several coordinate values at
+once, one per row.
 """
 
 from __future__ import annotations
@@ -24,9 +25,9 @@ if TYPE_CHECKING:
 
 _X, _Y, _Z = np.eye(3)
 _TURNING = 3
-"""Number of rotational transform axes; as many translational ones follow."""
+"""Number of rotational transform axes; the same number of translational axes follows."""
 _CUBIC = 4
-"""Least number of points of a cubic spline."""
+"""Smallest number of points of a cubic spline."""
 _TURNS: dict[str, list[Array]] = {
     "WeldJoint": [],
     "SliderJoint": [],

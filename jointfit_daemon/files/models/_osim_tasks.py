@@ -22,7 +22,7 @@ class IkSetup:
     time_range: tuple[float, float] | None
     """First and last time, s."""
     ignored: tuple[str, ...]
-    """Names of coordinate tasks."""
+    """Names of the coordinate tasks, which are ignored."""
 
 
 def read_ik_setup(path: Path) -> IkSetup:
@@ -58,7 +58,7 @@ def _applied(task: Element) -> bool:
 
 
 def _weight(task: Element) -> float:
-    """Return the weight of a task, 0 if it is not applied."""
+    """Return the weight of a task; 0 if the task is not applied."""
     weight = float(numbers_of(task, "weight", 1)[0])
     if weight < 0.0:
         raise ValueError(f"{task.get('name')}: weight is {weight:g}, expected 0 or more")

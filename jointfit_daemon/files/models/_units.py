@@ -1,8 +1,8 @@
 """Plausibility check of lengths in model files.
 
-Files without a unit, or in millimetres despite one, would yield a chain a thousand times too large
-that still fits some motion. No point of a body is ten metres from its own segment, so such a file
-is rejected.
+Files without a unit, or with millimetres despite another unit, would yield a chain a thousand times
+too large that still fits some motion. No point of a body is ten metres from its own segment, so
+files with such points are rejected.
 """
 
 from __future__ import annotations

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LEAST_KNOWN = 0.5
-"""Least share of known frames in a written column, relative to the frames with any known value."""
+"""Smallest share of known frames in a written column, relative to the frames with any known
+value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +36,7 @@ class WrittenTable:
 
     path: Path
     frames: int
-    """Number of written frames; 0: no file was written."""
+    """Number of written frames; 0 if no file was written."""
     notes: tuple[str, ...] = ()
     """Omitted columns and frames."""
 
@@ -76,7 +77,7 @@ def complete_part(known: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[
     Returns
     -------
     rows, columns
-        Masks, shapes (T,) and (K,). No row remains if no column does.
+        Masks, shapes (T,) and (K,). Without remaining columns, no row remains.
     """
     count = int(known.any(axis=1).sum())
     columns: NDArray[np.bool_] = known.sum(axis=0) >= max(LEAST_KNOWN * count, 1)

@@ -1,7 +1,7 @@
 """NPZ files: orientations of sensors and, with a reference system, of bones.
 
-Returned in the project's world (z up, x right, y forward) with segment frames likewise, whatever
-the axes of the file. Arrays of a file with n instants::
+World and segment frames are returned in the axes of the project (z up, x right, y forward), for any
+axes of the file. Arrays of a file with n instants::
 
     t        (n,)     seconds
     ID_quat  (n, 4)   orientation of sensor ID, (w, x, y, z), sensor to world
@@ -38,7 +38,7 @@ _GIB = 1 << 30
 LARGEST = _GIB
 """Largest uncompressed size of all arrays of a file, bytes: 15 hours of four sensors at 100 Hz."""
 _KINDS = "biufU"
-"""Accepted kinds of arrays: booleans, numbers, text (``up``)."""
+"""Accepted kinds of NumPy arrays: Booleans, numbers, and text for ``up``."""
 _SENSOR = "_quat"
 _BONE, _ORIGIN = "q_", "p_"
 
@@ -50,9 +50,9 @@ class OrientationTrial:
     t_s: NDArray[np.float64]
     """Times, s, shape (n,)."""
     sensors: Mapping[str, NDArray[np.float64]]
-    """q_world_sensor by id, shape (n, 4), unit; NaN where missing."""
+    """Sensor orientations q_world_sensor by id, shape (n, 4), unit; NaN where missing."""
     bones: Mapping[str, NDArray[np.float64]]
-    """q_world_segment by bone, shape (n, 4), unit."""
+    """Segment orientations q_world_segment by bone, shape (n, 4), unit."""
     origins: Mapping[str, NDArray[np.float64]]
     """Origin of each bone (its proximal joint center), m, shape (n, 3)."""
 
@@ -117,7 +117,7 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
     Raises
     ------
     MalformedFileError
-        As `read_arrays`; or without ``t``, or with neither a sensor nor a bone.
+        As `read_arrays`; or the file has no ``t``, or neither a sensor nor a bone.
     """
     arrays = read_arrays(path)
     names = [name.removesuffix(_SENSOR) for name in arrays if name.endswith(_SENSOR)]

@@ -1,8 +1,8 @@
 """STO and MOT files: OpenSim's tables over time, and STO tables of orientations.
 
-Numbers are returned as written, angles included; ``in_degrees`` is their unit. A file has free
-header lines and ``key=value`` lines up to ``endheader``, then the column names, then rows. In a
-table of orientations (``DataType=Quaternion``) every cell is ``w,x,y,z``, body to world.
+Numbers, including angles, are returned as written; ``in_degrees`` defines the unit of angles. A
+file has free header lines and ``key=value`` lines up to ``endheader``, then the column names, then
+rows. In a table of orientations (``DataType=Quaternion``) every cell is ``w,x,y,z``, body to world.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class TimeTable:
     """Named columns over time."""
 
     columns: tuple[str, ...]
-    """Names without ``time``."""
+    """Column names without ``time``."""
     t_s: NDArray[np.float64]
     """Times, s, shape (n,)."""
     values: NDArray[np.float64]
@@ -75,7 +75,8 @@ class OrientationTable:
     t_s: NDArray[np.float64]
     """Times, s, shape (n,)."""
     quaternions: NDArray[np.float64]
-    """q_world_body in the file's axes, shape (n, len(names), 4); NaN where missing."""
+    """Body orientations q_world_body in the file's axes, shape (n, len(names), 4); NaN where
+    missing."""
     rate_hz: float | None = None
     header: Mapping[str, str] = field(default_factory=dict)
     """Further ``key=value`` lines; keys in lower case."""

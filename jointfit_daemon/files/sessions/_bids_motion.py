@@ -55,7 +55,7 @@ _TYPES = {
     POSITION: "POS",
     ANGLE: "JNTANG",
 }
-"""Type of a channel by quantity; standard deviations are MISC."""
+"""Channel type of each quantity; standard deviations have the type MISC."""
 _DEGREES = frozenset({ANGLE, ANGLE_SD})
 _CHANNEL_COLUMNS = (
     "name", "component", "type", "tracked_point", "units", "placement", "reference_frame",
@@ -231,7 +231,7 @@ def _write_events(folder: Path, stem: str, events: Sequence[TimelineEvent]) -> N
     rows = ["\t".join(_EVENT_COLUMNS)]
     for event in events:
         data = orjson.dumps(dict(event.data)).decode()
-        text = " ".join(event.text.split())  # on one line
+        text = " ".join(event.text.split())  # written on one line
         texts = (event.kind, event.id or _MISSING, text or _MISSING, data)
         rows.append("\t".join((f"{event.t_s:.9f}", "0", *texts)))
     (folder / f"{stem}_events.tsv").write_text("\n".join(rows) + "\n", encoding="utf-8")
@@ -253,8 +253,8 @@ def _write_json(path: Path, content: Any) -> None:
 def read_bids_session(root: Path) -> SessionData:
     """Return the session of a Motion-BIDS data set with one subject and task.
 
-    In a foreign data set, tracking systems with positions become markers, those with quaternions
-    sensors.
+    In a foreign data set, tracking systems with positions become markers, and tracking systems with
+    quaternions become sensors.
 
     Raises
     ------
@@ -346,7 +346,7 @@ def _read_motion(path: Path, width: int) -> Any:
 
 
 def _channel_of(row: Mapping[str, str]) -> StreamColumn | None:
-    """Return a channel of ours by its description, another by its type; None if unknown."""
+    """Return an own channel by its description, a foreign one by its type; None if unknown."""
     quantity, _, component = row.get("description", "").partition(" ")
     item = row.get("tracked_point", "")
     placement = row.get("placement", _MISSING)

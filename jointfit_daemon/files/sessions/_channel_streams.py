@@ -1,7 +1,7 @@
-"""A session as streams of described channels, as XDF, Motion-BIDS and LSL hold it.
+"""A session as streams of described channels, for XDF, Motion-BIDS and LSL.
 
-Every channel names the object it belongs to (sensor, marker, segment or joint), its quantity, its
-component and its unit. Invariant: `session_of` of the streams of `streams_of` is the session.
+Every channel names the object to which it belongs (sensor, marker, segment or joint), its quantity,
+its component and its unit. Invariant: `session_of` of the streams of `streams_of` is the session.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ UNITS = {
     ANGLE: "rad",
     ANGLE_SD: "rad",
 }
-"""Unit of every quantity; empty: none, or as the sensor outputs it."""
+"""Unit of every quantity; empty if there is no unit or the sensor defines it."""
 _INERTIAL = ("angular_velocity", "acceleration", "magnetic_field")
 
 
@@ -78,7 +78,7 @@ class ChannelStream:
 
     group: Group
     name: str
-    """Name of the object, or of the group if the stream holds several objects."""
+    """Name of the object, or of the group if the stream contains several objects."""
     t_s: Array
     """Instants since the start of the session, s, shape (n,)."""
     channels: tuple[StreamColumn, ...]
@@ -118,7 +118,7 @@ def streams_of(session: SessionData) -> list[ChannelStream]:
 
 
 def merge_streams(streams: Sequence[ChannelStream]) -> list[ChannelStream]:
-    """Return the streams with those of a group merged into one where all share their times."""
+    """Return the streams; the streams of a group with common times are merged into one."""
     merged = []
     for group in GROUPS:
         own = [stream for stream in streams if stream.group == group]

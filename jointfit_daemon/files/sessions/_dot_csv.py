@@ -1,10 +1,11 @@
-"""CSV files of Xsens / Movella DOT sensors: one sensor in each file, written by app or exporter.
+"""CSV files of Xsens / Movella DOT sensors, written by app or exporter, one sensor per file.
 
 Lines ``NAME:,VALUE`` precede the column names: ``DeviceTag``, ``OutputRate`` and ``SyncStatus`` are
 read. ``SampleTimeFine`` numbers the rows: 32 bit, 1 µs, so it wraps after 71.6 minutes. Angular
 rates are in degrees a second. The world is east, north, up; quaternions map sensor to world. Modes
 without rates contain an increment for each row, ``dq`` and ``dv``, which becomes the mean rate over
-its period. Source: header and columns as in published files and programs; no recording of our own.
+its period. Source: header and columns as in published files and programs; no own recording was
+available.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ _TIME, _COUNTER = "SampleTimeFine", "PacketCounter"
 _TURN = 1 << 32
 _TICK_S = 1e-6
 _HEADER_LINES = 40
-"""Lines in which the column names must be found."""
+"""Number of lines within which the column names must be found."""
 _HZ = re.compile(r"([0-9.]+)\s*Hz", re.IGNORECASE)
 _WORDS = ("Quat", "Euler", "FreeAcc", "Acc", "Gyr", "Mag", "dq", "dv", "Status")
 
 
 class _DotFile(NamedTuple):
-    """One sensor, and what its header states."""
+    """One sensor, and the values in the header of its file."""
 
     first_ticks: float
     synchronized: bool
@@ -55,7 +56,7 @@ class _DotFile(NamedTuple):
 
 
 def is_dot_csv(path: Path) -> bool:
-    """Return whether a CSV file is that of a DOT sensor."""
+    """Return whether a CSV file contains data of a DOT sensor."""
     with path.open("rb") as file:
         head = file.read(8192).decode("utf-8", "replace")
     return any(_is_names(line) for line in head.splitlines()[:_HEADER_LINES])
@@ -64,8 +65,9 @@ def is_dot_csv(path: Path) -> bool:
 def read_dot_session(files: Sequence[Path], name: str) -> SessionData:
     """Return the sensors of one recording, from one CSV file for each sensor.
 
-    Files of synchronized sensors have a common time; the earliest row of all is at 0 s. Otherwise
-    every sensor begins at 0 s. The id of a sensor is its ``DeviceTag``, or the name of the file.
+    Files of synchronized sensors have a common time; the earliest row of all files is at 0 s.
+    Otherwise every sensor begins at 0 s. The id of a sensor is its ``DeviceTag``, or the name of
+    the file.
 
     Raises
     ------
@@ -99,7 +101,7 @@ def read_dot_session(files: Sequence[Path], name: str) -> SessionData:
 
 
 def _is_names(line: str) -> bool:
-    """Return whether a line has the column names."""
+    """Return whether a line contains the column names."""
     cells = cells_of(line, separator_of(line))
     return _TIME in cells and any(cell.startswith(_WORDS) for cell in cells)
 
@@ -142,7 +144,7 @@ def _read_sensor(path: Path) -> _DotFile:
 
 
 def _period_s(header: Mapping[str, str], t_s: Array) -> float:
-    """Return the period of the increments, s: lost rows do not lengthen it."""
+    """Return the period of the increments, s; lost rows do not change the period."""
     hz = _HZ.search(header.get("outputrate", ""))
     try:
         rate_hz = float(hz[1]) if hz else 0.0

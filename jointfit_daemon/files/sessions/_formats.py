@@ -1,4 +1,4 @@
-"""The formats a session is written to and read from, by name and by file extension."""
+"""Formats in which sessions are written and read, by name and by file extension."""
 
 from __future__ import annotations
 
@@ -50,15 +50,15 @@ if TYPE_CHECKING:
     Writer = Callable[[SessionData, Path], WrittenSession]
 
 _FORBIDDEN = '/\\:*?"<>|'
-"""Characters that are not part of the file names of all systems."""
+"""Characters that not all systems permit in file names."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionFormat:
-    """A format that sessions are written to."""
+    """A format in which sessions are written."""
 
     contents: str
-    """Content of its files."""
+    """Description of the content of the files."""
     write: Writer
 
 
@@ -89,7 +89,7 @@ def write_session(
     Parameters
     ----------
     session
-        Its name begins the names of the files.
+        Session to write. The file names begin with the session's name.
     folder
         Existing folder.
     to
@@ -102,7 +102,7 @@ def write_session(
     Raises
     ------
     NothingToWriteError
-        The session has nothing that the format can hold.
+        The session has no data that the format can contain.
     FileExistsError
         A file exists and `overwrite` is false.
     MissingPackageError
@@ -114,7 +114,7 @@ def write_session(
     name = "".join("_" if char in _FORBIDDEN else char for char in session.name).strip(". ")
     session = replace(session, name=name or "session")
 
-    # The files become visible together, after the last byte of the last of them.
+    # The files become visible together, after the last byte of the last file is written.
     with tempfile.TemporaryDirectory(prefix=".jointfit-export-", dir=folder) as staging:
         written = write(session, Path(staging))
         entries = [(entry, folder / entry.name) for entry in sorted(Path(staging).iterdir())]

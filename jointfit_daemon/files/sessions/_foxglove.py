@@ -1,4 +1,4 @@
-"""Sessions as MCAP files with the schemas of Foxglove, for its viewer and for Rerun.
+"""Sessions as MCAP files with the schemas of Foxglove, for the viewers Foxglove and Rerun.
 
 | topic | message | content |
 |---|---|---|
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _WORLD, _OPTICAL_WORLD = "world", "optical_world"
 _INFO, _WARNING = 2, 3
-"""Levels of foxglove.Log."""
+"""Numbers of the levels in the schema foxglove.Log."""
 _JOINT_SCHEMA = {
     "title": "jointfit.Joint",
     "type": "object",
@@ -43,7 +43,8 @@ _JOINT_SCHEMA = {
     },
 }
 _Message = tuple[float, str, str, Any]
-"""Time since the start of the session, s; topic; schema; protobuf message or JSON object."""
+"""One message: time since the start of the session, s; topic; schema; protobuf message or JSON
+object."""
 
 
 def write_foxglove_session(session: SessionData, folder: Path) -> WrittenSession:
@@ -100,7 +101,7 @@ class _MessageBuilder:
         self._register = import_extra("mcap_protobuf.schema", "foxglove").register_schema
 
     def unix_ns(self, t_s: float) -> int:
-        """Return UNIX time, ns; not before 1970."""
+        """Return the UNIX time of an instant, ns; at least 0."""
         return max(self._start_unix_ns + round(t_s * 1e9), 0)
 
     def register(self, writer: Writer, name: str, content: Any) -> int:
@@ -128,7 +129,10 @@ class _MessageBuilder:
     def _poses(
         self, world: str, name: str, t_s: Array, q: Array | None, place: Array | None
     ) -> Iterator[_Message]:
-        """Yield the known poses of a frame; None: not turned, or at the origin of the world."""
+        """Yield the known poses of a frame.
+
+        None means no rotation, or a position at the origin of the world.
+        """
         turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(t_s), 1)) if q is None else q
         places = np.zeros((len(t_s), 3)) if place is None else place
         poses = np.column_stack((t_s, turns, places))

@@ -1,6 +1,6 @@
-"""Facts of a session that a header line of a text format carries: one JSON object without blanks.
+"""Facts of a session in a header line of a text format, as one JSON object without blanks.
 
-``start_unix_ns`` is UNIX time 0 s of the file. Foreign files have no such line.
+``start_unix_ns`` is the UNIX time of the instant 0 s of the file. Foreign files have no such line.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ HEADER_KEY = "jointfit"
 
 
 def header_line(**facts: Any) -> dict[str, str]:
-    """Return the header entry of some facts; None values are left out."""
+    """Return the header entry of some facts; facts with the value None are left out."""
     known = {key: value for key, value in facts.items() if value is not None}
     return {HEADER_KEY: orjson.dumps(known).decode()}
 

@@ -1,7 +1,7 @@
 """Markers of a session as TRC and C3D files.
 
-TRC has the axes of OpenSim (y up), C3D those of the project (z up, declared). Frames are uniform in
-both: missing rows are frames without markers.
+TRC files have the axes of OpenSim (y up). C3D files have the axes of the project (z up) and declare
+them. Frames are uniform in both: missing rows are frames without markers.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _LATEST_FRAME = 0xFFFF
-"""Largest number of a first frame that the header of a C3D file can hold."""
+"""Largest number of a first frame that fits into the header of a C3D file."""
 _START, _FIRST, _RATE = "START_UNIX_NS", "FIRST_S", "RATE_HZ"
 
 
@@ -46,7 +46,7 @@ def write_trc_session(session: SessionData, folder: Path) -> WrittenSession:
 
 
 def read_trc_session(path: Path) -> SessionData:
-    """Return the markers of a TRC file; its axes are taken as those of OpenSim (y up)."""
+    """Return the markers of a TRC file; the axes of OpenSim (y up) are assumed."""
     return SessionData(path.stem, markers=_read_markers(path))
 
 
@@ -58,7 +58,7 @@ def write_c3d_session(session: SessionData, folder: Path) -> WrittenSession:
     path = folder / f"{session.name}.c3d"
     notes = axis.note(path.name)
 
-    # Frame 1 is at 0 s. A parameter of our own contains the remainder below a period.
+    # Frame 1 is at 0 s. A parameter of the group JOINTFIT contains the remainder below a period.
     first_s = float(axis.t_s[0]) if len(axis.t_s) else 0.0
     first_frame = round(first_s * axis.rate_hz) + 1
     if not 1 <= first_frame <= _LATEST_FRAME:

@@ -14,7 +14,7 @@ def import_extra(module: str, extra: str) -> Any:
     Raises
     ------
     MissingPackageError
-        It is not installed; the message names the command that installs it.
+        The package is not installed; the message names the command that installs it.
     """
     try:
         return importlib.import_module(module)

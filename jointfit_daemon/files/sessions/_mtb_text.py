@@ -49,8 +49,8 @@ def is_mtb_text(path: Path) -> bool:
 def read_mtb_session(files: Sequence[Path], name: str) -> SessionData:
     """Return the sensors of one recording, from one exported text file for each sensor.
 
-    The counters of all sensors have a common start, so the earliest row of all is at 0 s. The id of
-    a sensor is the serial number at the end of the file name.
+    The counters of all sensors have a common start, so the earliest row of all files is at 0 s. The
+    id of a sensor is the serial number at the end of the file name.
 
     Raises
     ------

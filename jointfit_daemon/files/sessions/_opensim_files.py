@@ -1,9 +1,10 @@
 """Orientations and joint angles of a session as files of OpenSim: STO and MOT.
 
-Orientations are q_world_body with z up, as OpenSense expects of sensors: its set-up files turn them
-by ``sensor_to_opensim_rotations`` = -pi/2 0 0. Positions in MOT files have the axes of OpenSim,
-y up. An unknown orientation is NaN, which OpenSense ignores. A MOT file has no unknown values:
-its frames and columns with them are left out, because OpenSim's Storage misreads NaN.
+Orientations are q_world_body with z up, as OpenSense expects for sensors. The set-up files of
+OpenSense rotate them by ``sensor_to_opensim_rotations`` = -pi/2 0 0. Positions in MOT files have
+the axes of OpenSim, y up. An unknown orientation is NaN, which OpenSense ignores. A MOT file has no
+unknown values: frames and columns with unknown values are left out, because OpenSim's Storage
+misreads NaN.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _POSITION_PARTS = (("_x", "_y", "_z"), ("_tx", "_ty", "_tz"))
-"""Endings of position columns: ours, and those of OpenSim's coordinates."""
+"""Endings of position columns: of this project, and of OpenSim's coordinates."""
 _TRANSLATION = re.compile(r"_t?[xyz]$")
 _LATE_START_S = 1.0
-"""Longest time before the last series starts that is left out of orientations, s."""
+"""Longest part of a session before the start of its last series that orientation files omit, s."""
 _SAME_INSTANT_S = 1e-6
 _GROUPS = ("sensors", "segments", "optical_segments")
 
@@ -94,9 +95,9 @@ def write_sto_session(
 
 
 def read_sto_session(path: Path) -> SessionData:
-    """Return the orientations of a STO file, or its numbers as `read_mot_session` does.
+    """Return the orientations of a STO file; other tables are read by `read_mot_session`.
 
-    Orientations of a foreign file are those of sensors, named by column.
+    Orientations of a foreign file become sensors with the names of the columns.
     """
     if not any(line.lower().startswith("datatype=quaternion") for line in read_lines(path)[:40]):
         return read_mot_session(path)

@@ -1,6 +1,6 @@
 """Sessions as tidy tables in files: ``NAME_TABLE.csv``, or ``NAME_TABLE.parquet``.
 
-Any of the files of a session is read together with its siblings.
+A file of a session is read together with the other files of this session.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.session_data import SessionData
 
 _BLOCK_ROWS = 1 << 15
-"""Rows that are converted to text at a time, which bounds the memory."""
+"""Number of rows that are converted to text at a time; the number limits the memory."""
 MOST_VALUES = 1 << 27
 """Largest number of values that are read from a file; they take 1 GiB."""
 _NEEDS_QUOTES = frozenset(',"\n\r')
@@ -66,7 +66,7 @@ def _texts_of(name: str, values: NDArray[Any]) -> list[str]:
 
 
 def read_csv_session(path: Path) -> SessionData:
-    """Return the session of a CSV file of `write_csv_session` and its siblings.
+    """Return the session of a CSV file of `write_csv_session` and the files next to it.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Table:
         else:
             try:
                 table[name] = np.array([text or "nan" for text in texts], dtype=np.float64)
-            except ValueError:  # find the cell
+            except ValueError:  # find the wrong cell
                 numbers = [number(path, k, text) for k, text in enumerate(texts, start=2)]
                 table[name] = np.array(numbers)
     return table
@@ -130,7 +130,7 @@ def write_parquet_session(session: SessionData, folder: Path) -> WrittenSession:
 
 
 def read_parquet_session(path: Path) -> SessionData:
-    """Return the session of a Parquet file of `write_parquet_session` and its siblings.
+    """Return the session of a file of `write_parquet_session` and the files next to it.
 
     Raises
     ------
@@ -163,9 +163,9 @@ def read_parquet_session(path: Path) -> SessionData:
 
 
 def _check_parquet(file: Path, names: list[str], metadata: Any, columns: Sequence[str]) -> None:
-    """Refuse other columns than expected, and more values than `MOST_VALUES`, before they are read.
+    """Refuse unexpected columns, and more than `MOST_VALUES` values, before reading them.
 
-    Repetitions take no space in a file: a few bytes can stand for any number of rows.
+    Repetitions take no space in a file, so a few bytes can represent any number of rows.
     """
     if names != list(columns):
         raise MalformedFileError(
@@ -180,7 +180,7 @@ def _check_parquet(file: Path, names: list[str], metadata: Any, columns: Sequenc
 
 
 def _texts_in(file: Path, name: str, column: Any) -> NDArray[Any]:
-    """Return the texts of a column of dictionaries; equal ones are one object."""
+    """Return the texts of a column of dictionaries; equal texts are one object."""
     found = [
         np.array([*chunk.dictionary.to_pylist(), None], dtype=object)[
             chunk.indices.fill_null(-1).to_numpy(zero_copy_only=False)

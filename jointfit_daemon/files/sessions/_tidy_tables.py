@@ -1,4 +1,4 @@
-"""A session as tidy tables, one row for each object and instant, as CSV and Parquet hold it.
+"""A session as tidy tables for CSV and Parquet, with one row for each object and instant.
 
 Units are part of the column names. Unknown values are NaN; the writers leave their cells empty.
 Invariant: `session_of_tables` of the tables of `tables_of` is the session.
@@ -55,7 +55,7 @@ TABLES: Mapping[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Columns of every table. Only the table ``session`` is always present."""
 _SOURCES = {"imu": "", "optical": "optical_"}
-"""Prefix of the group of series by source: from sensors, or from markers."""
+"""Prefix of the names of series groups, by source: sensors or markers."""
 _NAME, _START, _DESCRIPTION = "name", "start_unix_ns", "description."
 
 
@@ -126,7 +126,7 @@ def _degrees(values: Array | None) -> Array | None:
 
 
 def _filled(table: Mapping[str, Any]) -> Table:
-    """Return columns of full length: texts repeated, missing columns NaN."""
+    """Return columns of full length; texts are repeated, and missing columns are NaN."""
     count = len(table["t_s"])
     filled: Table = {}
     for name, column in table.items():
@@ -140,7 +140,7 @@ def _filled(table: Mapping[str, Any]) -> Table:
 
 
 def session_of_tables(tables: Mapping[str, Table], name: str) -> SessionData:
-    """Return the session of some tables; `name` is used if they have none."""
+    """Return the session of some tables; `name` is used if the tables contain no name."""
     table = tables.get("session", {})
     facts = dict(zip(table.get("key", ()), table.get("value", ()), strict=True))
     series: dict[str, Any] = {
@@ -244,5 +244,5 @@ def _stack(rows: Table, names: Sequence[str]) -> Array:
 
 
 def _known(values: Array) -> Array | None:
-    """Return values, or None if all are unknown."""
+    """Return the values, or None if all values are unknown."""
     return None if np.isnan(values).all() else values

@@ -1,7 +1,8 @@
 """Series on one uniform time axis, for formats that have a single rate.
 
-Rows whose instants lie on the axis are taken as they are, and missing ones become unknown. Other
-series are interpolated: linearly, orientations along the shortest rotation.
+If the instants of a series lie on the axis, its rows are used unchanged, and missing rows become
+unknown. Other series are interpolated linearly; orientations are interpolated along the shortest
+rotation.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ class UniformAxis:
         return [f"{file}: resampled to {self.rate_hz:.6g} Hz by interpolation: {names}"]
 
     def _take(self, name: str, t_s: Array) -> bool:
-        """Return whether a series needs interpolation, and remember it."""
+        """Return whether a series needs interpolation; store its name for the note."""
         if rows_on_axis(t_s, self.t_s) is not None:
             return False
         if name not in self.resampled:

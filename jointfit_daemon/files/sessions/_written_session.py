@@ -1,4 +1,4 @@
-"""Outcome of writing a session."""
+"""Result of writing a session to files."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ if TYPE_CHECKING:
 
 
 class NothingToWriteError(ValueError):
-    """The session has nothing that the format can hold; the message names a remedy."""
+    """The session has no data that the format can contain; the message gives a remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenSession:
-    """Files of one session in one format."""
+    """Written files of one session in one format."""
 
     files: tuple[Path, ...]
     notes: tuple[str, ...] = ()
-    """Series that were left out, cut off or resampled."""
+    """Notes on series that were left out, truncated or resampled."""

@@ -1,9 +1,10 @@
 """Sessions as XDF files, the format of the Lab Streaming Layer.
 
-One stream for each sensor, segment and joint, one for all markers, one of events. Time stamps are
-seconds since the start of the session, and the clock offset of every stream is 0. The nominal rate
-is 0 (irregular) where rows are missing, so that readers do not move the time stamps.
-Channels are described as https://github.com/sccn/xdf/wiki/Mocap-Meta-Data proposes.
+A file has one stream for each sensor, segment and joint, one stream for all markers, and one stream
+of events. Time stamps are seconds since the start of the session, and the clock offset of every
+stream is 0. The nominal rate is 0 (irregular) where rows are missing, so that readers do not move
+the time stamps. Channels are described as https://github.com/sccn/xdf/wiki/Mocap-Meta-Data
+proposes.
 """
 
 from __future__ import annotations
@@ -55,9 +56,9 @@ if TYPE_CHECKING:
 _EVENT_CHANNELS = ("kind", "id", "text", "data")
 _EVENTS = "events"
 _CHUNK_ROWS = 4096
-"""Samples in a chunk."""
+"""Number of samples in a chunk."""
 _MOCAP_WORDS = {ORIENTATION: "Orientation", POSITION: "Position"}
-"""Types of channels in the meta-data of motion capture, without their axis."""
+"""Channel types in the meta-data of motion capture, without the axis."""
 
 
 def write_xdf_session(session: SessionData, folder: Path) -> WrittenSession:
@@ -99,7 +100,7 @@ def _file_header(session: SessionData) -> bytes:
 
 
 def stream_description(stream: ChannelStream) -> ET.Element:
-    """Return the element ``desc`` of a stream: its group and its channels with their units."""
+    """Return the element ``desc`` of a stream: group, and channels with units."""
     description = ET.Element("desc")
     _add(description, "group", stream.group)
     channels = ET.SubElement(description, "channels")
@@ -145,7 +146,7 @@ def _events_header() -> bytes:
 
 
 def _stream_end(number: int, t_s: Array) -> bytes:
-    """Return the clock offsets of a stream, all 0, and its footer."""
+    """Return the chunks with the clock offsets of a stream, all 0, and with its footer."""
     info, head = ET.Element("info"), struct.pack("<I", number)
     first, last = (float(t_s[0]), float(t_s[-1])) if len(t_s) else (0.0, 0.0)
     _add(info, "first_timestamp", repr(first))
@@ -218,7 +219,7 @@ def _read_description(header: ET.Element) -> dict[str, str]:
 
 
 def _corrected_times(path: Path, stream: XdfStream) -> Array:
-    """Return the time stamps plus the clock offset, a line through its measurements, s."""
+    """Return time stamps plus clock offset, s; the offset is a line fitted to its measurements."""
     t_s = np.concatenate(stream.t_s) if stream.t_s else np.empty(0)
     missing = np.isnan(t_s)
     if missing.any():

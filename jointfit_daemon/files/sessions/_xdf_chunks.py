@@ -1,10 +1,10 @@
-"""Chunks of XDF files: bytes to chunks, and streams with their samples and clock offsets.
+"""Chunks of XDF files: reading of chunks, and of streams with samples and clock offsets.
 
-A file is ``XDF:`` followed by chunks; a chunk is the number of length bytes (1, 4 or 8), its length
-in them, a 16-bit tag and content. Source: https://github.com/sccn/xdf/wiki/Specifications.
+A file is ``XDF:`` followed by chunks; a chunk is the number of length bytes (1, 4 or 8), the length
+in these bytes, a 16-bit tag and content. Source: https://github.com/sccn/xdf/wiki/Specifications.
 
-Invariants: memory grows with the size of the file, whatever a length declares; a truncated or
-foreign file raises `MalformedFileError`.
+Invariants: memory grows with the size of the file, for any declared length; a truncated or foreign
+file raises `MalformedFileError`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MAGIC = b"XDF:"
 FILE_HEADER, STREAM_HEADER, SAMPLES, CLOCK_OFFSET, BOUNDARY, STREAM_FOOTER = range(1, 7)
 _LENGTHS = {1: "<B", 4: "<I", 8: "<Q"}
-"""Formats of a length by its number of bytes."""
+"""Formats of a length, by number of bytes."""
 FORMATS = {
     "float32": "<f4", "double64": "<f8",
     "int8": "<i1", "int16": "<i2", "int32": "<i4", "int64": "<i8",
@@ -44,13 +44,14 @@ class XdfStream:
 
     header: ET.Element
     t_s: list[Array] = field(default_factory=list)
-    """Time stamps, s, clock of the sender; NaN: follows from the nominal rate."""
+    """Time stamps, s, on the clock of the sender; NaN if a time stamp follows from the nominal
+    rate."""
     values: list[Array] = field(default_factory=list)
     """Numbers, shape (n, channels) for each chunk."""
     texts: list[list[str]] = field(default_factory=list)
     """Samples of a stream of strings."""
     offsets: list[tuple[float, float]] = field(default_factory=list)
-    """Time of measurement and clock offset, s."""
+    """Pairs of time of measurement and clock offset, s."""
 
     def text(self, path: str) -> str:
         """Return the text of an element of the header; empty if missing."""
@@ -64,7 +65,7 @@ class XdfStream:
 
     @property
     def rate_hz(self) -> float:
-        """Nominal rate, Hz; 0: irregular."""
+        """Nominal rate, Hz; 0 for irregular samples."""
         try:
             rate = float(self.text("nominal_srate") or 0.0)
         except ValueError:
@@ -73,12 +74,12 @@ class XdfStream:
 
 
 def pack_chunk(tag: int, content: bytes) -> bytes:
-    """Return a chunk."""
+    """Return the bytes of a chunk."""
     return _length(len(content) + 2) + struct.pack("<H", tag) + content
 
 
 def pack_text(text: str) -> bytes:
-    """Return a value of a stream of strings."""
+    """Return the bytes of one value of a stream of strings."""
     data = text.encode()
     return _length(len(data)) + data
 
@@ -210,7 +211,7 @@ def _add_texts(stream: XdfStream, body: memoryview, count: int) -> None:
 
 
 def _stamp(body: memoryview, at: int) -> tuple[float, int]:
-    """Return the time stamp of a sample, s, and the position after it; NaN if it has none."""
+    """Return the time stamp of a sample, s, and the position after it; NaN if absent."""
     if body[at] == 0:
         return float("nan"), at + 1
     return struct.unpack_from("<d", body, at + 1)[0], at + 9

@@ -22,15 +22,16 @@ _EULER = (("Roll", "Pitch", "Yaw"), ("Euler_X", "Euler_Y", "Euler_Z"))
 
 
 def unwrapped(counter: Array, turn: int) -> Array:
-    """Return a counter since its first row, without wraps, ticks, shape (n,)."""
-    # A step of more than half the range of the counter is a step back: rows in disorder.
+    """Return a counter since its first row, ticks, shape (n,), with wraps removed."""
+    # A step of more than half the counter's range is a step back, which means that rows are not in
+    # order.
     steps = np.mod(np.diff(counter) + turn / 2, turn) - turn / 2
     counted: Array = np.concatenate([[0.0], np.cumsum(steps)])[: len(counter)]
     return counted
 
 
 def orientation_columns(columns: Mapping[str, Array], count: int) -> Array:
-    """Return q_world_sensor, shape (count, 4); NaN where the file has none."""
+    """Return orientations q_world_sensor, shape (count, 4); NaN where unknown."""
     for names in _QUATERNIONS:
         if all(name in columns for name in names):
             return rotation.normalize(np.column_stack([columns[name] for name in names]))
@@ -53,7 +54,7 @@ def orientation_columns(columns: Mapping[str, Array], count: int) -> Array:
 
 
 def axes_columns(columns: Mapping[str, Array], pattern: str) -> Array | None:
-    """Return the vectors of three columns, shape (n, 3); None without one of them."""
+    """Return the vectors of three columns, shape (n, 3); None if one is missing."""
     parts = [columns.get(pattern.format(axis)) for axis in "XYZ"]
     known = [part for part in parts if part is not None]
     return np.column_stack(known) if len(known) == 3 else None  # noqa: PLR2004 - three axes

@@ -1,4 +1,4 @@
-"""Text files read within bounds: TOML, JSON and tables of numbers; values as TOML text."""
+"""Bounded reading of TOML, JSON and tables of numbers; conversion of values to TOML text."""
 
 from jointfit_daemon.files.text._structured import (
     MAX_NESTING,

@@ -1,4 +1,4 @@
-"""TOML and JSON files from untrusted sources, read within bounds.
+"""Bounded reading of TOML and JSON files from untrusted sources.
 
 Invariant: a file raises nothing but `MalformedFileError`. Reading is limited to `most_bytes`, never
 waits for a writer, and yields no value that exceeds the recursion limit of a later reader.
@@ -37,12 +37,12 @@ _REFUSALS = {
     errno.ENOTDIR: "a parent of the path is a file: check the path",
     errno.EACCES: "cannot be read (permission denied): allow this user to read it: `chmod a+r`",
 }
-"""Texts of common errors."""
+"""Message texts of common errors."""
 _PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*')"""
 _DEEP_KEY = re.compile(
     rf"(?:^|[\[{{,])[ \t]*(?:{_PART}[ \t]*\.[ \t]*){{{MAX_NESTING}}}{_PART}", re.MULTILINE
 )
-"""A dotted key of more than `MAX_NESTING` parts, as the key of a value or of a table."""
+"""Pattern of a dotted key of more than `MAX_NESTING` parts, as the key of a value or of a table."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
@@ -179,8 +179,8 @@ def _parsed(path: Path, name: str, parse: Callable[[str], Any], text: str) -> An
 def find_structure_fault(value: object) -> str | None:
     """Return the reason why a parsed value would make a later reader fail, or None.
 
-    Checks the nesting depth and integers beyond 64 bits. Iterative, since the value may be deeper
-    than the stack.
+    Checks the nesting depth and integers beyond 64 bits. The check is iterative, since the value
+    may be deeper than the stack.
     """
     waiting: list[tuple[object, str, int]] = [(value, "", 0)]
 

@@ -1,7 +1,7 @@
 """Tables of numbers in text files, with cells separated by tab, comma or blanks.
 
 Invariants: every fault of a file raises `MalformedFileError`; memory grows with the size of the
-file, whatever its header declares. An empty cell and any spelling of NaN are missing values (NaN).
+file, for any declared size. An empty cell and any spelling of NaN are missing values (NaN).
 Declared counts are often wrong in real files, so rows are counted.
 """
 
@@ -19,15 +19,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _CELLS_PER_CHARACTER = 16
-"""Most table cells per character of the file."""
+"""Maximum number of table cells per character of the file."""
 _FEW_CELLS = 1_000_000
-"""Cells up to which rows may be mostly missing; larger tables must contain data."""
+"""Number of cells up to which rows may be mostly missing; larger tables must contain data."""
 _SHOWN = 40
 """Maximum number of characters of a cell quoted in a message."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 DIGITS = 8
-"""Significant digits written."""
+"""Number of significant digits written."""
 
 
 class MalformedFileError(ValueError):
@@ -78,7 +78,7 @@ def cells_of(line: str, separator: str | None) -> list[str]:
 
 
 def strip_trailing_empty(cells: Sequence[str]) -> list[str]:
-    """Return `cells` without empty ones at the end, which are padding."""
+    """Return `cells` without the empty cells at the end, which are padding."""
     end = len(cells)
     while end and not cells[end - 1]:
         end -= 1

@@ -1,6 +1,6 @@
 """Keys and values as TOML text.
 
-Invariant: `tomllib` reads the text of a value as that value.
+Invariant: `tomllib` converts the text of a value back to the same value.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def toml_key(name: str) -> str:
-    """Return a key of TOML, in quotes if necessary."""
+    """Return the TOML text of a key, in quotes if necessary."""
     return name if _BARE_KEY.fullmatch(name) else toml_value(name)
 
 
 def toml_value(value: Any, *, hexadecimal: bool = False) -> str:
-    """Return a value of TOML, a mapping as an inline table without its keys of value None.
+    """Return the TOML text of a value; mappings become inline tables without None values.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def toml_value(value: Any, *, hexadecimal: bool = False) -> str:
     if isinstance(value, int) and hexadecimal:
         return f"{value:#x}"
     if isinstance(value, str):
-        # A string of JSON is one of TOML, except for DEL.
+        # A JSON string is also a TOML string, except for the character DEL.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, Mapping):
         pairs = (
