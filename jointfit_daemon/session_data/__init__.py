@@ -1,7 +1,7 @@
-"""A recorded session as arrays, independent of file formats: what files, replay and reports share.
+"""A recorded session as arrays, independent of file formats, for files, replay and reports.
 
-Every series has its own times, seconds since the start of the session. World and segment axes are
-those of CONVENTIONS.md; the optical world differs from the world of the sensors by a heading.
+Every series has its own times, seconds since the start of the session. CONVENTIONS.md defines world
+and segment axes; the optical world differs from the world of the sensors by a heading.
 """
 
 from jointfit_daemon.session_data._resampling import (

@@ -1,7 +1,7 @@
-"""Time axes of series: their rate, whether they are uniform, and values at other instants.
+"""Time axes of series: rate, uniformity, and interpolation of values at other instants.
 
-Gaps are not bridged: a row between two rows that are further apart than `MAX_GAP_SAMPLES` periods,
-or next to an unknown row, is unknown.
+Gaps are not bridged: an interpolated row between two rows that are further apart than
+`MAX_GAP_SAMPLES` periods, or next to an unknown row, is unknown.
 """
 
 from __future__ import annotations
@@ -20,11 +20,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 MAX_GAP_SAMPLES = 1.5
-"""Widest interval that is interpolated, in median sample periods: no missing sample is bridged."""
+"""Longest interval that is interpolated, in median sample periods. With this limit no missing
+sample is bridged."""
 UNIFORM_SHARE = 0.01
 """Largest deviation of an instant from a uniform time axis, in sample periods."""
 _EXACT_SHARE = 1e-6
-"""Distance to a row, in sample periods, up to which an instant takes the value of the row."""
+"""Largest time to a row, in sample periods, at which an instant gets the value of the row without
+interpolation."""
 
 
 def sample_rate_hz(t_s: Array) -> float:
@@ -45,10 +47,10 @@ def is_uniform(t_s: Array) -> bool:
 
 
 def uniform_times(axes: Sequence[Array]) -> Array:
-    """Return one uniform time axis for several series, at the highest rate of them, s, shape (n,).
+    """Return a uniform time axis for several series at their highest rate, s, shape (n,).
 
-    It is the axis of a series itself if all of them share it and it is uniform. Otherwise instants
-    are whole numbers of periods from the first row of the fastest series, over the range of all.
+    If all series share a uniform axis, this axis is returned. Otherwise instants are whole numbers
+    of periods from the first row of the fastest series, over the range of all series.
     """
     filled = [t_s for t_s in axes if len(t_s)]
     if not filled:
@@ -57,7 +59,7 @@ def uniform_times(axes: Sequence[Array]) -> Array:
     if is_uniform(first) and all(np.array_equal(t_s, first) for t_s in filled):
         return first
 
-    # Of equally fast series the first: their periods differ by rounding only.
+    # Among equally fast series, use the first one: their periods differ only by rounding.
     shortest = min(map(_period, filled))
     fastest = next(t_s for t_s in filled if _period(t_s) <= shortest * (1.0 + UNIFORM_SHARE))
     period = _period(fastest)
@@ -79,7 +81,7 @@ def _period(t_s: Array) -> float:
 
 
 def rows_on_axis(t_s: Array, axis_s: Array) -> NDArray[np.intp] | None:
-    """Return the row of a uniform axis for every instant; None if one lies between two rows.
+    """Return the row of a uniform axis for every instant; None if any is between two rows.
 
     Parameters
     ----------
@@ -105,7 +107,7 @@ def interpolate_values(t_s: Array, values: Array, at_s: Array) -> Array:
     if not len(t_s):
         return np.full((len(at_s), *values.shape[1:]), np.nan)
     share = share.reshape(-1, *([1] * (values.ndim - 1)))
-    # A row at its own instant is taken as it is, whatever follows it: 0 times NaN is NaN.
+    # At the instant of a row, use the row without the next row, because 0 times NaN is NaN.
     between: Array = np.where(
         share == 0.0, values[i], (1.0 - share) * values[i] + share * values[j]
     )
@@ -115,7 +117,8 @@ def interpolate_values(t_s: Array, values: Array, at_s: Array) -> Array:
 def interpolate_orientations(t_s: Array, q: Array, at_s: Array) -> Array:
     """Interpolate along the shortest rotation; shape (n, 4) to (m, 4), NaN as `interpolate_values`.
 
-    Spherical linear interpolation q_i exp(a log(q_i* q_i+1)).
+    The result is the spherical linear interpolation q_i exp(a log(q_i* q_i+1)) between the rows i
+    and i + 1, at the share a of their interval.
     """
     i, j, share = _neighbours(t_s, at_s)
     if not len(t_s):
@@ -126,7 +129,7 @@ def interpolate_orientations(t_s: Array, q: Array, at_s: Array) -> Array:
 
 
 def _neighbours(t_s: Array, at_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Return the rows before and after each instant, and the share between them; NaN: in a gap."""
+    """Return the rows before and after each instant, and the share between them, NaN in gaps."""
     if not len(t_s):
         none = np.zeros(len(at_s), dtype=np.intp)
         return none, none, np.full(len(at_s), np.nan)

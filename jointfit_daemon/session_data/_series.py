@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _UNIT_TOLERANCE = 1e-3
-"""Largest difference of the length of a quaternion from 1: payloads round components to 1e-5."""
+"""Largest difference of the norm of a quaternion from 1. Payloads round components to 1e-5."""
 
 
 class SessionDataError(ValueError):
@@ -34,7 +34,7 @@ class SensorSeries:
     t_s: Array
     """Instants since the start of the session, s, shape (n,)."""
     orientation: Array
-    """q_world_sensor, shape (n, 4); NaN where unknown."""
+    """Sensor orientations q_world_sensor, shape (n, 4); NaN where unknown."""
     angular_velocity: Array | None = None
     """Angular rate in sensor axes, rad/s, shape (n, 3)."""
     acceleration: Array | None = None
@@ -76,7 +76,7 @@ class SegmentSeries:
     t_s: Array
     """Instants since the start of the session, s, shape (n,)."""
     orientation: Array
-    """q_world_segment, shape (n, 4); NaN where unknown."""
+    """Segment orientations q_world_segment, shape (n, 4); NaN where unknown."""
     sd_rad: Array | None = None
     """Standard deviation per axis, rad, shape (n,); NaN where unknown."""
 
@@ -122,17 +122,17 @@ class JointSeries:
 
 @dataclass(frozen=True, slots=True)
 class TimelineEvent:
-    """Something that happened at an instant: a mark, a phase, a fault, a gap."""
+    """Event at an instant: a mark, a phase, a fault or a gap."""
 
     t_s: float
     """Instant since the start of the session, s."""
     kind: str
     """Kind in one word: ``mark``, ``phase``, ``device`` ..."""
     id: str = ""
-    """Sensor, segment or phase concerned; empty: the whole session."""
+    """Sensor, segment or phase to which the event belongs; empty for the whole session."""
     text: str = ""
     data: Mapping[str, object] = field(default_factory=dict)
-    """Further values; JSON types."""
+    """Further values of the event, of JSON types."""
 
 
 def _check_times(owner: str, t_s: Array) -> None:

@@ -31,7 +31,7 @@ class SessionData:
 
     name: str
     start_unix_ns: int | None = None
-    """UNIX time of ``t_s`` = 0, ns; None: unknown, as in most files of motion capture."""
+    """UNIX time of ``t_s`` = 0, ns; None if unknown, as in most motion-capture files."""
     sensors: tuple[SensorSeries, ...] = ()
     markers: MarkerSeries | None = None
     segments: tuple[SegmentSeries, ...] = ()
@@ -39,13 +39,13 @@ class SessionData:
     joints: tuple[JointSeries, ...] = ()
     """Joints from the sensors."""
     optical_segments: tuple[SegmentSeries, ...] = ()
-    """Orientations of segments from the markers: the reference."""
+    """Orientations of segments from the markers, which are the reference."""
     optical_joints: tuple[JointSeries, ...] = ()
-    """Joints from the markers: the reference."""
+    """Joints from the markers, which are the reference."""
     events: tuple[TimelineEvent, ...] = ()
     """Events in the order of their instants."""
     description: Mapping[str, str] = field(default_factory=dict)
-    """Where the data come from: rig, software, calibration, file."""
+    """Origin of the data: rig, software, calibration and file."""
 
     def __post_init__(self) -> None:
         check_unique("sensors", tuple(sensor.id for sensor in self.sensors))
