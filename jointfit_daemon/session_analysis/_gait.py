@@ -1,12 +1,13 @@
 r"""Gait cycles of a leg from the orientation of its shank.
 
 Mid-swing is the peak of the sagittal angular velocity of the shank (Aminian et al. 2002; Salarian
-et al. 2004). Initial contact is the end of the forward rotation that follows: the shank reaches its
-largest forward inclination when the foot is farthest in front of the body, the instant that Zeni et
-al. (2008) take from markers. A cycle extends from one initial contact to the next.
+et al. 2004). Initial contact is the end of the forward rotation after mid-swing. At this instant
+the shank reaches its largest forward inclination and the foot is farthest in front of the body.
+Zeni et al. (2008) detect the same instant from markers. A cycle extends from one initial contact to
+the next.
 
 Invariant: cycles do not overlap, contain no gap of the series, and belong to a run of at least
-`LEAST_CYCLES`; movement that is not walking yields no cycle, and the reason.
+`LEAST_CYCLES`; movement that is not walking yields no cycle, but a reason.
 """
 
 from __future__ import annotations
@@ -32,17 +33,18 @@ if TYPE_CHECKING:
     from jointfit_daemon.session_data import SegmentSeries
 
 LEAST_CYCLES = 3
-"""Fewest successive cycles that count as walking."""
+"""Smallest number of successive cycles that count as walking."""
 SWING_RATE = np.radians(100.0)
-"""Least angular velocity of the shank at mid-swing, rad/s; walking reaches 200 to 450 deg/s."""
+"""Smallest angular velocity of the shank at mid-swing, rad/s; walking reaches 200 to 450 deg/s."""
 SHORTEST_S, LONGEST_S = 0.6, 2.5
 """Limits of the duration of a cycle, s."""
 SWING_SHARE = (0.15, 0.44)
-"""Share of a cycle in which the shank rotates forward: about 0.3 in walking, 0.5 in a pendulum."""
+"""Limits of the share of a cycle in which the shank rotates forward. The share is about 0.3 in
+walking and 0.5 in a pendulum."""
 LEAST_RANGE = np.radians(30.0)
-"""Least range of the inclination of the shank within a cycle, rad."""
+"""Smallest range of the inclination of the shank within a cycle, rad."""
 SAME_PACE = 0.3
-"""Largest deviation of a cycle from the duration of the one before it, share."""
+"""Largest relative difference between the durations of two successive cycles."""
 CUTOFF_HZ = 6.0
 """Cut-off of the low-pass filter of the angular velocity, Hz (Winter 2009)."""
 _GRID_HZ = 100.0
@@ -51,14 +53,14 @@ _GRID_HZ = 100.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GaitCycles:
-    """Gait cycles of one leg."""
+    """Gait cycles of one leg, or the reason why there are none."""
 
     segment: str
     """Shank whose orientation determined the cycles."""
     cycles_s: Array
     """Start and end of each cycle (initial contacts), s, shape (n, 2)."""
     refused: str | None
-    """Reason for which no cycle was found; None with cycles."""
+    """Reason why no cycle was found; None if there are cycles."""
 
     @property
     def durations_s(self) -> Array:
@@ -69,7 +71,7 @@ class GaitCycles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CycleCurves:
-    """A quantity over the gait cycle, one row a cycle."""
+    """A quantity over the gait cycle, with one row for each cycle."""
 
     percent: Array
     """Instants, percent of the cycle, shape (m,)."""
@@ -162,7 +164,7 @@ def _candidates(times: Array, rates: Array) -> Iterator[tuple[float, float]]:
 
 
 def _objection(times: Array, rates: Array, cycle: tuple[float, float]) -> str | None:
-    """Return why an interval is not a cycle of walking; None if it is one."""
+    """Return why an interval is not a cycle of walking; None for a walking cycle."""
     start, end = cycle
     if not SHORTEST_S <= end - start <= LONGEST_S:
         return (

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 QUANTILE_95 = 1.959963984540054
 """Half width of the 95 % interval of a normal distribution, standard deviations."""
 _LEAST_GAP_S = 0.05
-"""Shortest interval without samples that is a gap, s: a delay of some samples is no gap."""
+"""Shortest interval without samples that is a gap, s. A delay of some samples is no gap."""
 _LEAST_GAP_PERIODS = 3.0
 """Shortest interval without samples that is a gap, sample periods."""
 
@@ -33,9 +33,9 @@ class MotionRange:
     maximum: float
     median: float
     low: float
-    """Limit that 2.5 % of the values are below."""
+    """Limit below which 2.5 % of the values are."""
     high: float
-    """Limit that 2.5 % of the values are above."""
+    """Limit above which 2.5 % of the values are."""
     minimum_sd: float
     """Standard deviation at the minimum; NaN if unknown."""
     maximum_sd: float
@@ -45,7 +45,7 @@ class MotionRange:
 
     @property
     def extent(self) -> float:
-        """Maximum less minimum, rad."""
+        """Maximum minus minimum, rad."""
         return self.maximum - self.minimum
 
     @property
@@ -72,16 +72,16 @@ def motion_range(joint: JointSeries, angle: str) -> MotionRange | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AngleDifference:
-    """An angle from the sensors less the same angle from the cameras (Bland and Altman 1986)."""
+    """Difference between an angle from the sensors and from the cameras (Bland and Altman 1986)."""
 
     joint: str
     angle: str
     t_s: Array
-    """Instants of the cameras at which both are known, s, shape (n,)."""
+    """Instants of the cameras at which both angles are known, s, shape (n,)."""
     difference: Array
-    """Sensors less cameras within half a turn, rad, shape (n,)."""
+    """Sensor angle minus camera angle, wrapped to half a turn, rad, shape (n,)."""
     mean: Array
-    """Mean of both, rad, shape (n,)."""
+    """Mean of sensor angle and camera angle, rad, shape (n,)."""
     bias: float
     """Mean of `difference`, rad."""
     sd: float
@@ -91,7 +91,8 @@ class AngleDifference:
     worst: float
     """Largest absolute difference, rad."""
     coverage: float
-    """Share of `difference` within the 95 % interval that the sensors state; NaN without one."""
+    """Share of `difference` within the 95 % interval of the sensors' standard deviation; NaN
+    without a standard deviation."""
 
     @property
     def limits(self) -> tuple[float, float]:
@@ -102,7 +103,7 @@ class AngleDifference:
 def angle_difference(
     sensors: JointSeries, cameras: JointSeries, angle: str
 ) -> AngleDifference | None:
-    """Compare an angle at the instants of the cameras; None if both are known at no instant."""
+    """Compare an angle at the instants of the cameras; None without common instants."""
     own = interpolate_values(sensors.t_s, sensors.angles[angle], cameras.t_s)
     reference = cameras.angles[angle]
     difference = np.mod(own - reference + np.pi, 2.0 * np.pi) - np.pi
@@ -138,7 +139,7 @@ class SeriesQuality:
 
     count: int
     rate_hz: float
-    """One over the median interval, Hz; NaN for less than two rows."""
+    """Rate: one over the median interval, Hz; NaN for less than two rows."""
     lost_share: float
     """Share of the expected samples between the first and the last row that is missing."""
     gaps_s: Array
@@ -152,7 +153,7 @@ def series_quality(t_s: Array, known: NDArray[np.bool_] | None = None) -> Series
     ----------
     t_s : ndarray, shape (n,)
     known : ndarray, shape (n,), optional
-        Rows to count; default: all.
+        Mask of the rows to count; by default all rows.
     """
     rate_hz = sample_rate_hz(t_s)
     kept = t_s if known is None else t_s[known]
