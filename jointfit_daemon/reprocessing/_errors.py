@@ -1,5 +1,5 @@
-"""The error of a recording that cannot be processed as requested."""
+"""Error for recordings that cannot be processed as requested."""
 
 
 class ReprocessingError(ValueError):
-    """A recording does not fit the rig, the calibration or the request; names cause and remedy."""
+    """A recording does not fit rig, calibration or request; the message gives the remedy."""

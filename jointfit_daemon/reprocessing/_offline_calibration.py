@@ -1,4 +1,4 @@
-"""Calibration from a recording: its requests start the same phases, and fits are computed again."""
+"""Calibration from a recording: recorded requests start the same phases with new fits."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class OfflineCalibration:
     rig: Rig
     """The rig in force at the end."""
     calibration: Calibration | None
-    """The last new calibration, with the date of its result; None if no phase gave one."""
+    """Last new calibration, with the date of its result; None if no phase gave a calibration."""
     rejected: str | None
-    """Reason why the last result was rejected; None if it was not."""
+    """Reason why the last result was rejected; None if it was accepted."""
     quality: Mapping[str, object]
     """Quality of the last result."""
 
@@ -54,11 +54,11 @@ def calibrate_recording(
     Parameters
     ----------
     path
-        The recording; of a session in several parts, any of them.
+        The recording; for a session in several parts, any part.
     rig
         Rig instead of the recorded one, for example with other markers or another method.
     report
-        Called with the time since the beginning, s, and every status of the calibration.
+        Function called with the time since the beginning, s, and every status of the calibration.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def calibrate_recording(
 
 @dataclass(slots=True)
 class _CalibrationRun:
-    """Collects the results of the phases."""
+    """Collects the results of the calibration phases."""
 
     report: Callable[[float, CalibrationStatus], None]
     rig: Rig | None = None
@@ -105,7 +105,7 @@ class _CalibrationRun:
     offset_ns: int | None = None
 
     def add_event(self, event: Event) -> None:
-        """Note an event before its outputs."""
+        """Process an event before its outputs."""
         self.now_ns = event.chunk.t_ns if isinstance(event, ChunkArrived) else event.t_ns
         if isinstance(event, Configured):
             self.begin_ns = event.t_ns if self.rig is None else self.begin_ns
@@ -116,7 +116,7 @@ class _CalibrationRun:
             self.requests += 1
 
     def add_result(self, ready: CalibrationReady) -> None:
-        """Note a new calibration, with the date of the session, as the daemon stores it."""
+        """Store a new calibration with the date of the session, as the daemon would."""
         self.calibration, self.rejected = ready.calibration, None
         if not ready.keep_date and self.offset_ns is not None:
             unix_s = (self.now_ns + self.offset_ns) / _NS_PER_S
@@ -125,7 +125,7 @@ class _CalibrationRun:
             self.calibration = replace(ready.calibration, created_utc=text)
 
     def add_status(self, status: CalibrationStatus) -> None:
-        """Report a status, and note the quality of a result."""
+        """Report a status, and store the quality of a result."""
         self.report((status.t_ns - self.begin_ns) / _NS_PER_S, status)
         if status.kept is not None:
             self.rejected, self.quality = status.kept, status.refused

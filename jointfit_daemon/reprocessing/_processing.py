@@ -1,8 +1,8 @@
-"""Recorded events in a new core: as recorded, or with another rig, calibration or new fits.
+"""Processing of recorded events in a new core, optionally with changed rig, calibration or fits.
 
-Invariant: without a change the core gets exactly the recorded events, so its outputs are those of
-the daemon, byte for byte. With a change, results that depend on it are computed again: no fit, no
-progress and no stored version of the recording reaches the core.
+Invariant: without a change the core receives exactly the recorded events, so its outputs equal the
+outputs of the daemon, byte for byte. With a change, dependent results are computed again. Then no
+recorded fit, progress message or stored version reaches the core.
 """
 
 from __future__ import annotations
@@ -47,11 +47,12 @@ class Changes:
     """Differences from the recorded run; by default none."""
 
     rig: Rig | None = None
-    """Rig instead of the recorded ones; None: as recorded."""
+    """Rig that replaces the recorded rigs; None to use the recorded rigs."""
     calibration: Calibration | None = None
-    """Calibration in force from the first to the last event; None: as in the recorded run."""
+    """Calibration in force from the first to the last event; None to use the recorded
+    calibrations."""
     compute_fits: bool = False
-    """Whether fits are computed again although nothing else differs."""
+    """Whether fits are computed again even without another difference."""
 
     @property
     def any(self) -> bool:
@@ -71,7 +72,7 @@ def process_events(
     changes
         Differences from the recorded run.
     core
-        A new core; None: one without observer.
+        A new core; None creates a core without observer.
 
     Raises
     ------
@@ -101,8 +102,9 @@ def process_events(
 class _ChangedRun:
     """A core with substituted configurations and fits that are computed here.
 
-    With another rig a result is delivered at the instant of its request. With the recorded rig it
-    is delivered at the recorded instant, so that all other inputs keep their order.
+    With another rig, the result of a fit is delivered at the instant of its request. With the
+    recorded rig, the result is delivered at the recorded instant, so that all other inputs keep
+    their order.
     """
 
     def __init__(self, core: Core, changes: Changes) -> None:
@@ -114,7 +116,7 @@ class _ChangedRun:
         self._now_ns = 0
 
     def feed(self, event: Event) -> Iterator[tuple[Event, list[Output]]]:
-        """Process one recorded event, or what replaces it."""
+        """Process one recorded event, or the event that replaces it."""
         if isinstance(event, _OF_A_SOURCE):
             if self._sources is not None and event.source in self._sources:
                 yield from self._pass_on(event)
@@ -126,7 +128,8 @@ class _ChangedRun:
             if isinstance(event, JobFinished) and waiting is not None and waiting.job == event.job:
                 yield from self._finish_job(waiting, event.t_ns)
         else:
-            # A given calibration stays: requests of another one, or of a fit, are left out.
+            # A given calibration remains in force, so requests for another calibration or for a fit
+            # are left out.
             requested = isinstance(event, Request) and event.command != "mark"
             other = requested or isinstance(event, CalibrationSelected)
             if self._changes.calibration is None or not other:
@@ -138,7 +141,7 @@ class _ChangedRun:
             yield from self._finish_job(self._waiting, self._now_ns)
 
     def _configuration(self, event: Configured) -> Configured | None:
-        """Return the configuration to use instead of a recorded one; None: the last one stays."""
+        """Return the configuration to use instead of a recorded one; None keeps the last."""
         changes, first = self._changes, self._sources is None
         rig = event.rig if changes.rig is None else changes.rig
         if not first and changes.rig is not None:
@@ -174,7 +177,7 @@ class _ChangedRun:
                 if self._changes.rig is not None:
                     yield from self._finish_job(output, self._now_ns)
                 else:
-                    self._waiting = output  # the only worker drops the job before
+                    self._waiting = output  # the only worker drops the previous job
 
     def _finish_job(self, job: FitJob, t_ns: int) -> Iterator[tuple[Event, list[Output]]]:
         self._waiting = None
@@ -182,7 +185,7 @@ class _ChangedRun:
 
 
 def compute_fit(job: FitJob) -> FitResult:
-    """Run a fit in this process; the result passes through JSON as that of the worker does."""
+    """Run a fit in this process; the result passes through JSON like a worker's result."""
     from jointfit_daemon.calibration.phases import run_job  # noqa: PLC0415 - loads scipy
 
     text = orjson.dumps(run_job(job.work).to_dict(), option=orjson.OPT_SERIALIZE_NUMPY)
@@ -195,7 +198,7 @@ def check_sources(recorded: Rig, wanted: Rig) -> None:
     Raises
     ------
     ReprocessingError
-        A source is missing, or its recorded bytes are those of another driver.
+        A source is missing, or its bytes were recorded with another driver.
     """
     drivers = {source.id: source.driver for source in recorded.sources}
     known = ", ".join(f"{name} ({driver})" for name, driver in drivers.items())
@@ -218,7 +221,7 @@ def check_calibration(calibration: Calibration, rig: Rig) -> None:
     Raises
     ------
     ReprocessingError
-        It belongs to others.
+        The calibration belongs to another limb or to other sensors.
     """
     if not calibration.fits(rig.chain):
         sensors = ", ".join(calibration.sensor)

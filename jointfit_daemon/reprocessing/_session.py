@@ -1,4 +1,4 @@
-"""A recording as arrays: with the recorded configuration, or processed again with another."""
+"""Conversion of a recording to arrays, with the recorded or another configuration."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def load_session(
     Parameters
     ----------
     path
-        The recording; of a session in several parts, any of them.
+        The recording; for a session in several parts, any part.
     rig
-        Rig instead of the recorded one; its fits are computed again.
+        Rig that replaces the recorded rig; fits are computed again.
     calibration
-        Calibration in force from the beginning, instead of those of the recorded run.
+        Calibration in force from the beginning, which replaces the recorded calibrations.
 
     Raises
     ------
@@ -53,7 +53,7 @@ def load_session(
     ValueError
         The file is not a recording.
     OSError
-        It cannot be read.
+        The file cannot be read.
     """
     collector = SessionCollector()
     core = Core(collector.add_measurement)
@@ -96,7 +96,7 @@ def load_session(
 
 
 def _note_gaps(recording: Recording, collector: SessionCollector) -> Iterator[Event]:
-    """Yield the events of a recording; pass its gaps to the time line."""
+    """Yield the events of a recording; pass its gaps to the collector."""
     for item in recording.messages():
         if isinstance(item, RecordingGap):
             collector.add_gap(item)

@@ -1,8 +1,8 @@
 """Arrays of a session from the measurements and outputs of the core.
 
-All series share one time axis, that of the cameras: the lag of each sensor, as of the calibration
-in force at the end, is subtracted from its stamps. Rows whose instant is not after the row before
-are left out, because a clock that settles or restarts may step back.
+All series share the time axis of the cameras. The lag of each sensor, from the calibration in force
+at the end, is subtracted from its stamps. Rows whose instant is not after the previous row are left
+out, because a clock that settles or restarts may step back.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ _UNKNOWN_VECTOR = (nan,) * 3
 
 
 class _Rows:
-    """Rows of numbers with increasing instants, in eight bytes each: sessions last for hours."""
+    """Rows of numbers with increasing instants.
+
+    A number takes only eight bytes, because sessions last for hours.
+    """
 
     __slots__ = ("_t_ns", "_values", "_width")
 
@@ -66,13 +69,13 @@ class _Rows:
         return table
 
     def known_columns(self, first: int, count: int) -> Array | None:
-        """Return `count` columns; None if all of their values are unknown."""
+        """Return `count` columns; None if all values are unknown."""
         table = self.columns(first, count)
         return None if np.isnan(table).all() else table
 
 
 class SessionCollector:
-    """Collects one session; feed it with everything that the core gets and returns."""
+    """Collects one session from the events, measurements and outputs of a core."""
 
     def __init__(self) -> None:
         self._begin_ns: int | None = None

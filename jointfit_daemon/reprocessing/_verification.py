@@ -1,8 +1,8 @@
 """Comparison of a replay with the recorded outputs, byte for byte.
 
 A recording that did not begin with the daemon starts with the configuration, but without the state
-of clocks and filters. Its orientations are compared with a tolerance after a warm-up instead, and
-the result states so.
+of clocks and filters. Orientations of such a recording are compared with a tolerance after a
+warm-up instead, and the result contains this fact.
 """
 
 from __future__ import annotations
@@ -37,12 +37,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output
 
 WARM_UP_S = 20.0
-"""Time after which clocks and filters of a core that started later agree with those of the daemon,
-s."""
+"""Time after which clocks and filters of a core that started later agree with the clocks and
+filters of the daemon, s."""
 TOLERANCE_RAD = np.radians(1.0)
 """Largest difference of an orientation after the warm-up, rad."""
 TOLERATED_SHARE = 0.99
-"""Share of the orientations that must be within the tolerance: a lost frame may differ more."""
+"""Share of the orientations that must be within the tolerance. Orientations near a lost frame may
+differ more."""
 _OUTPUT = "output/"
 _NS_PER_S = 1e9
 
@@ -54,9 +55,9 @@ class Difference:
     t_s: float
     """Time since the beginning of the recording, s."""
     channel: str
-    """Kind of output, as ``output/state``."""
+    """Kind of output, such as ``output/state``."""
     key: str
-    """First key with another value, as ``joints[1].angles[0]``; empty: the whole output."""
+    """First key with another value, such as ``joints[1].angles[0]``; empty for the whole output."""
     recorded: str
     """Recorded value as JSON; ``none`` if the recording has no such output."""
     replayed: str
@@ -73,12 +74,12 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class TolerantComparison:
-    """Orientations of a replay that cannot be exact, against the recorded ones."""
+    """Comparison of orientations for a replay that cannot be exact."""
 
     compared: int
     """Number of orientations after the warm-up."""
     within: int
-    """Number of those within the tolerance."""
+    """Number of orientations within the tolerance."""
     median_rad: float
     largest_rad: float
 
@@ -108,7 +109,7 @@ class Verification:
 
     @property
     def passed(self) -> bool:
-        """Whether something could be compared, and all of it agrees."""
+        """Whether outputs could be compared, and all compared outputs agree."""
         if self.tolerant is not None:
             return self.tolerant.agrees
         return self.difference is None and sum(self.compared.values()) > 0
@@ -163,7 +164,7 @@ def verify_recording(path: Path) -> Verification:
     Parameters
     ----------
     path
-        The recording; of a session in several parts, any of them.
+        The recording; for a session in several parts, any part.
 
     Raises
     ------
@@ -182,7 +183,7 @@ def verify_recording(path: Path) -> Verification:
 
 @dataclass(slots=True)
 class _ByteComparison:
-    """Outputs that the replay expects, in order."""
+    """Outputs of the replay that are not compared yet, in order."""
 
     begin_ns: int | None = None
     now_ns: int = 0
@@ -190,7 +191,7 @@ class _ByteComparison:
     compared: dict[str, int] = field(default_factory=dict)
 
     def feed(self, core: Core, event: Event) -> Difference | None:
-        """Process an event; return a difference if outputs of the event before are left."""
+        """Process an event; return a difference if earlier outputs are left."""
         if self.expected:
             channel, data = self.expected[0]
             return Difference(self.seconds, channel, "", "none", data.decode("utf-8", "replace"))
@@ -278,7 +279,7 @@ def _first_difference(recorded: Any, replayed: Any, key: str) -> tuple[str, str,
 
 
 class _Orientations:
-    """Orientations of segments with their instants."""
+    """Collects orientations of segments with their instants."""
 
     def __init__(self) -> None:
         self._rows: dict[str, tuple[list[int], list[Quaternion]]] = {}
@@ -307,7 +308,7 @@ class _Orientations:
 
 
 def _verify_orientations(recording: Recording) -> Verification:
-    """Compare orientations after the warm-up; a gap restarts it."""
+    """Compare orientations after the warm-up; a gap restarts the warm-up."""
     core, begin_ns, now_ns, quiet_ns = Core(), None, 0, 0
     gaps: list[str] = []
     recorded, replayed = _Orientations(), _Orientations()
