@@ -47,8 +47,7 @@ WINDOW = 16
 """Number of messages that may be sent before the first message is acknowledged. Brokers usually
 allow 20 or more; a broker may announce a smaller number (MQTT 5.0, 3.2.2.3.3)."""
 SUBSCRIBED_S = 30.0
-"""Time limit of a subscription, s: a broker may send thousands of stored messages before it
-confirms."""
+"""Time limit of a subscription, s: a broker may first send thousands of stored messages."""
 GOODBYE_S = 1.0
 """Time limit of an orderly disconnect, s."""
 _Properties: Any = Properties  # the constructor is not annotated, its attributes are dynamic
@@ -388,8 +387,7 @@ class _Client(aiomqtt.Client):
         super().__init__(*arguments, **options)
         self._encoder = PublishEncoder()
         self._unacknowledged: dict[int, tuple[float, Callable[[str | None], None]]] = {}
-        """Time limit, s, and callback of each unacknowledged message, by message id, the oldest
-        first."""
+        """Time limit, s, and callback of unacknowledged messages, by message id, oldest first."""
         self._acknowledged = asyncio.Event()
         self._limit_timer: asyncio.TimerHandle | None = None
         self._window = WINDOW

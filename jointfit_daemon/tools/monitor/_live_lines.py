@@ -29,7 +29,7 @@ _OPTICAL_S = 0.6
 _WIDE = 72
 """Smallest width at which the limb is to the left of the curve, cells."""
 _LEAST_CURVE, _MOST_CURVE = 3, 24
-"""Number of rows of the curve."""
+"""Smallest and largest number of rows of the curve."""
 _WITH_SD = ("flexion_deg", "elevation_deg", "inner_deg")
 """Names of the angles to which `sd_deg` of a joint can belong."""
 
