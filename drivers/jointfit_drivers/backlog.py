@@ -1,4 +1,4 @@
-"""Delay of the messages of one device, relative to its fastest ones.
+"""Delay of the messages of one device, relative to its fastest messages.
 
 After a silence, buffered messages arrive together: all of them are late, the last one by the least.
 Device time and arrival time then advance differently although the device continued. With e the

@@ -22,7 +22,7 @@ class BusEvents:
 
     def __init__(self) -> None:
         self.discarded_bytes = 0
-        """Bytes of rejected records, and of lost lines of an adapter."""
+        """Number of bytes in rejected records and in lost lines of an adapter."""
         self._text = ""
         self._reported_ns = 0
 

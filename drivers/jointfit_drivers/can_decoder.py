@@ -54,12 +54,12 @@ class CanDecoder(ABC):
 
     @property
     def messages(self) -> int:
-        """Well-formed frames of this device so far."""
+        """Number of well-formed frames of this device so far."""
         return self._frames - self.samples.refused
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes of rejected records, and of lost lines of an adapter."""
+        """Number of bytes in rejected records and in lost lines of an adapter."""
         return self._bus.discarded_bytes + self.samples.refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:

@@ -76,7 +76,7 @@ class CanReception:
         needed : CanKey
             Identifier in `ids` of the frames with measurements.
         resembles : callable
-            Whether the data of a frame look like those of `needed`, for a hint in the error
+            Whether the data of a frame resemble the data of `needed`, for a hint in the error
             message.
         """
         settings = self._settings

@@ -1,7 +1,7 @@
 """Detection of a device that is newer than the descriptions that its codec follows.
 
-Two signs show it: the version that the device reports, and well-formed contents of unknown kind or
-length. Both are warnings: what a codec decodes remains in use.
+Two signs indicate newer firmware: the version that the device reports, and well-formed contents of
+unknown kind or length. Both signs cause warnings only: contents that a codec decodes remain in use.
 
 Invariant: the output depends only on the calls; no clock and no port is read.
 """
@@ -97,7 +97,7 @@ class NewerFirmwareDetector:
         Parameters
         ----------
         content
-            Its name with number or size, such as ``message 0x77``.
+            Name of the content with number or size, such as ``message 0x77``.
         t_ns
             Its arrival, monotonic ns.
         """

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 _QUIET_S = 0.1
 """Pause, s, after which the rest of a message with a corrupt length is no longer expected."""
 _KEPT = 8192
-"""Bytes stored before the first reply: more than one message and the data behind it."""
+"""Number of bytes stored before the first reply: more than one message and the following data."""
 _LOGGED = 20
 """Chunks that are logged at the debug level, so that a new device can be judged from a log."""
 
@@ -34,11 +34,11 @@ class WireMessage(Protocol):
 
     @property
     def size(self) -> int:
-        """Bytes on the wire."""
+        """Length on the wire, bytes."""
 
     @property
     def end(self) -> int:
-        """Bytes fed to the codec up to and including its last one."""
+        """Number of bytes fed to the codec up to and including the last byte of the message."""
 
 
 Message = TypeVar("Message", bound=WireMessage)
@@ -52,7 +52,7 @@ class StreamCodec(Protocol[Found_co]):
 
     @property
     def pending(self) -> int:
-        """Bytes of an incomplete message."""
+        """Number of bytes of the incomplete message in the buffer."""
 
     def feed(self, data: bytes) -> Sequence[Found_co | CorruptBytes]:
         """Return the messages that `data` completed."""
@@ -84,7 +84,7 @@ class SerialConversation(Generic[Message]):
         self._t_ns = 0  # arrival of the last chunk
         self._logged = 0
         self.received = 0
-        """Bytes received so far."""
+        """Number of bytes received so far."""
         self.understood = 0
         """Messages received so far."""
 

@@ -30,7 +30,7 @@ class CountingCodec(StreamCodec[Found_co], Protocol[Found_co]):
 
     @property
     def discarded(self) -> int:
-        """Bytes without a message so far."""
+        """Number of bytes so far that belong to no message."""
 
 
 class SerialMessageDecoder(ABC, Generic[Message]):
@@ -72,12 +72,12 @@ class SerialMessageDecoder(ABC, Generic[Message]):
 
     @property
     def messages(self) -> int:
-        """Well-formed messages so far."""
+        """Number of well-formed messages so far."""
         return self._codec.messages - self._refusals.refused
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes so far that belong to no message, or to a message that was rejected."""
+        """Number of bytes so far that belong to no message or to a rejected message."""
         return self._codec.discarded + self._refusals.refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:

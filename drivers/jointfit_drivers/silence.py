@@ -105,7 +105,7 @@ async def explain_silence(
     DeviceLostError
         The device is silent, or streams and does not answer.
     DeviceMisconfiguredError
-        It answers at another speed, or is of another kind.
+        The device answers at another speed, or is of another kind.
     """
     received = conversation.received
     if conversation.understood:

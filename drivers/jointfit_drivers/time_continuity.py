@@ -12,8 +12,8 @@ the arrival times did, a backlog included.
 | the next one follows the held one             | both accepted; the clock restarted              |
 | the next one follows neither                  | the held one is dropped, the next one held      |
 
-A checksum passes some corrupt messages, so a single message never proves a restart. The period is
-that of the stream: three steps of about the same size determine it.
+A checksum passes some corrupt messages, so a single message never proves a restart. The period of
+the stream is determined by three steps of about the same size.
 
 Invariant: integers in, steps out; every input is accepted.
 """

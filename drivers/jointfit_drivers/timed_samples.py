@@ -41,7 +41,7 @@ class TimedReading(NamedTuple):
     """Content of one message: an orientation, raw measurements, or neither if it is not valid."""
 
     size: int
-    """Bytes on the wire."""
+    """Length on the wire, bytes."""
     arrival_ns: int
     ticks: int | None
     """Device time, ns; None without one."""

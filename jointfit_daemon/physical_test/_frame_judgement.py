@@ -11,9 +11,9 @@ about z in the world, and ``q_1* q_2`` +90 degrees about x in the sensor. Togeth
 all but the heading: an inverse quaternion exchanges world and sensor, in which the axes of
 rotations 1 and 3 are at a right angle instead of equal.
 
-Exchanged components and wrong signs are an orthogonal transformation of q. It always equals
-rotations of world and sensor, applied to q or to its inverse. Of several explanations the simplest
-is given.
+Exchanged components and wrong signs are an orthogonal transformation of q. This transformation
+always equals rotations of world and sensor, applied to q or to its inverse. Of several explanations
+the simplest is given.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One physical test: its steps, the rests that end them, and the settings that agree with it.
+"""One physical test: steps, rests that end the steps, and settings that agree with the test.
 
 The chunks are stored, so that other values of the keys `direction` and `world` are tried on the
 same movement.
@@ -79,11 +79,11 @@ class PhysicalTest:
         return STEPS[done].format(id=self.source.id) if done < len(STEPS) else None
 
     def begin(self) -> None:
-        """Accept rests from now on: those before the first instruction do not count."""
+        """Accept rests from now on: rests before the first instruction do not count."""
         self._finder = RestFinder()
 
     def add(self, chunk: Chunk) -> None:
-        """Add a chunk of the sensor; a rest in it ends the present step."""
+        """Add a chunk of the sensor; a rest within the chunk ends the present step."""
         if len(self.rests) == len(STEPS):
             return
         self._chunks.append(chunk)
@@ -98,14 +98,14 @@ class PhysicalTest:
                 self.rests.append(rest)
 
     def result(self) -> PhysicalTestResult:
-        """Judge the complete test; it decodes all chunks several times."""
+        """Evaluate the complete test; this method decodes all chunks several times."""
         return judge_recording(self.source, self._chunks, self.rests)
 
 
 def judge_recording(
     source: Source, chunks: Sequence[Chunk], rests: Sequence[tuple[int, int]]
 ) -> PhysicalTestResult:
-    """Judge a recorded test, and find the settings that agree with it.
+    """Evaluate a recorded test, and find the settings that agree with the test.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """From an open port to a BNO085 that sends the required reports, or to the error.
 
 In UART-RVC the device sends without being asked and ignores the host. In UART-SHTP it is silent
-after a reset; the settings of reports are read, and changed only where they differ. They are lost
-at the next reset: nothing is stored.
+after a reset; the settings of reports are read, and changed only where they differ. The settings
+are lost at the next reset: the driver stores nothing.
 
 Source: BNO08X data sheet 1000-3927, section 1.3.1: bytes to the device are separated by 100 us.
 """
@@ -129,7 +129,7 @@ async def ensure_shtp(port: SerialPort, emit: Emit, settings: Bno085Settings) ->
     DeviceLostError
         The device is silent, or stopped answering.
     DeviceMisconfiguredError
-        It is of another kind or in another mode, or does not accept the rate.
+        The device is of another kind or in another mode, or does not accept the rate.
     """
     held: list[Chunk] = []  # late stamps: the pauses of the handshake delay them
     conversation = ShtpConversation(port, held.append)

@@ -1,8 +1,8 @@
 r"""Decoder of the mode UART-RVC: Euler angles to samples with canonical orientation.
 
-According to the data sheet, yaw, pitch and roll are successive rotations about z, y and x. Its own
-example message contradicts this: pitch -1.10 and roll 20.85 degrees with accelerations of -371, -20
-and 977 mg. With pitch about x and roll about y (``zxy``),
+According to the data sheet, yaw, pitch and roll are successive rotations about z, y and x. The
+example message of the data sheet contradicts this: pitch -1.10 and roll 20.85 degrees with
+accelerations of -371, -20 and 977 mg. With pitch about x and roll about y (``zxy``),
 
 .. math:: R = R_z(\text{yaw})\, R_x(\text{pitch})\, R_y(\text{roll}), \qquad
     R^T e_z = (-0.356, -0.019, 0.934),
@@ -90,7 +90,7 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
         return out
 
     def _compare(self, frame: RvcFrame) -> list[Decoded]:
-        """Compare both orders with an acceleration at rest; warn if the other one fits."""
+        """Compare both orders with an acceleration at rest; warn if only the other order fits."""
         x, y, z = frame.acceleration
         strength = sqrt(x * x + y * y + z * z) / _G_COUNTS
         if abs(strength - 1.0) > _REST:

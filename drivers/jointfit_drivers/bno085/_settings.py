@@ -22,7 +22,7 @@ MAX_RATE_HZ = 400
 """Highest rate of rotation vectors, Hz."""
 _BITS = 10
 _PACKET_BYTES = 31
-"""Bytes of a packet with a base time and a rotation vector, with flags and some escapes."""
+"""Length of a packet with a base time and a rotation vector, with flags and some escapes, bytes."""
 _REPORTS = {
     "rotation_vector": HubReportId.ROTATION_VECTOR,
     "game_rotation_vector": HubReportId.GAME_ROTATION_VECTOR,

@@ -171,7 +171,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return step, [DeviceEvent("gap", f"{lost} messages lost", {"lost": lost})]
 
     def _reading(self, report: HubReport, raw: RawSamples) -> list[Decoded]:
-        """Take a raw reading; that of the gyroscope returns a sample."""
+        """Process a raw reading; a reading of the gyroscope returns a sample."""
         kind = report.report_id
         if kind == HubReportId.ACCELEROMETER:
             self._force, self._force_age = report, 0
@@ -201,7 +201,8 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
     def _time_of_reading(self, step: int, nominal_ns: float) -> int:
         """Return the time of a reading, ns: its number times the measured period.
 
-        Without a clock of the device, the period is that of the arrivals since the first reading.
+        Without a clock of the device, the period is computed from the arrivals since the first
+        reading.
         """
         if self._readings == 0:
             self._first_ns, self._readings = self._arrival_ns, 1

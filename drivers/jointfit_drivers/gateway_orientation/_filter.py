@@ -1,9 +1,9 @@
 r"""Orientation on the gateway, from the raw measurements of one IMU, by the VQF filter.
 
 A relative error of the sample time causes the same relative error of every rotation. The time
-between measurements is therefore the device's own (`RawReading.t_ns`). The filter works with
-steps of the first interval. If the mean interval differs from it (ticks too coarse for one
-interval), angular rates are scaled so that every step turns by the true angle:
+between measurements is therefore the device time (`RawReading.t_ns`). The filter works with steps
+of the first interval. If the mean interval differs from the first interval (ticks too coarse for
+one interval), angular rates are scaled so that every step rotates by the true angle:
 
 .. math:: \omega_\text{fed} = \omega\, \bar T / T_s
 
@@ -338,7 +338,8 @@ class GatewayOrientation:
         initial = [vqf.filterInitialState(float(value), *low_pass) for value in up]
         state["lastAccLp"], state["accLpState"] = up.tolist(), np.concatenate(initial).tolist()
 
-        # VQF's own frame retains its heading: its bias estimator contains means in it.
+        # The frame of VQF retains its heading, because the bias estimator contains means in this
+        # frame.
         w, _, _, z = _heading_between(tuple(state["accQuat"]), q)
         state["accQuat"] = list(multiply_one((w, 0.0, 0.0, -z), q))
         state["delta"] = remainder(2.0 * atan2(z, w), tau)

@@ -128,7 +128,7 @@ class RawSamples:
         stamp
             Arrival, device time and status of the message.
         reading
-            Its measurements, at a later time than those of the reading before it.
+            Measurements of the message, at a later time than the preceding reading.
         clipped
             Whether the device reported that a measurement is out of range.
         field_corrected
@@ -167,8 +167,8 @@ class RawSamples:
             )
             out.append(DeviceEvent("warning", text, {"missing": missing}))
 
-        # A device need not report saturation. It is therefore also detected by repetition: because
-        # of noise, a high rate repeats exactly only at the end of the gyroscope's range.
+        # A device need not report saturation. Saturation is therefore also detected by repetition:
+        # because of noise, a high rate repeats exactly only at the end of the gyroscope's range.
         before, self._rate = self._rate, reading.rate
         pairs = zip(self._rate, before, strict=True)
         clipped |= any(now == then and abs(now) > FAST for now, then in pairs)

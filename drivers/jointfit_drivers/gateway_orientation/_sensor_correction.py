@@ -1,6 +1,6 @@
 """Correction of raw readings by the stored calibration of the sensor.
 
-Invariant: a function of one reading; its cost is small beside that of the filter.
+Invariant: the correction depends on one reading only; the filter takes much longer.
 """
 
 from __future__ import annotations

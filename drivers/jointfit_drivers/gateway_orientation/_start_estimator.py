@@ -1,9 +1,10 @@
 r"""Orientation, gyroscope bias and field of an IMU whose orientation filter has just started.
 
 VQF takes the vertical from a mean over 3 s, and the heading from the field with that vertical. With
-a dip of 70 degrees, the heading has 2.7 times the error of the vertical, and an unknown bias turns
-both. VQF does not use the field to estimate the bias. This Kalman filter estimates all of them from
-gravity and field together, in steps of `STEP_S`. Its state is
+a dip of 70 degrees, the heading has 2.7 times the error of the vertical, and an unknown bias
+rotates heading and vertical. VQF does not use the field to estimate the bias. This Kalman filter
+estimates vertical, heading and bias from gravity and field together, in steps of `STEP_S`. The
+state of the filter is
 
 .. math:: (\varphi, b, v, B_n, B_u)
 
@@ -17,8 +18,9 @@ whose bias is assumed as :math:`\hat b`. With sums over the readings of a step, 
     v &\leftarrow v + \sum R f\,T - g\,\Delta t + \varphi \times \sum R f\,T
 
 Two observations follow. The velocity of a body part is limited, and the mean field of the step is
-:math:`\bar y = B + B \times \varphi`. Their deviations last for about a second. The variance of one
-step is therefore that of the deviation times `LASTING_S` over the length of the step.
+:math:`\bar y = B + B \times \varphi`. Deviations from both observations last for about a second.
+The variance of one step is therefore the variance of the deviation times `LASTING_S` over the
+length of the step.
 
 Invariant: a function of the readings added; no clock, no device and no other filter.
 
@@ -102,7 +104,7 @@ class StartEstimator:
     bias : ndarray, shape (3,)
         Expected bias, rad/s.
     bias_sd : float
-        Its standard deviation, rad/s.
+        Standard deviation of the bias, rad/s.
     """
 
     def __init__(

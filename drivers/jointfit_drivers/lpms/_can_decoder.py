@@ -70,12 +70,12 @@ class LpmsCanDecoder:
 
     @property
     def messages(self) -> int:
-        """Well-formed frames of this sensor so far."""
+        """Number of well-formed frames of this sensor so far."""
         return self._codec.messages - self._refused
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes of rejected records, and of lost lines of an adapter."""
+        """Number of bytes in rejected records and in lost lines of an adapter."""
         return self._bus.discarded_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:

@@ -42,8 +42,9 @@ class LpmsCanImu:
     def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterator[dict[str, Any]]:
         """Yield the settings of sensors that may have sent the received frames.
 
-        A candidate has a first frame of 8 bytes: of a node in CANopen style, or the first of four
-        consecutive ones. Both precisions are candidates. See `jointfit_daemon.device_search`.
+        A candidate has a first frame of 8 bytes. This frame belongs to a node in CANopen style, or
+        is the first of four consecutive frames. Both precisions are candidates. See
+        `jointfit_daemon.device_search`.
         """
         full = {number for (number, long), size in seen.items() if size == FRAME_BYTES and not long}
         for number in sorted(full):
@@ -88,7 +89,7 @@ class LpmsCanImu:
         last = frames_of(settings.mapping, precision)[-1]
 
         def resembles(data: bytes) -> bool:
-            """Whether `data` could be those of a quaternion, or of its half."""
+            """Whether `data` may contain a quaternion or half a quaternion."""
             values = decode_frame(data, precision)
             if values is None:
                 return False

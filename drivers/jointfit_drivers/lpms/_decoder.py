@@ -42,7 +42,7 @@ _SECONDS_CLOCK = TickClock(1_000, None)
 _MOST_SECONDS = 1e9
 _DATA = int(LpmsCommand.DATA)
 _TEXT_BYTES = 256
-"""Bytes without a message after which they are examined for text."""
+"""Number of bytes without a message after which these bytes are examined for text."""
 _HALF = TICK_MODULUS // 2
 
 

@@ -1,10 +1,12 @@
 """From an open port to a streaming LPMS sensor, or to the error that explains the failure.
 
-The settings of the sensor are read and compared. Only those that differ are set, and read again,
-because old firmware acknowledges nothing. They are stored in flash only with ``persist``.
+The settings of the sensor are read and compared. Only settings that differ are written, and then
+read again, because old firmware acknowledges nothing. The settings are stored in flash only with
+``persist``.
 
-Some commands have another meaning in the other generation. Before the first of them, the driver
-sends a query that has no effect in either generation, and whose reply differs between them.
+Some commands have another meaning in the other generation. Before the first such command, the
+driver sends a query that has no effect in either generation. The reply to this query differs
+between the generations.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Channels of a stream: which of them are coordinates of a marker, and which the pose of a body.
+"""Assignment of the channels of a stream to marker coordinates and body poses.
 
 The convention is the MoCap meta-data of XDF: each channel has a label, a marker or an object, a
 type (PositionX to Z, OrientationA to D with A the scalar, Confidence) and a unit. Where the type is
@@ -123,7 +123,7 @@ def stream_layout(description: StreamDescription, settings: LslMarkersSettings) 
 
 
 _Found = dict[tuple[str, str, bool], dict[str, int]]
-"""Channel of each part, by owner, name and whether the name is that of an object."""
+"""Channel of each part, by owner, name and whether the name belongs to an object."""
 
 
 def _named(description: StreamDescription, names: tuple[str, ...], warnings: list[str]) -> _Found:

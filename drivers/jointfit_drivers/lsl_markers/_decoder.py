@@ -85,12 +85,12 @@ class LslMarkersDecoder:
 
     @property
     def messages(self) -> int:
-        """Samples and other well-formed chunks so far."""
+        """Number of samples and other well-formed chunks so far."""
         return self._codec.messages
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes that belong to no chunk so far."""
+        """Number of bytes so far that belong to no chunk."""
         return self._codec.discarded
 
     def feed(self, chunk: Chunk) -> list[Decoded]:

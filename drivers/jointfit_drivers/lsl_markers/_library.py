@@ -14,7 +14,7 @@ from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_protocols.lsl import RoundTrip
 
 _READINGS = 5
-"""Comparisons of LSL's clock with that of the host; the one that took the shortest time is used."""
+"""Number of comparisons of the LSL clock with the host clock; the fastest comparison is used."""
 
 
 def load_library() -> Any:

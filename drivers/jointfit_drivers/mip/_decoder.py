@@ -1,8 +1,8 @@
 """Decoder of the MIP driver: chunks in, samples in SI units with canonical orientation out.
 
 A sample takes its time from a field of the same packet. An orientation without time is stamped with
-its arrival. It is rejected if earlier ones had a time. The two data sets with orientations have
-different delays: only one of them is decoded.
+its arrival. If earlier orientations had a time, an orientation without time is rejected. The two
+data sets with orientations have different delays, so only one data set is decoded.
 
 Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
 """

@@ -1,8 +1,9 @@
 """From an open port to a streaming MIP device, or to the error that explains the failure.
 
-Settings are read and compared, and written only where they differ. They are volatile: without
-``persist`` the device returns to its own at the next power-up. A fault that may clear by itself
-raises `DeviceLostError`, any other `DeviceMisconfiguredError`; the device then streams as before.
+Settings are read and compared, and written only where they differ. Written settings are volatile:
+without ``persist`` the device returns to its stored settings at the next power-up. A fault that may
+clear by itself raises `DeviceLostError`, any other `DeviceMisconfiguredError`; the device then
+streams as before.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Fields that a MIP device must send, by the source of its orientation.
 
-All of them, the time included, belong to one data set and need the same decimation: each field has
-its own, so that a packet may otherwise contain an orientation without time.
+All fields, including the time, belong to one data set and need the same decimation. Otherwise a
+packet may contain an orientation without time, because each field has a separate decimation.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class FrameContinuity:
         self._ticks = self._arrival_ns = 0
         self._late_run = 0
         self.duplicates = 0
-        """Frames dropped because their number was that of the last one."""
+        """Number of frames dropped because they had the number of the preceding frame."""
         self.late = 0
         """Frames dropped because a later one had arrived."""
 

@@ -20,7 +20,7 @@ async def gather_servers(named: Sequence[Search], searched: Sequence[Search]) ->
     Parameters
     ----------
     named : sequence of coroutines
-        Searches at named hosts. Their answers also contain the names of markers and bodies.
+        Searches at named hosts, whose answers also contain the names of markers and bodies.
     searched : sequence of coroutines
         Searches in networks, where a named host answers as well.
     """

@@ -1,7 +1,7 @@
 """Positions and orientations of a frame: world z up, unit quaternions, NaN for missing data.
 
-The **world** is rotated, p' = R p and q' = q_R q. The axes of a body remain those of the vendor. A
-position that is not finite or not plausible is absent. So is an orientation that is no rotation.
+The **world** is rotated, p' = R p and q' = q_R q. The axes of a body remain the axes of the vendor.
+Positions that are not finite or not plausible, and orientations that are no rotation, are absent.
 """
 
 from __future__ import annotations

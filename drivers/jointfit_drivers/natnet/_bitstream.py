@@ -1,7 +1,7 @@
 """Bitstream version of one NatNet server, changed only by a datagram that confirms the new one.
 
-An announced version is a candidate. It is adopted when a frame or a model cannot be decoded
-with the version in use and decodes exactly with the candidate. A forged announcement alone
+An announced version is a candidate. The candidate is adopted when a frame or a model cannot be
+decoded with the version in use and decodes exactly with the candidate. A forged announcement alone
 therefore changes nothing.
 
 Invariant: pure.

@@ -1,8 +1,8 @@
 """Decoder of the NatNet driver: datagrams in, optical frames and clock echoes out.
 
-A capture contains datagrams of both directions. Those of a client have no effect, except that the
-arrival of an echo request is the sending time of its answer. A frame that arrives before its model
-is counted in `unpublished` and dropped. Every number is checked against its range before use.
+A capture contains datagrams of both directions. Datagrams of a client have no effect, except that
+the arrival of an echo request is the sending time of the answer. A frame that arrives before its
+model is counted in `unpublished` and dropped. Every number is checked against its range before use.
 
 Invariant: the output depends only on the chunks fed; the decoder reads no clock and no socket.
 """
@@ -68,9 +68,9 @@ class NatNetDecoder:
         self._live = self._stamped = True
         self._named_unknown: set[int] = set()
         self.messages = 0
-        """Well-formed messages of any kind so far."""
+        """Number of well-formed messages of any kind so far."""
         self.discarded_bytes = 0
-        """Bytes of datagrams that contained no message."""
+        """Number of bytes in datagrams that contained no message."""
         self.unpublished = 0
         """Frames that arrived before the model or the server's version was known."""
         self.unknown_ids = 0
@@ -90,7 +90,7 @@ class NatNetDecoder:
 
     @property
     def duplicates(self) -> int:
-        """Frames dropped because their number was that of the last one."""
+        """Number of frames dropped because they had the number of the preceding frame."""
         return self._continuity.duplicates
 
     @property
@@ -124,7 +124,7 @@ class NatNetDecoder:
         return []
 
     def _take(self, chunk: Chunk, message: natnet.Message, out: list[Decoded]) -> None:
-        """Append the content of one message; those of other clients have none."""
+        """Append the content of one message; messages of other clients have no content."""
         match message:
             case natnet.FrameOfData():
                 self._frame(chunk, message, out)
@@ -256,7 +256,8 @@ class NatNetDecoder:
     def _exposure_ticks(self, frame: natnet.FrameOfData, out: list[Decoded]) -> int | None:
         """Return the exposure in ticks of the clock in use.
 
-        It is computed from the configured latency where the cameras do not stamp it.
+        The exposure is computed from the configured latency if the cameras do not stamp the
+        exposure.
         """
         hz = self._hz
         if self._time.precise:

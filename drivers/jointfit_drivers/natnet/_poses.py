@@ -52,8 +52,8 @@ class PoseConverter:
     Parameters
     ----------
     up_axis : {"x", "y", "z"}
-        The stream's up axis. The **world** is rotated, p' = R p and q' = q_R q; the axes of a
-        body are those of the vendor.
+        The stream's up axis. The **world** is rotated, p' = R p and q' = q_R q; the axes of a body
+        are the axes of the vendor.
     """
 
     def __init__(self, up_axis: str) -> None:

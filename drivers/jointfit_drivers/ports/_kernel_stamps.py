@@ -22,7 +22,7 @@ class KernelStamps(WallClock):
     Parameters
     ----------
     bitrate : int
-        Bit rate of the bus, bit/s. It gives the duration of a frame.
+        Bit rate of the bus, bit/s, which determines the duration of a frame.
     *clocks : callable
         The two clocks of `WallClock`; replaced in tests.
     """
@@ -38,7 +38,7 @@ class KernelStamps(WallClock):
         now. A stamp more than 2 s in the past, or more than 1 ms in the future, is replaced by
         the present time.
         """
-        # The present time, not that of the wake-up: otherwise frames that arrive while this process
-        # is delayed would be stamped too early.
+        # Use the present time, not the time of the wake-up: otherwise frames that arrive while this
+        # process is delayed would be stamped too early.
         end = self.monotonic(round(unix_s * _NS), self._monotonic_ns())
         return end - round(frame_bits(size, extended) * self._bit_ns)

@@ -33,7 +33,8 @@ _OLD_READS = 10
 _ANSWER_S = 0.3
 """Longest wait for an answer, s. Adapters answer within milliseconds, or not at all."""
 _NOT_SLCAN = 8
-"""Bytes outside SLCAN lines, without a single valid line, that identify another kind of device."""
+"""Number of bytes outside SLCAN lines, without a single valid line, that indicates another kind of
+device."""
 
 
 class SlcanBus:

@@ -181,7 +181,7 @@ class SharedBus:
         first_s : float, optional
             Longest wait for the first of these frames, s; default: `silence_s`.
         resembles : callable
-            Whether the data of a frame look like those of `needed`, for a hint in the error
+            Whether the data of a frame resemble the data of `needed`, for a hint in the error
             message.
         worked : bool
             Whether the device has sent measurements before: its settings are correct.

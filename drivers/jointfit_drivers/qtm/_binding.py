@@ -1,6 +1,6 @@
 """Binding of places in the components of frames to the names in rig.toml.
 
-Markers and bodies have no ids: their order is that of the settings XML. A body whose pose QTM
+Markers and bodies have no ids: their order is the order in the settings XML. A body whose pose QTM
 gives relative to another body, or to a fixed pose, is refused.
 
 Invariant: pure; a binding applies only to frames with the numbers of markers and bodies of its XML.

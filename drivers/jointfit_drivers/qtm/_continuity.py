@@ -32,12 +32,12 @@ class TimestampContinuity:
         self._stamp_us: int | None = None
         self._number = 0
         self.number = 0
-        """Number of the last accepted frame, which advances even if that of QTM does not."""
+        """Number of the last accepted frame, which advances even if the number of QTM does not."""
         self._late_run = 0
         self._steps: deque[int] = deque(maxlen=_STEPS)
         self._intervals_us: deque[int] = deque(maxlen=_STEPS)
         self.duplicates = 0
-        """Frames dropped because their stamp was that of the last one."""
+        """Number of frames dropped because they had the stamp of the preceding frame."""
         self.late = 0
         """Frames dropped because a later one had arrived."""
 

@@ -72,9 +72,9 @@ class QtmDecoder:
         self._live = True
         self._waiting = self._coded = False
         self.messages = 0
-        """Well-formed packets of any kind so far."""
+        """Number of well-formed packets of any kind so far."""
         self.discarded_bytes = 0
-        """Bytes of packets that contained no message."""
+        """Number of bytes in packets that contained no message."""
         self.unpublished = 0
         """Frames that arrived before the settings, or that did not fit them."""
         self.suspicious = 0
@@ -87,7 +87,7 @@ class QtmDecoder:
 
     @property
     def duplicates(self) -> int:
-        """Frames dropped because their stamp was that of the last one."""
+        """Number of frames dropped because they had the stamp of the preceding frame."""
         return self._continuity.duplicates
 
     @property

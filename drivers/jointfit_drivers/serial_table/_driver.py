@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _UNKNOWN_BYTES = 4096
-"""Bytes without a message after which the table does not fit."""
+"""Number of bytes without a message after which the table counts as wrong."""
 _UNKNOWN_S = 2.0
 """Time, s, of received bytes without a message after which the table does not fit."""
 _RAW_CHUNKS = 20

@@ -33,7 +33,7 @@ _PRINTABLE = 0.95
 _NAMED = 8
 """Types of frames listed in a message."""
 _SHOWN = 24
-"""Bytes shown in a message."""
+"""Number of bytes that an error message shows."""
 
 
 def explain_bytes(data: bytes, wire: FrameFormat | LineFormat) -> str:
@@ -123,7 +123,7 @@ def _explain_frames(data: bytes, wire: FrameFormat) -> str:
 def _length_finding(
     data: bytes, starts: Sequence[int], spacing: int, wire: FrameFormat
 ) -> str | None:
-    """Return the difference between the length of the table and that of the frames."""
+    """Return the difference between the length of the table and the length of the frames."""
     if isinstance(wire.length, int):
         if spacing == wire.length:
             return None

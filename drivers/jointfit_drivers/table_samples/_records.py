@@ -51,7 +51,7 @@ class TableRecord(NamedTuple):
     values: tuple[float | None, ...]
     """Numbers as sent, in the order of the slots; None if a frame is missing."""
     size: int
-    """Bytes of the record on the wire, or in the chunks of a CAN bus."""
+    """Length of the record on the wire, or in the chunks of a CAN bus, bytes."""
     data: tuple[bytes, ...]
     """Data of its frames."""
 

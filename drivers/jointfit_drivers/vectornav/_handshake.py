@@ -1,8 +1,9 @@
 """From an open port to a streaming VectorNav device, or to the error that explains the failure.
 
-Registers are read and compared, and written only where they differ. They are volatile: without
-``persist`` the device returns to its own at the next power-up. A fault that may clear by itself
-raises `DeviceLostError`, any other `DeviceMisconfiguredError`; the device then streams as before.
+Registers are read and compared, and written only where they differ. Written values are volatile:
+without ``persist`` the device returns to its stored values at the next power-up. A fault that may
+clear by itself raises `DeviceLostError`, any other `DeviceMisconfiguredError`; the device then
+streams as before.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ class RateCheck:
         self._intervals: list[int] = []
 
     def start(self, divisor: int) -> None:
-        """Begin a measurement; `divisor` is that of the output."""
+        """Begin a measurement; `divisor` is the rate divisor of the output."""
         self._divisor, self._last = divisor, None
         self._intervals.clear()
 

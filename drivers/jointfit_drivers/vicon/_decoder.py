@@ -67,9 +67,9 @@ class ViconDecoder:
         self._offered: frozenset[int] | None = None
         self._frames = self._arrival_ns = 0
         self.messages = 0
-        """Well-formed packets so far."""
+        """Number of well-formed packets so far."""
         self.discarded_bytes = 0
-        """Bytes of packets that could not be read."""
+        """Number of bytes in packets that could not be decoded."""
         self.unknown_ids = 0
         """Markers and segments dropped because no subject has them."""
         self.suspicious = 0
@@ -82,7 +82,7 @@ class ViconDecoder:
 
     @property
     def duplicates(self) -> int:
-        """Frames dropped because their number was that of the last one."""
+        """Number of frames dropped because they had the number of the preceding frame."""
         return self._continuity.duplicates
 
     @property

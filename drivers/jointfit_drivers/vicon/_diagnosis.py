@@ -1,6 +1,7 @@
 """Search for a DataStream server at named hosts, and diagnosis of "connected, but no data".
 
-The protocol has no discovery: hosts are asked by name or address. Both connect as the driver does.
+The protocol has no discovery: hosts are asked by name or address. Search and diagnosis connect as
+the driver does.
 """
 
 from __future__ import annotations

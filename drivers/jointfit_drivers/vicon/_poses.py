@@ -35,7 +35,7 @@ _MM = 1e-3
 _WIDEST = 2 * math.pi
 """Largest plausible component of a rotation vector, rad; NaN compares as larger."""
 _DEEPEST = 200
-"""Segments from a root to the last one; a longer chain is a loop."""
+"""Largest number of segments from a root to the last segment; a longer chain is a loop."""
 
 
 class ViconColumns(NamedTuple):

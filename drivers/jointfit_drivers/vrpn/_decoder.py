@@ -92,12 +92,12 @@ class VrpnDecoder:
 
     @property
     def messages(self) -> int:
-        """Well-formed messages of any kind so far."""
+        """Number of well-formed messages of any kind so far."""
         return self._codec.messages
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes that belong to no message so far."""
+        """Number of bytes so far that belong to no message."""
         return self._codec.discarded
 
     @property

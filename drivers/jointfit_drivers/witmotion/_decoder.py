@@ -100,12 +100,12 @@ class WitMotionDecoder:
 
     @property
     def messages(self) -> int:
-        """Well-formed frames so far."""
+        """Number of well-formed frames so far."""
         return self._codec.messages - self._refused
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes so far that belong to no frame, or to a frame that was rejected."""
+        """Number of bytes so far that belong to no frame or to a rejected frame."""
         return self._codec.discarded + self._refused * FRAME_BYTES
 
     def feed(self, chunk: Chunk) -> list[Decoded]:

@@ -1,7 +1,7 @@
 """Selection of one device on a line with several.
 
-Devices on one line differ in the bus id of their messages. Their orientations belong to different
-segments, so that only those of one device are used.
+Devices on one line differ in the bus id of their messages. The orientations of the devices belong
+to different segments, so that only the orientations of one device are used.
 
 Invariant: the result depends only on the bus ids fed.
 """

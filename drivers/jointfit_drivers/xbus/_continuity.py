@@ -185,7 +185,7 @@ class XbusContinuity:
         return XbusStep(restarted=not continued)
 
     def _delay_to(self, last: _OrientationPoint, point: _OrientationPoint) -> None:
-        """Update the delay with a point of the same clock as the one before it."""
+        """Update the delay with a point of the same clock as the preceding point."""
         ticks = self._ticks(last, point)
         if ticks is not None:
             self._delay.feed(ticks * TICK_NS, point.arrival_ns - last.arrival_ns)

@@ -58,7 +58,7 @@ class XbusConversation:
         self._recent = b""
         self._t_ns = 0
         self.received = 0
-        """Bytes received so far."""
+        """Number of bytes received so far."""
         self.reply_s = REPLY_S
         """Wait for a reply, s; longer for a device that acknowledged late."""
         self.understood = 0

@@ -134,12 +134,12 @@ class XbusDecoder:
 
     @property
     def messages(self) -> int:
-        """Well-formed messages so far."""
+        """Number of well-formed messages so far."""
         return self._xbus.messages - self._refused
 
     @property
     def discarded_bytes(self) -> int:
-        """Bytes so far that belong to no message, or to a message that was rejected."""
+        """Number of bytes so far that belong to no message or to a rejected message."""
         return self._xbus.discarded + self._refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:

@@ -1,8 +1,8 @@
 """From an open port to a measuring Xbus device, or to the error that explains the failure.
 
-The stored configuration of the device is read and compared. It is changed only where it differs
-in a relevant way and ``persist`` allows it, because an Xbus device stores every setting in
-flash at once. A fault that may clear by itself raises `DeviceLostError`, any other
+The stored configuration of the device is read and compared. A setting is changed only where it
+differs in a relevant way and ``persist`` allows the change, because an Xbus device stores every
+setting in flash at once. A fault that may clear by itself raises `DeviceLostError`, any other
 `DeviceMisconfiguredError`.
 """
 

@@ -1,8 +1,9 @@
 """Outputs that an Xbus device must send, by the source of its orientation.
 
-A `RequiredOutput` lists alternative data items; the device must send one of them. If it sends none,
-the driver requests the first. Increments (DeltaQ, DeltaV) are thus accepted in place of rate of
-turn and acceleration if the device is already configured for them.
+A `RequiredOutput` lists alternative data items; the device must send one of these items. If the
+device sends no item of the list, the driver requests the first item. Increments (DeltaQ, DeltaV)
+are thus accepted in place of rate of turn and acceleration if the device is already configured for
+them.
 """
 
 from __future__ import annotations

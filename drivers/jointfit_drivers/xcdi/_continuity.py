@@ -17,7 +17,7 @@ their widths, and P the measured step of SampleTime per group:
 
 The line of an adapter has no checksum, so a single group is not sufficient evidence of a restart. A
 sensor that is reset contradicts the previous groups once. Two sensors contradict each other
-continuously. Their groups cannot be separated, so none of them is used.
+continuously. The groups of the two sensors cannot be separated, so no group is used.
 
 Invariant: integers in, steps out; every input is accepted.
 """
@@ -101,7 +101,7 @@ class XcdiContinuity:
         ticks, counter : int, optional
             Its SampleTime and GroupCounter.
         broken : bool
-            Whether it, or the group before it, was incomplete.
+            Whether this group or the preceding group was incomplete.
         host_ticks : int, optional
             Its arrival, in ticks of the device's unit; None while the unit is unknown.
         """

@@ -6,7 +6,7 @@ from a uniform motion is, as an angle in rad,
 
     E = 2 |q2 - q1 - (q1 - q0) (t2 - t1) / (t1 - t0)|.
 
-It may be twice the largest one of the last seconds: a sensor that accelerates raises the limit.
+E may be twice the largest E of the last seconds: a sensor that accelerates raises the limit.
 
 | message                                       | outcome                                          |
 |-----------------------------------------------|--------------------------------------------------|
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 _FEW = 5.5
-"""Periods within which a message follows another one."""
+"""Largest number of periods between two successive messages."""
 _FIRST_US = 1_000_000
 """Time, us, within which a message follows while the period is unknown: that of a device at 1
 Hz."""

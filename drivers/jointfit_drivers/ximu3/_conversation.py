@@ -39,12 +39,12 @@ class XImu3Conversation:
 
     @property
     def received(self) -> int:
-        """Bytes received so far."""
+        """Number of bytes received so far."""
         return self._line.received
 
     @property
     def understood(self) -> bool:
-        """Whether the bytes received so far are certainly those of an x-IMU3."""
+        """Whether the bytes received so far certainly come from an x-IMU3."""
         return self._certain >= _CERTAIN
 
     def reset(self) -> None:

@@ -196,7 +196,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
         if native is None or q is None:
             return []
 
-        # A dropped quaternion may have changed the sign: continue that of the last sample.
+        # A dropped quaternion may have changed the sign: continue with the sign of the last sample.
         (a, b, c, d), (w, x, y, z) = self._q, q
         if a * w + b * x + c * y + d * z < 0.0:
             q = (-w, -x, -y, -z)

@@ -1,8 +1,8 @@
 """From an open port to an x-IMU3 with the required settings, or to the error that explains why not.
 
-The settings are read and compared. They are changed only where they differ and ``persist`` allows
-it, because the device also saves them when it is switched off. A fault that may clear by itself
-raises `DeviceLostError`, any other `DeviceMisconfiguredError`.
+The settings are read and compared. A setting is changed only where it differs and ``persist``
+allows the change, because the device also saves its settings when it is switched off. A fault that
+may clear by itself raises `DeviceLostError`, any other `DeviceMisconfiguredError`.
 """
 
 from __future__ import annotations

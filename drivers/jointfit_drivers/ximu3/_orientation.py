@@ -63,7 +63,8 @@ def _quaternion_of_matrix(rows: Sequence[float]) -> Quaternion | None:
     if not all(abs(value) <= _ORTHONORMAL for value in products) or not volume > 0.0:
         return None
 
-    # The largest of 4w², 4x², 4y², 4z² gives its component, and the others by division.
+    # The largest of 4w², 4x², 4y², 4z² gives one component; the other components follow by
+    # division.
     squares = (1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz)
     largest = squares.index(max(squares))
     double = sqrt(squares[largest])

@@ -30,7 +30,7 @@ class RequiredSetting(NamedTuple):
 
     key: str
     values: tuple[object, ...]
-    """The first one is written if the device has none of them."""
+    """Acceptable values; the driver writes the first value if the device has none of these."""
 
 
 def required_settings(settings: XImu3Settings) -> tuple[RequiredSetting, ...]:
