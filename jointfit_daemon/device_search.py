@@ -112,5 +112,5 @@ class Diagnosis(Protocol):
     async def diagnose(cls, settings: Any, wait_s: float) -> list[Finding]:
         """Return the findings for a table of rig.toml; `wait_s` limits the wait for data.
 
-        It opens the device as the daemon does, and raises no error of the device.
+        The search opens the device as the daemon does, and raises no error of the device.
         """

@@ -1,8 +1,8 @@
 """The table ``[imu.sensor_calibration]``: errors of one sensor that are corrected in its readings.
 
 `jointfit calibrate sensor` writes the table. A driver whose settings have the key
-`sensor_calibration` corrects raw readings with it before it computes orientations. The table is a
-part of rig.toml, so a recording contains it, and a replay corrects in the same way.
+`sensor_calibration` corrects raw readings with this table before the orientations are computed.
+The table is a part of rig.toml, so a recording contains it, and a replay corrects in the same way.
 
 Invariant: this module names no device.
 """

@@ -34,7 +34,7 @@ class CanDeviceSettings(Protocol):
 
     @property
     def can(self) -> CanBusSettings:
-        """Its bus."""
+        """Settings of the CAN bus of the sensor."""
 
     @property
     def silence_s(self) -> float:
@@ -47,7 +47,7 @@ class CanReception:
     Parameters
     ----------
     settings : CanDeviceSettings
-        Its table of rig.toml.
+        Table of the device in rig.toml.
     configured_by : str
         How its identifiers and outputs are changed, for error messages.
     """

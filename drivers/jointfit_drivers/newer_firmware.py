@@ -99,7 +99,7 @@ class NewerFirmwareDetector:
         content
             Name of the content with number or size, such as ``message 0x77``.
         t_ns
-            Its arrival, monotonic ns.
+            Arrival time of the content, monotonic ns.
         """
         count, since_ns = self._seen.get(content, (0, t_ns))
         if count >= self._sightings or (not count and len(self._seen) >= _MOST_KINDS):

@@ -24,7 +24,7 @@ class SerialReception:
     Parameters
     ----------
     settings : SerialImuSettings
-        Its table of rig.toml.
+        Table of the device in rig.toml.
     """
 
     def __init__(self, settings: SerialImuSettings) -> None:

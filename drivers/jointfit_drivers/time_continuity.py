@@ -75,9 +75,9 @@ class TimeContinuity:
         Parameters
         ----------
         device_ns : int
-            Its device time, ns.
+            Device time of the message, ns.
         arrival_ns : int
-            Its arrival, host monotonic ns.
+            Arrival time of the message, host monotonic ns.
         """
         instant = _Instant(device_ns, arrival_ns)
         last, held = self._last, self._held

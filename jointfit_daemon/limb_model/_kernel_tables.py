@@ -37,12 +37,12 @@ class KernelTables:
     terms: Array
     """Matrix of the first product, shape (bumps + p + q + 8, 2 width + 7).
 
-    Its product with [bends, u, u^2, 1] contains the exponents of all bumps, the roots of both
+    The product with [bends, u, u^2, 1] contains the exponents of all bumps, the roots of both
     leverages, the smooth parts of both corrections, and the trend."""
     sums: Array
     """Matrix of the second product, shape (10, bumps + p + q + 8).
 
-    Its product with the bumps, squared roots, smooth parts and trend contains both corrections, the
+    The product with the bumps, squared roots, smooth parts and trend contains both corrections, the
     trend and both leverage ratios."""
     bumps: int
     """Number of exponents at the start of the terms."""

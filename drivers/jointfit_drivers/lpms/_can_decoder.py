@@ -46,7 +46,7 @@ class LpmsCanDecoder:
     Parameters
     ----------
     settings : LpmsCanSettings
-        Its table of rig.toml.
+        Table of the device in rig.toml.
     """
 
     tick_clock = None

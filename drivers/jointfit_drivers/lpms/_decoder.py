@@ -61,7 +61,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
     Parameters
     ----------
     settings : LpmsSettings
-        Its table of rig.toml.
+        Table of the device in rig.toml.
     """
 
     def __init__(self, settings: LpmsSettings) -> None:

@@ -52,7 +52,7 @@ class LpmsHandshake:
     port, emit : SerialPort, Emit
         Open port, and the receiver of the sensor's bytes.
     settings : LpmsSettings
-        Its table of rig.toml.
+        Table of the device in rig.toml.
     hunt : bool
         Whether to search for a silent sensor at other speeds. A sensor whose bytes cannot be
         decoded is always searched for.

@@ -59,7 +59,7 @@ class TickRateCheck:
         tick : int
             Device time as sent, 32 bits.
         arrival_ns : int
-            Its arrival, ns.
+            Arrival time of the data packet, ns.
         """
         if self._since is None:
             self._since = (tick, arrival_ns)

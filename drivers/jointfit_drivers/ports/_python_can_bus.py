@@ -68,7 +68,7 @@ class PythonCanBus:
     Parameters
     ----------
     settings : CanBusSettings
-        Its ``[can.NAME]`` table; unknown keys are passed to python-can unchanged.
+        Table ``[can.NAME]`` of rig.toml; unknown keys are passed to python-can unchanged.
     """
 
     def __init__(self, settings: CanBusSettings) -> None:

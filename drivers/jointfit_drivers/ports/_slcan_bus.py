@@ -43,7 +43,7 @@ class SlcanBus:
     Parameters
     ----------
     settings : CanBusSettings
-        Its ``[can.NAME]`` table; ``channel`` is the serial port.
+        Table ``[can.NAME]`` of rig.toml; ``channel`` is the serial port.
     """
 
     def __init__(self, settings: CanBusSettings) -> None:

@@ -20,7 +20,7 @@ class SocketStamps(WallClock):
     Parameters
     ----------
     stamped : socket.socket
-        Its data are stamped by the kernel from now on.
+        Socket whose data the kernel stamps from now on.
     """
 
     def __init__(self, stamped: socket.socket) -> None:

@@ -225,7 +225,7 @@ def orientation_faults(form: TableForm, settings: TableImuSettings, *, timed: bo
     form
         Places of the table.
     settings
-        Its other keys.
+        Other keys of the table.
     timed
         Whether raw measurements need device time, because the arrivals are irregular.
     """

@@ -74,7 +74,7 @@ class FrameAssembler:
         key : ColumnKey
             The body.
         report : TrackerPose
-            Its report.
+            Report of the body.
         arrival_ns : int
             Arrival of the report, ns.
         """

@@ -28,14 +28,14 @@ class CalendarTime:
         self._reading_ns = 0
 
     def accept(self, ticks: int | None, arrival_ns: int) -> int | None:
-        """Return the time of a sample, ms since 2000; None if it is a glitch.
+        """Return the time of a sample, ms since 2000; None if the time is a glitch.
 
         Parameters
         ----------
         ticks
             Time as sent; None if it is not a time.
         arrival_ns
-            Its arrival, monotonic ns.
+            Arrival time of the sample, monotonic ns.
         """
         if ticks is None:
             return None
@@ -52,12 +52,12 @@ class CalendarTime:
         return ticks
 
     def reading_ns(self, ticks: int | None, period_ns: float) -> int:
-        """Return the time of a raw reading, ns from the first one.
+        """Return the time of a raw reading, ns from the first reading.
 
         Parameters
         ----------
         ticks
-            Its accepted time, ms; None after a glitch.
+            Accepted time of the sample, ms; None after a glitch.
         period_ns
             Mean interval of the readings, ns, in place of a missing or implausible one.
         """

@@ -81,7 +81,7 @@ class WitMotionHandshake:
     port, emit : SerialPort, Emit
         Open port, and the receiver of the device's bytes once it sends the required frames.
     settings : WitMotionSettings
-        Its table of rig.toml.
+        Table of the device in rig.toml.
     """
 
     def __init__(self, port: SerialPort, emit: Emit, settings: WitMotionSettings) -> None:

@@ -112,11 +112,11 @@ class XbusContinuity:
         Parameters
         ----------
         counter : int, optional
-            Its packet counter.
+            Packet counter of the message.
         ticks : int, optional
-            Its device time, in units of 100 us.
+            Device time of the message, in units of 100 us.
         arrival_ns : int
-            Its arrival, host monotonic ns.
+            Arrival time of the message, host monotonic ns.
         """
         self._messages += 1
         point = _OrientationPoint(counter, ticks, arrival_ns, self._messages)

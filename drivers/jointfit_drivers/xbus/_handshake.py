@@ -53,7 +53,7 @@ class XbusHandshake:
     port, emit : SerialPort, Emit
         Open port, and the receiver of the device's bytes.
     settings : XbusSettings
-        Its table of rig.toml.
+        Table of the device in rig.toml.
     hunt : bool
         Whether to search for a silent device at other speeds. A device whose bytes cannot be
         decoded is always searched for.

@@ -99,11 +99,11 @@ class XcdiContinuity:
         Parameters
         ----------
         ticks, counter : int, optional
-            Its SampleTime and GroupCounter.
+            SampleTime and GroupCounter of the group.
         broken : bool
             Whether this group or the preceding group was incomplete.
         host_ticks : int, optional
-            Its arrival, in ticks of the device's unit; None while the unit is unknown.
+            Arrival time of the group, in ticks of the device; None while the tick is unknown.
         """
         step, rivals = self._step(ticks, counter, host_ticks)
         self._contradictions.append(rivals)

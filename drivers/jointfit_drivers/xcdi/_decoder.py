@@ -44,7 +44,7 @@ class XcdiDecoder:
     Parameters
     ----------
     ids : XcdiIds
-        Its identifiers.
+        Identifiers of the sensor.
     unit : str
         ``100us`` or ``1us``, or ``auto``: determined from the data.
     byte_order : ByteOrder

@@ -70,7 +70,7 @@ class XImu3Decoder(SerialMessageDecoder[XImu3Data | XImu3Reply]):
     Parameters
     ----------
     settings : XImu3Settings
-        Its table of rig.toml.
+        Table of the device in rig.toml.
     """
 
     def __init__(self, settings: XImu3Settings) -> None:

@@ -45,7 +45,7 @@ class XImu3Handshake:
     port, emit : SerialPort, Emit
         Open port, and the receiver of the device's bytes.
     settings : XImu3Settings
-        Its table of rig.toml.
+        Table of the device in rig.toml.
     hunt : bool
         Whether to search for a silent device at other speeds.
     """
