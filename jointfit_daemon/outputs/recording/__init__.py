@@ -1,4 +1,4 @@
-"""Recordings: all inputs of the core and its outputs in MCAP files, written and read."""
+"""Recordings: writing and reading of all inputs and outputs of the core in MCAP files."""
 
 from jointfit_daemon.outputs.recording._blocks import RecordingError
 from jointfit_daemon.outputs.recording._channels import (

@@ -1,4 +1,4 @@
-"""Reads the records of a recording, also behind damaged places.
+"""Reads the records of a recording, also after damaged places.
 
 Invariant: no content of a file raises anything but `RecordingError`, or takes more memory than a
 record of `MOST_RECORD_BYTES` and its decompressed content.
@@ -29,29 +29,29 @@ if TYPE_CHECKING:
 MOST_RECORD_BYTES = 64 * 1024 * 1024
 """Largest record, and largest content of a chunk, bytes; the recorder writes chunks of 1 MiB."""
 _PREFIX = struct.Struct("<BQ")
-"""Opcode and length of a record."""
+"""Format of opcode and length of a record."""
 _RECORD_START = re.compile(
     rb"\x06.{7}\0.{28}\x04\0\0\0zstd|\x0c.{5}\0\0\0.\0\0\0jointfit\.", re.DOTALL
 )
-"""Start of a compressed chunk, or of metadata of a recording."""
+"""Pattern of the start of a compressed chunk, or of metadata of a recording."""
 _LONGEST_START = 64
-"""More bytes than `_RECORD_START` matches."""
+"""Number of bytes that exceeds every match of `_RECORD_START`."""
 _WINDOW_BYTES = 1024 * 1024
-"""Bytes that are searched at once."""
+"""Number of bytes that are searched at once."""
 _MOST_WASTED_RATIO = 20
 """Largest ratio of the bytes read in damaged records to the size of the file. It limits the time
 that a malicious file can take."""
 
 
 class RecordingError(ValueError):
-    """A file is not a recording, or cannot be read by this version."""
+    """The file is not a recording, or this version cannot read it."""
 
 
 class ChunkBlock(NamedTuple):
     """A chunk with the right checksum."""
 
     start: int
-    """Position in the file, bytes."""
+    """Position of the chunk in the file, bytes."""
     end: int
     content: bytes
     """Records of the chunk."""
@@ -75,7 +75,7 @@ class AttachmentBlock(NamedTuple):
 
 
 class DamagedBlock(NamedTuple):
-    """Bytes that are no record."""
+    """A range of bytes that belong to no record."""
 
     start: int
     end: int
@@ -92,7 +92,7 @@ Block: TypeAlias = ChunkBlock | MetadataBlock | AttachmentBlock | DamagedBlock |
 
 
 class _DamageError(ValueError):
-    """A record cannot be read; `read_bytes` bytes of its content were read in vain."""
+    """A record is damaged; `read_bytes` bytes of its content were read before the error."""
 
     def __init__(self, text: str, read_bytes: int = 0) -> None:
         super().__init__(text)
@@ -107,7 +107,7 @@ def read_blocks(path: Path) -> Iterator[Block]:
     RecordingError
         The file is not a recording of jointfitd.
     OSError
-        It cannot be read.
+        The file cannot be read.
     """
     with path.open("rb") as file:
         size = file.seek(0, 2)
@@ -155,11 +155,11 @@ def _check_header(file: BinaryIO, path: Path, size: int) -> int:
 
 
 _LONGEST_HEADER = 4096
-"""Longest header, bytes."""
+"""Largest length of the header, bytes."""
 
 
 def _read_record(file: BinaryIO, place: int, size: int) -> tuple[Block | None, int]:
-    """Return the record at `place` (None for one without meaning here) and the next position."""
+    """Return the record at `place` (None for an unused kind) and the next position."""
     file.seek(place)
     prefix = file.read(_PREFIX.size)
     if prefix.startswith(MCAP0_MAGIC) and place + len(MCAP0_MAGIC) == size:
@@ -183,7 +183,7 @@ def _read_record(file: BinaryIO, place: int, size: int) -> tuple[Block | None, i
     try:
         return _READERS[opcode](place, end, content), end
     except _READING_ERRORS as error:
-        # If the next record follows where expected, the length is right.
+        # If the next record begins at the expected position, the length is right.
         if _starts_record(file, end, size):
             return DamagedBlock(place, end, f"a damaged record: {error}"), end
         raise _DamageError(f"a damaged record: {error}", length) from error
@@ -202,11 +202,11 @@ def _starts_record(file: BinaryIO, place: int, size: int) -> bool:
 
 _DATA_END = bytes([Opcode.DATA_END])
 _MESSAGE_INDEX = struct.Struct("<BQHI")
-"""Opcode, length, channel and bytes of the entries of a message index."""
+"""Format of opcode, length, channel and size of the entries of a message index."""
 
 
 def _starts_message_index(start: bytes) -> bool:
-    """Return whether the two lengths of a message index agree: it has no checksum."""
+    """Return whether both lengths in a message index agree, since the index has no checksum."""
     if len(start) < _MESSAGE_INDEX.size:
         return False
     opcode, length, _, entries_bytes = _MESSAGE_INDEX.unpack_from(start)
@@ -215,7 +215,7 @@ def _starts_message_index(start: bytes) -> bool:
 
 
 def _find_record(file: BinaryIO, place: int, size: int) -> int:
-    """Return the position of the next record that can be found; the end without one."""
+    """Return the position of the next record that can be found, or else the end of the file."""
     while place < size:
         file.seek(place)
         window = file.read(_WINDOW_BYTES + _LONGEST_START)
@@ -239,7 +239,7 @@ def _read_chunk(start: int, end: int, content: bytes) -> Block:
         # A frame that claims another size could expand to any number of bytes.
         if zstandard.get_frame_parameters(data).content_size != chunk.uncompressed_size:
             raise _DamageError("the compressed size of a chunk contradicts its content")
-        # A decompressor of its own: a shared one is not safe in several threads.
+        # Use a new decompressor, because a shared decompressor is not safe in several threads.
         data = zstandard.ZstdDecompressor(max_window_size=MOST_RECORD_BYTES).decompress(data)
     elif chunk.compression:
         raise _DamageError(f"unknown compression {chunk.compression[:20]!r}")
@@ -267,7 +267,7 @@ _READERS = {
     Opcode.METADATA: _read_metadata,
     Opcode.ATTACHMENT: _read_attachment,
 }
-"""Records that are read; all others repeat their content."""
+"""Opcodes of the records that are read; all other records repeat their content."""
 _READING_ERRORS = (
     ValueError,
     OverflowError,

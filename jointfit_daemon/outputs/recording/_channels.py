@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 PROFILE = "jointfit"
 """Profile in the header of the file."""
 FORMAT = 1
-"""Version of the channels and metadata; a reader refuses a later one."""
+"""Version of the channels and metadata; a reader refuses later versions."""
 RECORDING_METADATA = "jointfit.recording"
 """Name of the metadata record that describes the file."""
 CHANNEL_METADATA = "jointfit.channel"
@@ -63,7 +63,7 @@ EVENT_CHANNELS = {event: EVENT + kind for event, kind in EVENT_KINDS.items()}
 
 
 def encode_output(output: Output) -> tuple[str, bytes] | None:
-    """Return the channel and the content of an output; None for one that is not recorded."""
+    """Return channel and content of an output; None for an output that is not recorded."""
     channel = OUTPUT_KINDS.get(type(output))
     if channel is None:
         return None
@@ -88,7 +88,7 @@ class ChannelForm(NamedTuple):
     encoding: str
     """Message encoding."""
     schema: str
-    """Name of the schema; empty without one."""
+    """Name of the schema; empty without a schema."""
     metadata: dict[str, str]
     """Metadata of the channel, such as ``clock`` and ``stamp_means``."""
 
@@ -184,4 +184,4 @@ _FIELDS: dict[str, dict[str, str]] = {
         "reason": "s",
     },
 }
-"""Fields of the JSON channels by the name of their schema; others are objects."""
+"""Fields of the JSON channels, by the name of their schema; schemas without fields are objects."""

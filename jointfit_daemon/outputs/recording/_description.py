@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _CHECKSUM = "crc32"
-"""Key of the checksum: MCAP has none for metadata records."""
+"""Key of the checksum in metadata records, for which MCAP has no checksum."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,7 @@ class RecordingInfo:
 
     @classmethod
     def from_metadata(cls, given: Mapping[str, str]) -> RecordingInfo:
-        """Return the description in a metadata record whose checksum is right.
+        """Return the description in a metadata record with a correct checksum.
 
         Raises
         ------
@@ -70,7 +70,7 @@ class RecordingInfo:
 
 @dataclass(frozen=True, slots=True)
 class RecordingGap:
-    """Consecutive messages that are missing in a recording."""
+    """A gap: consecutive messages that are missing in a recording."""
 
     first_sequence: int
     count: int

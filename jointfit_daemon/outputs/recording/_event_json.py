@@ -1,6 +1,7 @@
 """JSON form of the input events and outputs of the core in a recording.
 
-Invariant: every event except `ChunkArrived`, whose bytes are recorded as they are, round-trips.
+Invariant: conversion to JSON and back returns an equal event. The bytes of a `ChunkArrived` are
+recorded unchanged.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ UnchunkedEvent: TypeAlias = (
     | CalibrationStored
     | UnixOffset
 )
-"""An event that is recorded as JSON."""
+"""Any event that is recorded as JSON."""
 EVENT_KINDS: dict[type, str] = {
     Tick: "tick",
     Configured: "configured",
@@ -74,7 +75,7 @@ class DamagedEventError(ValueError):
 
 
 def encode_state(state: LimbState) -> bytes:
-    """Return `state` as JSON. Floats round-trip, so equal bytes mean equal states."""
+    """Return `state` as JSON. Floats keep all digits, so equal bytes mean equal states."""
     return orjson.dumps(state, _to_json)
 
 
@@ -136,7 +137,7 @@ def _event(kind: str, given: dict[str, Any]) -> UnchunkedEvent:
 
 
 def _to_json(value: object) -> object:
-    # first the named tuples, which orjson does not write: a limb state contains ten of them
+    # First convert named tuples, which orjson does not write. A limb state contains ten of them.
     if isinstance(value, tuple):
         names: tuple[str, ...] | None = getattr(value, "_fields", None)
         return list(value) if names is None else dict(zip(names, value, strict=True))

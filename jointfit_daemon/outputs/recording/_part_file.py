@@ -1,4 +1,4 @@
-"""One file of a recording while it is written.
+"""One file of a recording that is being written.
 
 Invariant: after a failed write the file continues at the same byte, so it has no damaged place.
 """
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.recording._description import RecordingInfo
 
 UNFINISHED = ".part"
-"""Suffix of the name of a file while it is written."""
+"""Suffix of the name of a file that is being written."""
 _SEQUENCES = 2**32
-"""MCAP stores sequence numbers modulo this."""
+"""MCAP stores sequence numbers modulo this number."""
 _CHUNK_BYTES = 1024 * 1024
 """A chunk that reaches this size is closed before the next flush, bytes."""
 
@@ -51,18 +51,19 @@ class PartFile:
     Parameters
     ----------
     path
-        Its final name.
+        Final path of the file.
     info
-        Its description.
+        Description of the file.
     attachments
-        Documents at its beginning.
+        Documents at the beginning of the file.
     suffix
-        Suffix of its name while it is written.
+        Suffix of the file name during writing.
 
     Raises
     ------
     OSError
-        The file cannot be created (FileExistsError: it exists, also under its final name).
+        The file cannot be created. FileExistsError means that it exists, possibly under its final
+        name.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class PartFile:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {"": 0}
 
-        # Twice, because a file without description is lost.
+        # The description is written twice, because a file without description is lost.
         unix_ns = info.start_t_ns + info.unix_offset_ns
         self._writer.add_metadata(RECORDING_METADATA, info.metadata())
         for name, media_type, data in attachments:
@@ -99,12 +100,12 @@ class PartFile:
 
     @property
     def size_bytes(self) -> int:
-        """Bytes of the file, including those that are not yet written."""
+        """Size of the file, including bytes that are not yet written."""
         return self._buffer.tell()
 
     @property
     def unwritten_bytes(self) -> int:
-        """Bytes that the disk did not yet take."""
+        """Number of bytes that are not yet written to the disk."""
         return self._buffer.unwritten_bytes
 
     def add(self, channel: str, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
@@ -123,7 +124,7 @@ class PartFile:
                 form.schema, "jsonschema", schema
             )
 
-        # A second definition outside of the chunk, which may be damaged.
+        # Write a second definition outside of the chunk, because the chunk may be damaged.
         number: int = self._writer.register_channel(
             channel, form.encoding, self._schemas[form.schema], form.metadata
         )
@@ -137,7 +138,7 @@ class PartFile:
         Raises
         ------
         OSError
-            The disk did not take all; the rest is written by the next call.
+            Not all bytes were written; the next call writes the rest.
         """
         self._writer.flush()
         self._buffer.write_to(self._fd)
@@ -151,12 +152,12 @@ class PartFile:
         next_sequence
             Sequence number of the first message after this file.
         reason
-            Why the file ends: ``rotated`` or ``stopped``.
+            Reason why the file ends: ``rotated`` or ``stopped``.
 
         Raises
         ------
         OSError
-            The disk did not take the end; the file keeps its unfinished name.
+            The end was not written; the name of the file remains unfinished.
         """
         try:
             self._writer.flush()
@@ -176,7 +177,7 @@ class PartFile:
         self.open_path.unlink(missing_ok=True)
 
     def close(self) -> None:
-        """Close the file as it is."""
+        """Close the file without writing its end."""
         if self._fd >= 0:
             fd, self._fd = self._fd, -1
             with suppress(OSError):
@@ -184,7 +185,7 @@ class PartFile:
 
 
 def sync_directory(directory: Path) -> None:
-    """Write the names in a directory to the disk."""
+    """Write the directory entry of new file names to the disk."""
     fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(fd)
@@ -193,7 +194,7 @@ def sync_directory(directory: Path) -> None:
 
 
 class _UnwrittenBytes:
-    """Collects what the library writes, because it loses bytes after a failed write."""
+    """Collects the bytes that the library writes, because it loses bytes after a failed write."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -214,7 +215,7 @@ class _UnwrittenBytes:
         """Do nothing: `write_to` writes."""
 
     def write_to(self, fd: int) -> None:
-        """Write all bytes to `fd`; keep the rest if it raises OSError."""
+        """Write all bytes to `fd`; after an OSError the rest remains."""
         done = 0
         try:
             while done < len(self._data):

@@ -1,4 +1,4 @@
-"""Reads recordings: finished ones, those of a crashed or running daemon, and damaged ones.
+"""Reads finished and damaged recordings, also of a crashed or running daemon.
 
 Invariant: messages are returned in the order in which they were processed, and each missing message
 is part of exactly one `RecordingGap`.
@@ -52,13 +52,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event
 
 _PART_NAME = re.compile(r"(?P<stem>.+-\d{8}T\d{6})-(?P<part>\d{4,})\.mcap(\.part)?")
-"""Name of a file of a session."""
+"""Pattern of the name of a file of a session."""
 _MESSAGE = struct.Struct("<BQHIQQ")
-"""Opcode, length, channel, sequence number, log time and publish time of a message."""
+"""Format of opcode, length, channel, sequence number, log time and publish time of a message."""
 _PREFIX = struct.Struct("<BQ")
-_MESSAGE_OPCODE = int(Opcode.MESSAGE)  # an enumeration is compared slowly
+_MESSAGE_OPCODE = int(Opcode.MESSAGE)  # comparing an enumeration is slow
 _RESTORING = {SNAPSHOT, GAP.partition("/")[0] + "/"}
-"""Prefixes of channels whose messages have no number of their own."""
+"""Prefixes of channels whose messages have no own sequence number."""
 _SEQUENCES, _HALF = 2**32, 2**31
 
 
@@ -66,16 +66,16 @@ class RecordedMessage(NamedTuple):
     """One message of a recording."""
 
     sequence: int
-    """Number of the message in the session; of a snapshot, that of the message after it."""
+    """Number of the message in the session. A snapshot has the number of the message after it."""
     channel: str
     t_ns: int
-    """Arrival, CLOCK_MONOTONIC ns."""
+    """Instant of arrival, CLOCK_MONOTONIC ns."""
     publish_t_ns: int
-    """Instant of the content where it is known, CLOCK_MONOTONIC ns."""
+    """Instant of the content if known, CLOCK_MONOTONIC ns."""
     data: bytes
 
     def event(self) -> Event | None:
-        """Return the input event of the core; None if the message is none.
+        """Return the input event of the core; None for other messages.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class RecordedPart:
     path: Path
     info: RecordingInfo
     documents: Mapping[str, bytes]
-    """Attachments by their name, such as ``rig.json``."""
+    """Attachments by name, such as ``rig.json``."""
 
     def messages(self) -> Iterator[RecordedMessage | DamagedBlock | PartEnd]:
         """Yield all messages of this file, its damaged places, and its end."""
@@ -131,7 +131,7 @@ class RecordedPart:
         yield end
 
     def survey(self) -> PartSurvey:
-        """Return the end and the damaged places; reads the whole file."""
+        """Return the end and the damaged places; the whole file is read."""
         found = [item for item in self.messages() if isinstance(item, DamagedBlock | PartEnd)]
         (end,) = [item for item in found if isinstance(item, PartEnd)]
         return PartSurvey([item for item in found if isinstance(item, DamagedBlock)], end)
@@ -150,7 +150,7 @@ class PartEnd(NamedTuple):
     next_sequence: int | None
     """Sequence number after the last message; None for a file that was not closed."""
     reason: str
-    """``rotated``, ``stopped``, ``recovered``, or empty."""
+    """Reason of the end: ``rotated``, ``stopped``, ``recovered``, or empty."""
     complete: bool
     """Whether the file has its regular end."""
 
@@ -163,7 +163,7 @@ def _read_metadata(name: str, values: dict[str, str], topics: dict[int, str]) ->
         if name == END_METADATA:
             found = unsealed(values)
             return PartEnd(int(found["next_sequence"]), found["reason"], complete=False)
-    except (ValueError, KeyError):  # damaged: the chunks contain the channels, too
+    except (ValueError, KeyError):  # damaged; the chunks also contain the channels
         return None
     return None
 
@@ -183,7 +183,7 @@ def _messages(
             return
         if opcode == _MESSAGE_OPCODE and length >= _MESSAGE.size - _PREFIX.size:
             _, _, number, low, log_ns, publish_ns = _MESSAGE.unpack_from(content, place)
-            # Numbers are stored modulo 2**32; the distance to the last one is far smaller.
+            # Numbers are stored modulo 2**32; the difference to the last number is far smaller.
             expected += (low - expected + _HALF) % _SEQUENCES - _HALF
             data = content[place + _MESSAGE.size : end]
             yield RecordedMessage(
@@ -255,7 +255,7 @@ class Recording:
                     yield from sequencer.follow(item)
 
     def events(self) -> Iterator[Event]:
-        """Yield the input events of the core in order; raises the errors of `messages`."""
+        """Yield the input events of the core in order; errors are the same as of `messages`."""
         for message in self.messages():
             if isinstance(message, RecordedMessage):
                 event = message.event()
@@ -284,7 +284,7 @@ class _Sequencer:
         """Last damaged place, the reason of the next gap."""
 
     def continues(self, item: RecordedMessage) -> bool:
-        """Return whether a message is the next one, and count it; snapshots and gaps are none."""
+        """Return whether a message is the next one, and count it; False for snapshots and gaps."""
         if item.sequence != self._expected or _channel_parts(item.channel)[0] in _RESTORING:
             return False
         self._expected, self._t_ns, self._restoring = item.sequence + 1, item.t_ns, False
@@ -293,7 +293,7 @@ class _Sequencer:
     def follow(
         self, item: RecordedMessage | DamagedBlock | PartEnd
     ) -> Iterator[RecordedMessage | RecordingGap]:
-        """Yield what follows from the next item of a file."""
+        """Yield the messages and gaps that follow from the next item of a file."""
         if isinstance(item, DamagedBlock):
             self.damage = f"bytes {item.start} to {item.end} are damaged: {item.reason}"
         elif isinstance(item, PartEnd):
@@ -303,7 +303,7 @@ class _Sequencer:
             if item.sequence > self._expected:
                 reason = self.damage
                 if item.channel == GAP:
-                    reason = ""  # of a gap in a file that was made by hand
+                    reason = ""  # from a gap in a file that was made by hand
                     with suppress(ValueError, KeyError, TypeError):
                         reason = str(orjson.loads(item.data)["reason"])
                 yield self._gap(item.sequence, item.t_ns, reason)
@@ -335,7 +335,8 @@ def open_recording(path: Path) -> Recording:
     Raises
     ------
     RecordingError
-        A file is not a recording or of a later version; the folder contains none, or several.
+        A file is not a recording or of a later version; the folder contains no recording, or
+        several.
     OSError
         A file cannot be read.
     """
@@ -393,9 +394,9 @@ def open_part(path: Path) -> RecordedPart:
     Raises
     ------
     RecordingError
-        It is not a recording, or of a later version.
+        The file is not a recording, or of a later version.
     OSError
-        It cannot be read.
+        The file cannot be read.
     """
     info: RecordingInfo | None = None
     documents: dict[str, bytes] = {}
@@ -413,7 +414,7 @@ def open_part(path: Path) -> RecordedPart:
 
 
 def _read_info(path: Path, values: dict[str, str]) -> RecordingInfo | None:
-    """Return the description; None if it is damaged, because the file has a second one."""
+    """Return the description; None if damaged, because the file has a second copy."""
     try:
         version = int(unsealed(values)["format"])
     except (ValueError, KeyError):
@@ -437,6 +438,6 @@ def read_events(path: Path) -> Iterator[Event]:
     RecordingError
         The file is not a recording, of a later version, or contains a damaged event.
     OSError
-        It cannot be read.
+        The file cannot be read.
     """
     yield from open_recording(path).events()

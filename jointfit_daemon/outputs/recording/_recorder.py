@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output
 
 FLUSH_S = 0.3
-"""Interval between the starts of two writes, s: a kill loses this and the duration of two writes.
+"""Interval between the starts of two writes, s. A kill loses the messages of this time and of the
+duration of two writes.
 """
 _SHORTEST_PAUSE_S = 0.02
 """Shortest pause between two writes to a slow disk, s."""
@@ -54,18 +55,18 @@ class RecordingHealth:
     """State of the present recording, or of the last one."""
 
     file: str = ""
-    """Name of the open file, or of the last one; empty without one."""
+    """Name of the open file, or else of the last file; empty without a file."""
     duration_s: float = 0.0
-    """Time from the start of the recording to now, or to its end."""
+    """Time from the start of the recording to now, or to the end of the recording."""
     written_bytes: int = 0
     backlog_bytes: int = 0
-    """Memory of messages that are not yet written."""
+    """Memory of messages that are not yet written, bytes."""
     lost: int = 0
-    """Messages that the disk did not take."""
+    """Number of messages that could not be written."""
     failure: str | None = None
-    """Reason for which messages are not written at present; None while they are."""
+    """Reason why messages are not written at present; None while writing works."""
     free_bytes: int | None = None
-    """Free space for recordings; None while it is unknown."""
+    """Free space for recordings; None while unknown."""
     active: bool = False
     """Whether the recorder is started."""
 
@@ -78,11 +79,11 @@ class Recorder:
     directory
         Folder of the files; created if absent.
     name
-        Beginning of the file names; the time follows.
+        Beginning of the file names, which is followed by the time.
     limits
-        When a file ends and the next one begins, and when old ones are deleted.
+        Conditions for the end of a file and for the deletion of old files.
     report
-        Receives each interruption and resumption.
+        Function that receives each interruption and resumption.
     autostart
         Whether to record from the first event on.
     """
@@ -100,9 +101,9 @@ class Recorder:
         self._limits = limits or RecordingLimits()
         self._report = report
         self._writing = asyncio.Lock()
-        """Lock that is held while the thread writes: one call at a time."""
+        """Lock of the writing thread, which allows one call at a time."""
         self._changing = asyncio.Lock()
-        """Lock that is held by a start or stop: each is answered with the state that it leaves."""
+        """Lock of starts and stops, so that each answer contains the state after its request."""
         self._writer: SessionWriter | None = None
         self._snapshot = self._before = Snapshot()
         self._t_ns = time.monotonic_ns()
@@ -166,7 +167,7 @@ class Recorder:
     # --- state -------------------------------------------------------------------------------
 
     def health(self) -> RecordingHealth:
-        """Return the state of the recording; while nothing is recorded, that of the last one."""
+        """Return the state of the recording that runs, or else of the last recording."""
         if self._writer is None:
             return replace(self._last, free_bytes=self._free_bytes)
         return self._health(self._writer)
@@ -190,7 +191,7 @@ class Recorder:
 
     @property
     def path(self) -> Path | None:
-        """The open file; None before the first write and after the last one."""
+        """The open file; None before the first write and after the last write."""
         return None if self._writer is None else self._writer.file
 
     # --- writing -----------------------------------------------------------------------------
@@ -215,7 +216,7 @@ class Recorder:
             return self._health(writer)
 
     async def stop(self) -> RecordingHealth:
-        """Write the rest, close the file and return its last state; do nothing without one."""
+        """Write the rest, close the file and return its last state; do nothing without a file."""
         async with self._changing, self._writing:
             writer = self._writer
             if writer is not None:
@@ -295,18 +296,18 @@ class Recorder:
             self._pass_reports(writer)
 
     def _take_rest(self) -> list[Batch]:
-        """Return the messages that wait, and the gap after them, if any."""
+        """Return the waiting messages, and the gap after them, if any."""
         rest = [self._take()]
         return rest if self._gap is None else [*rest, self._take()]
 
     def _take(self) -> Batch:
-        """Return the messages that wait, and begin to collect again."""
+        """Return the waiting messages, and begin to collect again."""
         messages, before, gap = self._pending, self._before, self._gap
         self._pending, self._pending_bytes, self._before = [], 0, self._snapshot
         batch = Batch(self._first_sequence, messages, before, self._snapshot, gap)
         self._first_sequence = batch.next_sequence
 
-        # Messages that exceeded the limit follow this batch, and precede the next one.
+        # Messages that exceeded the limit follow this batch, and precede the next batch.
         self._gap = None
         if self._lost:
             now_ns = time.monotonic_ns()

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _COPYING = ".repair"
-"""Suffix of the copy while it is written."""
+"""Suffix of the copy during writing."""
 DAMAGED = ".bad"
-"""Suffix of an unfinished file with damage before its end, after its repair."""
+"""Suffix that a repaired source file gets if it is damaged before its end."""
 _FLUSH_MESSAGES = 4096
-"""Messages between two writes."""
+"""Number of messages between two writes."""
 _PAUSE_MESSAGES, _PAUSE_S = 32, 0.001
-"""Messages copied at once in a running daemon, and the pause after them, s."""
+"""Number of messages copied at once in a running daemon, and the following pause, s."""
 
 
 class RepairStoppedError(Exception):
@@ -40,20 +40,20 @@ class RepairStoppedError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class RepairResult:
-    """A repaired recording."""
+    """Result of the repair of a recording."""
 
     source: Path
     path: Path
-    """The clean file."""
+    """Path of the clean file."""
     messages: int
     seconds: float
     """Time from the first to the last message, s."""
     gaps: tuple[RecordingGap, ...]
-    """Missing messages before the end."""
+    """Number of missing messages before the end."""
     unreadable_bytes: int
-    """Bytes of the source that are no record: damaged, or written in part."""
+    """Number of bytes of the source that belong to no record: damaged, or partly written."""
     closed: bool
-    """Whether the source was closed; else the messages of its last second may be missing."""
+    """Whether the source was closed; otherwise the messages of its last second may be missing."""
 
 
 def repair_recording(
@@ -74,7 +74,7 @@ def repair_recording(
     pause
         Whether to pause after every 32 messages, because the process acquires data.
     stopped
-        Returns whether to stop early.
+        Function that returns whether to stop early.
 
     Raises
     ------
@@ -153,7 +153,7 @@ def _unused(source: Path) -> Iterator[None]:
             raise RecordingError(
                 f"{source}: a daemon is writing this recording: stop the recording first"
             ) from error
-        except OSError:  # a file system without locks
+        except OSError:  # the file system has no locks
             pass
         yield
     finally:
@@ -165,13 +165,13 @@ def repair_unfinished(
 ) -> list[RepairResult | str]:
     """Repair the files that earlier runs of `rig` left unfinished.
 
-    A repaired file gets its final name. The unfinished one is deleted; if it was damaged before its
-    end, or a file with the final name exists, it is renamed to ``….bad`` instead.
+    A repaired file gets its final name. The unfinished file is deleted; if it was damaged before
+    its end, or a file with the final name exists, it is renamed to ``….bad`` instead.
 
     Returns
     -------
     list of RepairResult or str
-        Result of every file that was repaired; of the others the reason.
+        Result of every repaired file, or the reason why a file was not repaired.
     """
     found: list[RepairResult | str] = []
     try:
@@ -184,7 +184,7 @@ def repair_unfinished(
         target = source.with_name(source.name.removesuffix(UNFINISHED))
         damaged = source.with_name(source.name + DAMAGED)
         try:
-            if target.exists():  # a person has repaired it
+            if target.exists():  # a person has already repaired it
                 source.rename(damaged)
                 found.append(f"{source.name}: {target.name} exists already; renamed {damaged.name}")
                 continue

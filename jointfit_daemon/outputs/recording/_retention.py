@@ -1,4 +1,4 @@
-"""Deletes the oldest recordings of a rig."""
+"""Deletion of the oldest recordings of a rig."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def delete_oldest(directory: Path, rig: str, keep_bytes: float) -> list[Path]:
     directory
         Folder of the recordings.
     rig
-        Beginning of the file names; files of other rigs stay.
+        Beginning of the file names; files of other rigs are not deleted.
     keep_bytes
         Largest sum of the sizes, the open file included, bytes.
 

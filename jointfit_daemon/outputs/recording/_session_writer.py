@@ -1,7 +1,7 @@
 """Writes the messages of one session to its files; every method blocks and runs in a thread.
 
-Invariant: no failure of the disk raises. Messages that the disk did not take are counted, and a gap
-is recorded as soon as the disk takes messages again.
+Invariant: no failure of the disk raises. Messages that cannot be written are counted, and a gap is
+recorded as soon as writing works again.
 """
 
 from __future__ import annotations
@@ -47,24 +47,25 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 MOST_UNWRITTEN_BYTES = 16 * 1024 * 1024
-"""Most bytes that wait for a full disk: minutes of four IMUs. Later messages are lost."""
+"""Largest number of bytes that wait for a full disk: minutes of four IMUs. Later messages are
+lost."""
 RETRY_S = 1.0
 """Interval between attempts to create a file, s."""
 ABANDON_S = 5.0
-"""Time after which a file that cannot be written is abandoned for a new one, s."""
+"""Time after which an unwritable file is abandoned for a new file, s."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors that end when files are deleted; the file is not abandoned."""
+"""Errors that end when files are deleted; with these errors a file is not abandoned."""
 _YIELD_MESSAGES, _YIELD_S = 32, 0.0005
-"""Messages encoded at once, and the pause after them, s: the event loop waits for the interpreter
-lock for less than half a millisecond."""
+"""Number of messages encoded at once, and the pause after them, s: the event loop waits for the
+interpreter lock for less than half a millisecond."""
 _LONGEST_PAUSED_S = 0.05
-"""Time after which a batch is encoded without pauses, s: on a busy machine they take long, and
-messages that are not written are lost at a kill."""
+"""Time after which a batch is encoded without pauses, s: on a busy machine the pauses take long,
+and a kill loses messages that are not written."""
 
 PROGRAM = f"jointfitd {__version__}"
 """Name and version of this program."""
 SOFTWARE = f"{PROGRAM}, {LIBRARY_IDENTIFIER}, Python {sys.version.split()[0]}"
-"""Programs that write a recording."""
+"""Names and versions of the programs that write a recording."""
 
 
 class DaemonMessage(NamedTuple):
@@ -77,7 +78,7 @@ class DaemonMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """Consecutive messages."""
+    """A batch of consecutive messages."""
 
     first_sequence: int
     messages: Sequence[object]
@@ -87,7 +88,7 @@ class Batch:
     after: Snapshot
     """State after the last message."""
     gap: RecordingGap | None
-    """Messages immediately before the first one that were lost."""
+    """Number of lost messages immediately before the first message."""
 
     @property
     def next_sequence(self) -> int:
@@ -96,7 +97,7 @@ class Batch:
 
 
 class RecordingReport(NamedTuple):
-    """A change of the recording worth reporting."""
+    """A change of the recording that is reported."""
 
     text: str
     level: NoticeLevel = NoticeLevel.INFO
@@ -104,7 +105,7 @@ class RecordingReport(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RecordingLimits:
-    """When a file ends, and when the oldest files are deleted."""
+    """Limits at which a file ends and at which the oldest files are deleted."""
 
     file_bytes: float = float("inf")
     file_s: float = float("inf")
@@ -125,7 +126,7 @@ class SessionWriter:
     began_with_daemon
         Whether the first message is the first event of the daemon.
     limits
-        When a file ends and the next one begins.
+        Limits at which a file ends and the next file begins.
     pause_s
         Pause after every 32 messages, s.
     """
@@ -137,11 +138,11 @@ class SessionWriter:
     pause_s: float = _YIELD_S
     session: str = field(default_factory=lambda: uuid4().hex)
     fault: str | None = None
-    """Why messages are not written at present; None while they are."""
+    """Reason why messages are not written at present; None while writing works."""
     lost: int = 0
-    """Messages that the disk did not take."""
+    """Number of messages that could not be written."""
     written_bytes: int = 0
-    """Size of all finished files and the present one."""
+    """Size of all finished files and of the present file, bytes."""
     reports: list[RecordingReport] = field(default_factory=list)
     """Changes that are not yet reported; the owner empties the list."""
     _part: PartFile | None = None
@@ -159,12 +160,12 @@ class SessionWriter:
 
     @property
     def file(self) -> Path | None:
-        """The open file; None if there is none."""
+        """The open file; None without a file."""
         return None if self._part is None else self._part.open_path
 
     @property
     def unwritten_bytes(self) -> int:
-        """Encoded bytes that the disk did not yet take."""
+        """Number of encoded bytes that are not yet written."""
         return 0 if self._part is None else self._part.unwritten_bytes
 
     def write(self, batch: Batch) -> None:
@@ -177,7 +178,7 @@ class SessionWriter:
             self._lose_messages(batch.first_sequence, batch.next_sequence)
             return
 
-        # The messages that were lost before `batch`, and the state after them.
+        # Record the messages that were lost before `batch`, and the state after them.
         if self._gap is not None:
             gap, self._gap = self._gap, None
             part.add(GAP, gap.to_t_ns, gap.to_t_ns, batch.first_sequence, orjson.dumps(gap))
@@ -208,7 +209,7 @@ class SessionWriter:
     # --- files -------------------------------------------------------------------------------
 
     def _open(self, batch: Batch) -> PartFile | None:
-        """Create the next file; return None if that is not possible."""
+        """Create the next file; return None if creating fails."""
         now_s = time.monotonic()
         if now_s < self._retry_s:
             return None
@@ -266,7 +267,7 @@ class SessionWriter:
             try:
                 path = self.directory / f"{self._stem}-{info.part:04d}.mcap"
                 part = PartFile(path, info, attachments)
-            except FileExistsError:  # another session of the same second
+            except FileExistsError:  # another session began in the same second
                 if info.part > 1:
                     raise
                 self._stem, unix_s = "", unix_s + 1
@@ -274,13 +275,13 @@ class SessionWriter:
             try:
                 part.flush()
                 sync_directory(self.directory)  # not all file systems write the name with the file
-            except OSError:  # leave no file without a message behind
+            except OSError:  # delete a file without messages
                 part.discard()
                 raise
             return part
 
     def _flush(self, part: PartFile) -> bool:
-        """Write everything; return whether the disk took it."""
+        """Write all waiting bytes; return whether this succeeded."""
         try:
             part.flush()
         except OSError as error:
@@ -355,7 +356,7 @@ class SessionWriter:
     # --- losses ------------------------------------------------------------------------------
 
     def _lose(self, gap: RecordingGap) -> None:
-        """Remember consecutive lost messages until the gap can be recorded."""
+        """Store the numbers of consecutive lost messages until the gap can be recorded."""
         self.lost += gap.count
         before = self._gap
         if before is not None:
@@ -366,7 +367,7 @@ class SessionWriter:
         self._gap = gap
 
     def _lose_messages(self, first: int, following: int) -> None:
-        """Lose all messages from `first` to the one before `following`."""
+        """Count all messages from `first` up to, but not including, `following` as lost."""
         if following > first:
             now_ns = time.monotonic_ns()
             reason = self.fault or "the disk is too slow"

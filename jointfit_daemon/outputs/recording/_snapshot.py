@@ -1,4 +1,4 @@
-"""State of the core's inputs: what a recording needs if it does not begin with the daemon."""
+"""State of the core's inputs, which a recording contains if it begins after the daemon."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Snapshot:
     configured: Configured | None = None
     """The configuration in force, with the calibration in force."""
     calibrated_t_ns: int = 0
-    """Instant at which `Configured.calibration_age_s` was right, CLOCK_MONOTONIC ns."""
+    """Instant to which `Configured.calibration_age_s` refers, CLOCK_MONOTONIC ns."""
     unix_offset_ns: int | None = None
     opened: Mapping[str, SourceOpened] = field(default_factory=lambda: MappingProxyType({}))
     """Open sources by their name."""
@@ -66,7 +66,7 @@ class Snapshot:
         return found
 
     def after_output(self, output: Output, t_ns: int) -> Snapshot:
-        """Return the state after an output; `t_ns` is the stamp of the event before it."""
+        """Return the state after an output; `t_ns` is the stamp of the previous event."""
         if not isinstance(output, CalibrationReady) or self.configured is None:
             return self
         configured = replace(self.configured, calibration=output.calibration, calibration_age_s=0.0)
