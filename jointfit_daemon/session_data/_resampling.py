@@ -117,8 +117,8 @@ def interpolate_values(t_s: Array, values: Array, at_s: Array) -> Array:
 def interpolate_orientations(t_s: Array, q: Array, at_s: Array) -> Array:
     """Interpolate along the shortest rotation; shape (n, 4) to (m, 4), NaN as `interpolate_values`.
 
-    The result is the spherical linear interpolation q_i exp(a log(q_i* q_i+1)) between the rows i
-    and i + 1, at the share a of their interval.
+    The result is the spherical linear interpolation q_i exp(a log(q_i* q_i+1)). It is the value
+    between rows i and i + 1, at the share a of their interval.
     """
     i, j, share = _neighbours(t_s, at_s)
     if not len(t_s):

@@ -17,8 +17,8 @@ from math import inf
 from jointfit_daemon.pipeline.events import Notice, NoticeKind
 
 RECOVERY_S = 4.0
-"""Time after a stall of the event loop in which sensors recover, s: 2 s without a fault, and 2 s to
-process the delayed data."""
+"""Time after a stall of the event loop in which sensors recover, s. It consists of 2 s without a
+fault, and 2 s to process the delayed data."""
 LONGEST_S = 30.0
 """Longest time for which stalls postpone a line, s."""
 

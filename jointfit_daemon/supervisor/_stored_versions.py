@@ -37,8 +37,9 @@ class VersionSummary:
     restored_from: int | None = None
     """Version of which this version is a copy."""
     online: dict[str, Any] | None = None
-    """Last refit by online learning in the models of this version: number of refits since the
-    functional phase, version before it, and errors before and after; None without one."""
+    """Last refit by online learning in the models of this version, None without a refit. The keys
+    are number of refits since the functional phase, previous version, and errors before and
+    after."""
     functional: bool | None = None
     """Whether the calibration was determined from a movement in view of the cameras."""
     usable: bool = False

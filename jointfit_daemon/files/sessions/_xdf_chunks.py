@@ -1,6 +1,6 @@
 """Chunks of XDF files: reading of chunks, and of streams with samples and clock offsets.
 
-A file is ``XDF:`` followed by chunks; a chunk is the number of length bytes (1, 4 or 8), the length
+A file is ``XDF:`` followed by chunks. A chunk is the number of length bytes (1, 4 or 8), the length
 in these bytes, a 16-bit tag and content. Source: https://github.com/sccn/xdf/wiki/Specifications.
 
 Invariants: memory grows with the size of the file, for any declared length; a truncated or foreign

@@ -55,9 +55,10 @@ class TakeoverDetector:
     def suspects(self, lasted_s: float, *, taken_over: bool) -> bool:
         """Return whether an older daemon probably ended the last connection.
 
-        The n-th short connection in a row, or the (n + 2)-th without a reason, raises the suspicion
-        if the first one was shorter than ``NEWCOMER_S * 2**(n - 1)``. An established daemon counts
-        as connected for `SHORT_S`, so one of two established daemons also gives way.
+        The n-th short connection in a row raises the suspicion; without a reason from the broker,
+        the (n + 2)-th does. The first connection must have been shorter than
+        ``NEWCOMER_S * 2**(n - 1)``. An established daemon counts as connected for `SHORT_S`, so one
+        of two established daemons also gives way.
 
         Parameters
         ----------

@@ -15,7 +15,7 @@ _CONVERTED = {"_rad": ("_deg", 180.0 / math.pi), "_ns": ("_ms", 1e-6)}
 _TABLES = {"segments": "segments_rad", "flexion": "flexion_rad"}
 """Tables of ``holdout`` with values in radians by segment or joint, and method."""
 _PARAMETERS = ("sensors", "regression")
-"""Tables of quaternions and coefficients, which are published with all digits: with four digits, an
+"""Tables of quaternions and coefficients, which are published with all digits. With four digits, an
 orientation computed from the table would have an error of about 0.1 degrees."""
 _DIGITS = 4
 

@@ -165,7 +165,7 @@ def repair_unfinished(
 ) -> list[RepairResult | str]:
     """Repair the files that earlier runs of `rig` left unfinished.
 
-    A repaired file gets its final name. The unfinished file is deleted; if it was damaged before
+    A repaired file gets its final name. The unfinished file is deleted. If it was damaged before
     its end, or a file with the final name exists, it is renamed to ``….bad`` instead.
 
     Returns

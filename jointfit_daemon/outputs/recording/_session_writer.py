@@ -56,10 +56,10 @@ ABANDON_S = 5.0
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors that end when files are deleted; with these errors a file is not abandoned."""
 _YIELD_MESSAGES, _YIELD_S = 32, 0.0005
-"""Number of messages encoded at once, and the pause after them, s: the event loop waits for the
+"""Number of messages encoded at once, and the pause after them, s. The event loop waits for the
 interpreter lock for less than half a millisecond."""
 _LONGEST_PAUSED_S = 0.05
-"""Time after which a batch is encoded without pauses, s: on a busy machine the pauses take long,
+"""Time after which a batch is encoded without pauses, s. On a busy machine the pauses take long,
 and a kill loses messages that are not written."""
 
 PROGRAM = f"jointfitd {__version__}"

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 RECENT_NS = 10_000_000_000
 """Time over which recent errors are computed, ns: a few gait cycles."""
 FARTHEST_M = 1000.0
-"""Distance from the origin beyond which a marker counts as missing, m: no camera has this range,
+"""Distance from the origin beyond which a marker counts as missing, m. No camera has this range,
 and the squares of larger distances would spoil the solution."""
 FEWEST_MARKERS = 3
 """Smallest number of markers of a frame with a solution. Fewer markers do not determine the

@@ -147,8 +147,8 @@ def _markers_in_use(answers: Given) -> set[str]:
 def markers(answers: Given, found: Found, part: str) -> tuple[str, ...] | None:
     """Return the markers of the stream whose names fit `part`, or usual names without a stream.
 
-    A group of names that differ in their last digits belongs to a part if the group has the name of
-    the part, or begins with the usual letters of the part.
+    Names that differ only in their last digits form a group. The group belongs to a part if it has
+    the name of the part, or begins with the usual letters of the part.
     """
     if not found.markers:
         return unused_markers(answers, found, part)
