@@ -1,8 +1,8 @@
 """TLS to a broker.
 
 Invariant: certificates are always verified, and the TLS version is at least 1.2. Verification
-cannot be switched off: a private broker has a private certificate authority, which ``[mqtt.tls]
-ca`` names.
+cannot be switched off: a private broker has a private certificate authority, which
+``[mqtt.tls] ca`` names.
 """
 
 from __future__ import annotations
