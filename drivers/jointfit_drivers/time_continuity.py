@@ -46,7 +46,7 @@ class TimeStep(NamedTuple):
     lost: int = 0
     """Number of messages lost before this one."""
     held: bool = False
-    """Whether this message is to be held until the next one."""
+    """Whether this message is to be held until the next message."""
     restarted: bool = False
     """Whether the held message is valid, comes first, and is the first of a restarted clock."""
 
@@ -116,7 +116,7 @@ class TimeContinuity:
         )
 
     def _accept(self, last: _Instant, instant: _Instant) -> int:
-        """Make `instant` the last one; return the number of messages lost before it."""
+        """Store `instant` as the last instant; return the number of messages lost before."""
         self._last = instant
         step_ns = instant.device_ns - last.device_ns
         self._delay.feed(step_ns, instant.arrival_ns - last.arrival_ns)

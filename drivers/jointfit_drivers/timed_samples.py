@@ -38,7 +38,7 @@ class RawVectors(NamedTuple):
 
 
 class TimedReading(NamedTuple):
-    """Content of one message: an orientation, raw measurements, or neither if it is not valid."""
+    """Content of one message: an orientation or raw measurements; neither if invalid."""
 
     size: int
     """Length on the wire, bytes."""

@@ -92,7 +92,7 @@ class LabelFault(NamedTuple):
     parts: tuple[str, ...]
     """Body parts of these markers, sorted."""
     cycle: bool = True
-    """Whether the last marker is at the place of the first. Otherwise the last one is hidden."""
+    """Whether the last marker is at the place of the first marker, not hidden."""
 
     @property
     def places(self) -> str:
@@ -373,7 +373,7 @@ class LabelSearch:
         return found[0] if len(found) == 1 else None
 
     def _groups(self, place_of: dict[int, int], elsewhere: Sequence[int]) -> list[LabelFault]:
-        """Return the chains and cycles of labels at each other's places."""
+        """Return the chains and cycles of exchanged labels."""
         groups = []
         left = dict(place_of)
         ends = [c for c in place_of if c not in set(place_of.values())]  # open chains first

@@ -43,7 +43,7 @@ class PhysicalTestResult:
     agrees: bool
     """Whether world, axes and direction are as configured."""
     deviations_deg: tuple[float, float, float]
-    """Deviation of each measured rotation from the one that was asked for, deg."""
+    """Deviation of each measured rotation from the requested rotation, deg."""
     found: str
     """Convention of the quaternions as received, in words."""
     rig_toml: tuple[str, ...]
@@ -74,7 +74,7 @@ class PhysicalTest:
 
     @property
     def instruction(self) -> str | None:
-        """Instruction of the present step; None after the last one."""
+        """Instruction of the present step; None after the last step."""
         done = len(self.rests)
         return STEPS[done].format(id=self.source.id) if done < len(STEPS) else None
 

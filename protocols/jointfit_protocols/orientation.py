@@ -91,7 +91,7 @@ class OrientationGate:
         self._norms: list[float] = []
 
     def admit(self, q: Quaternion) -> Quaternion | None:
-        """Return `q` as a unit quaternion with the sign nearest the last one; None if rejected."""
+        """Return `q` as a unit quaternion with the sign of the last result; None if rejected."""
         w, x, y, z = q
         square = w * w + x * x + y * y + z * z
         refused = not self._low <= square <= self._high  # NaN compares false: refused

@@ -56,7 +56,7 @@ class BitstreamTracker:
         return self.version != UNKNOWN
 
     def announce(self, version: Version) -> None:
-        """Process the version of a SERVERINFO: the first one is used, later ones are candidates."""
+        """Process the version of a SERVERINFO: the first is used, later versions are candidates."""
         self._announced = version
         if not self.known or not supported(self.version):
             self.version = version

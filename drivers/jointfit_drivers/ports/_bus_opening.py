@@ -33,7 +33,7 @@ OPEN_S = 5.0
 _SERVER_S = 1.5
 """Longest wait for the connection to a server, and for each answer, s."""
 _GREETING, _OPENED = "< hi >", "< ok >"
-"""Texts of a socketcand server: the first one, and the answer to the opening of a bus."""
+"""Texts of a socketcand server: the greeting, and the answer to the opening of a bus."""
 _LONGEST = 40
 """Longest answer, bytes: enough to name another kind of server."""
 

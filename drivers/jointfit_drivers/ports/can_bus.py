@@ -127,7 +127,7 @@ class SharedBus:
         """Identifiers of every device that has subscribed, also while it waits for a retry."""
 
     async def enter(self) -> None:
-        """Register a user; the first one opens the bus."""
+        """Register a user; the first user opens the bus."""
         self.users += 1
         async with self._lock:
             if self._backend is None:
@@ -137,7 +137,7 @@ class SharedBus:
                 self._backend = backend
 
     async def leave(self) -> None:
-        """Unregister a user; the last one closes the bus."""
+        """Unregister a user; the last user closes the bus."""
         self.users -= 1
         async with self._lock:
             if self.users and self._failed is None:

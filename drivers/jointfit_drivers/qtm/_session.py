@@ -38,7 +38,7 @@ RETRY_S = 1.0
 RESUME_S = 2.0
 """Time after the start of a measurement without frames, s, before they are requested again."""
 VERSIONS = tuple(f"1.{minor}" for minor in range(25, 18, -1))
-"""Versions of the protocol that the driver requests, the first one preferably."""
+"""Versions of the protocol that the driver requests, in order of preference."""
 GREETING = "QTM RT Interface connected"
 START = "start QTM, and a new measurement or the preview"
 _DATA_TYPES = {PacketType.DATA, PacketType.NO_MORE_DATA}

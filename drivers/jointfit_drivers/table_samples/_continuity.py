@@ -44,7 +44,7 @@ class RecordStep(NamedTuple):
     restarted: bool = False
     """Whether the device restarted before the held sample."""
     held: bool = False
-    """Whether this sample waits for the next one."""
+    """Whether this sample waits for the next sample."""
     confirmed: bool = False
     """Whether the held sample is valid and comes first; otherwise it is dropped."""
     lost_since: int = 0

@@ -115,7 +115,7 @@ class RecordSamples(Refusals):
         return out + self._sample(record, ticks, counter)
 
     def _confirmed(self, held: TableRecord, *, restarted: bool) -> list[Decoded]:
-        """Return the sample of the held record, which the next one confirmed."""
+        """Return the sample of the held record, which the next record confirmed."""
         ticks = self._ticks(held.values)
         out: list[Decoded] = []
         if restarted:
@@ -130,7 +130,7 @@ class RecordSamples(Refusals):
 
     @override
     def flush(self) -> list[Decoded]:
-        """Refuse a record that waits for the next one."""
+        """Refuse a record that waits for the next record."""
         held, self._held = self._held, None
         if held is None:
             return []

@@ -18,7 +18,7 @@ _SIGHTINGS = 10
 
 
 class BusIdSelection:
-    """Selects the device whose measurements are used: the first one that sends."""
+    """Selects the device whose measurements are used: the first device that sends."""
 
     def __init__(self) -> None:
         self._selected: int | None = None

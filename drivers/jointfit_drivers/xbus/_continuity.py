@@ -59,7 +59,7 @@ class XbusStep(NamedTuple):
     restarted: bool = False
     """Whether the device restarted before the held orientation."""
     held: bool = False
-    """Whether this orientation is to be held until the next one."""
+    """Whether this orientation is to be held until the next orientation."""
     confirmed: bool = False
     """Whether the held orientation is valid and is returned first; otherwise it is dropped."""
     lost_since: int = 0
@@ -152,7 +152,7 @@ class XbusContinuity:
         self._delay = BacklogDelay()
 
     def _accept(self, last: _OrientationPoint, point: _OrientationPoint) -> XbusStep:
-        """Make `point` the last one and update the measured rate."""
+        """Store `point` as the last point and update the measured rate."""
         self._last, self._trusted = point, True
         self._delay_to(last, point)
 

@@ -75,7 +75,7 @@ class XbusConversation:
         await self._port.write(encode(mid, data))
 
     async def request(self, mid: int, data: bytes = b"", *, tries: int = 2) -> XbusMessage | None:
-        """Send a request until its reply, or an error, arrives; return None if neither does."""
+        """Send a request until its reply or an error arrives; return None if nothing arrives."""
         for _ in range(tries):
             await self.send(mid, data)
             reply = await self.receive({mid + 1, XbusMessageId.ERROR}, self.reply_s)

@@ -64,7 +64,7 @@ class XcdiStep(NamedTuple):
     shared: bool = False
     """Whether two sensors send with the same identifiers; this group may then be a mixture."""
     held: bool = False
-    """Whether this group is to be held until the next one."""
+    """Whether this group is to be held until the next group."""
     confirmed: bool = False
     """Whether the held group is valid and is returned first; otherwise it is dropped."""
 
@@ -185,7 +185,7 @@ class _Track:
         self._steps: list[float] = []
 
     def continues(self, ticks: int | None, counter: int | None) -> bool:
-        """Whether a group may be the next one of this sensor."""
+        """Whether a group may be the next group of this sensor."""
         count = self._count(counter)
         if count is not None and count > COUNTER_MODULUS // 2:
             return False

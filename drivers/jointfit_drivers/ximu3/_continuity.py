@@ -77,7 +77,7 @@ class XImu3Step(NamedTuple):
     restarted: bool = False
     """Whether the device restarted before the held one."""
     held: bool = False
-    """Whether this one is to be held until the next one."""
+    """Whether this message is to be held until the next message."""
     confirmed: bool = False
     """Whether the held one is valid and is returned first; otherwise it is dropped."""
     lost_since: int = 0
@@ -151,7 +151,7 @@ class XImu3Continuity:
         return self._deviation_of(last, point) <= allowed
 
     def _confirms(self, held: XImu3Point, point: XImu3Point) -> bool:
-        """Whether a message may be the next one after the held one."""
+        """Whether a message may be the next message after the held message."""
         passed = point.ticks - held.ticks
         if not 0 <= passed <= (_FEW * self._period if self._period else _FIRST_US):
             return False
@@ -188,7 +188,7 @@ class XImu3Continuity:
         return 2.0 * sqrt(w * w + x * x + y * y + z * z)
 
     def _accept(self, last: XImu3Point, point: XImu3Point) -> int:
-        """Make `point` the last one; return the number of messages lost before it."""
+        """Store `point` as the last point; return the number of messages lost before."""
         passed = point.ticks - last.ticks
         self._delay.feed(passed * 1000, point.arrival_ns - last.arrival_ns)
         dropped, self._dropped = self._dropped, 0

@@ -257,7 +257,7 @@ class MagnetometerStep:
         return StepProgress(share, () if self.is_complete else direction_names(missing))
 
     def add(self, reading: SensorReading) -> None:
-        """Add a reading; it is kept if its field differs from the last one."""
+        """Add a reading if its field differs from the field of the last added reading."""
         field = reading.magnetic
         if field is None:
             return

@@ -128,7 +128,7 @@ def _previous(job: StaticJob | FunctionalJob | RefitJob) -> Calibration | None:
 
 
 def _alignment(job: StaticJob | FunctionalJob) -> PlateAlignment | None:
-    """Return the alignment of this session, else the one of the calibration in force, else None."""
+    """Return the alignment of this session or of the calibration in force; None without either."""
     if job.alignment is not None:
         return PlateAlignment.from_dict(job.alignment)
     previous = _previous(job)

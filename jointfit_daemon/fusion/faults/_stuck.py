@@ -101,7 +101,7 @@ class _SensorHistory:
         return False
 
     def reset(self) -> None:
-        """Mark the sensor as silent: its next orientation is not compared with the last one."""
+        """Mark the sensor as silent; the next orientation is not compared with the last."""
         self.since_ns = None
         self.repeating = self.lagging = self.still = False
 

@@ -147,7 +147,7 @@ class TickTime:
         return self.to_ns(ticks)
 
     def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - the readers' common shape
-        """Return the event for a restart at this sample, `elapsed_ns` after the one before."""
+        """Return the event for a restart at this sample, `elapsed_ns` after the last sample."""
         before, modulus = self._last or 0, self._clock.modulus
         if modulus:
             before %= modulus
@@ -212,7 +212,7 @@ class CounterTime:
         return number * self._period_ns
 
     def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - the readers' common shape
-        """Return the event for a restart at this sample, `elapsed_ns` after the one before."""
+        """Return the event for a restart at this sample, `elapsed_ns` after the last sample."""
         period = self._period_ns
         return clock_restart_event(self._raw * period, (counter or 0) * period, elapsed_ns)
 
@@ -291,7 +291,7 @@ class ArrivalTime:
         return number * period
 
     def explain(self, ticks: int | None, counter: int | None, elapsed_ns: int) -> ClockEvent:  # noqa: ARG002 - the readers' common shape
-        """Return the event for a restart at this sample, `elapsed_ns` after the one before."""
+        """Return the event for a restart at this sample, `elapsed_ns` after the last sample."""
         if elapsed_ns > _SILENCE_NS:
             return clock_event(
                 f"no samples for {elapsed_ns / NS:.1f} s from a device without sample counter; "

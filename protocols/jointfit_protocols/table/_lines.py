@@ -29,7 +29,7 @@ class LineFormat(NamedTuple):
     """Description of the lines of a serial device."""
 
     columns: Mapping[int, int]
-    """Column of each slot of the record; the first one is 0."""
+    """Column of each slot of the record; the first column is 0."""
     separator: bytes = b","
     prefix: bytes = b""
     """First bytes of every line with measurements; the first column follows."""

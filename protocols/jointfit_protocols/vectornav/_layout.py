@@ -36,7 +36,7 @@ class Field(IntEnum):
     YAW_PITCH_ROLL = 0x03
     """Yaw, pitch and roll, degrees."""
     QUATERNION = 0x04
-    """x, y, z, w: the scalar is the last one. Sensor to north-east-down."""
+    """Quaternion x, y, z, w with the scalar last, from sensor to north-east-down."""
     ANGULAR_RATE = 0x05
     """Compensated angular rate, rad/s."""
     ACCELERATION = 0x08

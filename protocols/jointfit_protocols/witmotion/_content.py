@@ -61,7 +61,7 @@ def rate_of(data: bytes) -> tuple[float, float, float]:
 
 
 def registers_of(data: bytes) -> tuple[int, int, int, int]:
-    """Return the four registers of a frame 0x5F, from the one that was requested."""
+    """Return the four registers of a frame 0x5F, from the requested register on."""
     a, b, c, d = _REGISTERS.unpack(data)
     return a, b, c, d
 
