@@ -77,7 +77,7 @@ def test_the_recording_gives_202_samples_and_one_refused_message(
     assert len(found) == subject.messages == 202
     assert (found[0].ticks, found[-1].ticks) == (1_000_000, 2_990_001)
     assert [event for event in events if not isinstance(event, ImuSample)] == [
-        Corrupt(32, "quaternion norm is not 1")
+        Corrupt(32, "quaternion norm is not 1", rejected=1)
     ]
     assert subject.discarded_bytes == 32
 
@@ -146,14 +146,14 @@ def test_matrices_and_angles_give_the_orientation_of_the_quaternion(one: int, ot
 def test_a_matrix_that_is_no_rotation_is_refused() -> None:
     mirror = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0)
     assert fed(decoder(), encode_data("R", 1, mirror), encode_data("R", 2, 9 * (0.5,))) == 2 * [
-        Corrupt(46, "rotation matrix is not orthonormal")
+        Corrupt(46, "rotation matrix is not orthonormal", rejected=1)
     ]
 
 
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
 def test_euler_angles_that_are_not_finite_are_refused(value: float) -> None:
     wire = encode_data("A", 1, (0.0, value, 0.0))
-    assert fed(decoder(), wire) == [Corrupt(len(wire), "Euler angles are not finite")]
+    assert fed(decoder(), wire) == [Corrupt(len(wire), "Euler angles are not finite", rejected=1)]
 
 
 def test_older_firmware_sends_the_quaternion_with_accelerations() -> None:
@@ -236,7 +236,7 @@ def test_a_time_with_a_flipped_bit_is_dropped() -> None:
         assert len(samples(events)) == 59
         assert reports(events, "gap", "restart") == []
     wires[45] = message(45, ticks=1 << 60)
-    assert Corrupt(26, "device time out of range") in fed(decoder(), *wires)
+    assert Corrupt(26, "device time out of range", rejected=1) in fed(decoder(), *wires)
 
 
 def test_a_sudden_motion_is_delayed_by_one_message_and_complete() -> None:
@@ -277,7 +277,7 @@ def test_edges_are_pulses_of_the_configured_wire() -> None:
     pulses = [event for event in rising if isinstance(event, SyncPulse)]
     assert [(pulse.ticks, pulse.line) for pulse in pulses] == [(1_091_000, 2), (1_093_000, 2)]
     assert [event for event in rising if isinstance(event, Corrupt)] == [
-        Corrupt(14, "time of an edge far from that of the measurements")
+        Corrupt(14, "time of an edge far from that of the measurements", rejected=1)
     ]
     falling = fed(decoder(sync_wire=2, sync_edge="falling"), *wires[:-1])
     assert [e.ticks for e in falling if isinstance(e, SyncPulse)] == [1_090_000, 1_092_000]
@@ -354,4 +354,4 @@ def test_raw_values_out_of_range_are_refused() -> None:
     subject = decoder(orientation="gateway")
     good = [encode_data("I", n * PERIOD_US, (0.0, 0.0, 0.0, 0.0, 0.0, 1.0)) for n in range(5)]
     bad = encode_data("I", 5 * PERIOD_US, (math.nan, 0.0, 0.0, 0.0, 0.0, 1.0))
-    assert fed(subject, *good, bad)[-1] == Corrupt(34, "raw values out of range")
+    assert fed(subject, *good, bad)[-1] == Corrupt(34, "raw values out of range", rejected=1)
