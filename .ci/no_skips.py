@@ -28,6 +28,7 @@ NOT_IN_MINIMAL = (
         for package in ("mosquitto", "systemd", "groff-base", "gcc python3-dev")
     ),
     "needs a host whose own name has an address",
+    "make mutation installs it",
 )
 """Further reasons of tests that the minimal system may skip."""
 
