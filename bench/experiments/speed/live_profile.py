@@ -1,8 +1,8 @@
 """Shares of the CPU time of a running daemon by part of the program, sampled with py-spy.
 
 A sample counts for the innermost function of the project on the stack: time in NumPy, orjson or the
-system counts for the function that calls it. What no function of the project calls is the event
-loop.
+system counts for the function that calls it. A sample without any function of the project counts
+for the event loop.
 """
 
 from __future__ import annotations
