@@ -46,6 +46,11 @@ PARTS = ("parallel", "alone", "experiments", "experiments-alone")
 """Which tests run together: by the markers `experiment` and `alone`."""
 ONLY_EXPERIMENTS = re.compile(r"^pytestmark = .*\bmark\.experiment\b", re.MULTILINE)
 """Line of a file whose tests are all experiments."""
+EXPERIMENT_TIMEOUT_S = 600.0
+"""Time limit of an experiment without a limit of its own, against hangs only. Experiments that
+compute run at low priority, so that daemons beside them keep their time: they can take ten times as
+long as alone.
+"""
 GRACE_S = 6.0
 """How long descriptors and tasks may take to close: executors, child processes and the task of an
 MQTT client that checks its connection every second end a little later.
@@ -82,7 +87,10 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect the tests of the other parts."""
+    """Give experiments time, and deselect the tests of the other parts."""
+    for item in items:
+        if item.get_closest_marker("experiment") and not item.get_closest_marker("timeout"):
+            item.add_marker(pytest.mark.timeout(EXPERIMENT_TIMEOUT_S))
     part = config.getoption("part")
     if part is None:
         return
