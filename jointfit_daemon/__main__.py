@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         level=options.log_level.upper(),
         handlers=[_log_handler(rig.name, limited=options.log_level != "debug")],
     )
-    # aiomqtt's logger: the daemon reports connection faults itself
+    # The daemon reports connection faults itself, so aiomqtt's logger reports errors only.
     logging.getLogger("mqtt").setLevel(logging.ERROR)
 
     if not _lock_state_directory():

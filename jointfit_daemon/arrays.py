@@ -6,4 +6,4 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-"""Real numbers in double precision; the shape and the unit are in the docstring of each use."""
+"""Real numbers in double precision. Each docstring that uses the type states shape and unit."""

@@ -1,7 +1,7 @@
 """Optional abilities of drivers: to find devices, and to name the cause of missing data.
 
-A driver class that has a method of this module is asked by ``jointfit probe``, ``jointfit doctor``
-and ``jointfit init``. A driver without it works as before, and is not asked.
+``jointfit probe``, ``jointfit doctor`` and ``jointfit init`` call the methods of this module. A
+driver class may implement any of them; the commands skip drivers without the method.
 
 Invariant: this module names no device.
 """
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
 Level = Literal["ok", "note", "warning", "error", "unknown"]
-"""Level of a finding; ``unknown``: it could not be checked."""
+"""Level of a finding. ``unknown`` means that the check could not be made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +23,8 @@ class Finding:
     """One result of a diagnosis."""
 
     check: str
-    """Subject of the check: ``serial``, ``can``, ``mocap``, ``broker``, ``clock``, ``disk`` and so
-    on."""
+    """Subject of the check, such as ``serial``, ``can``, ``mocap``, ``broker``, ``clock`` or
+    ``disk``."""
     id: str
     """Name of the device, interface or file; empty if the subject is the host."""
     level: Level
@@ -36,10 +36,10 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class FoundServer:
-    """One server of motion capture that answered."""
+    """One motion-capture server that answered the search."""
 
     driver: str
-    """Driver that uses it."""
+    """Name of the driver that reads data from this server."""
     server: str
     """Numeric address of the server."""
     port: int
@@ -47,26 +47,26 @@ class FoundServer:
     """Address of this host's network card at which the answer arrived."""
     application: str
     version: str
-    """Version of the application."""
+    """Version of the server application."""
     protocol: str
     """Name and version of the protocol, such as ``NatNet 3.1``."""
     transport: str
     """``unicast`` or ``multicast``."""
     bodies: tuple[str, ...] = ()
-    """Names of its rigid bodies, if it was asked for them."""
+    """Names of the server's rigid bodies; empty if they were not requested."""
     markers: tuple[str, ...] = ()
-    """Names of its labeled markers, if it was asked for them."""
+    """Names of the server's labeled markers; empty if they were not requested."""
 
 
 class StreamSearch(Protocol):
-    """Ability of a driver with byte streams."""
+    """Search ability of a driver whose devices send byte streams."""
 
     usual_bauds: ClassVar[tuple[int, ...]]
-    """Speeds at which its devices send, the most frequent first, baud."""
+    """Usual speeds of the devices, baud, the most frequent first."""
 
 
 class CanSearch(Protocol):
-    """Ability of a driver with CAN frames."""
+    """Search ability of a driver whose devices send CAN frames."""
 
     @classmethod
     def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterable[Mapping[str, Any]]:
@@ -75,13 +75,13 @@ class CanSearch(Protocol):
         Parameters
         ----------
         seen
-            Number of data bytes of each identifier that was received, by number and whether it
-            has 29 bits.
+            Number of data bytes of each received identifier. A key consists of the number of the
+            identifier and whether it has 29 bits.
         """
 
 
 class ServerSearch(Protocol):
-    """Ability of a driver of motion capture to find servers."""
+    """Search ability of a driver for motion-capture servers."""
 
     @classmethod
     async def find_servers(
@@ -92,9 +92,9 @@ class ServerSearch(Protocol):
         Parameters
         ----------
         hosts
-            Names or addresses to ask; each answers with its rigid bodies and markers, too.
+            Names or addresses of hosts to query. The answers include rigid bodies and markers.
         broadcast
-            Whether to ask all hosts in the networks of this host.
+            Whether to query all hosts in the networks of this host.
         port
             Command port; None for the usual one.
 
@@ -112,5 +112,6 @@ class Diagnosis(Protocol):
     async def diagnose(cls, settings: Any, wait_s: float) -> list[Finding]:
         """Return the findings for a table of rig.toml; `wait_s` limits the wait for data.
 
-        The search opens the device as the daemon does, and raises no error of the device.
+        The method opens the device in the same way as the daemon. Errors of the device become
+        findings, not exceptions.
         """

@@ -1,8 +1,8 @@
 """The driver interface: settings, decoder, errors, and lookup by entry point.
 
 Invariant: this module names no device. Drivers are registered in the entry point group
-``jointfit.drivers`` and imported one at a time when used, so a broken plug-in affects its users
-only.
+``jointfit.drivers``. A driver is imported when a rig first uses it, so a broken plug-in affects
+only rigs that use it.
 
 A driver has two parts. ``decoder()`` returns the pure part: it converts chunks to samples in SI
 units, without clock or port. ``run(emit)`` opens and configures the device, and reads until
@@ -43,7 +43,8 @@ ENTRY_POINT_GROUP = "jointfit.drivers"
 """Entry point group in which a package registers its drivers."""
 
 Emit = Callable[[Chunk], None]
-"""Passes one chunk to the daemon, synchronously. Do not catch its exceptions: they are bugs."""
+"""Function that passes one chunk to the daemon synchronously. A driver must not catch its
+exceptions, because they are bugs."""
 
 Wire = Literal["stream", "datagram", "can"]
 """Content of a chunk: any part of a byte stream, one datagram, or a sequence of CAN records."""
@@ -60,29 +61,30 @@ class DeviceLostError(Exception):
 class DeviceAbsentError(DeviceLostError):
     """The port of the device is unplugged, or does not exist.
 
-    The next attempts fail for the same reason, so only the first report is passed on.
+    Further attempts fail for the same reason until the port appears, so only the first failure is
+    reported.
     """
 
 
 class DeviceMisconfiguredError(Exception):
     """The device cannot work with these settings; the message names the setting to change.
 
-    The source pauses until another device is on its port, for at most a minute, or until a reload.
-    Faults that can end by themselves (a port in use, no free descriptor, a bus that is down) are a
-    `DeviceLostError`.
+    The source pauses for at most a minute. It continues earlier after a reload, or if another
+    device appears on its port. Raise `DeviceLostError` for faults that can end without a change of
+    the settings: a port in use, no free file descriptor, or a bus that is down.
     """
 
 
 class Settings(BaseModel):
-    """Base of all tables of rig.toml: frozen, unknown keys are refused."""
+    """Base class of all tables of rig.toml. Instances are frozen, and unknown keys are rejected."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def contradictions(self) -> Iterable[tuple[str, str]]:
         """Yield the keys whose values do not fit together, each with the fault and its remedy.
 
-        Override this method instead of adding a validator of the model: the check of rig.toml also
-        calls it for tables with other faults. A value that cannot be read is then None.
+        Override this method instead of adding a model validator. The check of rig.toml also calls
+        it for tables with other faults; values that cannot be read are then None.
         """
         return ()
 
@@ -98,7 +100,7 @@ CONTRADICTION = "contradiction"
 
 
 class CanBusError(ValueError):
-    """A ``[can.NAME]`` table cannot be used on this machine; a validator of a driver raises it.
+    """A ``[can.NAME]`` table cannot be used on this machine. Validators of drivers raise it.
 
     Parameters
     ----------
@@ -143,7 +145,8 @@ _HOST_LABEL = re.compile(r"(?!-)[\w-]{1,63}(?<!-)")
 
 
 _NO_PORT = re.compile(r"(v|vx|sl)?can\d+|eth\d+|tty\w+|COM\d+", re.IGNORECASE)
-"""Names of network interfaces, of Windows, and of device files without their folder."""
+"""Names that are no path of a port: network interfaces, Windows ports, and device files without
+their folder."""
 
 
 def port_path_fault(path: str) -> str | None:
@@ -195,7 +198,7 @@ class CanBusSettings(Settings):
     @field_validator("channel")
     @classmethod
     def _check_channel(cls, channel: str, info: ValidationInfo) -> str:
-        """Refuse names that the kernel does not permit."""
+        """Reject names that the kernel does not permit."""
         if not channel:
             raise ValueError("must not be empty")
         interface = info.data.get("interface")
@@ -210,7 +213,7 @@ class CanBusSettings(Settings):
     @field_validator("bitrate")
     @classmethod
     def _check_bitrate(cls, bitrate: int, info: ValidationInfo) -> int:
-        """Refuse bit rates for which SLCAN has no command."""
+        """Reject bit rates for which SLCAN has no command."""
         if info.data.get("interface") == "slcan" and bitrate not in _SLCAN_BITRATES:
             known = ", ".join(map(str, _SLCAN_BITRATES))
             raise ValueError(f"not a bit rate of SLCAN: expected one of {known}")
@@ -245,12 +248,12 @@ class ImuSettings(Settings):
 
     @property
     def serial_bits_per_s(self) -> float | None:
-        """Bit rate of its samples on a separate serial line, bit/s; None if unlimited."""
+        """Bit rate of the samples on a separate serial line, bit/s; None without a limit."""
         return None
 
     @property
     def can_frames(self) -> tuple[tuple[int, bool], ...]:
-        """CAN frames of one sample: number of data bytes, and whether the identifier has 29 bit."""
+        """CAN frames of one sample: number of data bytes, whether the identifier has 29 bits."""
         return ()
 
 
@@ -286,7 +289,7 @@ class MocapSettings(Settings):
 def device_path(settings: object) -> str | None:
     """Return the device file or interface of a driver: its `port`, or the channel of its bus.
 
-    None if the table has neither, as for a network device.
+    Return None if the table has neither, for example for a network device.
     """
     found = getattr(settings, "port", None) or getattr(
         getattr(settings, "can", None), "channel", None
@@ -297,8 +300,8 @@ def device_path(settings: object) -> str | None:
 class Decoder(Protocol):
     """The pure part of a driver. No input raises an exception.
 
-    A decoder that decodes frames and does not return them has counters of type int:
-    ``unpublished`` (the content is not described yet), ``duplicates`` and ``late``.
+    Some decoders decode frames that they do not return. Such a decoder has three counters of type
+    int: ``unpublished`` (frames whose layout is not known yet), ``duplicates`` and ``late``.
     """
 
     @property
@@ -324,9 +327,9 @@ class Driver(Protocol):
     """The interface of a driver class, as registered by an entry point."""
 
     Settings: ClassVar[type[Any]]
-    """Pydantic model of its table in rig.toml; derives from `ImuSettings` or `MocapSettings`."""
+    """Pydantic model of the driver's table; a subclass of `ImuSettings` or `MocapSettings`."""
     wire: ClassVar[Wire]
-    """Content of its chunks."""
+    """Content of the driver's chunks."""
 
     def __init__(self, settings: Any) -> None: ...
 
@@ -336,7 +339,7 @@ class Driver(Protocol):
     async def run(self, emit: Emit) -> None:
         """Open and configure the device, and read until cancelled.
 
-        Every further attempt calls this method of the same object again.
+        After a failure the daemon calls this method again on the same object.
 
         Raises
         ------
@@ -352,7 +355,7 @@ class UnknownDriverError(LookupError):
 
 
 def entry_points(*, group: str) -> EntryPoints:
-    """Return the entry points of a group; the search on `sys.path` takes 8 ms and is done once."""
+    """Return the entry points of a group. The search of `sys.path` takes 8 ms, so it is cached."""
     return _entry_points_on(tuple(sys.path), group)
 
 
@@ -372,7 +375,7 @@ def find_driver(name: str) -> type[Driver]:
     Raises
     ------
     UnknownDriverError
-        The name is not registered; the message lists the nearest and all names.
+        The name is not registered; the message contains the most similar name and all names.
     """
     found = [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name == name]
     if not found:

@@ -59,29 +59,30 @@ class ImuSample(NamedTuple):
     """One sample of one IMU."""
 
     arrival_ns: int
-    """Arrival of the first byte, CLOCK_MONOTONIC ns (on a UART back-dated by bytes and baud)."""
+    """Arrival of the first byte, CLOCK_MONOTONIC ns. On a UART it is computed from the number of
+    bytes and the baud rate."""
     q_world_sensor: Quaternion
     """Unit quaternion, sensor to ENU world of this sensor (heading may be arbitrary)."""
     q_native: Quaternion
-    """Quaternion as sent: scaled, neither rotated nor normalised."""
+    """Quaternion as sent, converted to real numbers, but neither rotated nor normalised."""
     ticks: int | None
     """Device time as sent, in ticks of the decoder's ``tick_clock``; None without device time."""
     counter: int | None
-    """Sequence number as sent; None without one."""
+    """Sequence number as sent; None if the device sends none."""
     status: int | None = None
-    """Status word of the device; None without one."""
+    """Status word of the device; None if the device sends none."""
     rate: Vector | None = None
-    """Angular rate at the instant of the orientation, sensor axes, rad/s; None without one. A mean
-    over the interval since the last sample is not accepted."""
+    """Angular rate at the instant of the orientation, sensor axes, rad/s; None if not sent. A mean
+    over the interval since the last sample is not permitted."""
     acceleration: Vector | None = None
-    """Specific force, sensor axes, m/s² (+9.81 upwards at rest); None without one."""
+    """Specific force, sensor axes, m/s² (+9.81 upwards at rest); None if not sent."""
     magnetic: Vector | None = None
-    """Magnetic field, sensor axes, in the unit of the device; None without one."""
+    """Magnetic field, sensor axes, in the unit of the device; None if not sent."""
 
 
 @dataclass(frozen=True, slots=True)
 class MocapLayout:
-    """Names of the markers and rigid bodies of a `MocapFrame`, in its order."""
+    """Names of the markers and rigid bodies of a `MocapFrame`, in the order of its arrays."""
 
     markers: tuple[str, ...]
     bodies: tuple[str, ...]
@@ -101,16 +102,17 @@ class MocapFrame:
     body_positions: NDArray[np.float64]
     """Rigid-body positions, m, shape (len(layout.bodies), 3)."""
     body_orientations: NDArray[np.float64]
-    """q_world_body, shape (len(layout.bodies), 4)."""
+    """Rigid-body orientations q_world_body, shape (len(layout.bodies), 4)."""
     live: bool = True
-    """Whether the frame is measured; False if the server plays back a recording."""
+    """Whether the frame is a live measurement; False if the server plays back a recording."""
     counted: bool = True
-    """Whether the server numbers its frames; if not, `number` shows no loss."""
+    """Whether the server numbers its frames. Without frame numbers, lost frames are not
+    detected."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockEcho:
-    """One round trip: host stamps of request and reply, and device ticks in between."""
+    """One exchange with a device: host stamps of request and reply, and device ticks in between."""
 
     sent_ns: int
     received_ns: int
@@ -120,9 +122,9 @@ class ClockEcho:
 class SyncPulse(NamedTuple):
     """One edge on a hardware sync line, with the stamp of the device that detected or generated it.
 
-    An edge is the same instant on all devices connected to the line, within one microsecond: the
-    rising (or configured) edge. A decoder returns pulses in wire order among its samples, and only
-    pulses that the device reported.
+    An edge (rising, unless configured otherwise) occurs at the same instant on all devices
+    connected to the line, within one microsecond. A decoder returns pulses in wire order among its
+    samples. It returns only pulses that the device reported.
     """
 
     arrival_ns: int
@@ -132,7 +134,7 @@ class SyncPulse(NamedTuple):
     line: int = 0
     """Configured number of the line; equal for all devices connected to it."""
     number: int | None = None
-    """Edge counter of the device; None without one."""
+    """Edge counter of the device; None if the device sends none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,22 +144,23 @@ class Corrupt:
     discarded: int
     reason: str
     rejected: int = 0
-    """Well-formed messages among these bytes, whose content cannot be used."""
+    """Number of well-formed messages among these bytes whose content cannot be used."""
 
 
 DeviceEventKind = Literal[
     "info", "restart", "clock", "gap", "counter", "setting", "warning", "error"
 ]  # fmt: skip
-"""Kinds of device events, explained at `DeviceEvent`."""
+"""Kinds of device events; `DeviceEvent` explains them."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceEvent:
     """A message or state change of a device that is not a measurement.
 
-    Kinds: ``info`` (data: model, serial, firmware, settings read back), ``restart`` (the device
-    restarted), ``clock`` (its time restarted), ``gap`` (data: lost), ``counter`` (it jumped without
-    loss), ``setting`` (changed in operation), ``warning``, ``error``.
+    Kinds: ``info`` (data: model, serial number, firmware, settings read back), ``restart`` (the
+    device restarted), ``clock`` (the device time restarted), ``gap`` (data: number of lost
+    samples), ``counter`` (the sequence number jumped without loss), ``setting`` (a setting changed
+    during operation), ``warning``, ``error``.
     """
 
     kind: DeviceEventKind
@@ -173,7 +176,7 @@ Decoded = ImuSample | MocapFrame | ClockEcho | SyncPulse | Corrupt | DeviceEvent
 
 
 class AngleConvention(StrEnum):
-    """Definition of the three angles of a joint, see docs/kinematics.md."""
+    """Definition of the three angles of a joint; see docs/kinematics.md."""
 
     FLEXION = "flexion"
     """Flexion, adduction, axial rotation: hip, knee, ankle, elbow, wrist."""
@@ -182,7 +185,8 @@ class AngleConvention(StrEnum):
     TILT_TORSION = "tilt_torsion"
     """Flexion and adduction as components of the tilt of the distal long axis, and torsion."""
     TRUNK = "trunk"
-    """Flexion, lateral bending and axial rotation of the upper segment on the lower one."""
+    """Flexion, lateral bending and axial rotation of the upper segment relative to the lower
+    one."""
 
 
 ANGLE_NAMES = {
@@ -198,9 +202,9 @@ ANGLE_NAMES = {
 class Chain:
     """A limb: joints O1 to On+1 from proximal to distal, and the n segments between them.
 
-    A branched limb has more ends: joint i is the proximal joint of segment i, and the joints after
-    them are the distal ends of the last segments. A segment follows the one that carries it. The
-    first segment has two distal joints, O1 is the midpoint between them.
+    In a branched limb, joint i is the proximal joint of segment i. The joints after the last
+    segment are the distal ends of the branches. A segment always follows its proximal segment in
+    the order. The first segment has two distal joints, and O1 is the midpoint between them.
     """
 
     joints: tuple[str, ...]
@@ -208,34 +212,38 @@ class Chain:
     sensors: tuple[tuple[str, ...], ...]
     """Sensor ids of each segment, in the order of ``segments``; at least one per segment."""
     left_side: bool = False
-    """Whether the limb is a left one: adduction and rotation change sign (CONVENTIONS.md)."""
+    """Whether the limb is on the left side: adduction and rotation change sign (CONVENTIONS.md)."""
     origin: Vector | None = None
-    """Fixed position of O1 in the world, m; None: O1 is the origin, or its optical position."""
+    """Fixed position of O1 in the world, m. If None, O1 is at the origin or at its optical
+    position."""
     lengths: tuple[float | None, ...] = ()
     """Configured segment lengths, m; None if calibration estimates them."""
     proximal: str | None = None
-    """Body part proximal of O1 (pelvis), with markers only; None without one."""
+    """Body part proximal of O1, such as the pelvis, with markers only; None if there is none."""
     distal: str | None = None
-    """Body part distal of the last joint (foot), with markers only; None without one."""
+    """Body part distal of the last joint, such as the foot, with markers only; None if there is
+    none."""
     static_axes: bool = False
-    """Segment axes equal the world in the static pose; otherwise joint centres define them."""
+    """Whether the segment axes equal the world axes in the static pose. If False, joint centres
+    define the segment axes."""
     planar: bool = False
-    """Whether cameras alone follow a movement in a plane, without sensors and calibration."""
+    """Whether the cameras alone measure a movement in a plane, without sensors and calibration."""
     conventions: tuple[AngleConvention | None, ...] = ()
     """Configured angle conventions of the joints; None if the name of the joint selects it."""
     parents: tuple[int | None, ...] = ()
-    """Number of the segment proximal of each joint, None for O1; empty for a limb without
-    branches."""
+    """Number of the proximal segment of each joint, None for O1. The tuple is empty for a limb
+    without branches."""
     left_joints: tuple[bool, ...] = ()
-    """Whether each joint is a left one; empty if ``left_side`` holds for all."""
+    """Whether each joint is on the left side; empty if ``left_side`` holds for all joints."""
     distals: tuple[str | None, ...] = ()
-    """Body parts distal of the ends of a branched limb, instead of ``distal``; None without one."""
+    """Body parts distal of the ends of a branched limb, used instead of ``distal``; None for an end
+    without such a part."""
 
 
 class JointAngles(NamedTuple):
     """Three angles of a joint, rad, in the order of its `AngleConvention`.
 
-    The fields have the names of the convention ``flexion``; signs in CONVENTIONS.md.
+    The field names are those of the convention ``flexion``. CONVENTIONS.md defines the signs.
     """
 
     flexion: float
@@ -271,7 +279,8 @@ class JointState(NamedTuple):
     convention: AngleConvention = AngleConvention.FLEXION
     """Definition of `angles` and `rates`."""
     proximal: int | None = None
-    """Number of its proximal segment in a branched limb; None: the one before the joint."""
+    """Number of the joint's proximal segment in a branched limb. None means the segment before the
+    joint."""
 
 
 class FusionMode(StrEnum):
@@ -342,26 +351,28 @@ class SensorOrientation(NamedTuple):
     q_world_sensor: Quaternion | None
     """Orientation in the sensor's own world, at the instant of the frame; None without data."""
     q_world_segment: Quaternion | None
-    """Orientation of its segment from this sensor alone; None without data or calibration."""
+    """Orientation of the sensor's segment from this sensor alone; None without data or
+    calibration."""
 
 
 class SensorStates(NamedTuple):
-    """The sensors of one frame, and the rotations of the joints."""
+    """All sensors in one frame, and the rotations of the joints."""
 
     seq: int
     """Frame number of the limb state."""
     t_ns: int
     sensors: tuple[SensorOrientation, ...]
     joints: tuple[tuple[str, Quaternion | None], ...]
-    """q_proximal_distal of every joint between two segments, from the fused segments."""
+    """q_proximal_distal of every joint between two segments, computed from the fused segments."""
 
 
 class OpticalSegment(NamedTuple):
-    """One segment according to the cameras."""
+    """Orientation of one segment as measured by the cameras."""
 
     name: str
     q_world_segment: Quaternion | None
-    """Orientation by the cameras; None while fewer than three of its markers are visible."""
+    """Orientation measured by the cameras; None while fewer than three markers of the segment are
+    visible."""
     residual: float | None
     """Angle between the orientations from the IMUs and from the cameras, rad."""
     residual_rms: float | None
@@ -369,7 +380,7 @@ class OpticalSegment(NamedTuple):
 
 
 class OpticalJoint(NamedTuple):
-    """One joint according to the cameras; residuals are IMU minus cameras."""
+    """One joint as measured by the cameras. Residuals are IMU minus cameras."""
 
     name: str
     position: Vector | None
@@ -384,7 +395,8 @@ class OpticalJoint(NamedTuple):
     inner: float | None = None
     """Included angle between the two segments, rad."""
     residual: JointAngles | None = None
-    """Differences of the angles, rad, within half a turn."""
+    """Differences between the angles from the IMUs and from the cameras, rad, at most half a
+    turn."""
     residual_rms: JointAngles | None = None
     """RMS of `residual` over the last seconds, rad."""
     convention: AngleConvention = AngleConvention.FLEXION
@@ -392,10 +404,10 @@ class OpticalJoint(NamedTuple):
 
 
 class RunningCenter(NamedTuple):
-    """Center of rotation of one joint from the last frames of the cameras.
+    """Center of rotation of one joint, estimated from the most recent camera frames.
 
-    Coordinates are those of the proximal body part: origin at the mean of its markers, axes of the
-    segment, or of the static pose for a part without sensors.
+    Coordinates are those of the proximal body part. The origin is the mean of the part's markers.
+    The axes are those of the segment, or of the static pose for a part without sensors.
     """
 
     joint: str
@@ -404,7 +416,7 @@ class RunningCenter(NamedTuple):
     arc: float
     """Range of the marker directions about the center, rad."""
     refused: str | None
-    """Reason for which there is no center."""
+    """Reason why there is no center; None if there is one."""
     center: Vector | None = None
     """Position of the center, m."""
     covariance: tuple[Vector, Vector, Vector] | None = None
@@ -412,13 +424,14 @@ class RunningCenter(NamedTuple):
     unseen: tuple[Vector, ...] = ()
     """Unit directions along which the center was not observed."""
     axis: Vector | None = None
-    """Unit axis of a hinge."""
+    """Unit axis of the joint if it is a hinge; None otherwise."""
     effective_frames: float | None = None
     """Number of independent frames."""
     position: Vector | None = None
     """Current position in the optical world, m; None while the body part is not visible."""
     shift: Vector | None = None
-    """Distance from the calibrated center along the directions that both observed, m."""
+    """Displacement from the calibrated center along the directions that both estimates observed,
+    m."""
     p_value: float | None = None
     """Probability of a shift of this size by chance."""
     moved: bool | None = None
@@ -426,7 +439,7 @@ class RunningCenter(NamedTuple):
 
 
 class RunningCenters(NamedTuple):
-    """Running centers of rotation of all joints with markers on both sides."""
+    """Running centers of rotation of all joints with markers on both adjacent body parts."""
 
     t_ns: int
     memory_s: float
@@ -435,7 +448,7 @@ class RunningCenters(NamedTuple):
 
 
 class OpticalState(NamedTuple):
-    """The limb according to the cameras in one frame, and the errors of the IMUs relative to it."""
+    """The limb as measured by the cameras in one frame, and the errors of the IMUs."""
 
     number: int
     """Frame number of the camera server."""
@@ -449,19 +462,19 @@ class ModelCoordinate(NamedTuple):
 
     name: str
     is_angle: bool
-    """Angle, rad, or else translation, m."""
+    """Whether the coordinate is an angle (rad) or a translation (m)."""
     value: float | None
     """Value of the coordinate; None if the visible markers do not determine it."""
     sd: float | None
 
 
 class MarkerFitErrors(NamedTuple):
-    """Distances of markers from their places in a chain model, m."""
+    """Distances between measured markers and the marker positions of a chain model, m."""
 
     rms: float
     maximum: float
     accepted: bool
-    """Whether RMS and maximum are within the limits that are common in the field."""
+    """Whether RMS and maximum are within the limits that are common in biomechanics."""
 
 
 class ChainModelState(NamedTuple):
@@ -473,16 +486,17 @@ class ChainModelState(NamedTuple):
     model: str
     """Name of the chain model."""
     refined: bool
-    """Whether its marker positions are those of the calibration in force."""
+    """Whether the model's marker positions come from the calibration in force."""
     coordinates: tuple[ModelCoordinate, ...]
     errors: Mapping[str, float | None]
-    """Distance of each marker from its place in the model, m; None if it is not visible."""
+    """Distance of each marker from its position in the model, m; None if the marker is not
+    visible."""
     fit: MarkerFitErrors | None
     """Errors of the markers in use; None if fewer than three are visible."""
     recent: MarkerFitErrors | None
-    """Errors over the last seconds."""
+    """Errors of the markers over the last seconds."""
     flags: tuple[str, ...]
-    """`MarkerFlag` with the names of markers."""
+    """Values of `MarkerFlag`, each with the names of the markers concerned."""
 
 
 class PlanarJoint(NamedTuple):
@@ -490,11 +504,13 @@ class PlanarJoint(NamedTuple):
 
     name: str
     position: Vector | None
-    """Position in the optical world, m; its component along the normal is that of the markers."""
+    """Position in the optical world, m. Its component normal to the plane is the mean of the
+    markers."""
     error: float | None
     """Predicted RMS error of the position in the plane, m."""
     arc: float | None
-    """Arc of the markers about the joint, rad; the larger one of both sides."""
+    """Arc of the markers about the joint, rad; the larger of the arcs of the two adjacent
+    segments."""
     refused: str | None
     """Reason why there is no position, with the remedy."""
 
@@ -504,8 +520,8 @@ class Stick(NamedTuple):
 
     segment: str
     ends: tuple[Vector | None, ...]
-    """Ends of the segment from proximal to distal, m: two joints, or a marker and a joint; None if
-    unknown."""
+    """Ends of the segment from proximal to distal, m. The ends are two joints, or a marker and a
+    joint; None if unknown."""
 
 
 class StickFigure(NamedTuple):
@@ -517,9 +533,9 @@ class StickFigure(NamedTuple):
     normal: Vector | None
     """Unit normal of the plane of movement; None while it is unknown."""
     off_plane: float | None
-    """RMS distance of the markers from their planes, m."""
+    """RMS distance of the markers from their planes, parallel to the plane of movement, m."""
     refused: str | None
-    """Reason why there is no plane."""
+    """Reason why there is no plane of movement; None if there is one."""
     joints: tuple[PlanarJoint, ...]
     sticks: tuple[Stick, ...]
 

@@ -16,8 +16,8 @@ _CUTOFF = 0.5
 """Least similarity, 0 to 1, of a suggested spelling: half of the characters agree."""
 
 _SHORT = 3
-"""Length, characters, up to which a similar name has the same first character, or the same
-characters in another order."""
+"""Largest length, characters, of a name that counts as short. A name similar to a short name has
+the same first character, or the same characters in another order."""
 
 
 _OTHER_WORDS = {
@@ -63,14 +63,14 @@ _OTHER_WORDS = {
     "vertical": ("up_axis",),
     "zaxis": ("up_axis",),
 }
-"""Keys of rig.toml by their synonyms, which are in lower case and without separators. Of several
-keys, the first one that the table has is suggested."""
+"""Keys of rig.toml for each synonym. Synonyms are in lower case without separators. The first of
+these keys that the table permits is suggested."""
 
 
 def nearest_key(key: object, known: Iterable[str]) -> str | None:
-    """Return the key of `known` of which `key` is a misspelling or a synonym; None without one.
+    """Return the key of `known` that `key` probably means; None if there is none.
 
-    A key that differs in case and separators only takes precedence over a synonym.
+    A key of `known` that differs only in case and separators takes precedence over a synonym.
     """
     keys = [other for other in known if other != key]
     folded = _without_separators(str(key))
@@ -86,7 +86,7 @@ def _without_separators(key: str) -> str:
 def nearest_names(name: object, known: Iterable[str], *, count: int = 1) -> list[str]:
     """Return up to `count` names of `known` that resemble `name`, the most similar first.
 
-    `name` itself is never returned, and a value that is not text is compared by its `str`.
+    `name` itself is never returned. A value that is not text is compared by its `str`.
     """
     wanted = str(name)
     folded = wanted.casefold()

@@ -1,8 +1,9 @@
-"""The table ``[imu.sensor_calibration]``: errors of one sensor that are corrected in its readings.
+"""The table ``[imu.sensor_calibration]``: errors of one sensor, and their correction in readings.
 
 `jointfit calibrate sensor` writes the table. A driver whose settings have the key
 `sensor_calibration` corrects raw readings with this table before the orientations are computed.
-The table is a part of rig.toml, so a recording contains it, and a replay corrects in the same way.
+The table is part of rig.toml. A recording therefore contains it, and a replay applies the same
+correction.
 
 Invariant: this module names no device.
 """
@@ -27,7 +28,7 @@ LARGEST_CHANGE = 0.9
 
 
 class SensorCalibrationSettings(Settings):
-    """Errors of one sensor; the corrected vector is matrix (measured - bias)."""
+    """Errors of one sensor. The corrected vector is matrix · (measured - bias)."""
 
     date: str = Field(
         pattern=r"^\d{4}-\d{2}-\d{2}$",
@@ -64,7 +65,7 @@ class SensorCalibrationSettings(Settings):
     @field_validator("gyroscope_matrix", "accelerometer_matrix", "magnetometer_matrix")
     @classmethod
     def _near_the_identity(cls, matrix: Rows | None) -> Rows | None:
-        """Refuse a matrix that no calibration yields."""
+        """Reject a matrix that deviates too far from the identity for a real sensor."""
         for row, values in enumerate(matrix or ()):
             for column, value in enumerate(values):
                 if abs(value - (row == column)) > LARGEST_CHANGE:
@@ -85,7 +86,7 @@ class SensorCalibrationSettings(Settings):
 
     @property
     def parts(self) -> tuple[str, ...]:
-        """Names of the calibrated parts."""
+        """Names of the calibrated sensor parts, such as the gyroscope."""
         gyroscope = (self.gyroscope_bias_deg_s, self.gyroscope_matrix)
         known = (*gyroscope, self.accelerometer_bias, self.magnetometer_bias)
         names = ("gyroscope", "gyroscope scale", "accelerometer", "magnetometer")
@@ -106,18 +107,18 @@ class CalibratableSettings(Protocol):
 
     @property
     def sensor_calibration(self) -> SensorCalibrationSettings | None:
-        """Calibration in force."""
+        """Calibration in force; None if there is none."""
 
     def for_readings(self) -> Any:
         """Return settings whose decoder returns each uncorrected reading as a sample.
 
-        The samples contain angular rate, specific force and, if the device sent it with this
-        reading, the magnetic field; their orientation is the identity.
+        A sample contains angular rate and specific force. It contains the magnetic field if the
+        device sent it with this reading. Its orientation is the identity.
         """
 
 
 def calibration_of(settings: object) -> SensorCalibrationSettings | None:
-    """Return the calibration that a driver applies; None without one."""
+    """Return the calibration that a driver applies; None if there is none."""
     found = getattr(settings, "sensor_calibration", None)
     return found if isinstance(found, SensorCalibrationSettings) else None
 

@@ -1,6 +1,7 @@
 """Configuration: converts rig.toml to a frozen `Rig` in SI units, or reports all its faults.
 
-Degrees and millimetres of rig.toml are converted here. Invariant: no device is opened.
+Degrees and millimetres of rig.toml are converted to radians and metres here. Invariant: no device
+is opened.
 """
 
 from jointfit_daemon.config._checks import (

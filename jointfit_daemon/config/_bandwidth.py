@@ -1,7 +1,7 @@
-"""Check that serial lines and CAN buses have the bit rate that their sensors need.
+"""Check that serial lines and CAN buses are fast enough for their sensors.
 
-The check assumes the worst case: all sensors of a bus send at their rate, with the largest number
-of stuff bits.
+The check assumes the worst case: all sensors of a bus send at their configured rate, and every CAN
+frame has the largest number of stuff bits.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ _CAN_RATES = (125_000, 250_000, 500_000, 800_000, 1_000_000)
 
 
 def frame_bits(data_bytes: int, *, extended: bool) -> int:
-    """Return the largest length of a CAN frame, bit, with stuff bits and interframe space.
+    """Return the largest length of a CAN frame, bit, including stuff bits and interframe space.
 
-    With s = 34 (11-bit identifier) or 54 (29-bit) bits from the start to the end of the checksum
-    and d data bytes, at most (s + 8 d − 1) / 4 stuff bits occur (ISO 11898-1).
+    A frame has s bits from its start to the end of its checksum, without data: s = 34 with an
+    11-bit identifier, s = 54 with a 29-bit identifier. With d data bytes, at most (s + 8 d − 1) / 4
+    stuff bits occur (ISO 11898-1).
     """
     plain, stuffed = (64, 54) if extended else (44, 34)
     gap = 3
@@ -52,11 +53,15 @@ _ADAPTERS: dict[str, tuple[str, int, Callable[[int, bool], int]]] = {
     "seeedstudio": ("baudrate", 2_000_000, lambda size, ext: (7 if ext else 5) + size),
     "robotell": ("ttyBaudrate", 115_200, lambda _size, _: 21),
 }
-"""Serial adapters of python-can: key of the speed, its default, and the bytes of a CAN frame."""
+"""Serial CAN adapters of python-can. Values: key of the speed, default speed in baud, and function
+that returns the number of bytes of a CAN frame on the serial line."""
 
 
 def _adapter_line(bus: CanBusSettings) -> tuple[str, int, Callable[[int, bool], int]] | None:
-    """Return key and speed, baud, of an adapter's serial line, and the bits of a CAN frame."""
+    """Return the serial line of a CAN adapter: key of its speed, speed in baud, bits per CAN frame.
+
+    Return None if the bus does not use a serial line.
+    """
     if bus.interface == "slcan" and bus.transport == "uart":
         return "baud", bus.baud, lambda size, ext: slcan_bits(size, extended=ext)
     if bus.interface not in _ADAPTERS:
@@ -69,15 +74,16 @@ def _adapter_line(bus: CanBusSettings) -> tuple[str, int, Callable[[int, bool], 
 def least_load(settings: Any, unknown: Iterable[str]) -> Any:
     """Return a sensor's settings with the smallest possible load; None if unknown.
 
-    The load with a faulty choice, such as a misspelled orientation, is at least the smallest of all
-    choices. If even this load is too large, the line is too slow in any case.
+    A faulty choice, such as a misspelled orientation, stands for any valid choice. Its load is at
+    least the smallest load of all choices. If even this load is too large, the line is too slow in
+    any case.
 
     Parameters
     ----------
     settings
-        Table of the sensor; faulty keys are None.
+        Table of the sensor, in which faulty keys are None.
     unknown
-        Keys that do not exist: each is probably a misspelling of the key that it resembles.
+        Keys that do not exist. Each is probably a misspelling of the key that it resembles.
     """
     fields = type(settings).model_fields
     faulty = {
@@ -104,7 +110,10 @@ def least_load(settings: Any, unknown: Iterable[str]) -> Any:
 
 
 def _choices(field: FieldInfo) -> list[Any]:
-    """Return all values of a key with few values; identifiers do not change the load."""
+    """Return all values of a key that has few values.
+
+    Identifiers count as one value, because they do not change the load.
+    """
     annotation: Any = field.annotation
     if annotation is bool:
         return [False, True]

@@ -1,7 +1,7 @@
 """Limb from ``[[chain.joint]]`` tables: a tree with a right and a left branch.
 
-Invariant: `branched_limb` orders joints and segments so that a segment follows the segment that
-carries it, and joint i is the proximal joint of segment i.
+Invariant: `branched_limb` orders joints and segments so that every segment follows its proximal
+segment, and joint i is the proximal joint of segment i.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ class BranchedLimb(NamedTuple):
 def branched_limb(table: ChainTable) -> BranchedLimb:
     """Return the limb of a table without faults.
 
-    The position of the first segment is the position of ``NAME_origin``, the midpoint of its two
-    joints.
+    The position of the first segment is published under the name ``NAME_origin``. It is the
+    midpoint of the segment's two distal joints.
     """
     joints, segments = table.joint, set(table.segments)
     carried = {j.child: j for j in joints if j.child is not None and j.child in segments}
     root = _roots(table)[0]
 
-    # Depth first, so that a branch is contiguous.
+    # The order is depth first, so the segments of a branch are contiguous.
     order: list[str] = []
     waiting = [root]
     while waiting:
@@ -71,7 +71,7 @@ def origin_name(root: str) -> str:
 
 
 def _side_of(joint: JointTable, carried: Mapping[str, JointTable]) -> str | None:
-    """Return the configured side of a joint, or the side of the nearest joint above it."""
+    """Return the configured side of a joint, or the side of the nearest joint proximal of it."""
     above: JointTable | None = joint
     while above is not None:
         if above.side is not None:
@@ -88,7 +88,8 @@ def _roots(table: ChainTable) -> list[str]:
 def check_branches(table: ChainTable) -> list[Fault]:
     """Check that the joints connect all segments to one tree; keys with faults are None.
 
-    Later checks need the results of earlier ones, so the first group with faults is returned.
+    Later checks require that the earlier ones passed. The result therefore contains only the first
+    group of faults.
     """
     given = {"joints": table.joints, "proximal": table.proximal, "distal": table.distal}
     given["side"] = "left" if table.side == "left" else None

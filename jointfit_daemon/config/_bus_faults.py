@@ -1,4 +1,4 @@
-"""Replacement of wrong keys in a ``[can.NAME]`` table, so that further faults are found."""
+"""Replacement of wrong keys in a ``[can.NAME]`` table, so that the check finds further faults."""
 
 from __future__ import annotations
 
@@ -20,15 +20,16 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 _CLOSE = 0.8
-"""Smallest similarity, 0 to 1, at which a misspelled interface is checked as the interface that it
-resembles."""
+"""Smallest similarity, 0 to 1, between a misspelled interface and the known interface that replaces
+it in further checks."""
 
 
 def unusable_keys(table: Mapping[str, Any], in_use: Iterable[str]) -> dict[str, str]:
-    """Return the faults by key if all drivers for CAN refuse the bus of `table`.
+    """Return the faults of a bus by key; empty if at least one CAN driver accepts the bus.
 
-    Drivers know the interfaces that can be opened. The drivers `in_use` are asked first, so that no
-    other is imported for a valid bus. The other drivers are used for a bus that no sensor names.
+    Only drivers know which interfaces can be opened. The drivers `in_use` check the bus first. If
+    one of them accepts it, no other driver is imported. All other drivers check a bus that no
+    sensor uses.
     """
     bus = readable_part({"channel": "can0", **table}, CanBusSettings, [])
     defaults = dict(CanBusSettings(channel="can0"))
@@ -62,15 +63,18 @@ def _refusal(model: Any, bus: CanBusSettings) -> dict[str, str]:
 
 
 def likely_interface(interface: str) -> str:
-    """Return the interface that replaces an unknown one: `virtual` accepts every other key."""
+    """Return the interface that replaces an unknown one.
+
+    The default `virtual` accepts all other keys.
+    """
     return next(iter(get_close_matches(interface, ("socketcan", "slcan"), 1, _CLOSE)), "virtual")
 
 
 def complete_bus(partial: CanBusSettings, name: str) -> CanBusSettings:
-    """Return the bus of a table with faults; its wrong keys, None in `partial`, are replaced.
+    """Return a bus in which valid values replace the wrong keys, which are None in `partial`.
 
-    The values cause no further fault. `name` must be unique, because sensors are compared on equal
-    buses only.
+    The replaced values cause no further fault. `name` must be unique: buses with equal settings
+    count as one bus, whose sensors must have different identifiers.
     """
     channel = f"/dev/{name}" if partial.interface in SERIAL_ADAPTERS else name
     valid = dict(CanBusSettings(interface="virtual", channel=channel))

@@ -1,7 +1,7 @@
 """The chain model of ``[chain] model``, and its agreement with the rig.
 
-The segment names of a model come from its file. A body part of the rig therefore corresponds to the
-segment that carries its markers.
+A model file has its own segment names. A body part of the rig therefore corresponds to the segment
+of the model that carries the markers of this body part.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def read_chain_model(given: str | dict[str, Any]) -> LoadedModel:
 
 
 def content_of(model: LoadedModel) -> dict[str, Any]:
-    """Return a model as a table; `read_chain_model` is the inverse, with default coordinates."""
+    """Return a model as a table. `read_chain_model` converts it back, with default coordinates."""
     return as_data(model.chain)
 
 
@@ -70,7 +70,7 @@ def load_chain_model(
 ) -> tuple[LoadedModel | None, list[Fault]]:
     """Return the chain model and its faults; keys of the tables that had faults are None.
 
-    The remarks of the model name the markers of the rig that are missing in the model.
+    The remarks of the returned model list the rig's markers that the model does not contain.
     """
     try:
         loaded = read_chain_model(given)
@@ -110,9 +110,9 @@ def load_chain_model(
 def load_refinement(
     model: ChainModel, table: ChainRefinementTable
 ) -> tuple[ChainRefinement | None, dict[str, float], list[Fault]]:
-    """Return the refinement of a chain model, the weights of markers, and faults.
+    """Return the refinement settings of a chain model, the weights of its markers, and the faults.
 
-    Keys of `table` that had faults are None; in this case there is no refinement.
+    Keys of `table` that had faults are None. If there is such a key, no refinement is returned.
     """
     faults: list[Fault] = []
 

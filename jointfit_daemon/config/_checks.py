@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import CanBusSettings, MocapSettings
 
 _FORBIDDEN = "+#/"
-"""Characters with a meaning in MQTT topics."""
+"""Characters that have a special meaning in MQTT topics."""
 _FOLDER = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _LONGEST_M = 3.0
 """Upper limit of a segment length, m; larger numbers are probably millimetres."""
@@ -58,7 +58,7 @@ def check_control_characters(value: object, key: str = "") -> Iterator[Fault]:
 
 
 def without_control_characters(value: Any) -> Any:
-    """Return a copy of `value` without NUL, for the checks of everything else."""
+    """Return a copy of `value` without NUL, so that the other checks can run."""
     if isinstance(value, dict):
         return {
             without_control_characters(name): without_control_characters(inner)
@@ -70,7 +70,7 @@ def without_control_characters(value: Any) -> Any:
 
 
 def imu_name(imu: Mapping[str, Any], number: int) -> str:
-    """Return the name of the `number`-th ``[[imu]]`` table in messages: its id if it is a text."""
+    """Return the name of an ``[[imu]]`` table in messages: its id, or its `number` without id."""
     name = imu.get("id")
     return name.replace("\0", "") if isinstance(name, str) and name else f"#{number}"
 
@@ -158,7 +158,7 @@ def _check_values_by_name(table: ChainTable) -> Iterator[Fault]:
 
 
 def check_durations(table: CalibrationTable) -> Iterator[Fault]:
-    """Check that the functional phase may last its shortest duration; wrong keys are None."""
+    """Check that ``functional_s`` is at least ``functional_min_s``; wrong keys are None."""
     longest, shortest = table.functional_s, table.functional_min_s
     if None not in (longest, shortest) and longest < shortest:
         text = f"is shorter than functional_min_s = {shortest:g}: lengthen it, or shorten that one"
@@ -168,7 +168,7 @@ def check_durations(table: CalibrationTable) -> Iterator[Fault]:
 def check_procedure(
     calibration: CalibrationTable | None, chain: ChainTable | None
 ) -> Iterator[Fault]:
-    """Check that method and segment axes are those of the patent, if its procedure is chosen.
+    """Check that the regression method and the segment axes fit ``procedure = "patent"``.
 
     Keys of the tables that had faults are None.
     """
@@ -189,7 +189,7 @@ def check_procedure(
 def check_known_name(
     key: str, name: str, known: Collection[str], what: str, taken: Collection[str] = ()
 ) -> list[Fault]:
-    """Check that `name` is one of `known`; a proposed name is never one of `taken`."""
+    """Check that `name` is one of `known`. A suggested name is never one of `taken`."""
     if name in known:
         return []
     choices = ", ".join(known) or "none"
@@ -204,7 +204,7 @@ def _repeated(key: str, names: Iterable[str]) -> Iterator[Fault]:
 
 
 def check_sensors(imus: Sequence[Mapping[str, Any]], table: ChainTable | None) -> Iterator[Fault]:
-    """Check ids and segments of all ``[[imu]]`` tables that can be read."""
+    """Check the ids and segments of all readable ``[[imu]]`` tables."""
     ids = [imu["id"] for imu in imus if isinstance(imu.get("id"), str)]
     yield from _repeated("imu.id", ids)
     for name in dict.fromkeys(ids):
@@ -235,7 +235,7 @@ def body_parts_of(table: ChainTable) -> list[str]:
 
 def check_markers(settings: MocapSettings, table: ChainTable | None) -> Iterator[Fault]:
     """Check the markers and rigid bodies of ``[mocap]``; keys that had faults are None."""
-    # If the value is no table, its fault is already reported.
+    # A value that is not a table is already reported.
     given: dict[str, dict[str, Any]] = {
         kind: value if isinstance(value := getattr(settings, kind), dict) else {}
         for kind in ("markers", "rigid_body")
@@ -308,7 +308,7 @@ def _check_planar_markers(table: ChainTable, cameras: MocapSettings) -> Iterator
 def check_center_methods(
     table: CalibrationTable, chain: ChainTable | None, mocap: MocapSettings | None
 ) -> Iterator[Fault]:
-    """Check that joints with their own estimator exist and can be measured.
+    """Check that joints with a configured estimator exist and that the cameras can measure them.
 
     Keys of `table` and `chain` that had faults are None; `mocap` is None without cameras.
     """
@@ -371,7 +371,7 @@ def check_ports(sources: Sequence[Source], buses: Mapping[str, CanBusSettings]) 
 
 
 def check_can_ids(sources: Sequence[Source]) -> Iterator[Fault]:
-    """Check that every message id on a bus belongs to one sensor.
+    """Check that every message id on a bus is used by one sensor only.
 
     An 11-bit and a 29-bit identifier of the same number are different identifiers.
     """
@@ -413,7 +413,7 @@ def missing_files(mqtt: MqttSettings) -> list[str]:
 
 
 def drifting_imus(sources: Sequence[Source]) -> frozenset[str]:
-    """Return the IMUs whose heading the gateway computes without a magnetometer."""
+    """Return the IMUs whose heading drifts: the gateway computes it without a magnetometer."""
     return frozenset(_on_gateway(sources)[True])
 
 
@@ -443,9 +443,10 @@ def heading_warning(sources: Sequence[Source]) -> str | None:
 
 
 def binding_warning(sources: Sequence[Source]) -> str | None:
-    """Return a warning if the cameras measure no segment; None otherwise.
+    """Return a warning if no segment has markers for the cameras to measure; None otherwise.
 
-    The configuration is permitted, because a plate alone measures the axes of the sensors.
+    The configuration is permitted, because a single plate with markers measures the axes of the
+    sensors.
     """
     for source in sources:
         settings = source.settings
@@ -471,9 +472,9 @@ def rig_warnings(rig: Rig) -> list[str]:
 
 
 def _numbers(ids: object) -> Iterator[tuple[str, int]]:
-    """Yield message names and identifiers of an ``ids`` table, a model or a dict.
+    """Yield the message names and identifiers of an ``ids`` table, which is a model or a dict.
 
-    A model that derives identifiers from each other has a method ``resolved``.
+    A model whose identifiers depend on each other has a method ``resolved``.
     """
     resolved = getattr(ids, "resolved", None)
     fields = type(ids).model_fields if isinstance(ids, BaseModel) else {}

@@ -34,23 +34,23 @@ class Fault:
     key: str
     """Path of the key, such as ``imu[S1].rate_hz``."""
     expected: str
-    """Description of a valid value, or of the fault."""
+    """Description of a valid value, or of the fault if no valid value can be described."""
     value: Any = _NO_VALUE
     near: str | None = None
     """Nearest valid name."""
 
     @property
     def has_value(self) -> bool:
-        """Whether the fault concerns an existing value, not a missing one."""
+        """Whether the fault concerns an existing value; False for a missing key."""
         return self.value is not _NO_VALUE
 
     def as_dict(self) -> dict[str, Any]:
-        """Return its attributes for JSON; ``value`` exists only if the fault has one."""
+        """Return the attributes for JSON; ``value`` exists only if the fault has a value."""
         fields = {"key": self.key, "expected": self.expected, "near": self.near}
         return fields | {"value": self.value} if self.has_value else fields
 
     def text(self) -> str:
-        """Return the message, one line."""
+        """Return the message as one line."""
         written = isinstance(self.value, bool)
         value = str(self.value).lower() if written else repr(self.value)  # TOML: true, false
         if len(value) > _LONGEST_VALUE:
@@ -81,8 +81,8 @@ class ConfigError(Exception):
 def faults_of(error: ValidationError, model: type[BaseModel], key: str) -> list[Fault]:
     """Return the faults that pydantic found in the table at `key`.
 
-    Two kinds of faults are omitted: contradictions, which `_readable.contradictions` finds
-    completely, and faults of a bus, which are reported for the table of the bus.
+    Contradictions are omitted, because `_readable.contradictions` finds all of them. Faults of a
+    bus are omitted, because they are reported for the table of the bus.
     """
     return [
         _fault(detail, model, key)

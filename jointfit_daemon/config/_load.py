@@ -127,20 +127,23 @@ class _RigReader:
     def __init__(self, table: dict[str, Any]) -> None:
         self.table, self.faults = fill_open_places(table)
         self.partial: dict[str, Any] = {}
-        """Tables with faults, by key, as partial models for checks of several tables."""
+        """Partial models of the tables with faults, by key, for checks across tables."""
         self.cameras: MocapSettings | None = None
-        """The table of the cameras, even with faults."""
+        """The ``[mocap]`` table, including tables with faults."""
         self.imus_read: list[Source] = []
-        """All IMUs whose tables could be read, even with faults."""
+        """All IMUs whose tables are readable, including tables with faults."""
         self.imus_with_load: list[Source] = []
-        """IMUs of `imus_read` with known bit rate, because their faults concern only names."""
+        """IMUs of `imus_read` with a known bit rate: at most names in their tables are wrong."""
         for key in table:
             if key not in SECTIONS:
                 known = f"unknown table; known: {', '.join(SECTIONS)}"
                 self.faults.append(Fault(key, known, near=nearest_name(key, SECTIONS)))
 
     def rig(self) -> Rig | None:
-        """Return the rig if there is no fault; collect the faults of all tables otherwise."""
+        """Return the rig if there is no fault.
+
+        Otherwise collect the faults of all tables and return None.
+        """
         head = self._section("rig", RigTable, needed=True)
         chain = self._section("chain", ChainTable, needed=True)
         calibration = self._section("calibration", CalibrationTable)
@@ -154,10 +157,10 @@ class _RigReader:
         sources = self._imus(limb, buses)
         mocap = self._mocap(limb, head)
 
-        # Check values across tables, even if some tables have faults.
+        # Values are compared across tables, even if some tables have faults.
         self.faults += _checks.check_ports(self.imus_read, buses)
         self.faults += _checks.check_can_ids(with_known_ids(self.imus_read, self.faults))
-        # A load that was computed from a faulty key is meaningless.
+        # A load computed from a faulty key is meaningless.
         reported = {fault.key for fault in self.faults}
         loads = [
             *_bandwidth.check_serial_lines(self.imus_with_load),
@@ -216,9 +219,9 @@ class _RigReader:
             self.faults += _checks.check_center_methods(table, limb, cameras)
 
     def _chain_model(self, chain: ChainTable, cameras: MocapSettings | None) -> LoadedModel | None:
-        """Return the chain model, and replace the file name by its content.
+        """Return the chain model, and replace its file name in the table by the file's content.
 
-        A recording of the table is then sufficient for a replay.
+        A recording of the table then contains everything that a replay needs.
         """
         if chain.model is None:
             return None
@@ -279,7 +282,7 @@ class _RigReader:
         return self._validate(key, self.table.get(key, {}), model)
 
     def _optional_section(self, key: str, model: type[Model]) -> Model | None:
-        """Return a table; None if the table is absent."""
+        """Return a table of rig.toml; None if it is absent."""
         return self._section(key, model) if key in self.table else None
 
     def _validate(self, key: str, table: object, model: type[Model]) -> Model | None:
@@ -323,7 +326,7 @@ class _RigReader:
     def _check_bus_keys(
         self, key: str, table: dict[str, Any], in_use: Sequence[str]
     ) -> dict[str, Any]:
-        """Report the keys that the interface refuses; return the table with a valid interface."""
+        """Report keys that the CAN interface rejects; return the table with a valid interface."""
         unusable = unusable_keys(table, in_use)
         usable = table
         if "interface" in unusable:
@@ -361,7 +364,7 @@ class _RigReader:
         return found
 
     def _imu_tables(self) -> list[dict[str, Any]]:
-        """Return the readable tables of sensors; report the unreadable tables."""
+        """Return the readable tables of sensors, and report the unreadable ones."""
         found = self.table.get("imu", [])
         if not isinstance(found, list) or not all(isinstance(imu, dict) for imu in found):
             single = "; write [[imu]] in place of [imu]" if isinstance(found, dict) else ""
@@ -374,7 +377,7 @@ class _RigReader:
     def _with_bus(
         self, key: str, imu: dict[str, Any], buses: Mapping[str, CanBusSettings]
     ) -> dict[str, Any]:
-        """Replace the name of a bus by its ``[can.NAME]`` table."""
+        """Return a sensor's table with the ``[can.NAME]`` table instead of the name of the bus."""
         if "can" not in imu:
             return imu
         name = imu["can"]
@@ -388,8 +391,8 @@ class _RigReader:
         elif isinstance(named, dict) and name not in named:
             text = f"no table [can.{name}]; known: {', '.join(named) or 'none'}"
             self.faults.append(Fault(f"{key}.can", text, name, nearest_name(name, named)))
-        # The fault is already reported. The sensor gets a virtual bus, so that its other keys are
-        # checked.
+        # The unknown bus is already reported. The sensor gets a virtual bus, so that its other keys
+        # can be checked.
         bus = CanBusSettings(interface="virtual", channel=f"unknown {name}")
         return imu | {"can": bus.model_dump()}
 
@@ -421,7 +424,7 @@ class _RigReader:
     def _settings(
         self, key: str, table: object, driver: type[Driver] | None, base: type[BaseModel]
     ) -> Any:
-        """Validate with the model of the driver; without one, the keys common to all drivers."""
+        """Validate a table with its driver's model, or with `base` if the driver is unknown."""
         if driver is not None:
             try:
                 return self._validate(key, table, driver.Settings)
@@ -452,10 +455,10 @@ class _RigReader:
 def _likely_driver(
     near: str | None, table: Mapping[str, Any], base: type[BaseModel]
 ) -> type[Driver] | None:
-    """Return the driver that is probably meant, to check the other keys of its table.
+    """Return the driver that the table probably means, so that its other keys can be checked.
 
-    This is the driver with a name similar to the misspelled name (`near`). Otherwise it is the
-    driver that accepts the most of the keys that not all drivers have.
+    The first choice is the driver whose name is similar to the misspelled name (`near`). The second
+    choice is the driver that accepts the largest number of keys that are not common to all drivers.
     """
     drivers = _drivers(base)
     if near in drivers:
@@ -466,15 +469,15 @@ def _likely_driver(
     most = [name for name in known if known[name] == max(known.values())]
     if len(most) != 1:
         return None
-    # A name that resembles no driver may be a driver that is not installed and has its own keys.
+    # A name that resembles no known driver may be a driver that is not installed.
     return drivers[most[0]] if known[most[0]] or "driver" not in table else None
 
 
 def _drivers(base: type[BaseModel]) -> dict[str, type[Driver]]:
-    """Return the drivers by name whose settings are of the kind `base`, and that can be loaded."""
+    """Return the loadable drivers by name whose settings derive from `base`."""
     found = {}
     for name in driver_names():
-        # A broken plug-in is a fault of its users only.
+        # A broken plug-in must affect only the rigs that use it.
         with suppress(Exception):
             driver = find_driver(name)
             if issubclass(driver.Settings, base):

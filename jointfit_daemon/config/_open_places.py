@@ -1,7 +1,7 @@
 """Open places of a rig.toml: keys with the word ``later`` instead of a value.
 
-`jointfit init` writes them where a device, its identifiers or its names were not known yet.
-Invariant: an open place is one fault with its remedy, and causes no other fault.
+`jointfit init` writes the word where a device, its identifiers or its names were not known yet.
+Invariant: an open place is reported as one fault with its remedy, and causes no other fault.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 LATER = "later"
 """Word that replaces a device, identifiers or names that are not known yet."""
 _FEW = 4
-"""Number of markers in an open place. Every check requires fewer markers."""
+"""Number of placeholder markers in an open place. No check requires more markers."""
 _AGAIN = "`jointfit init FOLDER --force` asks for the open places only"
 _PORT = (
     "not filled in yet: connect the sensor and enter its serial port, which `jointfit probe` lists;"
@@ -57,7 +57,7 @@ def fill_open_places(table: Mapping[str, Any]) -> tuple[dict[str, Any], list[Fau
                 filled["imu"][at] = imu | {"port": f"/dev/{LATER}-{at}"}
                 faults.append(Fault(f"{key}.port", _PORT, LATER))
             if imu.get("ids") == LATER:
-                # The default identifiers of the driver may belong to another sensor; see
+                # The driver's default identifiers may belong to another sensor; see
                 # `with_known_ids`.
                 filled["imu"][at] = {name: value for name, value in imu.items() if name != "ids"}
                 faults.append(Fault(f"{key}.ids", _IDS, LATER))

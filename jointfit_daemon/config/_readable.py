@@ -1,4 +1,4 @@
-"""The readable part of a table with faults, for the checks of values against each other."""
+"""The readable part of a table with faults, for checks that compare values with each other."""
 
 from __future__ import annotations
 
@@ -35,8 +35,9 @@ def readable_part(table: Mapping[str, Any], model: type[Model], wrong: _Location
     Returns
     -------
     Model
-        These keys are None: missing required keys, keys that are probably misspelled in the table,
-        and keys with unreadable values. In arrays of texts a number is the text of its digits.
+        Model whose unreadable keys are None: missing required keys, keys that are probably
+        misspelled, and keys with unreadable values. In arrays of texts, a number becomes the text
+        of its digits.
     """
     fields = model.model_fields
     unknown = table.keys() - fields.keys()
@@ -81,7 +82,7 @@ def _readable(value: Any, annotation: Any, wrong: _Locations) -> Any:
 
 
 def _valid(value: Any, annotation: Any) -> Any:
-    """Return a value without faults of its own."""
+    """Return a value that has no faults of its own; None otherwise."""
     try:
         return _adapter(annotation).validate_json(json.dumps(value, default=str), strict=True)
     except ValidationError:
@@ -111,12 +112,12 @@ def _elements(values: Sequence[Any], kind: Any, wrong: _Locations) -> tuple[Any,
 
 
 def contradictions(settings: BaseModel, key: str) -> Iterator[Fault]:
-    """Return the values of `settings` and its inner tables that do not fit together.
+    """Return the contradictions between values of `settings`, or of one of its inner tables.
 
     Parameters
     ----------
     settings
-        A table; values that cannot be read are None.
+        A table, in which unreadable values are None.
     key
         Path of the table.
     """

@@ -1,6 +1,6 @@
 """Contents of a rig.toml in SI units.
 
-The data are frozen, so that equal sources can share a running driver.
+All data are frozen and comparable, so that equal sources can share a running driver.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ class Source:
     kind: Literal["imu", "mocap"]
     driver: str
     rate_hz: float
-    """Sample rate requested of the device, Hz; for mocap, by default the output rate."""
+    """Sample rate that is requested from the device, Hz. For mocap the default is the output
+    rate."""
     segment: str | None
     """Segment to which the sensor is attached; None for mocap."""
     settings: Any
@@ -51,7 +52,7 @@ class Rig:
     align_mode: Literal["smooth", "fast"]
     chain: Chain
     sources: tuple[Source, ...]
-    """IMUs in the order of rig.toml, then mocap, if any."""
+    """IMUs in the order of rig.toml, followed by the motion-capture source if there is one."""
     calibration: CalibrationSettings
     calibration_store: str
     mqtt: MqttSettings
@@ -59,10 +60,10 @@ class Rig:
     metrics: MetricsSettings | None
     lsl: LslSettings | None
     chain_model: LoadedModel | None
-    """Chain model for inverse kinematics from the markers; None without one."""
+    """Chain model for inverse kinematics from the markers; None if none is configured."""
     table: Mapping[str, Any]
-    """The parsed rig.toml, for recordings, with the content of the chain model; it contains no
-    secrets (passwords are in files)."""
+    """The parsed rig.toml with the content of the chain model, for recordings. It contains no
+    secrets, because passwords are stored in separate files."""
 
     @property
     def cameras(self) -> tuple[Source, ...]:

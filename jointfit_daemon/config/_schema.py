@@ -32,7 +32,7 @@ _SECTIONS: dict[str, type[BaseModel]] = {
 
 
 def rig_schema() -> dict[str, Any]:
-    """Return the JSON schema (2020-12) of rig.toml, without drivers that cannot be loaded."""
+    """Return the JSON schema (2020-12) of rig.toml; it omits drivers that cannot be loaded."""
     drivers: dict[str, type[BaseModel]] = {}
     for name in driver_names():
         try:

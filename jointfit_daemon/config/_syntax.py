@@ -1,8 +1,9 @@
-"""Parsing of rig.toml, with all syntax errors.
+"""Parsing of rig.toml that reports all syntax errors of a file, not only the first.
 
-A file with errors is read statement by statement. A statement that cannot be read is replaced by a
-wrong value of the same key, so that the other statements are checked as well. A removed key would
-cause further faults, such as a missing key, or a default value that contradicts other tables.
+A file with errors is parsed statement by statement. The parser replaces an unreadable statement by
+a wrong value of the same key, so that the other statements are checked as well. If the key were
+removed, further faults would result, such as a missing key, or a default value that contradicts
+other tables.
 """
 
 from __future__ import annotations
@@ -23,18 +24,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _MOST_BYTES = 256 * 1024
-"""Largest file, bytes: a rig of four sensors has 3 kB, and parsing takes 0.5 s per MB."""
+"""Largest file, bytes. A rig of four sensors has 3 kB, and parsing takes 0.5 s per MB."""
 _MOST_ERRORS = 50
 """Largest number of syntax errors that are reported."""
 _MOST_REPEATED = 20
-"""Largest number of tables and keys that occur twice; finding each of them requires parsing the
-whole file."""
+"""Largest number of repeated tables and keys that are reported. Finding each of them requires
+parsing the whole file."""
 _MOST_LINES = 200
 """Largest number of lines of one value in a file with syntax errors."""
 UNREADABLE = "unreadable-line"
 """Key of the table that replaces the value on a line with a syntax error. No table of a rig has
-this key, so the value is wrong everywhere; its further faults are not reported.
-"""
+this key, so the value is wrong everywhere. Its further faults are not reported."""
 _POSITION = re.compile(r"(.*?)(?: \(at (?:line (\d+), column \d+|end of document)\))?", re.DOTALL)
 _HEADER = re.compile(r"\[{1,2}\s*([\w-]+(?:\s*\.\s*[\w-]+)*)")
 _WHOLE_HEADER = re.compile(rf"{_HEADER.pattern}\s*\]{{1,2}}\s*(?:#.*)?")
@@ -85,7 +85,7 @@ def read_table(path: Path) -> tuple[dict[str, Any], list[Fault]]:
 
 
 def _parse(text: str) -> tuple[dict[str, Any] | None, list[Fault]]:
-    """Return the table and the syntax errors; no table if the repaired text is no TOML."""
+    """Return the table and the syntax errors; no table if the repaired text is invalid TOML."""
     try:
         return parse_toml(text), []
     except (ValueError, RecursionError):
@@ -120,15 +120,15 @@ def _with_remedy(text: str, line: str) -> str:
 
 
 class _Repair:
-    """Lines of a rig.toml; statements with errors are replaced by valid statements."""
+    """Lines of a rig.toml in which valid statements replace the statements with errors."""
 
     def __init__(self, lines: list[str]) -> None:
         self.lines, self.faults = list(lines), list[Fault]()
         self._original = lines
         self._starts: list[int] = []
-        """Places of the first lines of all statements."""
+        """Line indices at which the statements start."""
         self._repeated: dict[str, list[str]] = {}
-        """Repeated tables: temporary name of each, and path of the first table with the same
+        """Repeated tables by their temporary name, with the path of the first table of the same
         name."""
 
     def replace_statements(self) -> None:
@@ -140,7 +140,7 @@ class _Repair:
             at += length or self._replace(at)
 
     def parse(self) -> dict[str, Any] | None:
-        """Return the table, after the removal of keys and tables that occur a second time."""
+        """Remove repeated keys and tables; return the table, or None if it is invalid."""
         for _ in range(_MOST_REPEATED):
             error = _error_of(text := "\n".join(self.lines))
             if error is None:
@@ -174,7 +174,7 @@ class _Repair:
         opened = is_value and any(mark in line for mark in ("[", "{", '"""', "'''"))
         end = at + 1
         while opened and end < len(self.lines):
-            # Within an unclosed value, this line looks like the start of a statement.
+            # This line looks like the start of a statement, so the value before it was not closed.
             if _ASSIGNED.match(self.lines[end]) or _WHOLE_HEADER.fullmatch(self.lines[end]):
                 break
             end += 1
@@ -186,7 +186,7 @@ class _Repair:
         return end - at
 
     def _remove_repeated(self, text: str, number: int | None) -> None:
-        """Report and remove a statement that is wrong only because of other statements."""
+        """Report and remove a statement that is valid alone but contradicts other statements."""
         last = len(self.lines) if number is None else number
         at = max(start for start in self._starts if start < last)
         line = self.lines[at].strip()
@@ -215,7 +215,7 @@ class _Repair:
                 self._report(at, "one table of several: write [[imu]]")
 
     def _merged(self, table: dict[str, Any]) -> dict[str, Any]:
-        """Move the keys of repeated tables into the first one of the name."""
+        """Return the table, with keys of repeated tables moved into the first of these tables."""
         unnamed = {name: table.pop(name) for name in [*table] if name.startswith(UNREADABLE)}
         for name, path in self._repeated.items():
             keys, first = unnamed.get(name, {}), table
@@ -230,7 +230,7 @@ class _Repair:
 
 
 def _replacement(line: str, at: int) -> str:
-    """Return a valid line for a wrong line: a similar header, or an unreadable value."""
+    """Return a valid replacement of a wrong line: a similar header, or an unreadable value."""
     if line.startswith("["):
         header = _HEADER.match(line)
         if header is None:
@@ -244,9 +244,9 @@ def _replacement(line: str, at: int) -> str:
 
 
 def without_unreadable(fault: Fault) -> Fault | None:
-    """Return the fault of a value, or None if its line is reported as a syntax error already.
+    """Return the fault of a value; None if its line is already reported as a syntax error.
 
-    An unknown key on such a line is a separate fault, which is returned without the value.
+    An unknown key on such a line is a separate fault, which is returned without its value.
     """
     shown = f"{fault.key} {fault.value!r}" if fault.has_value else fault.key
     if UNREADABLE not in f"{shown} {fault.expected}":

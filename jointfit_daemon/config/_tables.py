@@ -1,6 +1,7 @@
 """Models of the tables of rig.toml, except those of drivers.
 
-Invariant: unknown keys are refused, and the description of every field states its meaning and unit.
+Invariant: unknown keys are rejected, and the description of every field states its meaning and
+unit.
 ``jointfit schema`` prints the descriptions.
 """
 
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 JOINTS_HELP = "joints from proximal to distal, one more than segments"
-"""Description of the key ``chain.joints``; it is needed unless the limb has branches."""
+"""Description of the key ``chain.joints``. The key is required unless the limb has branches."""
 _PLAIN, _TLS = 1883, 8883
 """Default ports without and with TLS (IANA: mqtt, secure-mqtt)."""
 _LAST_PORT = 65535
@@ -151,7 +152,7 @@ class ChainRefinementTable(Settings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Refuse options that exclude each other."""
+        """Yield options that exclude each other."""
         first_mm: float | None = self.first_step_mm  # None: cannot be read
         last_mm: float | None = self.threshold_mm
         if first_mm is not None and last_mm is not None and last_mm > first_mm:
@@ -174,7 +175,7 @@ class ChainRefinementTable(Settings):
 
 
 DEFAULT_STORE = "default"
-"""Calibration store of a rig that names none."""
+"""Calibration store of a rig whose configuration names no store."""
 
 
 class CalibrationTable(Settings):
@@ -449,10 +450,10 @@ class MetricsSettings(Settings):
 
     @property
     def host(self) -> str:
-        """Address or name."""
+        """Address or name at which the server listens."""
         return self.listen.rpartition(":")[0].removeprefix("[").removesuffix("]")
 
     @property
     def port(self) -> int:
-        """TCP port; 0 for any free one."""
+        """TCP port at which the server listens; 0 selects any free port."""
         return int(self.listen.rpartition(":")[2])

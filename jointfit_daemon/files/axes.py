@@ -1,8 +1,8 @@
 """Conversion between the axes of files and the axes of the project, where z is up.
 
-Axes are renamed cyclically, so they remain right-handed: a vector (x, y, z) of a file with y up, as
-in OpenSim (x forward, y up, z right), becomes (z, x, y). Segment axes have the same names as world
-axes, and are renamed as well.
+The axes are renamed cyclically, so they remain right-handed. A vector (x, y, z) of a file with y
+up, as in OpenSim (x forward, y up, z right), becomes (z, x, y). Segment axes are renamed in the
+same way.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def from_z_up(vectors: ArrayLike, up_axis: Axis = "y") -> Array:
 
 
 def quaternions_to_z_up(quaternions: ArrayLike, up_axis: Axis = "y") -> Array:
-    """Return quaternions (w, x, y, z) of a file, shape (..., 4), unit; NaN for 0 0 0 0."""
+    """Return a file's unit quaternions (w, x, y, z), shape (..., 4), z up; NaN for 0 0 0 0."""
     columns = [0, *(1 + i for i in _TO_Z_UP[up_axis])]
     turned = np.asarray(quaternions, dtype=np.float64)[..., columns]
     norms = np.linalg.norm(turned, axis=-1, keepdims=True)

@@ -1,11 +1,12 @@
-"""``candump -L`` text as CAN chunks; every line is counted.
+"""Conversion of ``candump -L`` text to CAN chunks; every line is counted.
 
     (1436509052.249713) can0 105#2A366C2B       eight identifier digits: 29 bits; #R: remote
 
-A chunk is one record of `jointfit_protocols.can_frame` (24 bytes: i64 time in ns, u32 identifier,
-u8 flags, u8 size, two zeros, eight data bytes). The record is packed here again because the daemon
-does not import wire formats; a test compares both implementations. A line that is not a classic CAN
-frame becomes a record of lost bytes of the same format, so that the decoder counts it.
+A chunk is one record of `jointfit_protocols.can_frame` with 24 bytes: i64 time in ns, u32
+identifier, u8 flags, u8 size, two zeros, eight data bytes. This module packs the record itself,
+because the daemon does not import wire formats. A test compares both implementations. A line that
+is not a classic CAN frame becomes a record of lost bytes of the same format, so that the decoder
+counts it.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ _LINE = re.compile(
 
 
 def is_candump(data: bytes) -> bool:
-    """Return whether the first line other than blanks and comments is ``candump -L`` output."""
+    """Return whether the first line, blanks and comments excepted, is ``candump -L`` output."""
     for line in data[:4096].splitlines():
         text = line.strip()
         if text and not text.startswith(b"#"):
@@ -68,7 +69,7 @@ def pack_can_frame(t_ns: int, number: int, data: bytes, *, extended: bool = Fals
 def frame_sizes(records: bytes) -> dict[tuple[int, bool], int]:
     """Return the number of data bytes of each identifier in consecutive records.
 
-    A key is an identifier and whether it has 29 bits. Error and remote frames are left out.
+    A key consists of an identifier and whether it has 29 bits. Error and remote frames are ignored.
     """
     whole = len(records) // RECORD_BYTES * RECORD_BYTES
     return {

@@ -1,11 +1,11 @@
-"""Recorded bytes of any wire as chunks, for `jointfit decode`.
+"""Conversion of recorded bytes of any wire to chunks, for `jointfit decode`.
 
 The file type is determined from the first bytes, not from the name:
 
 | file | wire | chunks |
 |---|---|---|
-| pcapng, pcap | datagram | one per UDP datagram, both directions, at the packet's own time |
-| pcapng, pcap | datagram, split | the same, and the packets of one direction of a TCP connection |
+| pcapng, pcap | datagram | one per UDP datagram, both directions, with the time of the packet |
+| pcapng, pcap | datagram, split | the same, and the packets in one direction of a TCP connection |
 | pcapng, pcap | stream | the segments of one direction of a TCP connection |
 | ``candump -L`` text | can | one per line, a record of `jointfit_protocols.can_frame` |
 | raw bytes | stream | pieces of 4096 bytes; the time is that of 921 600 baud |
@@ -13,7 +13,7 @@ The file type is determined from the first bytes, not from the name:
 | raw bytes | datagram | messages ``u16 id, u16 length, …`` that fit exactly, else one datagram |
 | raw bytes | can | consecutive records of `jointfit_protocols.can_frame` |
 
-*Split* means a driver with a `packet_stream`, whose chunks are packets of a connection.
+*Split* marks a driver with a `packet_stream`, whose chunks are packets of a TCP connection.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.files.captures._tcp_streams import Splitter
 
     Rating = Callable[[Iterable[Chunk]], int]
-    """Function that returns the number of messages that a decoder finds in some chunks."""
+    """Function that returns the number of messages that a decoder finds in the given chunks."""
 
 PIECE = 4096
 """Number of bytes per chunk of a raw stream."""
@@ -52,18 +52,18 @@ NS_PER_BYTE = 10 * 10**9 // 921_600
 """Assumed duration of a byte in a raw stream, ns: ten bits at 921 600 baud."""
 
 _RATED = 2000
-"""Number of chunks of each TCP direction from which the best direction is chosen."""
+"""Number of chunks of each TCP direction that are decoded to choose the best direction."""
 
 
 class UnreadableCaptureError(ValueError):
-    """File that is not a capture of this wire; the message names both types.
+    """The file is not a capture of the requested wire; the message names both types of wire.
 
     Parameters
     ----------
     text
         The message.
     recorded
-        Wire that was recorded; None if unknown.
+        Wire that the file contains; None if unknown.
     """
 
     def __init__(self, text: str, recorded: Wire | None = None) -> None:
@@ -90,10 +90,10 @@ def read_capture(
     port : int, optional
         Select UDP datagrams from or to this port.
     split : callable, optional
-        Function that returns a new splitter of a connection into the driver's chunks.
+        Function that returns a new splitter, which divides the bytes of a connection into chunks.
     rate : callable, optional
-        Function that rates the directions of TCP connections. Without this function, TCP
-        connections are not read.
+        Function that rates the directions of TCP connections. If it is None, TCP connections are
+        ignored.
 
     Raises
     ------

@@ -2,10 +2,10 @@
 
 A truncated file yields the packets before the cut.
 
-Supported: little- and big-endian files, several sections and interfaces, microsecond to nanosecond
-timestamps, Ethernet (with VLAN tags), Linux cooked, loopback and raw IP links, IPv4 and IPv6 with
-reassembly of fragments. Everything else in the file is skipped. Time stamps are the time stamps in
-the file, ns since 1970.
+The reader supports little- and big-endian files, several sections and interfaces, and microsecond
+to nanosecond time stamps. It supports Ethernet (with VLAN tags), Linux cooked, loopback and raw IP
+links, and IPv4 and IPv6 with reassembly of fragments. Everything else in the file is skipped. Time
+stamps are returned as in the file, in ns since 1970.
 
 Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791; RFC 8200; RFC 9293.
 """
@@ -77,7 +77,7 @@ class TcpSegment(NamedTuple):
     sequence: int
     """Number of the first byte of the payload."""
     begins: bool
-    """Whether the segment begins a connection."""
+    """Whether the segment begins a connection (flag SYN)."""
     payload: bytes
 
 
@@ -107,7 +107,7 @@ def read_packets(data: bytes) -> Iterator[UdpPacket | TcpSegment]:
 
 
 def _tcp_segment(t_ns: int, addresses: bytes, segment: bytes) -> TcpSegment | None:
-    """Return the TCP segment of an IP packet between two addresses; None if truncated."""
+    """Return the TCP segment of an IP packet between two addresses; None if it is truncated."""
     if len(segment) < _TCP_HEAD.size:
         return None
     source, target, sequence, _, size, flags = _TCP_HEAD.unpack_from(segment)
@@ -192,7 +192,7 @@ def _read_pcap(data: bytes) -> Iterator[tuple[int, int, bytes]]:
 
 
 def _ip_offset(frame: bytes, link: int) -> int | None:
-    """Return the offset of the IP header, or None."""
+    """Return the offset of the IP header; None if the frame contains no IP packet."""
     if link == _ETHERNET:
         at = 12
         while frame[at : at + 2] in {kind.to_bytes(2, "big") for kind in _VLAN}:
@@ -210,13 +210,13 @@ def _ip_offset(frame: bytes, link: int) -> int | None:
 
 
 class _IpPacket(NamedTuple):
-    """One IP packet with a whole UDP or TCP segment, or a fragment of it."""
+    """One IP packet that contains a whole UDP or TCP segment, or a fragment of a segment."""
 
     protocol: int
     addresses: bytes
-    """Source and target."""
+    """Source and destination address."""
     number: int
-    """Identification that the fragments of one datagram share."""
+    """Identification that is common to all fragments of one datagram."""
     more: bool
     """Whether further fragments follow."""
     offset: int
@@ -225,7 +225,7 @@ class _IpPacket(NamedTuple):
 
 
 def _ip_packet(packet: bytes) -> _IpPacket | None:
-    """Return an IPv4 packet of UDP or TCP; None for others, or if the header is truncated."""
+    """Return an IPv4 packet of UDP or TCP; None for other protocols and truncated headers."""
     version = packet[0] >> 4 if packet else 0
     found = None
     if version == 4 and len(packet) >= _IPV4_HEAD:  # noqa: PLR2004 - IPv4
@@ -239,7 +239,7 @@ def _ip_packet(packet: bytes) -> _IpPacket | None:
 
 
 def _ipv6_packet(packet: bytes) -> _IpPacket | None:
-    """Return an IPv6 packet without its extension headers; None if one is truncated."""
+    """Return an IPv6 packet without its extension headers; None if a header is truncated."""
     size, kind = struct.unpack_from(">HB", packet, 4)
     at, end = _IPV6_HEAD, _IPV6_HEAD + size if size else len(packet)
     number = fields = 0

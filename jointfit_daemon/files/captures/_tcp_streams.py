@@ -1,8 +1,9 @@
-"""Conversion of TCP segments to the bytes of each direction of a connection, and to packets.
+"""Conversion of TCP segments to a byte stream for each direction of a connection, and to packets.
 
-Retransmitted segments are used once, and late segments are put in order. A capture may begin inside
-a connection, or lack segments: the bytes after such a hole begin a new run. Most servers begin a
-packet with a segment; therefore packets are searched again at the next segment.
+Each retransmitted segment is used once, and late segments are sorted into the stream. A capture may
+begin in the middle of a connection or lack segments. The bytes after such a hole begin a new run.
+Most servers begin a packet with a new segment, so the search for packets restarts at the next
+segment.
 
 Invariant: all functions are pure; at most `_MOST_WAITING` segments of a direction wait for an
 earlier one.
@@ -26,7 +27,7 @@ earlier segment counts as lost."""
 
 
 class LostBytes(Protocol):
-    """Bytes without a packet."""
+    """Bytes that belong to no packet."""
 
     @property
     def discarded(self) -> int:
@@ -46,7 +47,7 @@ class Splitter(Protocol):
 
 
 class Piece(NamedTuple):
-    """Consecutive bytes of one direction."""
+    """Consecutive bytes in one direction of a connection."""
 
     t_ns: int
     data: bytes
@@ -65,7 +66,10 @@ def directions(segments: Iterable[TcpSegment]) -> list[list[Piece]]:
 
 
 def split_pieces(pieces: Iterable[Piece], split: Callable[[], Splitter]) -> Iterator[Chunk]:
-    """Yield one chunk for each packet; bytes without a packet are chunks of as many zeros."""
+    """Yield one chunk for each packet.
+
+    Bytes without a packet become a chunk of the same length filled with zeros.
+    """
     stream, t_ns = split(), 0
     for piece in pieces:
         t_ns = piece.t_ns
@@ -78,7 +82,7 @@ def split_pieces(pieces: Iterable[Piece], split: Callable[[], Splitter]) -> Iter
 
 
 class _Direction:
-    """Bytes of one direction of a connection."""
+    """Reassembly of the bytes in one direction of a connection."""
 
     def __init__(self) -> None:
         self.pieces: list[Piece] = []
@@ -104,7 +108,7 @@ class _Direction:
         self._use_waiting()
 
     def end(self) -> None:
-        """Use the waiting segments in order, with holes between them."""
+        """Use all waiting segments in order, and mark the holes between them."""
         while self._waiting:
             self._skip_hole()
             self._use_waiting()
@@ -114,13 +118,13 @@ class _Direction:
             self._use(self._waiting.pop(self._next), continues=True)
 
     def _skip_hole(self) -> None:
-        """Continue with the earliest waiting segment."""
+        """Continue with the earliest waiting segment, and count the missing bytes as lost."""
         known = self._next or 0
         first = min(self._waiting, key=lambda sequence: (sequence - known) % _NUMBERS)
         self._use(self._waiting.pop(first), continues=(first - known) % _NUMBERS >= _NUMBERS // 2)
 
     def _use(self, segment: TcpSegment, *, continues: bool) -> None:
-        """Append the bytes of a segment without the bytes that are already known."""
+        """Append the bytes of a segment that are not in the stream yet."""
         self._broken |= not continues
         start = self._next if continues and self._next is not None else segment.sequence
         data = segment.payload[(start - segment.sequence) % _NUMBERS :]

@@ -1,8 +1,8 @@
 """C3D files: marker trials, read with the optional package ``c3d``.
 
-Positions are returned in metres, in the file's own axes. A point with a negative residual is
-missing (NaN), for any coordinates. A positive residual is the residual of the cameras. Times follow
-the frame numbers: frame 1 is at 0 s, as in a TRC file of the same trial.
+Positions are returned in metres, in the axes of the file. A point with a negative residual is
+missing (NaN), whatever its coordinates. A positive residual is the residual that the cameras
+reported. Times follow the frame numbers: frame 1 is at 0 s, as in a TRC file of the same trial.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def read_c3d(path: Path) -> C3dTrial:
     """Return points and events of a C3D file.
 
     Labels are returned as written (``Subject:LASI``). Frame numbers and `t_s` start at the first
-    frame of the trial, which is rarely 1. Analog channels are ignored.
+    frame of the trial, whose number is rarely 1. Analog channels are ignored.
 
     Raises
     ------
@@ -103,7 +103,7 @@ def _read(path: Path, reader: Any) -> C3dTrial:
 
     positions = cells[..., :3].copy()
     positions[cells[..., 3] < 0.0] = np.nan
-    # the format defines a residual of 0 for points that were interpolated or filtered
+    # The C3D format defines a residual of 0 for points that were interpolated or filtered.
     residuals = np.where(cells[..., 3] > 0.0, cells[..., 3], np.nan) * METRES[unit]
     numbers = np.arange(first, first + len(cells), dtype=np.int64)
     trajectories = MarkerTrajectories(
@@ -127,7 +127,7 @@ def _read(path: Path, reader: Any) -> C3dTrial:
 
 
 def _labels(reader: Any) -> tuple[str, ...]:
-    """Return the labels of the points; more than 255 continue in LABELS2, LABELS3, ..."""
+    """Return the labels of the points. Labels after the first 255 are in LABELS2, LABELS3, ..."""
     names: tuple[str, ...] = ()
     for suffix in ("", *map(str, range(2, 257))):
         found = reader.get(f"POINT:LABELS{suffix}")
@@ -138,7 +138,7 @@ def _labels(reader: Any) -> tuple[str, ...]:
 
 
 def _events(reader: Any) -> tuple[C3dEvent, ...]:
-    """Return the events that have a time; times are minutes and seconds."""
+    """Return the events that have a time. The file stores a time as minutes and seconds."""
     times = reader.get("EVENT:TIMES")
     if times is None:
         return ()

@@ -1,9 +1,10 @@
 """C3D files with marker points and events: little-endian, points as floats.
 
-Blocks of 512 bytes: the header, the parameters (groups POINT, TRIAL, EVENT and JOINTFIT), then the
-frames, each point as four 32-bit floats: x, y, z, residual. A missing point has the residual -1 and
-zeros. Source: The C3D File Format, User Guide (2008), sections "Header", "Parameters", "3D point
-data"; for events the parameters of the group EVENT as Vicon programs write them.
+The file consists of blocks of 512 bytes: the header, the parameters (groups POINT, TRIAL, EVENT and
+JOINTFIT), and the frames. Each point of a frame is four 32-bit floats: x, y, z, residual. A missing
+point has the residual -1 and the coordinates 0. Source: The C3D File Format, User Guide (2008),
+sections "Header", "Parameters", "3D point data"; the parameters of the group EVENT follow files
+written by Vicon programs.
 """
 
 from __future__ import annotations
@@ -23,23 +24,24 @@ _BLOCK = 512
 _KEY = 0x50
 """Second byte of header and parameters in every C3D file."""
 _INTEL = 84
-"""Processor type: little-endian."""
+"""Number of the processor type Intel: little-endian."""
 _FLOATS = -1.0
-"""POINT:SCALE; a negative value means floats in the unit of POINT:UNITS."""
+"""Value of POINT:SCALE. A negative value means that the points are floats in POINT:UNITS."""
 _CHARACTERS, _INTEGER, _REAL = -1, 2, 4
-"""Types of a parameter."""
+"""Numbers of the parameter types."""
 _POINT, _TRIAL, _EVENT, _OWN = 1, 2, 3, 4
-"""Numbers of the groups."""
+"""Numbers of the parameter groups."""
 _MISSING = -1.0
 """Residual of a missing point."""
 _MOST_WORD = 0xFFFF
-"""Largest 16-bit number. Only the group TRIAL counts frames above this number."""
+"""Largest 16-bit number. Larger frame numbers can only be stored in the group TRIAL."""
 MOST_ITEMS = 255
-"""Maximum number of entries of a list parameter: events, and labels before LABELS2."""
+"""Largest number of entries of a list parameter, which limits the events and the labels per
+list."""
 _MOST_BYTES = 255
-"""Maximum size of a text in a list parameter in bytes."""
+"""Largest size of a text in a list parameter, bytes."""
 _MOST_BLOCKS = 255
-"""Maximum number of blocks of all parameters."""
+"""Largest number of blocks of all parameters."""
 
 
 class C3dEvent(NamedTuple):
@@ -71,17 +73,17 @@ def c3d_bytes(
     names
         Labels of the points.
     positions
-        Shape (n, len(names), 3), m; NaN where a point is missing. Written in mm.
+        Shape (n, len(names), 3), m; NaN where a point is missing. The file contains mm.
     rate_hz
         Frames per second.
     up
-        The upward axis, ``"+Y"`` for example (POINT:Y_SCREEN).
+        Upward axis, for example ``"+Y"`` (POINT:Y_SCREEN).
     first_frame
         Number of the first frame, 1 to 65535.
     events
-        At most `MOST_ITEMS`.
+        Events, at most `MOST_ITEMS`.
     own_texts
-        Parameters of the group JOINTFIT.
+        Texts that are stored as parameters of the group JOINTFIT.
 
     Raises
     ------
@@ -91,8 +93,8 @@ def c3d_bytes(
     frames, points = positions.shape[:2]
     last_frame = first_frame + frames - 1
 
-    # The number of the first data block is part of the parameters. The length of the parameters
-    # does not depend on it.
+    # The parameters contain the number of the first data block. Their length does not depend on
+    # this number.
     entries = _entries(names, frames, first_frame, rate_hz, up)
     entries += _event_entries(events)
     if own_texts:
@@ -109,7 +111,7 @@ def c3d_bytes(
 
     data_block = 2 + blocks
     start = _parameter(_POINT, "DATA_START", _INTEGER, (), struct.pack("<H", data_block))
-    # a name of length 0 ends the section
+    # An entry with a name of length 0 ends the section.
     parameters = bytes([1, _KEY, blocks, _INTEL]) + b"".join([*entries, start]) + bytes(2)
 
     header = struct.pack(
@@ -125,7 +127,8 @@ def c3d_bytes(
     if last_frame <= _MOST_WORD:
         sections.append(data)
         data = b""
-    # Readers that use only the header read a longer file to its end, so it has no padding frames.
+    # Programs that use only the header read a longer file to its end. The file therefore has no
+    # padding frames.
     return b"".join(section + bytes(-len(section) % _BLOCK) for section in sections) + data
 
 
@@ -156,7 +159,8 @@ def _event_entries(events: Sequence[C3dEvent]) -> list[bytes]:
     count = len(events)
     entries = [_parameter(_EVENT, "USED", _INTEGER, (), struct.pack("<H", count))]
     if events:
-        # Minutes and seconds: a 32-bit float of seconds alone loses milliseconds after an hour.
+        # Times are stored as minutes and seconds, because a 32-bit float of seconds loses
+        # milliseconds after an hour.
         times = [part for event in events for part in divmod(event.t_s, 60.0)]
         entries += [
             _parameter(_EVENT, "TIMES", _REAL, (2, count), struct.pack(f"<{2 * count}f", *times)),
@@ -190,6 +194,6 @@ def _parameter(group: int, name: str, kind: int, shape: tuple[int, ...], data: b
 
 
 def _entry(name: str, group: int, rest: bytes) -> bytes:
-    """Return an entry: lengths, name, offset to the next entry from itself, and `rest`."""
+    """Return a parameter entry: lengths, name, relative offset of the next entry, and `rest`."""
     offset = struct.pack("<H", len(rest) + 2)
     return struct.pack("<bb", len(name), group) + name.encode() + offset + rest

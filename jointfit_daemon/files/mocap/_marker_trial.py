@@ -1,7 +1,8 @@
 """Marker trials from TRC or C3D files, in metres with z up.
 
-The source of the vertical axis (file, caller or convention of the format) is part of the result. A
-marker exactly at the origin is missing (NaN): some programs write missing markers in this way.
+The result records the source of the vertical axis: the file, the caller, or the convention of the
+format. A marker exactly at the origin is treated as missing (NaN), because some programs write
+missing markers in this way.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 
 class UnknownMarkerError(ValueError):
-    """Marker that is not in the trial; the message lists similar names."""
+    """A marker name does not exist in the trial; the message lists similar names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,21 +42,21 @@ class MarkerTrial:
     def points(self, names: Sequence[str]) -> NDArray[np.float64]:
         """Return the trajectories of markers by name, m, shape (n, len(names), 3).
 
-        The prefix of a subject may be omitted where that is unambiguous: ``LASI`` finds
+        The prefix of a subject may be omitted if the short name is unambiguous: ``LASI`` finds
         ``Tom:LASI``.
 
         Raises
         ------
         UnknownMarkerError
-            All unknown names, each with similar ones.
+            Some names are unknown; the message lists them, each with similar names.
         """
         wanted = [self._index(name) for name in names]
         unknown = [name for name, at in zip(names, wanted, strict=True) if at is None]
         if not unknown:
             return self.trajectories.positions[:, [at for at in wanted if at is not None]]
 
-        # Propose markers similar to each unknown name, then list all markers. Requested markers are
-        # not proposed.
+        # For each unknown name the message suggests similar markers, then lists all markers.
+        # Markers that were also requested are not suggested.
         taken = set(names)
         free = [n for n in self.trajectories.names if not {n, _bare(n)} & taken]
         spellings = [*free, *map(_bare, free)]
@@ -68,7 +69,7 @@ class MarkerTrial:
         raise UnknownMarkerError("; ".join(problems))
 
     def residuals(self, names: Sequence[str]) -> NDArray[np.float64] | None:
-        """Return the residuals of the cameras by known names, m, shape (n, len(names)).
+        """Return the camera residuals of the named markers, m, shape (n, len(names)).
 
         The result is None if the file contains no residuals. Missing residuals are NaN.
         """
@@ -77,11 +78,11 @@ class MarkerTrial:
         return None if found is None else found[:, [at for at in wanted if at is not None]]
 
     def direction(self, axis: Axis) -> NDArray[np.float64]:
-        """Return an axis of the file in the world with z up, shape (3,)."""
+        """Return the direction of an axis of the file in the world with z up, shape (3,)."""
         return to_z_up(np.eye(3)["xyz".index(axis)], self.up_axis)
 
     def to_file(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return vectors (..., 3) in the file's own axes."""
+        """Convert vectors (..., 3) from z up to the axes of the file."""
         return from_z_up(vectors, self.up_axis)
 
     def _index(self, name: str) -> int | None:
@@ -103,8 +104,8 @@ def read_marker_trial(path: Path, up_axis: Axis | None = None) -> MarkerTrial:
     path
         File in mm, cm or m.
     up_axis
-        Vertical axis of the file. Default: as declared in a C3D file, else z; for TRC y, the
-        convention of OpenSim.
+        Vertical axis of the file. By default a C3D file's declared axis is used, or z if it
+        declares none. The default for TRC files is y, the convention of OpenSim.
 
     Raises
     ------

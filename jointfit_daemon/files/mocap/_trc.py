@@ -1,6 +1,6 @@
 """TRC files: marker trajectories exported by motion-capture programs.
 
-Positions are returned in metres, in the file's own axes; a missing marker is NaN. Rows::
+Positions are returned in metres, in the axes of the file. A missing marker is NaN. Rows of a file::
 
     PathFileType  4  (X/Y/Z)  name
     DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames
@@ -43,7 +43,7 @@ _HEADER_ROWS = 5
 _SHOWN = 40
 """Maximum number of characters of a wrong cell in a message."""
 METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
-"""Metres per unit of length in marker files."""
+"""Number of metres per unit of length in marker files."""
 _KEYS = (
     "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
 )
@@ -62,14 +62,14 @@ class MarkerTrajectories:
     """Positions in the file's axes, m, shape (n, len(names), 3); NaN where missing."""
     rate_hz: float
     warnings: tuple[str, ...] = ()
-    """Contradictions between header and rows."""
+    """Descriptions of contradictions between header and rows."""
     residuals: NDArray[np.float64] | None = None
     """Residual of the cameras for every position, m, shape (n, len(names)); NaN where the residual
     is unknown. None if the format has no residuals."""
 
 
 _MOST_FRAMES = 2.0**53
-"""Largest exact frame number; larger numbers lose their last digit."""
+"""Largest frame number that a float represents exactly."""
 
 
 def read_trc(path: Path) -> MarkerTrajectories:
@@ -89,7 +89,7 @@ def read_trc(path: Path) -> MarkerTrajectories:
             f"{path}, line 4: no marker names after Frame# and Time: export it again"
         )
 
-    # OpenSim also refuses equal names.
+    # OpenSim also rejects equal names.
     for name, times in Counter(filter(None, names)).items():
         if times > 1:
             columns = [str(3 + 3 * at) for at, other in enumerate(names) if other == name]
@@ -151,7 +151,7 @@ def _require_header(path: Path, lines: Sequence[str]) -> None:
 
 
 def write_trc(path: Path, trajectories: MarkerTrajectories) -> None:
-    """Write a TRC file in metres: tabs, 8 significant digits, empty cells for missing."""
+    """Write a TRC file in metres: tabs, 8 significant digits, empty cells for missing markers."""
     count, markers = len(trajectories.t_s), len(trajectories.names)
     rate = written(trajectories.rate_hz)
     first = int(trajectories.frames[0]) if count else 1

@@ -1,7 +1,7 @@
 """Chain models in TOML (for editing) and JSON (for programs), with the same keys.
 
-Files use metres, radians and z up, as the program does. Keys with a default may be omitted. All
-errors of a file are reported at once. The format is described in docs/kinematics.md.
+Files use metres, radians and z up, in the same way as the program. Keys with a default may be
+omitted. All errors of a file are reported together. docs/kinematics.md describes the format.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ def read_model(path: Path) -> ChainModel:
     Raises
     ------
     MalformedFileError
-        No such file by its name, damaged, unknown keys, values of the wrong type, segments that
-        do not form a chain, or lengths that cannot be metres.
+        The file does not exist or is damaged, has unknown keys, values of the wrong type or lengths
+        that cannot be metres, or its segments do not form a chain.
     """
     kind = path.suffix.lower()
     if kind not in {".toml", ".json"}:
@@ -62,7 +62,7 @@ def read_model(path: Path) -> ChainModel:
 
 
 def model_of(data: Any, source: str, name: str = "chain") -> ChainModel:
-    """Return the chain model of parsed data; the inverse of `as_data`.
+    """Return the chain model of parsed data; `as_data` is the inverse.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def model_of(data: Any, source: str, name: str = "chain") -> ChainModel:
     Raises
     ------
     MalformedFileError
-        As `read_model`.
+        For the reasons given at `read_model`.
     """
     wrong = _wrong(data)
     if wrong:

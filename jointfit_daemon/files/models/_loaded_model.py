@@ -21,10 +21,10 @@ class LoadedModel:
 
     chain: ChainModel
     coordinates: tuple[JointCoordinates, ...]
-    """Names of the coordinates of each segment, from an OpenSim model or else from the segment
-    name."""
+    """Names of the coordinates of each segment. They are taken from an OpenSim model, or else
+    derived from the segment name."""
     remarks: tuple[str, ...] = ()
-    """Differences from an OpenSim model."""
+    """Descriptions of the differences from the OpenSim model."""
 
 
 def load_model(path: Path) -> LoadedModel:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def read_marker_weights(path: Path) -> dict[str, float]:
-    """Return the weights of squared errors by marker name.
+    """Return the weights by marker name; squared marker errors are multiplied by them.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
 """OpenSim models as chain models: the joints of selected bodies, and their markers.
 
-OpenSim's world and bodies have y up, x forward, z right; chain models have z up, y forward, x
-right. Every vector (x, y, z) becomes (z, x, y), including the axes of bodies, so segment frames
-correspond. Differences between the models are reported as remarks; unsupported elements are
-rejected.
+The world and the bodies of OpenSim have y up, x forward and z right. Chain models have z up, y
+forward and x right. Every vector (x, y, z) becomes (z, x, y). This includes the axes of bodies, so
+the segment frames of both models correspond. Differences between the models are reported as
+remarks. Unsupported elements raise an error.
 """
 
 from __future__ import annotations
@@ -61,7 +61,8 @@ def read_osim(path: Path, *, markers: Collection[str] | None = None) -> Imported
     path
         ``.osim`` file.
     markers
-        Use only these markers; bodies that no marker needs are omitted. Default: all.
+        Markers to use; bodies that none of these markers needs are omitted. The default is all
+        markers.
 
     Raises
     ------
@@ -110,7 +111,7 @@ def read_osim(path: Path, *, markers: Collection[str] | None = None) -> Imported
 
 
 class _Tree:
-    """Tree of bodies and joints, parents first; welded bodies are merged."""
+    """Tree of bodies and joints in which parents precede children. Welded bodies are merged."""
 
     def __init__(self, document: OsimDocument) -> None:
         self.remarks = [
@@ -144,7 +145,7 @@ class _Tree:
                 self._add(GROUND, body, None)
 
     def _add(self, parent_body: str, body: str, joint: NearestJoint | None) -> None:
-        """Attach a body to its parent; without a `joint` the body moves freely."""
+        """Attach a body to its parent. A body without a `joint` moves freely."""
         parent, placed = self._at[parent_body]
         if joint is not None and joint.kind is None:
             self._at[body] = (parent, placed @ joint.rest)
@@ -177,7 +178,7 @@ class _Tree:
         )
 
     def placed(self, marker: OsimMarker) -> Marker | None:
-        """Return a marker on its segment; None, with a remark, if it is fixed to the world."""
+        """Return a marker on its segment; for a marker fixed to the world, None with a remark."""
         segment, transform = self._at[marker.body]
         if segment is None:
             self.remarks.append(f"marker {marker.name} is fixed to the world and left out")
