@@ -1,6 +1,7 @@
 """Rates of joint angles, as difference quotients over the last 50 ms.
 
-The span limits the noise of the rate. The rate belongs to an instant 25 ms before the frame.
+A shorter span would increase the noise of the rate. The rate applies to an instant 25 ms before the
+frame.
 
 Invariant: the cost per frame is O(1), and only frames with known angles are compared.
 """
@@ -15,7 +16,7 @@ from jointfit_daemon.model import JointAngles
 SPAN_NS = 50_000_000
 """Shortest span of a difference quotient once enough frames exist, ns."""
 MAX_GAP_NS = 120_000_000
-"""Longest time between two frames that give a rate, ns."""
+"""Longest time between two frames from which a rate is computed, ns."""
 
 
 class AngleRates:
@@ -38,8 +39,8 @@ class AngleRates:
         angles : JointAngles or None
             Angles in this frame, rad; None if unknown.
         gimbal : bool
-            Whether the joint is at gimbal lock. Rates are then unknown, and start again with the
-            next frames.
+            Whether the joint is at gimbal lock. Rates are then unknown, and are computed again from
+            the frames that follow.
         """
         past = self._past.get(joint)
         if past is None:

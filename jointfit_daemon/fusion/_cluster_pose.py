@@ -2,8 +2,9 @@
 
 The fit equals the fit of ``limb_model.rigid_fit``, except for rounding. Quantities that do not
 change from frame to frame are computed once for each set of visible markers. The fit of a frame
-uses plain floats: a matrix of NumPy costs more than its arithmetic here, and several times as much
-where the caches of the processor no longer contain the code of the library.
+uses plain floats. For matrices this small the overhead of a NumPy call exceeds the time of the
+arithmetic. The overhead is several times larger if the processor caches no longer contain the code
+of NumPy.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ class _MarkerSubset(NamedTuple):
     rows: list[int]
     """Rows of the cluster template."""
     centered: list[Vector]
-    """Template about the mean of these markers, m."""
+    """Template positions relative to the mean of these markers, m."""
     offsets: list[Vector]
-    """Vectors from that mean to the points, static world, m."""
+    """Vectors from the mean of these markers to the points, static world, m."""
     moment: float
     """Sum of the squares of `centered`, m²."""
 
@@ -71,7 +72,7 @@ class ClusterPose:
         columns = _columns(cluster, layout)
         self._columns = None if columns is None else np.array(columns, dtype=np.intp)
         self._all = None if cluster.body else self._subset(bytes([1]) * len(cluster.markers))
-        """All markers, the usual case."""
+        """Quantities of the set of all markers, which is the usual case."""
 
     def fit(self, frame: MocapFrame) -> FittedPose | None:
         """Return the pose in `frame`, or None if too few markers are visible."""
@@ -91,7 +92,7 @@ class ClusterPose:
         return FittedPose(q, [(x + dx, y + dy, z + dz) for dx, dy, dz in turned])
 
     def _fit_markers(self, seen: list[Vector]) -> FittedPose | None:
-        r"""Return the pose from the visible markers, by the rotation of Horn (1987).
+        r"""Return the pose from the visible markers, with the rotation of Horn (1987).
 
         With the largest sum :math:`\lambda` of ``y · R a``, the sum of squared residuals is
         :math:`\sum |a|^2 + \sum |y|^2 - 2 \lambda`.
@@ -123,7 +124,7 @@ class ClusterPose:
         moment = ((xx, xy, xz), (yx, yy, yz), (zx, zy, zz))
         try:
             q, largest = fit_rotation(moment, sqrt(subset.moment * squares))
-        except ZeroDivisionError:  # the markers are in one point, or on a line
+        except ZeroDivisionError:  # the markers coincide or lie on a line
             return None
         if not subset.moment + squares - 2.0 * largest <= MAX_FIT_RMS_M**2 * count:
             return None
@@ -147,7 +148,7 @@ def _vectors(rows: Array) -> list[Vector]:
 
 
 def _columns(cluster: MarkerCluster, layout: MocapLayout) -> list[int] | None:
-    """Return the columns of a cluster, or None if the stream lacks one of its names."""
+    """Return the columns of a cluster, or None if the stream lacks a name of the cluster."""
     if cluster.body is not None:
         return [layout.bodies.index(cluster.body)] if cluster.body in layout.bodies else None
     if any(marker not in layout.markers for marker in cluster.markers):

@@ -1,8 +1,8 @@
 """Forward kinematics of one frame: joint positions and angles with standard deviations.
 
 Orientation errors are taken as isotropic and independent between segments, except for flexion (see
-`joint_angle_estimate`). Only the trace of a position covariance is propagated, since a LimbState
-contains no more.
+`joint_angle_estimate`). Only the trace of a position covariance is propagated, because a LimbState
+contains nothing else of the covariance.
 """
 
 from __future__ import annotations
@@ -30,19 +30,21 @@ class SegmentLength(NamedTuple):
 
 
 class JointPlace(NamedTuple):
-    """Place of a joint on its proximal segment."""
+    """Position of a joint on its proximal segment."""
 
     segment: int
     """Number of the proximal segment."""
     share: float = 0.0
-    """Place of the joint on the segment: 0 at the distal end, otherwise the part of the segment's
-    length to the right (+) or left (-) of its origin."""
+    """Position of the joint on the segment. It is 0 at the distal end. Otherwise it is the distance
+    to the right (+) or left (-) of the segment's origin, as a fraction of the segment's length.
+    """
 
 
 def joint_places(chain: Chain) -> list[JointPlace]:
-    """Return the places of all joints but the first.
+    """Return the positions on their segments of all joints except the first joint.
 
-    The two distal joints of a branched segment are half its length to the right and left.
+    The two distal joints of a branched segment are half its length to the right and left of its
+    origin.
     """
     places = []
     for joint in range(1, len(chain.joints)):
@@ -74,17 +76,17 @@ def joint_positions(
     lengths: Sequence[SegmentLength],
     places: Sequence[JointPlace],
 ) -> list[tuple[Vector | None, float | None]]:
-    r"""Return position (m) and variance per axis (m²) of every joint, from O1 downwards.
+    r"""Return position (m) and variance per axis (m²) of every joint, from O1 to the distal end.
 
-    With the proximal joint i of the segment that carries joint j,
+    If joint i is the proximal end of a segment of length L and joint j its distal end,
 
     .. math:: P_j = P_i - L\,R_i e_z, \qquad
               \mathrm{tr}\,\Sigma_j = \mathrm{tr}\,\Sigma_i + 2 L^2 \sigma_i^2 + \sigma_L^2
 
     For joints to the right or left of the origin of a segment, :math:`P_j = P_i \pm \frac{L}{2} R_i
     e_x`; their variance contains half the length and half the standard deviation of the length. The
-    propagation is of first order, with isotropic orientation errors. Both values are None below a
-    segment of unknown orientation or length.
+    propagation is of first order, with isotropic orientation errors. Both values are None for all
+    joints distal to a segment of unknown orientation or length.
     """
     traces = [0.0]
     out: list[tuple[Vector | None, float | None]] = [(origin, 0.0)]
@@ -121,25 +123,24 @@ def joint_angle_estimate(
     maps the rates of the angles to angular velocity. To first order, the diagonal entry of the main
     angle gives the standard deviation :math:`f \sqrt{\sigma_1^2 + \sigma_2^2}`. The factor f is
     :math:`1 / \cos\theta` for flexion with adduction (or bending) :math:`\theta`, 1 for elevation,
-    and that of ``read_joint`` for a tilt.
+    and the factor of ``read_joint`` for a tilt.
 
-    If the standard deviation of a segment about its x axis is known, it replaces the isotropic one
-    in the conventions ``flexion`` and ``trunk``, whose flexion hardly depends on the other axes. If
-    it is known for both segments,
-    :math:`2 \rho \sigma_1 \sigma_2` is subtracted, where :math:`\rho` is the correlation of the
-    model errors about x. Errors of held, uncorrected or inconsistent segments are treated as
-    independent.
+    If the standard deviation of a segment about its x axis is known, it replaces the isotropic
+    value in the conventions ``flexion`` and ``trunk``. In these conventions flexion hardly depends
+    on the other axes. If the value is known for both segments, :math:`2 \rho \sigma_1 \sigma_2` is
+    subtracted, where :math:`\rho` is the correlation of the model errors about x. Errors of held,
+    uncorrected or inconsistent segments are treated as independent.
 
     Parameters
     ----------
     proximal, distal : FusedSegment
         The segments above and below the joint.
     sign : float
-        Sign of flexion about x, see CONVENTIONS.md.
+        Sign of flexion about x, as defined in CONVENTIONS.md.
     left : bool
         Whether the limb is on the left side.
     correlation : float
-        :math:`\rho`.
+        Correlation :math:`\rho`.
     convention : AngleConvention
         Definition of the angles.
     """
@@ -151,7 +152,7 @@ def joint_angle_estimate(
 
     first, second = proximal.flexion_sd, distal.flexion_sd
     if convention in {AngleConvention.ELEVATION, AngleConvention.TILT_TORSION}:
-        first = second = None  # their main axis is not the x axis of a segment
+        first = second = None  # the main axis of these conventions is not the x axis of a segment
     total = (proximal.sd if first is None else hypot(first, proximal.fault_sd)) ** 2
     total += (distal.sd if second is None else hypot(second, distal.fault_sd)) ** 2
     if first is not None and second is not None:

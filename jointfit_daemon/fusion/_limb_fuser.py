@@ -57,10 +57,11 @@ class LimbFuser:
     chain : Chain
         Joints, segments and sensors of the rig.
     calibration : Calibration or None
-        With None, or with the calibration of another chain (flag ``other_chain``), every state is
+        If it is None or belongs to another chain (flag ``other_chain``), every state is
         ``uncalibrated``.
     sensor_monitor : SensorMonitor, optional
-        Monitor to continue with: sensor states outlive a change of the calibration.
+        Existing monitor to use, so that a change of the calibration does not reset the sensor
+        states.
     drifting : collection of str
         Sensors without heading reference, see ``ConsistencyMonitor``.
     """
@@ -75,10 +76,11 @@ class LimbFuser:
         self._chain, self._drifting = chain, drifting
         self.sensor_monitor = sensor_monitor or SensorMonitor(chain)
         self.worn = True
-        """Whether the sensors are on the body; on the plate they are not compared."""
+        """Whether the sensors are on the body. Sensors on the calibration plate are not compared.
+        """
         usable = calibration is not None and calibration.fits(chain)
         self._uncorrected = calibration is not None and calibration.procedure == "patent"
-        """Whether the sensors are used as they are, also with faults."""
+        """Whether sensors are used without correction, even if they have faults."""
         self._calibration = calibration if usable else None
         self._base_flags: tuple[str, ...] = (FrameFlag.UNCALIBRATED,)
         if calibration is not None and not usable:
@@ -138,26 +140,29 @@ class LimbFuser:
         Parameters
         ----------
         t_ns, completed_ns, seq
-            Instant of the frame, arrival of its last sample, and frame number; passed through.
+            Instant of the frame, arrival of its last sample, and frame number. The state contains
+            them unchanged.
         orientations : mapping of str to Quaternion
             q_world_sensor of every sensor with data, each in its own world. Unknown sensors are
             ignored. Must not be changed afterwards.
         extrapolated : frozenset of str
-            Sensors whose value is extrapolated beyond their last sample.
+            Sensors whose orientation is extrapolated beyond their last sample.
         optical_origin : Vector, optional
             Position of O1 in the current mocap frame, m; overrides the configured origin.
         sync, mode
-            Passed through; without a calibration the mode is ``uncalibrated``.
+            Values that the state contains unchanged; without a calibration the mode is
+            ``uncalibrated``.
 
         Notes
         -----
-        Flags, in this order: ``uncalibrated``, ``other_chain``, those of the calibration,
+        The flags have this order: ``uncalibrated``, ``other_chain``, the flags of the calibration,
         ``extrapolating`` (a sample is extrapolated in time), ``origin_fixed`` (mocap runs but O1 is
         not visible, so the configured origin is used), ``stuck:SENSOR``, ``slipped:SENSOR`` or
         ``pair_disagrees:SEGMENT``, ``heading_disagrees:JOINT``, ``heading_unseen``, and per segment
         ``one_sensor:``, ``untrained:`` (outside the training range), ``held:``, ``lost:``;
         ``gimbal`` is last. In the procedure of the patent, ``uncorrected`` follows the flags of the
-        calibration; flags of faults are then reports, and the sensors are used as they are.
+        calibration. Fault flags then only report the faults, and the sensors are used without
+        correction.
         """
         working, stuck = self.sensor_monitor.update(t_ns, completed_ns, orientations)
         orientations = orientations if self._uncorrected else working
@@ -173,7 +178,7 @@ class LimbFuser:
                 self._unknown_joints,
             )
 
-        # Chain of rotations: optical world, world, sensor, segment.
+        # The product of three rotations is q_optical_segment.
         inputs = {
             name: multiply_one(multiply_one(q_world, orientations[name]), q_alignment)
             for name, q_world, q_alignment in self._alignments
@@ -217,9 +222,10 @@ class LimbFuser:
             fuser.set_calibration_time(t_ns)
 
     def resume(self, before: LimbFuser) -> None:
-        """Continue from the fuser before a reload, if sensors and alignments are unchanged.
+        """Take over the state of the previous fuser if sensors and alignments are unchanged.
 
-        Drift corrections, faults and fading continue, so a reload does not change the output.
+        Drift corrections, faults and fading continue, so that a reload of the configuration does
+        not change the output.
         """
         old, new = before._calibration, self._calibration
         if old is None or new is None or not old.fits(self._chain):
@@ -266,7 +272,8 @@ class LimbFuser:
             for fuser, near in zip(self._fusers, self._neighbors, strict=True)
         ]
         if any(spread):
-            # Inconsistent sensors: an independent error with a standard deviation per axis, rad.
+            # Inconsistent sensors add an independent error; `sd` is its standard deviation per
+            # axis, rad.
             fused = [
                 one if one.sd is None else one._replace(sd=hypot(one.sd, sd), fault_sd=sd)
                 for one, sd in zip(fused, spread, strict=True)
@@ -310,7 +317,7 @@ class LimbFuser:
             if estimate.gimbal and FrameFlag.GIMBAL not in flags:
                 flags.append(FrameFlag.GIMBAL)
             angles, included, main_sd, gimbal = estimate
-            measured = angles if proximal.used and distal.used else None  # not while held
+            measured = angles if proximal.used and distal.used else None  # no rate if held
             rates = self._rates.update(t_ns, name, measured, gimbal=gimbal)
             joints.append(
                 JointState(

@@ -1,6 +1,6 @@
-"""Segments and joints of a calibrated limb in one mocap frame: the optical reference.
+"""Optical reference: segments and joints of a calibrated limb in one mocap frame.
 
-Invariant: nothing here depends on an IMU, so the result is an independent reference for fusion.
+Invariant: the result does not depend on an IMU, so it is an independent reference for fusion.
 """
 
 from __future__ import annotations
@@ -35,9 +35,11 @@ class OpticalReading(NamedTuple):
     segments: list[Quaternion | None]
     """Orientation q_optical_segment of each segment."""
     positions: list[Vector | None]
-    """Joint centers, m: mean of the two centers fixed in the adjacent body parts."""
+    """Joint centers, m. Each is the mean of two centers, which are fixed in the two adjacent body
+    parts.
+    """
     gaps: list[float | None]
-    """Distances between these two centers, m."""
+    """Distance between these two centers at each joint, m."""
     joints: list[JointReading | None]
     """Angles of the joints between two segments; None at the ends of the chain."""
 
@@ -47,8 +49,8 @@ class OpticalLimb:
 
     Let (R, t) be the rigid motion of a body part since the static pose. The segment of the part has
     the orientation :math:`R\,R_{static}`, and a joint center c fixed in the part moves to :math:`R
-    c + t`. The centers fixed in the two parts of a joint differ by the gap, which soft-tissue
-    artefact and errors of the center cause.
+    c + t`. Each joint has two such centers, one fixed in each adjacent part. The distance between
+    them is the gap; it is caused by soft-tissue artefact and errors of the center.
 
     Parameters
     ----------

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 
 class OpticalOrigin:
-    """Locates O1 by the markers of the body part proximal to it, else of the first segment.
+    """Locates O1 from the markers of the proximal body part, or else of the first segment.
 
     Parameters
     ----------
     chain : Chain
-        Names O1 and the body parts next to it.
+        Chain whose first joint is O1.
     calibration : Calibration or None
-        Marker clusters and joint center; without them O1 is never located.
+        Marker clusters and joint center. Without a calibration O1 is never located.
     """
 
     def __init__(self, chain: Chain, calibration: Calibration | None) -> None:

@@ -1,4 +1,4 @@
-"""Orientation of one segment by the regression of the patent alone.
+"""Orientation of one segment, computed only by the regression of the patent.
 
 Invariant: the orientation of a frame depends only on the sensors of this frame. The orientation is
 the regression of all sensors of the segment, or None.
@@ -40,15 +40,16 @@ class PatentSegmentFuser(SegmentFuser):
 
     @override
     def replace_models(self, models: Mapping[str, SegmentModel]) -> None:
-        """Use other models of the same sensors, from the next frame on."""
+        """Use other models of the same sensors from the next frame on."""
         self._use(models)
 
     @override
     def fuse(self, t_ns: int, inputs: Inputs, neighbor: Sequence[str]) -> FusedSegment:
         """Return the regression at `t_ns`; ``lost`` if a sensor is missing.
 
-        A regression output that is too short has no direction, so the segment is ``lost`` and
-        ``untrained``. The neighbor is no input of the patent.
+        A regression output with a norm near 0 determines no orientation, so the segment is ``lost``
+        and ``untrained``. `neighbor` is ignored, because the regression of the patent does not use
+        it.
         """
         lost = FrameFlag.LOST.of(self._name)
         if any(name not in inputs for name in self._sensors):

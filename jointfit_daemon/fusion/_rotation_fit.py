@@ -1,4 +1,4 @@
-r"""Rotation between two sets of matched points, without matrices.
+r"""Rotation between two sets of matched points, computed without matrix operations.
 
 The rotation is the unit quaternion q that maximizes :math:`q^T N q` (Horn 1987, J. Opt. Soc. Am. A
 4:629), an eigenvector of the largest eigenvalue of the symmetric matrix N. With the cross moment
@@ -10,7 +10,7 @@ The rotation is the unit quaternion q that maximizes :math:`q^T N q` (Horn 1987,
 All roots are real, so Newton's method from above converges to the largest root (Theobald 2005, Acta
 Cryst. A 61:478). The eigenvector is a column of the adjugate of :math:`N - \lambda I`.
 
-Invariant: every operation is a scalar one, so that compiled and interpreted code agree bit for bit.
+Invariant: every operation is scalar, so that compiled and interpreted code agree bit for bit.
 """
 
 from __future__ import annotations
@@ -23,12 +23,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion, Vector
 
 _MOST_STEPS = 60
-"""Newton steps; a simple root takes about six, and a double one halves its error in each."""
+"""Largest number of Newton steps. A simple root takes about six. At a double root each step halves
+the error.
+"""
 _CONVERGED = 1e-16
 """Relative step below which the root is exact to rounding."""
 _LARGE = 0.2
-"""Square of a component of q from which its column of the adjugate is used; the largest of the four
-squares is at least a quarter."""
+"""Square of a component of q above which the corresponding column of the adjugate is used. The
+largest of the four squares is at least 0.25.
+"""
 
 _Rest = tuple[float, float, float, float, float, float]
 
@@ -41,14 +44,15 @@ def fit_rotation(s: tuple[Vector, Vector, Vector], bound: float) -> tuple[Quater
     s : tuple of three Vector
         Rows of the cross moment, sum of ``a_i y_j``, m².
     bound : float
-        Upper bound of the sum, such as the root of the product of the moments of a and y, m².
+        Upper bound of the sum, such as the square root of the product of the moments of a and y,
+        m².
 
     Returns
     -------
     q : Quaternion
         q_y_a with w >= 0.
     largest : float
-        The sum, m².
+        Maximum of the sum, m².
 
     Raises
     ------
@@ -104,7 +108,7 @@ def _adjugate_column(side: Vector, rest: _Rest) -> Quaternion:
     Parameters
     ----------
     side : Vector
-        First column without its first element, which does not matter.
+        First column without its first element, which has no effect on the result.
     rest : tuple of 6 floats
         Upper triangle of the other rows.
     """

@@ -1,15 +1,15 @@
 """Orientation of one segment from the sensors that have data.
 
-In order of preference: the model trained for exactly these sensors, their mean, the last
-orientation for 0.2 s, none. If the set of sensors changes, the orientation moves from the old to
-the new one within 0.25 s:
+The orientation is the first available of these: the prediction of the model trained for exactly
+these sensors, the mean of these sensors, the last orientation for 0.2 s, and None. If the set of
+sensors changes, the output moves from the old to the new orientation within 0.25 s:
 
-- A sensor came back: both sets have data, and their predictions are blended. One wrong sample of
-  the returning sensor, which is common, enters with the small weight of the first frames.
-- A sensor was lost: the difference between both sets in the frames before fades out. A last sample
-  that contradicts those before does not count.
+- If a sensor returns, both sets have data, and their predictions are blended. The first sample of a
+  returning sensor is often wrong, but its frame has a small weight.
+- If a sensor is lost, the difference between both sets in the previous frames is faded out. The
+  last frame is ignored if its difference contradicts the frames before.
 
-Invariant: every degradation sets a flag. The orientation does not jump, except back from a wrong
+Invariant: every degradation sets a flag. The orientation jumps only when it returns from a wrong
 sample.
 """
 
@@ -38,13 +38,14 @@ if TYPE_CHECKING:
 MIN_SD = 0.0005
 """Smallest standard deviation of an orientation, rad; it is the resolution of common sensors."""
 HEADING_SD = radians(2.0)
-"""Standard deviation of the heading of a sensor's world just after calibration, rad. The error is
-common to the sensors of a segment, so it is not observable in the training data (measured on
-simulated subjects one minute after calibration). The error hardly affects flexion."""
+"""Standard deviation of the heading of a sensor's world just after calibration, rad. The value was
+measured on simulated subjects one minute after calibration. The error is common to the sensors of a
+segment, so the training data do not show it. It hardly affects flexion.
+"""
 HEADING_WALK = radians(0.3)
-"""Random walk of that heading, rad per square root of a minute.
-
-After an hour the standard deviation is about 3°."""
+"""Random walk of the heading of a sensor's world, rad per square root of a minute. After an hour
+the standard deviation is about 3°.
+"""
 _HEADING_VAR, _WALK_VAR = HEADING_SD * HEADING_SD, HEADING_WALK * HEADING_WALK
 FADE_NS = 250_000_000
 """Fade time after a change of the set of sensors, ns."""
@@ -54,7 +55,7 @@ OUTLIER = radians(3.0)
 """Change of the difference between two sets of sensors within three frames above which the last
 frame counts as wrong, rad. Soft-tissue artefact reaches a third of this threshold."""
 _HISTORY = 5
-"""Number of stored frames; with two wrong frames the median is still correct."""
+"""Number of stored frames. The median of five frames is correct even if two are wrong."""
 HOLD_NS = 200_000_000
 """Time for which the last orientation is held if no sensor has data, ns."""
 MINUTE_NS = 60_000_000_000
@@ -77,7 +78,9 @@ class FusedSegment(NamedTuple):
     """Sensors that contributed."""
     flags: tuple[str, ...]
     flexion_sd: float | None = None
-    """Standard deviation about the x axis of the segment, rad, if the model distinguishes axes."""
+    """Standard deviation about the x axis of the segment, rad; None if the model has one value for
+    all axes.
+    """
     fault_sd: float = 0.0
     """Standard deviation per axis caused by inconsistent sensors, rad; included in `sd`."""
 
@@ -108,7 +111,9 @@ class SegmentFuser:
         self._models = calibration.models
         self._replaced_models: Mapping[str, SegmentModel] | None = None
         self._chosen: dict[tuple[Names, Names], tuple[SegmentModel | None, Names]] = {}
-        """Model and its neighbor sensors, by sensors with data on segment and neighbor."""
+        """Chosen model and its neighbor sensors. The key is the sensors with data on the segment
+        and on the neighbor.
+        """
         self._use(self._models)
         self._calibrated_ns: int | None = None
         self._last: tuple[int, Quaternion, float] | None = None
@@ -144,9 +149,11 @@ class SegmentFuser:
         t_ns : int
             Instant of the frame.
         inputs : dict
-            q_optical_segment of all sensors of the limb with data, each of its own segment.
+            q_optical_segment of every sensor of the limb with data; the segment is the sensor's own
+            segment.
         neighbor : sequence of str
-            Sensors of the segment that the models use as posture input; always the same.
+            Sensors of the neighboring segment, whose posture is an input of the models; must not
+            change between calls.
         """
         before = self._before
         if before is not None and inputs.keys() == before[2].keys():
@@ -194,10 +201,10 @@ class SegmentFuser:
         return FusedSegment(q, held_sd, (), (FrameFlag.HELD.of(self._name),))
 
     def _predict(self, alive: Names, near: Names, inputs: Inputs) -> Prediction:
-        """Return the prediction of the chosen model, or the mean if there is none."""
+        """Return the prediction of the chosen model, or the mean of the sensors without a model."""
         chosen = self._chosen.get((alive, near))
         if chosen is None:
-            # A model for these sensors and the largest known set of neighbor sensors.
+            # Choose the model for these sensors with the largest known set of neighbor sensors.
             chosen = None, ()
             for others in (near, near[:1], ()):
                 model = self._models.get(model_key(alive, "+".join(others) or None))
@@ -254,10 +261,10 @@ class SegmentFuser:
         self._fading = (t_ns, FADE_NS, offset or difference_one(target, self._last[1]))
 
     def _offset_before(self, alive: Names, near: Names) -> Vector:
-        """Return the rotation from a set of sensors to the output, in the frames before its use.
+        """Return the rotation from the prediction of a set of sensors to the past output.
 
-        The result is the rotation of the last frame, unless this rotation differs too much from the
-        median of the last frames.
+        The result is the rotation in the last frame. If this rotation differs too much from the
+        median of the last frames, the result is the median.
         """
         offsets = [
             difference_one(self._predict(alive, near, inputs).q, q)
@@ -300,7 +307,7 @@ class SegmentFuser:
 
 
 def _present(names: Names, inputs: Inputs) -> Names:
-    """Return the sensors with data; usually all, and then the given tuple."""
+    """Return the sensors with data; if all have data, return the given tuple."""
     for name in names:
         if name not in inputs:
             return tuple([s for s in names if s in inputs])
@@ -310,8 +317,9 @@ def _present(names: Names, inputs: Inputs) -> Names:
 def mean_one(orientations: Sequence[Quaternion]) -> Quaternion:
     """Return the mean of orientations within 90° of each other, with equal weights.
 
-    Normalized sum of the quaternions with the sign of the first. For two it equals the eigenvector
-    mean of Markley et al. (2007); for more it differs in third order of their distances.
+    The mean is the normalized sum of the quaternions, each with the sign of the first. For two
+    orientations it equals the eigenvector mean of Markley et al. (2007). For more orientations the
+    difference is of third order in their distances.
     """
     w, x, y, z = a, b, c, d = orientations[0]
     for p, i, j, k in orientations[1:]:

@@ -1,6 +1,6 @@
-"""Orientations of the single sensors of a frame, as they enter fusion.
+"""Orientations of the individual sensors of a frame, which are the inputs of the fusion.
 
-Invariant: no fault correction is contained, so that subscribers can repeat the fusion.
+Invariant: the orientations contain no fault correction, so that subscribers can repeat the fusion.
 """
 
 from __future__ import annotations
@@ -29,14 +29,15 @@ def sensor_states(
     .. math:: q_{so} = q_W \otimes q_s \otimes q_\mathrm{bias}, \qquad
               q_j = q_\mathrm{proximal}^* \otimes q_\mathrm{distal}
 
-    with the world of the sensor q_W and its alignment q_bias. Source: the patent, steps S3 and S7.
+    where q_W is the rotation of the sensor's world and q_bias the sensor-to-segment alignment. The
+    source is the patent, steps S3 and S7.
 
     Parameters
     ----------
     chain : Chain
         Sensors and joints of the rig.
     calibration : Calibration or None
-        The calibration in force, of this chain.
+        Current calibration of this chain.
     orientations : mapping of str to Quaternion
         q_world_sensor of every sensor with data, each in its own world.
     state : LimbState

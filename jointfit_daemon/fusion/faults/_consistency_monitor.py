@@ -1,18 +1,19 @@
 """Consistency of the sensors of a limb: slip, magnetic disturbance and heading drift.
 
-Twenty-five times a second the monitor compares the sensors with the links of the calibration:
+Twenty-five times a second the monitor compares pairs of sensors. A *link* of the calibration
+predicts the relation of a pair. The pairs are:
 
 * pairs on one segment (:mod:`jointfit_daemon.fusion.faults._slip`),
 * pairs across a hinge (:mod:`jointfit_daemon.fusion.faults._joint_heading`).
 
-A difference within seconds is a slip, or a magnetic disturbance if it is about the vertical. A
-difference about the vertical that grows over minutes is heading drift. Heading errors are removed
-from the sensors before fusion. Only differences are observable, so the drifts of the segments, and
-of the sensors of each segment, have the mean 0.
+A difference that appears within seconds is a slip, or a magnetic disturbance if it is a rotation
+about the vertical. A difference about the vertical that grows over minutes is heading drift.
+Heading errors are removed from the sensors before fusion. Only differences are observable. The
+drifts of the segments are therefore defined to have the mean 0, and so are the drifts of the
+sensors of each segment.
 
-If the difference of a pair is larger than soft tissue causes, both sensors are rotated by equal
-amounts until it is as large as usual, because the soft-tissue model does not hold for a sensor that
-slipped.
+If the difference of a pair is larger than soft tissue can cause, the soft-tissue model does not
+apply. Both sensors are then rotated by equal amounts until the difference has its usual size.
 
 Invariant: the cost per frame is O(1).
 """
@@ -45,26 +46,30 @@ if TYPE_CHECKING:
     Inputs = dict[str, Quaternion]
 
 UPDATE_NS = 39_000_000
-"""Interval of the comparisons, ns: 25 a second with frames at 100 Hz."""
+"""Interval of the comparisons, ns. With frames at 100 Hz it results in 25 comparisons per second.
+"""
 SUDDEN_SD = radians(2.0)
 """Change of a segment's standard deviation between two comparisons above which the next frame is
-compared, too, rad. One wrong sample thus has no effect for a whole interval."""
+compared as well, rad. One wrong sample therefore affects one frame instead of a whole interval.
+"""
 MIN_DRIFT = radians(0.2)
 """Smallest heading drift that is corrected, rad."""
 REPORTED_DRIFT = radians(5.0)
 """Heading drift that is reported, rad."""
 MAJORITY = 3
-"""Fewest sensors on a segment among which a slipped one can be identified."""
+"""Fewest sensors on a segment among which a slipped sensor can be identified."""
 MOST_PAIRED = 5
-"""Sensors of a segment up to which every pair is compared. The number of pairs grows with their
-square."""
+"""Largest number of sensors on a segment for which every pair is compared. The number of pairs
+grows with the square of the number of sensors.
+"""
 
 
 def compared_pairs(group: Sequence[str]) -> list[tuple[str, str]]:
     """Return the pairs of sensors of one segment that are compared, in the order of `group`.
 
-    Of many sensors, the first is compared with all others, and each of these with its neighbours in
-    a ring. A single slipped sensor then contradicts exactly its own pairs, also if one is lost.
+    If a segment has many sensors, the first is compared with all others. Each of the others is also
+    compared with its two neighbours in a ring. A single slipped sensor then contradicts exactly its
+    own pairs, even if another sensor is lost.
     """
     pairs, last = combinations(range(len(group)), 2), len(group) - 1
     return [
@@ -78,7 +83,7 @@ class ConsistencyResult(NamedTuple):
     """Result of the comparisons of one frame."""
 
     spread: tuple[float, ...]
-    """Standard deviation to add to each segment, per axis, rad."""
+    """Standard deviation per axis that is added to each segment, rad."""
     slipped: frozenset[str]
     """Sensors that contradict all others of their segment: excluded from fusion."""
     flags: tuple[str, ...]
@@ -92,11 +97,10 @@ class ConsistencyMonitor:
     chain : Chain
         Sensors by segment.
     calibration : Calibration
-        Calibration whose links predict the relations between sensors.
+        Calibration with the links between sensors.
     drifting : collection of str
-        Sensors without heading reference. Where no hinge makes their headings observable, the
-        standard deviation grows without limit; for other sensors the drift is assumed to be
-        bounded.
+        Sensors without heading reference. If no hinge makes their headings observable, the standard
+        deviation grows without limit. For other sensors the drift is assumed to be bounded.
     """
 
     def __init__(
@@ -130,12 +134,12 @@ class ConsistencyMonitor:
         self._segment_drift = [0.0] * len(chain.segments)
         """Part of the heading drift that is common to all sensors of a segment, rad."""
         self._half_turns: dict[str, tuple[float, float]] = {}
-        """cos and sin of half the heading correction, for corrected sensors."""
+        """cos and sin of half the heading correction, by corrected sensor."""
         self._disturbances = MagneticDisturbanceDetector(chain.sensors)
         self._preceding = {n: group[:k] for group in chain.sensors for k, n in enumerate(group)}
         """Sensors of the same segment listed before each sensor."""
         self._corrections: dict[str, Quaternion] = {}
-        """Rotations in segment axes that reduce the differences of pairs."""
+        """Rotation of each sensor, in segment axes, that reduces the differences of its pairs."""
         self._consistent = [True] * len(chain.segments)
         """Whether all pairs of each segment are consistent."""
         self._all_consistent = True
@@ -148,7 +152,7 @@ class ConsistencyMonitor:
     # --- every frame -------------------------------------------------------------------------
 
     def correct_headings(self, inputs: Inputs) -> Inputs:
-        """Return the orientations with drift and magnetic disturbances removed."""
+        """Return the orientations without heading drift and magnetic disturbances."""
         if not self._half_turns:
             return inputs
         corrected = inputs.copy()
@@ -234,8 +238,7 @@ class ConsistencyMonitor:
             pair.clear_excess()
             return ()
 
-        # A slipped neighbor gives a wrong posture and would make this pair appear inconsistent,
-        # too.
+        # With the wrong posture of a slipped neighbor this pair would appear inconsistent as well.
         near = None
         for neighbor in link.near:
             if neighbor in verticals:
@@ -272,7 +275,7 @@ class ConsistencyMonitor:
             residual = heading - joint.standing - expected
             residual -= tau * round(residual / tau)
             differences.append(HeadingDifference(link.a, link.b, residual, sd))
-            if consistent:  # one link represents all
+            if consistent:  # one link represents all links of the joint
                 break
         if not differences:
             return []
@@ -293,12 +296,12 @@ class ConsistencyMonitor:
         return [HeadingDifference(a, b, uncorrected, sd)]
 
     def _heading_correction(self, a: str, b: str) -> float:
-        """Return the correction of magnetic disturbances, b against a, rad."""
+        """Return the correction of magnetic disturbances of sensor b relative to sensor a, rad."""
         corrections = self._disturbances.corrections
         return corrections.get(b, 0.0) - corrections.get(a, 0.0) if corrections else 0.0
 
     def _tilted(self, *sensors: str) -> bool:
-        """Return whether any of the sensors contradicts its partner in more than heading."""
+        """Return whether a pair of any of the sensors is inconsistent in more than heading."""
         return not self._all_consistent and any(
             pair.tilted and (pair.link.a in sensors or pair.link.b in sensors)
             for consistent, pairs in zip(self._consistent, self._pairs, strict=True)
@@ -318,7 +321,7 @@ class ConsistencyMonitor:
     # --- heading drift, once a second --------------------------------------------------------
 
     def _distribute_drifts(self) -> None:
-        """Compute the drift of each sensor: sums along the branches, with mean 0."""
+        """Compute the drift of each sensor from sums of pair drifts, with mean 0."""
         along = [0.0]
         for inner, joint in zip(self._inner, self._joints, strict=True):
             along.append(along[inner.proximal] + (joint.drift.heading if joint.links else 0.0))
@@ -413,7 +416,7 @@ class ConsistencyMonitor:
 
     @property
     def common_heading_sd(self) -> float:
-        """Standard deviation of the heading that all segments share, rad; not observable."""
+        """Standard deviation of the unobservable heading error that all segments share, rad."""
         unobserved = 0.0 if self._common is None else self._common.sd
         return hypot(unobserved, self._disturbances.ambiguity)
 

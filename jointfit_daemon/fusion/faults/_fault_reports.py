@@ -1,4 +1,4 @@
-"""Reports of sensors that contradict each other: texts and data of the events."""
+"""Texts and data of the events that report contradictions between sensors."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def slip_report(
     segment : str
         Segment of the pair.
     disturbed : tuple of str and float, optional
-        The sensor of the pair whose heading deviates from all others, and its deviation, rad.
+        Sensor of the pair whose heading deviates from all other sensors, and its deviation, rad.
     """
     a, b = pair.link.a, pair.link.b
     data: dict[str, object] = {"pair": [a, b], "apart_deg": round(degrees(pair.distance), 1)}
@@ -48,7 +48,7 @@ def slip_report(
 
 
 def drift_report(heading: float, proximal: str, distal: str, joint: str) -> SensorReport:
-    """Return the report of a heading drift of segment `distal` against `proximal`, rad."""
+    """Return the report of a drift by `heading` rad of segment `distal` relative to `proximal`."""
     text = (
         f"heading drifted by {degrees(heading):.0f} deg against {proximal} (estimated at {joint}, "
         "corrected). A new static pose resets the headings"
@@ -60,7 +60,7 @@ def drift_report(heading: float, proximal: str, distal: str, joint: str) -> Sens
 def heading_report(
     heading: float, proximal: str, distal: str, *, inconsistent: bool
 ) -> SensorReport:
-    """Return the report of two segments whose headings diverged within seconds, by rad."""
+    """Return the report of two segments whose headings diverged by `heading` rad within seconds."""
     data = {"heading_deg": round(degrees(heading), 1)}
     if not inconsistent:
         text = f"heading agrees with {proximal} again"

@@ -1,4 +1,4 @@
-r"""Kalman filter for the slow drift of one heading against another.
+r"""Kalman filter for the slow drift of one heading relative to another.
 
 States are the heading error :math:`\delta` (rad), its rate :math:`\rho` (rad/s) and the bias
 :math:`b` of the measurements (rad). The bias represents joint motion and soft-tissue artefacts,
@@ -7,8 +7,8 @@ which repeat with the movement and shift the measured heading as long as the mov
 .. math:: \dot\delta = \rho,\quad \dot\rho = -\rho/\tau_\rho + w_1,\quad
           \dot b = -b/\tau_b + w_2,\quad z = \delta + b + n
 
-Rate and bias are stationary Ornstein-Uhlenbeck processes. The bias decays with :data:`BIAS_S`, so
-an offset that persists is attributed to drift.
+Rate and bias are stationary Ornstein-Uhlenbeck processes. The bias decays with the time constant
+:data:`BIAS_S`, so a persistent offset is attributed to drift.
 
 Invariant: without measurements the standard deviation grows. A measurement costs a few additions;
 the filter runs once per second.
@@ -21,19 +21,19 @@ from math import exp, radians, sqrt
 import numpy as np
 
 BLOCK_S = 1.0
-"""Interval of the filter, s: measurements within it are averaged."""
+"""Interval of the filter, s. Measurements within an interval are averaged."""
 MIN_MEASUREMENTS = 5
-"""Fewest measurements of an interval that update the filter."""
+"""Fewest measurements in an interval with which the filter is updated."""
 RATE_SD = radians(3.0) / 60.0
 """Standard deviation of the drift of a heading without magnetometer, rad/s: 3 degrees a minute."""
 RATE_S = 300.0
 """Correlation time of the drift rate, s."""
 BIAS_S = 15.0
-"""Correlation time of the measurement bias, s: a movement rarely lasts longer."""
+"""Correlation time of the measurement bias, s. A movement rarely lasts longer."""
 START_SD = radians(1.0)
-"""Standard deviation of the headings that a static pose sets, rad."""
+"""Standard deviation of the headings just after a static pose, rad."""
 OUTLIER_SIGMA = 5.0
-"""Innovations beyond this many standard deviations are rejected: they are slips or restarts."""
+"""Innovations beyond this many standard deviations are rejected; slips and restarts cause them."""
 
 
 class HeadingDriftFilter:
@@ -57,8 +57,9 @@ class HeadingDriftFilter:
         self.sd = START_SD
         """Standard deviation of the estimated heading error, rad."""
         self.observed_sd = max(START_SD, 0.6 * spread)
-        """Standard deviation that is reached with regular measurements, rad. The calibration
-        residuals contain it already."""
+        """Standard deviation that is reached with regular measurements, rad. The residuals of the
+        calibration already contain this error.
+        """
         self.rejected = 0
         """Number of consecutive intervals whose mean was rejected as an outlier."""
 
@@ -68,7 +69,7 @@ class HeadingDriftFilter:
         self._count += 1
 
     def step(self, t_ns: int) -> bool:
-        """Advance to `t_ns`; return whether the estimate was renewed, which is once a second."""
+        """Advance to `t_ns`; return whether the estimate was updated (once per second)."""
         if self._t_ns is None:
             self._t_ns = t_ns
         dt = (t_ns - self._t_ns) * 1e-9

@@ -1,8 +1,9 @@
 """Monitoring of the relative heading of two neighboring segments that a hinge joint connects.
 
-The flexion axis of a hinge is common to both segments, so its heading can be compared. Slow drift
-is estimated by :mod:`jointfit_daemon.fusion.faults._heading_drift`. A change within seconds is a
-fault: it is reported, and the part that is not corrected elsewhere is added to the uncertainty.
+The flexion axis of a hinge is common to both segments, so the two headings of this axis must agree.
+Slow drift is estimated by :mod:`jointfit_daemon.fusion.faults._heading_drift`. A change within
+seconds is a fault and is reported. The part of the change that other modules do not correct is
+added to the uncertainty.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import SensorLink
 
 HINGE_SPREAD = radians(6.0)
-"""Largest spread of the flexion axes against each other at a hinge, posture removed, rad. Headings
-across a joint with a larger spread are not compared."""
+"""Largest standard deviation between the flexion axes of both segments at a hinge, rad. The part
+that depends on posture is removed first. Headings across a joint with a larger value are not
+compared.
+"""
 LIMIT_SIGMA = 3.0
 """Heading difference at which two segments are inconsistent, in standard deviations of
 the difference without a fault."""
@@ -41,17 +44,18 @@ class JointHeadingMonitor:
     links : sequence of SensorLink
         Links between sensors of the two segments, from the calibration.
     standing : float
-        Heading of the distal flexion axis against the proximal one in the static pose, rad.
+        Heading of the distal flexion axis relative to the proximal flexion axis in the static pose,
+        rad.
     drifts : bool
-        Whether a sensor of the joint has no heading reference, so that its heading drifts even
-        where no hinge makes it observable.
+        Whether a sensor of the joint has no heading reference. Its heading then drifts, even if no
+        hinge makes the drift observable.
     """
 
     def __init__(self, links: Sequence[SensorLink], standing: float, *, drifts: bool) -> None:
         self.links = [link for link in links if link.spread <= HINGE_SPREAD]
         self.standing = standing
         self._uncertain = bool(self.links) or drifts
-        """Whether the drift is measured, or known to grow unmeasured."""
+        """Whether the drift is measured, or grows without being measured."""
         spread = max((link.spread for link in self.links), default=HINGE_SPREAD)
         self.drift = HeadingDriftFilter(spread)
         self._sd = spread
@@ -59,7 +63,8 @@ class JointHeadingMonitor:
         self._residual = self._corrected = 0.0
         self._before_ns: int | None = None
         self.difference = 0.0
-        """Smoothed heading difference of the best agreeing sensors, drift removed, rad."""
+        """Smoothed heading difference, without drift, of the pair of sensors that agrees best, rad.
+        """
 
     @property
     def inconsistent(self) -> bool:
@@ -88,7 +93,7 @@ class JointHeadingMonitor:
             Smallest heading difference of any pair of sensors before the corrections of magnetic
             disturbances, rad.
         sd : float
-            Standard deviation of a healthy difference, rad.
+            Standard deviation of the difference without faults, rad.
         """
         if self._before_ns is None:
             self._before_ns = t_ns

@@ -1,19 +1,20 @@
-r"""Detection and correction of magnetic disturbances: headings that change within seconds.
+r"""Detection and correction of magnetic disturbances, which change headings within seconds.
 
-Ferromagnetic objects turn the heading of a sensor with magnetometer within seconds and release it
-later. The differences are measured by pairs on one segment and pairs across a hinge. From these,
-each sensor gets a heading :math:`h_i` against the first, and its deviation from the weighted median
-is corrected; every segment has the same weight:
+A ferromagnetic object near a sensor with magnetometer changes its heading within seconds. The
+heading returns when the object is removed. Heading differences are measured between pairs on one
+segment and pairs across a hinge. The sum of these differences is the heading :math:`h_i` of each
+sensor relative to the first. The deviation of this heading from the weighted median is corrected;
+every segment has the same weight:
 
 .. math:: o_i = h_i - \mathrm{median}(h), \qquad
           \text{correction: } o_i \cdot \mathrm{clip}\bigl((|o_i| - s_0) / (s_1 - s_0), 0, 1\bigr)
 
-One disturbed sensor of four is thus identified and corrected, and the others are unchanged. If two
-halves of the sensors contradict each other, the median is an interval. The middle of the interval
-is used, which preserves joint angles. Half the width of the interval is the uncertainty of all
-headings.
+If one of four sensors is disturbed, it is identified and corrected, and the others are unchanged.
+If two halves of the sensors contradict each other, the median is an interval. The middle of the
+interval is used, which preserves joint angles. Half the width of the interval is the uncertainty of
+all headings.
 
-Only differences are observable: a disturbance that turns all sensors alike is not detected.
+Only differences are observable, so a disturbance that rotates all sensors equally is not detected.
 """
 
 from __future__ import annotations
@@ -28,10 +29,12 @@ if TYPE_CHECKING:
 SMOOTHING_S = 0.4
 """Time constant of the measured differences, s."""
 CORRECTION_S = 0.25
-"""Time constant with which corrections follow, s: the output does not jump."""
+"""Time constant with which corrections approach their targets, s, so that the output does not jump.
+"""
 STALE_NS = 500_000_000
-"""Longest time without a measurement after which a difference continues, ns; later it starts from
-0."""
+"""Longest time without a measurement after which a smoothed difference continues, ns. After a
+longer time the difference restarts from 0.
+"""
 CORRECTION_START = 1.6
 """Deviation from the median at which the correction starts, in standard deviations."""
 CORRECTION_FULL = 3.2
@@ -43,7 +46,7 @@ MIN_SD = 0.026
 
 
 class HeadingDifference(NamedTuple):
-    """Heading of sensor `b` against sensor `a`, posture and drift removed."""
+    """Heading of sensor `b` relative to sensor `a`, without the effects of posture and drift."""
 
     a: str
     b: str
@@ -81,9 +84,13 @@ class MagneticDisturbanceDetector:
         self._segment = {name: i for i, group in enumerate(groups) for name in group}
         self._differences: dict[tuple[str, str], _SmoothedDifference] = {}
         self.corrections: dict[str, float] = {}
-        """Angles to subtract from the headings of sensors, rad; absent sensors need none."""
+        """Angle to subtract from the heading of each sensor, rad; sensors without a correction are
+        absent.
+        """
         self.ambiguity = 0.0
-        """Standard deviation of all headings because halves contradict each other, rad."""
+        """Standard deviation of all headings if two halves of the sensors contradict each other,
+        rad.
+        """
         self._before_ns: int | None = None
         self._deviations: dict[str, float] = {}
         """Deviations of sensors from the median, rad; empty while all differences are small."""
@@ -96,8 +103,8 @@ class MagneticDisturbanceDetector:
         t_ns : int
             Instant of the frame.
         differences : iterable of HeadingDifference
-            Differences within segments and across hinges. The differences must form a forest: at
-            most one path leads from one sensor to another.
+            Differences within segments and across hinges. The differences must form a forest, a
+            graph with at most one path between two sensors.
         """
         edges = []
         total, max_sd = 0.0, MIN_SD
@@ -118,7 +125,7 @@ class MagneticDisturbanceDetector:
     def outlier(self, a: str, b: str) -> tuple[str, float] | None:
         """Return the corrected sensor of a pair and its deviation, if the other sensor agrees.
 
-        The other sensor agrees if it deviates by less than half as much.
+        The other sensor agrees if its deviation is less than half as large.
         """
         deviations = self._deviations
         larger = abs(deviations.get(a, 0.0)) > abs(deviations.get(b, 0.0))
@@ -163,8 +170,8 @@ class MagneticDisturbanceDetector:
                 correction = _ramp(heading - middle, sd)
                 if correction:
                     targets[name] = correction
-                    # The same source may disturb the other sensors by an amount that remains
-                    # unobserved.
+                    # The same object may disturb the other sensors by an amount that is not
+                    # observed.
                     ambiguity = max(ambiguity, min(abs(correction), sd))
             ambiguity = max(ambiguity, _ramp(0.5 * (high - low), sd))
         return targets, ambiguity
@@ -173,7 +180,7 @@ class MagneticDisturbanceDetector:
 def _connected_headings(
     edges: list[tuple[str, str, _SmoothedDifference]],
 ) -> list[tuple[dict[str, float], float]]:
-    """Return headings and largest standard deviation of each connected set of sensors.
+    """Return the headings and the largest standard deviation of each connected set of sensors.
 
     The first sensor of each set has the heading 0.
     """
@@ -199,7 +206,7 @@ def _connected_headings(
 
 
 def _weighted_median(weighted: list[tuple[float, float]]) -> tuple[float, float]:
-    """Return the lowest and highest value with half of the weight on either side."""
+    """Return the lowest and highest value that have half of the weight on either side."""
     weighted = sorted(weighted)
     half = 0.5 * sum(weight for _, weight in weighted)
     below = 0.0
@@ -213,6 +220,6 @@ def _weighted_median(weighted: list[tuple[float, float]]) -> tuple[float, float]
 
 
 def _ramp(angle: float, sd: float) -> float:
-    """Return the corrected part of a deviation: none of a small one, all of a large one."""
+    """Return the part of a deviation that is corrected, from none if small to all if large."""
     share = (abs(angle) / sd - CORRECTION_START) / (CORRECTION_FULL - CORRECTION_START)
     return angle * min(max(share, 0.0), 1.0)

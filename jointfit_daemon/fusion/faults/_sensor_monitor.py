@@ -1,9 +1,11 @@
 """State of every sensor of a limb (ok, lost, stuck) and reports of its changes.
 
-Fusion drops a lost or stuck sensor in the frame in which the fault is detected. The report waits
-for the times below, so that single lost samples and loose connectors cause no flood of events.
+Fusion excludes a lost or stuck sensor from the frame in which the fault is detected. The report is
+delayed by `REPORT_DELAY_NS`, so that single lost samples and loose connectors do not cause many
+events.
 
-Invariant: the cost per frame is O(1); a state is reported at most once in a row.
+Invariant: the cost per frame is O(1), and no two successive reports of a sensor have the same
+state.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 SensorState = Literal["absent", "ok", "lost", "stuck"]
 
 REPORT_DELAY_NS: dict[SensorState, int] = {"lost": 200_000_000, "ok": 2_000_000_000}
-"""Time in a state after which it is reported, ns; other states are reported at once."""
+"""Duration of a state after which it is reported, ns; other states are reported immediately."""
 
 
 class SensorReport(NamedTuple):
@@ -48,7 +50,7 @@ class _SensorStatus:
 
 
 class SensorMonitor:
-    """Follows the state of the sensors of one limb.
+    """Monitors the state of the sensors of one limb.
 
     Parameters
     ----------
@@ -87,7 +89,7 @@ class SensorMonitor:
             )
             if state != sensor.state and not (state == "lost" and sensor.state == "absent"):
                 sensor.state, sensor.since_ns, self._unreported = state, now_ns, True
-                if sensor.reported == "absent":  # the core reports the start of streaming
+                if sensor.reported == "absent":  # `pipeline` reports the start of streaming
                     sensor.reported = "ok"
 
         if not stuck:

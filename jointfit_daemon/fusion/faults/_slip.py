@@ -1,9 +1,9 @@
-"""Detection of sensor slip: pairs of sensors of one segment against their calibrated relation.
+"""Detection of sensor slip by comparing pairs of sensors of one segment with the calibration.
 
 The calibration predicts the rotation between two sensors of a segment from posture
-(`limb_model.SensorLink`). A difference beyond the usual residual enters
-the uncertainty at once; the pair is reported as inconsistent only if the difference persists, and
-as consistent after the difference has been well below the limit for a longer time.
+(`limb_model.SensorLink`). A difference beyond the usual residual increases the uncertainty
+immediately. The pair is reported as inconsistent only if the difference persists. It is reported as
+consistent after the difference has been well below the limit for a longer time.
 """
 
 from __future__ import annotations
@@ -25,39 +25,43 @@ SMOOTHING_S = 0.4
 ONSET_NS = 500_000_000
 """Time above the limit after which a pair is inconsistent, ns."""
 RELEASE_NS = 2_000_000_000
-"""Time below the release limit after which it is consistent again, ns."""
+"""Time below the release limit after which the pair is consistent again, ns."""
 LIMIT_FACTOR = 2.4
-"""Limit of the smoothed difference in units of its usual RMS length. Healthy sensors stay below 1.5
-for hours (simulated soft tissue) and below 2.1 in movements outside the training (recorded)."""
+"""Limit of the smoothed difference in units of its usual RMS length. Sensors without fault stay
+below 1.5 for hours with simulated soft tissue. They stay below 2.1 in recorded movements outside
+the training range.
+"""
 MIN_LIMIT = radians(6.0)
 """Smallest limit, rad."""
 RELEASE_SHARE = 0.65
-"""Share of the limit below which an inconsistency may end."""
+"""Fraction of the limit below which an inconsistency may end."""
 TILT_SHARE = 0.75
-"""Share of the limit up to which a difference other than heading may be soft-tissue artefact."""
+"""Fraction of the limit up to which a difference without its heading part may be soft-tissue
+artefact.
+"""
 USUAL_FACTOR = 1.5
 """Largest usual difference of a single frame, in units of its RMS length."""
 USUAL_MEAN_FACTOR = 1.2
-"""Largest usual mean difference over :data:`MEAN_S`, in the same units."""
+"""Largest usual mean difference over :data:`MEAN_S`, in units of the RMS length."""
 MEAN_S = 1.0
 """Time constant of the mean difference, s."""
 RECENT_FRAMES = 10
-"""Updates back to the frame that sudden changes are measured against: 0.4 s."""
+"""Number of updates over which sudden changes are measured: 0.4 s."""
 UNTRAINED_SD = radians(5.0)
-"""Standard deviation per component of a pair without training movement, rad."""
+"""Standard deviation per component, rad, of the difference of a pair without training movement."""
 
 
 def untrained_link(a: str, b: str) -> SensorLink:
-    """Return the link of a pair of which only the static pose is known: it predicts no rotation."""
+    """Return the link of a pair of which only the static pose is known; it predicts no rotation."""
     zero = (0.0,) * 10
     return SensorLink(a, b, "pair", (), (zero, zero, zero), zero, zero, 0.0, UNTRAINED_SD)
 
 
 def pair_corrections(pairs: Sequence[SlipDetector]) -> dict[str, Quaternion]:
-    """Return the rotations that bring the sensors of a segment back to their usual differences.
+    """Return the rotations that reduce the differences of a segment's sensors to the usual size.
 
-    Every sensor gets an equal share of the excess of its pairs, so none is preferred. The rotations
-    are in segment axes.
+    The excess of each pair is divided equally, because neither sensor is known to be wrong. The
+    rotations are in segment axes.
     """
     of_sensor = Counter(name for pair in pairs for name in (pair.link.a, pair.link.b))
     corrections = {}
@@ -74,7 +78,7 @@ def pair_corrections(pairs: Sequence[SlipDetector]) -> dict[str, Quaternion]:
 
 
 class FaultDebouncer:
-    """Switches a fault on after :data:`ONSET_NS` above a limit, and off after a longer calm."""
+    """Sets a fault after :data:`ONSET_NS` above a limit; clears it after a longer time below."""
 
     def __init__(self) -> None:
         self.active = False
@@ -124,13 +128,13 @@ class SlipDetector:
         self.limit = MIN_LIMIT
         """Distance above which the pair is inconsistent, rad."""
         self.excess = 0.0
-        """Difference beyond the usual in the last frame, after corrections, rad."""
+        """Part of the last corrected difference that exceeds the usual difference, rad."""
         self.excess_vector: Vector = (0.0, 0.0, 0.0)
-        """Excess of b against a as a rotation vector, segment axes, rad; valid if `exceeded`."""
+        """Excess as the rotation vector from a to b in segment axes, rad; valid if `exceeded`."""
         self.exceeded = False
         """Whether the last difference was larger than usual."""
         self.heading = 0.0
-        """Vertical component of the last difference, b against a, rad."""
+        """Vertical component of the last difference from a to b, rad."""
 
     @property
     def inconsistent(self) -> bool:
@@ -139,7 +143,7 @@ class SlipDetector:
 
     @property
     def tilted(self) -> bool:
-        """Whether the pair is (or becomes) inconsistent in more than heading."""
+        """Whether a present or pending inconsistency is more than a heading difference."""
         return not self.consistent and hypot(*self._tilt) > TILT_SHARE * self.limit
 
     @property
@@ -148,7 +152,7 @@ class SlipDetector:
         return not self.inconsistent and self.distance < self.limit
 
     def clear_excess(self) -> None:
-        """Clear the excess: a sensor of the pair is silent."""
+        """Clear the excess, because a sensor of the pair sends no data."""
         self.excess, self.exceeded = 0.0, False
 
     def update(
@@ -167,11 +171,11 @@ class SlipDetector:
         t_ns : int
             Instant of the frame.
         a, b : Quaternion
-            q_world_segment of either sensor.
+            q_world_segment computed from each sensor.
         verticals : tuple of Vector
             The vertical in the frame of `a` and in the frame of the neighboring segment.
         correction : float
-            Heading correction, b against a, that `a` and `b` already contain, rad.
+            Correction of the heading from a to b that `a` and `b` already contain, rad.
         """
         up_a, up_near = verticals
         (ex, ey, ez), sd = self.link.expected(up_a, up_near)
@@ -179,7 +183,8 @@ class SlipDetector:
         residual = rx, ry, rz = dx - ex, dy - ey, dz - ez
         usual = sqrt(3.0) * sd
 
-        # Split into heading (about the vertical) and tilt; the limit applies before correction.
+        # The difference is split into heading (about the vertical) and tilt. The limit applies to
+        # the difference before the correction.
         ux, uy, uz = up_a
         heading = rx * ux + ry * uy + rz * uz
         self.heading = heading + correction

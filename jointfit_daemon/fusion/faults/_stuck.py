@@ -1,19 +1,21 @@
-"""Detection of stuck sensors: sensors that keep sending but no longer follow their segment.
+"""Detection of stuck sensors, which continue to send but no longer follow their segment.
 
 A sensor is stuck if either
 
 * it repeats its orientation while another sensor turns, or
 * it follows less than a small share of a large rotation of its partner on the same segment.
 
-How long a healthy sensor repeats itself (coarse resolution, slow filter) is estimated from
-repetitions that ended by themselves. A stuck sensor is used again after 0.2 s of movement.
+A working sensor may also repeat its value, because of coarse resolution or a slow filter. The usual
+duration of such repetitions is estimated from repetitions that ended without a fault. A stuck
+sensor is used again after 0.2 s of movement.
 
-Sensors without noise do not leave or reach rest in the same frame: their sampling instants differ,
-and a delayed sample is extrapolated from rest. A repetition therefore counts only for the time in
-which another sensor varied.
+Sensors without noise do not start or stop moving in the same frame. Their sampling instants differ,
+and a delayed sample is extrapolated from rest. Only the part of a repetition in which another
+sensor varied therefore counts.
 
-Invariant: only rotations of each sensor against itself are compared, so neither its alignment nor
-its world matters. The cost per frame is O(1).
+Invariant: only rotations of a sensor relative to its own earlier orientation are compared. The
+result therefore does not depend on the alignment or the world of the sensor. The cost per frame is
+O(1).
 """
 
 from __future__ import annotations
@@ -33,16 +35,17 @@ REPEAT_NS = 50_000_000
 REPEAT_AT_REST_NS = 400_000_000
 """Repetition of a sensor at rest that counts as stuck if another sensor still varies, ns."""
 OBSERVATION_NS = 5_000_000_000
-"""Time after which the noise of a sensor at rest is known, ns."""
+"""Time at rest after which the noise of a sensor is known, ns."""
 NATURAL_FACTOR = 3
-"""Repetitions up to this multiple of the natural repetition time are healthy."""
+"""Repetitions up to this multiple of the natural repetition time are no fault."""
 NATURAL_LIMIT_NS = 150_000_000
-"""Largest natural repetition time that is learned, ns: a longer one would hide a fault."""
+"""Largest natural repetition time that is learned, ns. A longer time would hide a fault."""
 PARTNER_ROTATION = radians(1.0)
-"""Rotation of a sensor on the same segment that a healthy sensor always follows, rad."""
+"""Rotation of a sensor on the same segment that a working sensor always follows, rad."""
 OTHER_ROTATION = radians(10.0)
-"""Rotation of a sensor on another segment that a healthy sensor always follows, rad. This rotation
-is larger, because joints allow segments to move alone."""
+"""Rotation of a sensor on another segment that a working sensor always follows, rad. It is larger
+than `PARTNER_ROTATION`, because joints allow one segment to move alone.
+"""
 OTHER_REPEAT_NS = 300_000_000
 """Shortest repetition that the rotation of another segment can confirm, ns."""
 WINDOW_NS = 150_000_000
@@ -50,10 +53,11 @@ WINDOW_NS = 150_000_000
 WINDOW_ROTATION = radians(6.0)
 """Rotation of a partner within one window that starts a comparison, rad."""
 FOLLOWED_SHARE = 0.05
-"""Share of that rotation that even a loosely attached sensor follows. Two consecutive windows
-must fall below it, because a sensor may move back to its start within one window."""
+"""Fraction of the partner's rotation that even a loosely attached sensor follows. The rotation must
+be smaller in two consecutive windows, because a sensor may return to its start within one window.
+"""
 RECOVERY_NS = 200_000_000
-"""Movement after which a stuck sensor is used again, ns."""
+"""Duration of movement after which a stuck sensor is used again, ns."""
 _ROUNDING = 1e-12
 """Squared sine of half a rotation that is rounding error: 2e-6 rad."""
 
@@ -82,7 +86,7 @@ class _SensorHistory:
         """Add one orientation; return whether it equals the preceding orientation."""
         since_ns = self.since_ns
         if since_ns is not None:
-            # One component mostly decides whether the two orientations differ by rounding only.
+            # In most cases one component shows that the orientations differ by more than rounding.
             (aw, ax, ay, az), (bw, bx, by, bz) = self.q, q
             x = aw * bx - ax * bw - ay * bz + az * by
             if x * x < _ROUNDING and _squared_half_sine(self.q, q) < _ROUNDING:
@@ -101,7 +105,7 @@ class _SensorHistory:
         return False
 
     def reset(self) -> None:
-        """Mark the sensor as silent; the next orientation is not compared with the last."""
+        """Mark the sensor as silent, so that the next orientation is not compared with the last."""
         self.since_ns = None
         self.repeating = self.lagging = self.still = False
 
@@ -128,7 +132,9 @@ class StuckSensorDetector:
         self._items = tuple(self._sensors.items())
         self._window: tuple[int, Orientations] | None = None
         self._varying_ns: tuple[int, int] | None = None
-        """First and last instant at which a sensor varied, without a pause of all sensors."""
+        """First and last instant of the period in which sensors varied without a pause of all
+        sensors.
+        """
 
     def update(self, t_ns: int, orientations: Orientations) -> list[str]:
         """Add one frame and return the ids of the sensors that are stuck.
@@ -152,7 +158,7 @@ class StuckSensorDetector:
                 varying = True
         if varying:
             first_ns, last_ns = self._varying_ns or (t_ns, t_ns)
-            if t_ns - last_ns > REPEAT_AT_REST_NS:  # all sensors were at rest
+            if t_ns - last_ns > REPEAT_AT_REST_NS:  # a pause of all sensors ended
                 first_ns = t_ns
             self._varying_ns = first_ns, t_ns
 
@@ -175,7 +181,7 @@ class StuckSensorDetector:
         orientations: Orientations,
         repeating: Sequence[str],
     ) -> bool:
-        """Return whether other sensors turned, or still vary, during a repetition of `sensor`."""
+        """Return whether other sensors rotate or vary during a repetition of `sensor`."""
         since_ns, first_ns = sensor.since_ns, sensor.first_ns
         if since_ns is None or first_ns is None or self._varying_ns is None:
             return False
@@ -184,7 +190,7 @@ class StuckSensorDetector:
         if varied_last_ns - max(since_ns, varied_first_ns) < max(REPEAT_NS, usual_ns):
             return False
 
-        # The limb moved.
+        # Case 1: the limb moved.
         start = sensor.orientations
         if any(_turned(name, start, orientations, PARTNER_ROTATION) for name in sensor.partners):
             return True
@@ -193,7 +199,8 @@ class StuckSensorDetector:
         ):
             return True
 
-        # The limb is at rest: the noise of other sensors indicates that orientations should vary.
+        # Case 2: the limb is at rest. The noise of other sensors shows that orientations should
+        # vary.
         if length_ns < REPEAT_AT_REST_NS or since_ns - first_ns < OBSERVATION_NS:
             return False
         return any(
@@ -202,7 +209,7 @@ class StuckSensorDetector:
         )
 
     def _update_lagging(self, start: Orientations, end: Orientations) -> None:
-        """Mark sensors that hardly moved in two windows in which a partner turned far."""
+        """Mark sensors that hardly rotated in two windows in which a partner rotated far."""
         for name, sensor in self._items:
             if any(_turned(other, start, end, WINDOW_ROTATION) for other in sensor.partners):
                 present = name in start and name in end
@@ -223,7 +230,7 @@ def _squared_half_sine(a: Quaternion, b: Quaternion) -> float:
 
 
 def _turned(name: str, start: Orientations, end: Orientations, angle: float) -> bool:
-    """Return whether a sensor turned by at least `angle` rad between two frames."""
+    """Return whether a sensor rotated by at least `angle` rad between two frames."""
     a, b = start.get(name), end.get(name)
     if a is None or b is None:
         return False

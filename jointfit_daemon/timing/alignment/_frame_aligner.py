@@ -1,20 +1,22 @@
 """Alignment of sample streams to frames at a fixed rate.
 
-Time advances with samples and with ``advance``; memory is bounded. Frames are emitted in order,
-each once. Every sample has exactly one outcome.
+The aligner reads no clock: the caller passes the time to ``advance``. Memory is bounded. Every
+frame is emitted once, in order. Every sample has exactly one outcome.
 
 Frame k has the instant ``t_k = k period`` of host CLOCK_MONOTONIC, so the grid does not depend on
 the start time. The frame is emitted when every active stream has a sample at or after t_k, or at
-the deadline of the frame: the next sample of each stream is expected at its usual delay, plus at
-most 1.5 of its periods. Missing samples are extrapolated by up to 2.5 periods; after that the
-stream is missing from the frame.
+the deadline of the frame. The deadline is the time at which the next sample of every stream usually
+arrives, plus at most 1.5 periods of that stream. If a sample is missing, the orientation of its
+stream is extrapolated by up to 2.5 periods. After that the frame does not contain the stream.
 
-Invariant: frames never stop. While no stream has samples, frames are emitted without orientations,
-first when every stream counts as lost, then at the usual delay. Only frames that were not requested
-within a second (the whole process was stopped) are skipped.
+Invariant: frames never stop. While no stream has samples, frames without orientations are emitted.
+The first of these frames is emitted when every stream counts as lost, the others at the usual
+delay. Frames are skipped only if the whole process was stopped and did not request them within a
+second.
 
-In mode ``fast`` a sample one period of its stream before t_k is sufficient, and the rest is
-extrapolated: frames are emitted one period earlier, never before t_k itself.
+In mode ``fast`` the last sample of a stream may precede t_k by up to one period of the stream, and
+the orientation is extrapolated to t_k. Frames are therefore emitted up to one period earlier, but
+never before t_k.
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ Mode = Literal["smooth", "fast"]
 """``smooth`` waits for samples and interpolates; ``fast`` extrapolates by at most one period."""
 
 OWED_NS = 1_000_000_000
-"""Age, ns, above which frames without orientations are skipped: a process that was stopped for an
-hour would otherwise emit 360 000 of them.
+"""Age, ns, above which frames without orientations are skipped. Otherwise a process that was
+stopped for an hour would emit 360 000 such frames at 100 Hz.
 """
 
 
@@ -49,8 +51,8 @@ class AlignedFrame(NamedTuple):
     extrapolated: frozenset[str]
     missing: frozenset[str]
     synced: bool
-    """Whether the clocks of all `orientations` have settled. Without orientations: the value of
-    the last frame with some, until a stream ends.
+    """Whether the clocks of all `orientations` have settled. A frame without orientations has the
+    value of the last frame with orientations, until all streams have ended.
     """
 
 
@@ -67,7 +69,7 @@ class FrameAligner:
     period_ns : int
         Frame period, ns.
     mode : {"smooth", "fast"}
-        Whether to wait for samples.
+        ``smooth`` waits for samples, ``fast`` extrapolates.
     begin_ns : int, optional
         Instant of the first frame, with or without samples, ns; by default the instant of the first
         sample.
@@ -93,18 +95,20 @@ class FrameAligner:
         self._period_ns = period_ns
         self._fast = mode == "fast"
         self._next = None if begin_ns is None else -(-begin_ns // period_ns)
-        """Number of the next frame; None until a stream begins."""
-        self._served: int | None = None  # number of a frame that some stream can serve
-        self._serves_ns: int | None = None  # first instant a stream can serve, if not the next
+        """Number k of the next frame; None before the first sample."""
+        self._served: int | None = None  # number of a frame for which a stream has data
+        self._serves_ns: int | None = None  # first instant with data of a stream
         self._completed_ns = 0
         self._synced = False
         """Whether the clocks behind the last frame had settled."""
         self._deadline_ns: int | None = None
         self._changed = True  # change since the last computation of `_deadline_ns`
         self._dues: dict[str, int] = {}
-        """Time at which each stream is ready for the next frame; empty until first requested."""
+        """Host time at which each stream is ready for the next frame, ns; empty until first
+        computed.
+        """
         self.skipped_frames = 0
-        """Number of skipped frames, see ``OWED_NS``."""
+        """Number of skipped frames; ``OWED_NS`` defines when a frame is skipped."""
 
     # --- samples -----------------------------------------------------------------------------
 
@@ -124,21 +128,21 @@ class FrameAligner:
         Parameters
         ----------
         name : str
-            Stream id; KeyError if unknown.
+            Id of the stream. An unknown id raises KeyError.
         t_ns, arrival_ns : int
             Host time of the sampling instant and of the arrival, ns.
         q : Quaternion
             Unit quaternion of either sign.
         synced : bool
-            Whether its clock has settled.
+            Whether the clock of the stream has settled.
         epoch : int
-            Epoch of its clock; samples of different epochs are not combined.
+            Epoch of the clock of the stream; samples of different epochs are not combined.
         rate : Vector, optional
             Measured angular rate at `t_ns` in the sensor's own frame, rad/s.
         """
         stream = self._streams[name]
         self._changed = True
-        if epoch != stream.epoch:  # the stream discards its samples
+        if epoch != stream.epoch:  # a new epoch: the stream discards its samples
             self._served = None
 
         passed_ns = None if self._next is None else (self._next - 1) * self._period_ns
@@ -157,7 +161,7 @@ class FrameAligner:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Time at which ``advance`` emits a frame without further samples, ns; or None."""
+        """Host time at which ``advance`` emits a frame even if no sample arrives, ns, or None."""
         if self._changed:
             self._deadline_ns = self._due()
             self._changed = False
@@ -176,8 +180,9 @@ class FrameAligner:
         now_ns : int
             Host instant, ns.
         complete_only : bool
-                Return no frame that lacks a sample, even after its deadline. For calls between two
-            reads: after a stall of the process the missing sample is usually waiting in the kernel.
+                Return no frame that lacks a sample, even after the deadline of the frame. The
+                option is for calls between two reads of the devices. After a stall of the process
+                the kernel usually has the missing sample in a buffer.
         """
         frames: list[AlignedFrame] = []
         while (due_ns := self.next_deadline_ns) is not None and due_ns <= now_ns:
@@ -197,7 +202,7 @@ class FrameAligner:
         )
 
     def _pass_over(self, now_ns: int) -> bool:
-        """Skip to the first frame that is recent or can be served; False if it is the next."""
+        """Skip old frames without data; return False if no frame was skipped."""
         until_ns = now_ns - OWED_NS
         if self._serves_ns is not None:
             until_ns = min(until_ns, self._serves_ns)
@@ -209,7 +214,7 @@ class FrameAligner:
         return True
 
     def _find_servers(self) -> None:
-        """Determine whether a stream serves the next frame, or else its first served instant.
+        """Determine whether a stream has data for the next frame, or the first instant with data.
 
         Streams that have ended are reset.
         """
@@ -217,7 +222,7 @@ class FrameAligner:
         t_next, served = self.next_ns, False
         for _, stream in self._items:
             if served and stream.waited_for:
-                continue  # one serving stream is sufficient, and this one has not ended
+                continue  # one stream with data is sufficient, and this stream has not ended
             start = stream.serves_from(t_next)
             if start is None:
                 stream.settle()
@@ -270,7 +275,8 @@ class FrameAligner:
             if stream.extrapolated:
                 extrapolated.append(name)
 
-        # unchanged while no stream has ended, because clocks remain settled during a pause
+        # Clocks remain settled during a pause, so the value is unchanged until all streams have
+        # ended.
         if not orientations:
             synced = self._synced and any(stream.waited_for for _, stream in self._items)
 
@@ -297,7 +303,7 @@ class FrameAligner:
         self._changed, self._served = True, None
 
     def close(self) -> None:
-        """Count the outcome of every pending sample; the next sample starts again."""
+        """Count the outcome of every pending sample and remove it; the next sample starts again."""
         for _, stream in self._items:
             stream.reset()
         self._changed, self._served = True, None

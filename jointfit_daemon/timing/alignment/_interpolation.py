@@ -1,8 +1,9 @@
 r"""Interpolation and short extrapolation of the orientations of one stream.
 
-Quaternions are tuples of floats; a call takes a few microseconds. All computations use the tangent
-space of the newest sample *a* at or before the instant, :math:`r(t) = \log(q_a^* q(t))`. Other
-samples are plain vectors in this space. Angular rates are rates of the body in body coordinates:
+Quaternions are tuples of floats; a call takes a few microseconds. The requested instant is between
+two samples or after the last sample. Sample *a* is the newest sample at or before this instant. All
+computations use the tangent space of *a*, :math:`r(t) = \log(q_a^* q(t))`, in which the other
+samples are vectors. Angular rates are rates of the body in body coordinates:
 :math:`\dot q = q \otimes (0, \omega/2)`.
 """
 
@@ -20,9 +21,10 @@ _NS = 1e-9
 CURVATURE_SHARE = 0.5
 """Fraction of the measured curvature used in extrapolation; see docs/timing.md."""
 _CONTRADICTS = 0.25
-"""Relative difference between a rotation and the integral of its rates that is accepted."""
+"""Largest accepted relative difference between a rotation and the integral of the measured rates.
+"""
 _CONTRADICTS_RAD = 0.02
-"""Absolute difference accepted in addition, rad."""
+"""Absolute difference that is accepted in addition, rad."""
 
 
 class OrientationSample(Protocol):
@@ -31,10 +33,10 @@ class OrientationSample(Protocol):
     t_ns: int
     q: Quaternion
     rate: Vector | None
-    """Angular rate in the sensor's own frame at ``t_ns``, rad/s; None: not measured."""
+    """Angular rate in the sensor's own frame at ``t_ns``, rad/s; None if not measured."""
     turn: Vector | None
-    """Rotation vector from the sample before it, rad, cached; None before it is computed, and
-    again after a sample is inserted between them.
+    """Rotation vector from the previous sample to this sample, rad. The value is cached. It is None
+    until it is computed, and None again after a sample was inserted between the two.
     """
 
 
@@ -43,19 +45,21 @@ def interpolate_orientation(
 ) -> Quaternion:
     r"""Return the orientation at `t_ns`, between the neighbours `a` and `b`.
 
-    With rates at both ends the result is a cubic Hermite interpolation in the tangent space of `a`.
-    Otherwise, with a sample `before` them, it is the parabola through all three,
+    If both neighbours have rates, the result is a cubic Hermite interpolation in the tangent space
+    of `a`. Without rates, but with a sample `before`, the result is the parabola through the three
+    samples,
 
     .. math:: r(x) = r_b \frac{x (x + h_0)}{h_1 (h_0 + h_1)}
               + r_0 \frac{x (x - h_1)}{h_0 (h_0 + h_1)}
 
-    with :math:`h_0, h_1` the intervals before and after `a`; otherwise slerp. The error of the
-    parabola is of third order in the interval, that of slerp of second order.
+    where :math:`h_0, h_1` are the intervals before and after `a`. Without `before` the result is a
+    spherical linear interpolation (slerp). The error of the parabola is of third order in the
+    interval, the error of slerp of second order.
 
     Parameters
     ----------
     before, a, b : OrientationSample
-        Neighbours in order of time; `before` may be missing. Signs of quaternions do not matter.
+        Successive samples in order of time; `before` may be None. Quaternions may have either sign.
     t_ns : int
         Instant in ``[a.t_ns, b.t_ns]``.
     """
@@ -66,7 +70,7 @@ def interpolate_orientation(
     elif before is not None:
         h0 = (a.t_ns - before.t_ns) * _NS
         m, n = x * (x + h0) / (h * (h0 + h)), x * (h - x) / (h0 * (h0 + h))
-        r = _combine(m, turn, n, _turn_to(a, before))  # `before` is at minus that in this space
+        r = _combine(m, turn, n, _turn_to(a, before))  # `before` is at the negative of this vector
     else:
         share = x / h
         r = (share * turn[0], share * turn[1], share * turn[2])
@@ -82,23 +86,23 @@ def extrapolate_orientation(
 ) -> Quaternion:
     r"""Return the orientation at `t_ns`, after the last sample `a`.
 
-    The motion continues at the last rate, measured or computed from the last interval. A fraction
-    of the measured angular acceleration acts for the duration of this interval:
+    The motion continues at the last angular rate, which is measured or computed from the last
+    interval. A fraction of the angular acceleration continues for the duration of this interval:
 
     .. math:: r(x) = v x + \tfrac12 \beta\, a\, (x_c (x_c + h_0) + (2 x_c + h_0)(x - x_c)),
               \quad x_c = \min(x, h_0)
 
-    with the last interval's rate *v*, the second divided difference *a*, and :math:`\beta` = 1/2. A
-    larger :math:`\beta` follows faster motion but amplifies noise (docs/timing.md).
+    where *v* is the rate of the last interval, *a* the second divided difference, and :math:`\beta`
+    = 1/2. A larger :math:`\beta` follows faster motion but amplifies noise (docs/timing.md).
 
     Parameters
     ----------
     earlier, before, a : OrientationSample
-        The last samples in order of time; `earlier` may be missing.
+        The last three samples in order of time; `earlier` may be None.
     t_ns : int
         Instant at or after ``a.t_ns``.
     bend : float
-        The factor beta, used where rates are not measured.
+        The factor beta, used if rates are not measured.
     """
     x, h0 = (t_ns - a.t_ns) * _NS, (a.t_ns - before.t_ns) * _NS
     x_c = min(x, h0)
@@ -119,7 +123,7 @@ def extrapolate_orientation(
 
 
 def _turn_to(sample: OrientationSample, before: OrientationSample) -> Vector:
-    """Return the rotation vector from the sample before, cached for the next interval."""
+    """Return the rotation vector from the previous sample, and store it for the next call."""
     if sample.turn is None:
         sample.turn = difference_one(before.q, sample.q)
     return sample.turn
@@ -134,7 +138,7 @@ def _cross(u: Vector, v: Vector) -> Vector:
 
 
 def _agree(start: Vector, end: Vector, turn: Vector, h: float) -> bool:
-    """Return whether rates agree with the rotation between them; wrong axes or units do not."""
+    """Return whether the rates at both ends agree with the rotation; wrong axes or units do not."""
     miss = size = 0.0
     for i in range(3):
         miss += (0.5 * h * (start[i] + end[i]) - turn[i]) ** 2
@@ -145,8 +149,8 @@ def _agree(start: Vector, end: Vector, turn: Vector, h: float) -> bool:
 def _hermite(start: Vector, end: Vector, turn: Vector, x: float, h: float) -> Vector:
     """Return the cubic from 0 to `turn` with the given body rates at both ends.
 
-    The end tangent is the rate through the inverse right Jacobian of the rotation, ``w + r x w / 2
-    + r x (r x w) / 12``, to third order.
+    The tangent at the end is the rate multiplied by the inverse right Jacobian of the rotation, ``w
+    + r x w / 2 + r x (r x w) / 12``, accurate to third order.
     """
     across = _cross(turn, end)
     twice = _cross(turn, across)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 _FAR = 10
-"""Periods by which a frame is too early for the grid; less is a frame out of order."""
+"""A frame this many periods before the grid restarts the grid; smaller steps are reordered frames.
+"""
 
 
 class RateDivider:
-    """Selects from frames with increasing stamps those that keep to a lower rate.
+    """Selects frames at a lower rate from frames with increasing timestamps.
 
-    The selected frames lie on a grid, so that their mean rate is `rate_hz` although no frame lies
-    exactly on a grid time. The grid begins again after a pause, and after a stamp far ahead of the
-    others, which would otherwise exclude all frames up to its time.
+    For every time of a regular grid, the first frame at or after this time is selected. The mean
+    rate is therefore `rate_hz`, although no frame lies exactly on a grid time. The grid restarts
+    after a pause. It also restarts after a timestamp far in the future, which would otherwise
+    exclude all frames up to its time.
 
     Parameters
     ----------
@@ -24,7 +26,7 @@ class RateDivider:
         self._next_ns = 0
 
     def is_due(self, t_ns: int) -> bool:
-        """Return whether the frame with this stamp is selected, and count it if it is."""
+        """Return whether the frame with this timestamp is selected; if so, advance the grid."""
         early_ns = self._next_ns - t_ns
         if 0 < early_ns <= _FAR * self._period_ns:
             return False

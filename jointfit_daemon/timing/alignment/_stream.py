@@ -1,8 +1,8 @@
-"""One stream of the frame aligner: its pending samples, its usual delay, its counters.
+"""One stream of the frame aligner, with its pending samples, usual delay and counters.
 
-Bounded memory, independent of the other streams. A sample is stored while a frame may still need
-it; at most three at or before the last frame are stored for extrapolation. The outcome of a sample
-is counted when it is removed.
+Memory is bounded, and streams are independent of each other. A sample is stored while a frame may
+still need it. At most three samples at or before the last frame are stored for extrapolation. The
+outcome of a sample is counted when it is removed.
 """
 
 from __future__ import annotations
@@ -19,29 +19,30 @@ if TYPE_CHECKING:
 CAPACITY = 512
 """Largest number of pending samples."""
 PATIENCE = 1.45
-"""Periods to wait for a sample beyond its usual delay: below 1.5 including the ripple of the delay.
+"""Periods to wait for a sample beyond its usual delay. With the ripple of the delay estimate the
+wait stays below 1.5 periods.
 """
 REACH = 2.5
 """Largest extrapolation after the last sample, periods."""
 GAP = 4.0
 """Largest interval between two samples for interpolation, periods."""
 CROWDED = 0.5
-"""Least interval between two samples for a rate, periods: timestamps may be close together while a
-clock settles.
+"""Least interval between two samples from which a rate is computed, periods. Timestamps may be
+close together while a clock settles.
 """
 LOST_PERIODS = 3
 """Silence after which a stream counts as lost, periods."""
 LOST_LEAST_NS = 50_000_000
 """Least silence after which a stream counts as lost, ns."""
 FUTURE_NS = 100_000_000
-"""Timestamp after its own arrival by more than this is invalid, ns."""
+"""A timestamp later than the arrival by more than this is invalid, ns."""
 PAST_NS = 10_000_000_000
-"""Timestamp before its own arrival by more than this is too late for live use, ns."""
+"""A sample older than this at its arrival is too late for live use, ns."""
 DELAY_MOST_NS = 250_000_000
 """Largest delay that frames wait for, ns."""
 
 _EARLY = 20
-"""Samples expected up to 1/20 period before a frame may also arrive just after it."""
+"""A sample expected less than 1/20 period before a frame may also be sampled just after it."""
 _DELAY_STEP = 128
 """The usual delay changes by 1/128 period per sample."""
 _DELAY_UP = 3
@@ -56,7 +57,7 @@ class SampleOutcome(StrEnum):
     USED = "used"
     """Used in at least one frame."""
     DECIMATED = "decimated"
-    """Skipped: the stream is faster than the frames."""
+    """Skipped, because the stream is faster than the frames."""
     LATE = "late"
     """Sample that arrived after all frames that needed it."""
     DUPLICATE = "duplicate"
@@ -64,8 +65,9 @@ class SampleOutcome(StrEnum):
     DROPPED = "dropped"
     """Sample discarded because of overflow, reset, close, or a timestamp in the future."""
     IDLE = "idle"
-    """Motion-capture frame that is not needed outside of a calibration; never a sample of a
-    stream."""
+    """Motion-capture frame that is not needed outside of a calibration. A stream never has this
+    outcome.
+    """
 
 
 class _Sample:
@@ -98,7 +100,7 @@ class Stream:
         self._crowded_ns = round(CROWDED * period)
         self._lost_after_ns = max(LOST_PERIODS * period, LOST_LEAST_NS)
         self._delay_step = max(1, period // _DELAY_STEP)
-        self._delay_ns: int | None = None  # usual arrival minus stamp
+        self._delay_ns: int | None = None  # usual arrival time minus timestamp
         self._samples: deque[_Sample] = deque()
         self.epoch: int | None = None
         """Epoch of the clock behind the samples."""
@@ -108,7 +110,7 @@ class Stream:
         self._counts = dict.fromkeys(SampleOutcome, 0)
         self.newest_ns = self.newest_arrival_ns = 0
         self.extrapolated = self.synced = False
-        """Outcome of the last ``at``, and whether its clock had settled."""
+        """Whether the last result of ``at`` was extrapolated, and whether its clock had settled."""
 
     # --- samples -----------------------------------------------------------------------------
 
@@ -171,7 +173,7 @@ class Stream:
     # --- frames ------------------------------------------------------------------------------
 
     def serves_from(self, t_ns: int | None) -> int | None:
-        """Return the first instant at or after `t_ns` that this stream can serve, or None."""
+        """Return the first instant at or after `t_ns` for which this stream has data, or None."""
         samples = self._samples
         if not samples:
             return None
@@ -204,10 +206,10 @@ class Stream:
         return 0
 
     def given_up_ns(self, t_ns: int) -> int:
-        """Return how long a frame at `t_ns` without any samples waits for this stream, ns.
+        """Return the host time until which a frame without samples waits for this stream, ns.
 
-        The frame waits for the usual delay of the stream, however long, until the stream counts as
-        lost.
+        The frame has the instant `t_ns`. It waits for the usual delay of the stream, without an
+        upper limit, until the stream counts as lost.
         """
         if self.newest_ns >= t_ns:
             return t_ns
@@ -218,7 +220,7 @@ class Stream:
         return max(usual_ns, min(t_ns + delay_ns, self.newest_arrival_ns) + self._lost_after_ns)
 
     def at(self, t_ns: int) -> Quaternion | None:
-        """Return the orientation at `t_ns`, increasing from call to call; None: missing."""
+        """Return the orientation at `t_ns`, or None without data; `t_ns` must not decrease."""
         self.extrapolated = False
         samples = self._samples
 
@@ -252,7 +254,7 @@ class Stream:
         return self._beyond(last, t_ns)
 
     def _before(self, at: int) -> _Sample | None:
-        """Return the sample before the one at that index, if the two determine a rate."""
+        """Return the sample before index `at` if it determines a rate with the next sample."""
         if not at:
             return None
         before = self._samples[at - 1]
@@ -279,12 +281,12 @@ class Stream:
         self.waited_for = False
 
     def settle(self) -> None:
-        """Discard the samples of a stream that has ended: no frame can use them."""
+        """Discard the samples if the stream has ended, because no frame can use them."""
         if self._samples and not self.waited_for:
             self.reset()
 
     def reset(self) -> None:
-        """Discard all samples; those that no frame used count as dropped."""
+        """Discard all samples; samples that no frame used count as dropped."""
         samples = self._samples
         while samples:
             self._leave(samples.popleft(), SampleOutcome.DROPPED)

@@ -22,20 +22,22 @@ class ClockEvent(NamedTuple):
     """An event to be published."""
 
     kind: Literal["restart", "clock", "warning"]
-    """``restart``: the device restarted; ``clock``: only its time changed; ``warning``."""
+    """``restart``: the device restarted; ``clock``: only its time changed; ``warning``: check the
+    setup.
+    """
     text: str
     data: Mapping[str, object]
 
 
 def clock_restart_event(before_ns: int, now_ns: int, elapsed_ns: int) -> ClockEvent:
-    """Return the event for device time that does not continue.
+    """Return the event for a device time that does not continue the previous device times.
 
     Parameters
     ----------
     before_ns, now_ns : int
-        Device time of the last sample and of this one, ns.
+        Device time of the last sample and of this sample, ns.
     elapsed_ns : int
-        Host time between their arrivals, ns.
+        Host time between the arrivals of the two samples, ns.
     """
     jump = now_ns - before_ns - elapsed_ns
     data = {"jump_ms": round(jump / _MS, 3)}
@@ -67,7 +69,7 @@ def late_arrival_event(late_ns: float, seconds: float) -> ClockEvent:
 
 
 def as_restart_event(news: ClockEvent) -> ClockEvent:
-    """Return `event` as a restart: a device that was disconnected may have been restarted."""
+    """Return `news` as a restart event, because a disconnected device may have been restarted."""
     return ClockEvent("restart", f"after reconnecting, {news.text}", news.data)
 
 
@@ -88,7 +90,7 @@ def clock_reset_event(step_ns: int, elapsed_ns: int) -> ClockEvent:
 
 
 def echo_jump_event(off_ns: int) -> ClockEvent:
-    """Return the event for an echo that contradicts the echoes before."""
+    """Return the event for an echo that contradicts the previous echoes."""
     text = (
         f"device clock jumped by {off_ns / _MS:.1f} ms relative to its echoes: the device "
         "restarted or its clock was set"

@@ -1,14 +1,15 @@
 """Unwrapping of counters that restart at zero.
 
-A counter of `modulus` values determines the count up to whole turns. Between readings close in time
-the change is taken as less than half a turn in either direction. After a longer silence the elapsed
-host time gives the number of turns.
+A counter with `modulus` values determines the count up to a multiple of the modulus. A *turn* is
+one cycle of the counter through all values. If two readings are close in time, the change is
+assumed to be less than half a turn in either direction. After a longer silence the number of turns
+is computed from the elapsed host time.
 """
 
 from __future__ import annotations
 
 _QUARTER = 4
-"""Elapsed time of more than 1/4 turn: host time resolves the number of turns."""
+"""If more than 1/4 turn has elapsed, host time determines the number of turns."""
 
 
 def unwrap(raw: int, last: int, modulus: int | None, elapsed_ns: int, turn_ns: int) -> int:
@@ -21,7 +22,7 @@ def unwrap(raw: int, last: int, modulus: int | None, elapsed_ns: int, turn_ns: i
     last : int
         Unwrapped count of the previous reading.
     modulus : int or None
-        Number of counter values; None for a counter that never wraps: `raw` is returned.
+        Number of counter values. None is a counter that never wraps; `raw` is then returned.
     elapsed_ns : int
         Host time between the two arrivals, ns.
     turn_ns : int
@@ -30,7 +31,7 @@ def unwrap(raw: int, last: int, modulus: int | None, elapsed_ns: int, turn_ns: i
     Returns
     -------
     int
-        Below `last` if the reading is an older, reordered one.
+        Unwrapped count. It is below `last` if the reading is older than the previous reading.
     """
     if modulus is None:
         return raw

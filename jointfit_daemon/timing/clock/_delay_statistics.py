@@ -1,8 +1,8 @@
 """Delay percentiles and sample rate of the last minute.
 
-Memory and time per sample are constant. Two half-minute histograms alternate; results cover the
-running histogram and the preceding histogram. Bins are an eighth of an octave wide, so percentiles
-are accurate to 5 %. The maximum is exact.
+Memory and time per sample are constant. Two half-minute histograms alternate. Results combine the
+current and the preceding histogram. Bins are an eighth of an octave wide, so percentiles are
+accurate to 5 %. The maximum is exact.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ HALF_NS = 30_000_000_000
 _UNIT_BITS = 10
 """Finest step: 2**10 ns, about a microsecond."""
 _SUB_BITS = 3
-"""Eight bins per octave."""
+"""Binary logarithm of the number of bins per octave: eight bins."""
 _SUBS = 1 << _SUB_BITS
 _BINS = (40 - _UNIT_BITS) * _SUBS
 _LINEAR = 2 * _SUBS
@@ -39,7 +39,7 @@ class _Half:
 
 
 class DelayStatistics:
-    """Arrivals and delays of one source in the last half to whole minute."""
+    """Arrivals and delays of one source in the last 30 s to 60 s."""
 
     __slots__ = ("_before", "_end_ns", "_now")
 
@@ -66,7 +66,7 @@ class DelayStatistics:
 
     @property
     def rate_hz(self) -> float | None:
-        """Arrival rate, Hz, silences included; None with fewer than two samples."""
+        """Mean arrival rate, Hz, pauses included; None with fewer than two samples."""
         before, now = self._before, self._now
         count = before.count + now.count
         first = before.first_ns if before.count else now.first_ns
@@ -89,7 +89,7 @@ class DelayStatistics:
 
 
 def bin_of(delay_ns: int) -> int:
-    """Return the bin of a delay: linear up to 16 units, then eight bins per octave."""
+    """Return the bin of a delay; bins are linear up to 16 units, then eight per octave."""
     units = delay_ns >> _UNIT_BITS if delay_ns > 0 else 0
     if units < _LINEAR:
         return units

@@ -1,18 +1,19 @@
-"""Device time to host time: one clock per device, one timestamp per sample.
+"""Conversion of device time to host time, with one clock per device.
 
-Streaming and in order of arrival; a few microseconds per sample, constant memory.
+Every sample gets a timestamp, in order of arrival. A sample takes a few microseconds, and memory is
+constant.
 
-The model is ``t(u) = u + c + s (u - u_0)``, with u the device time in ns. The best available source
-is used:
+The model is ``t(u) = u + c + s (u - u_0)``, where u is the device time in ns, c the offset and s
+the skew. The first available source of this list is used:
 
-1. sync edges, or a clock declared to be the host's (``_direct_time``);
+1. sync edges, or a device clock declared to be the host clock (``_direct_time``);
 2. echoes (``_echo_fit``), which leave half the path asymmetry in c;
 3. the minimum-delay filter on arrivals (``_minimum_delay``), which leaves the minimum delay D_min
-in c. The prior mean of D_min, `latency_ns`, is subtracted; the rest is part of the lag estimated
-from motion (``timing.lag``).
+in c. The prior mean of D_min, `latency_ns`, is subtracted. The remaining delay is part of the lag
+that ``timing.lag`` estimates from motion.
 
-Timestamps never run backwards and are slewed (``_stamps``). An error too large to be slewed starts
-a new epoch: samples of different epochs must not be combined.
+Timestamps never decrease. Small errors are corrected gradually (slewed, ``_stamps``). A larger
+error starts a new epoch; samples of different epochs must not be combined.
 """
 
 from __future__ import annotations
@@ -42,10 +43,10 @@ ABSENT_LIMIT = 100
 CAUGHT_UP_NS = 50_000
 """Largest distance of a timestamp from its estimate at which the clock becomes synced, ns."""
 AWAY_SLACK_NS = 500_000_000
-"""Tolerance of device time after the port was closed, ns: bytes may have been buffered."""
+"""Tolerance of device time after the port was closed, ns, because bytes may have been buffered."""
 AWAY_TURNS = 20
-"""Least period of the readings in units of that tolerance; with shorter ones a restarted device
-would pass the check by chance in more than one of ten cases.
+"""Least period of the device readings, in units of the tolerance. With a shorter period a restarted
+device would pass the check by chance in more than one of ten cases.
 """
 
 _ARRIVAL, _COUNTER, _TICKS = range(3)
@@ -83,9 +84,9 @@ class DeviceClock:
     def __init__(self, period_ns: int, *, latency_ns: int = 0, latency_sd_ns: int = 0) -> None:
         self.epoch = 0
         self.sigma_ns: float | None = None
-        """Standard deviation of the last timestamp, ns; None before any."""
+        """Standard deviation of the last timestamp, ns; None before the first timestamp."""
         self.jitter_ns: float | None = None
-        """Mean delay, ns, beyond the fastest samples or, with echoes, beyond the sampling instant.
+        """Mean delay relative to the fastest samples or, with echoes, to the sampling instant, ns.
         """
         self.latency_ns, self.latency_sd_ns = latency_ns, latency_sd_ns
         self.minute = DelayStatistics()
@@ -100,7 +101,7 @@ class DeviceClock:
         self._forget()
 
     def _forget(self) -> None:
-        """Restart the estimate; the last timestamp remains, so host time never runs backwards."""
+        """Restart the estimate, but keep the last timestamp so that timestamps never decrease."""
         self._reader: DeviceTime | None = None
         self._envelope = MinimumDelayFilter(CRYSTAL)
         self._echo: EchoFit | None = None
@@ -145,7 +146,7 @@ class DeviceClock:
 
     @property
     def offset_ns(self) -> int | None:
-        """Host minus device time at the last sample, ns; None before any."""
+        """Host time minus device time at the last sample, ns; None before the first sample."""
         return self._line.offset_ns
 
     @property
@@ -155,7 +156,7 @@ class DeviceClock:
 
     @property
     def last_u(self) -> int | None:
-        """Device time of the last sample in order, ns; None before any."""
+        """Device time of the newest sample, ns; None before the first sample."""
         return self._line.last_u
 
     @property
@@ -180,12 +181,13 @@ class DeviceClock:
     # --- input -------------------------------------------------------------------------------
 
     def feed_restart(self) -> None:
-        """Restart the clock: the device reported, or may have had, a restart."""
+        """Restart the clock after a reported or possible restart of the device."""
         self._begin(None)
 
     def feed_reopened(self) -> None:
-        """Note that the port was reopened; the next sample shows whether the device restarted."""
-        # The instant of the last sample, because its arrival may have been delayed.
+        """Record that the port was reopened; the next sample shows whether the device restarted."""
+        # The sampling instant is used, because the arrival of the last sample may have been
+        # delayed.
         last_t = self._line.last_t if self._synced else None
         self._away_since_ns = self._arrival_ns if last_t is None else last_t
         if isinstance(self._reader, TickTime):
@@ -231,7 +233,7 @@ class DeviceClock:
     def edge_ns(self, ticks: int, tick_clock: TickClock | None) -> int | None:
         """Return the device time of a sync edge, ns; None if it cannot be converted.
 
-        An edge falls anywhere in a tick, so half a tick is added to its count.
+        An edge may occur at any time within a tick, so half a tick is added.
         """
         if tick_clock is None or tick_clock != self._tick_clock or self._line.last_u is None:
             return None
@@ -242,7 +244,7 @@ class DeviceClock:
         """Add a sync edge: device time `u` is the instant `v` of the `reference`, ns."""
         direct = self._direct
         if direct is not None and not isinstance(direct, SyncEdgeFit):
-            return  # the clock is declared to be the host's own
+            return  # the device clock is declared to be the host clock
         if direct is None or direct.reference is not reference or direct.broken:
             if self._refused:
                 return
@@ -262,7 +264,7 @@ class DeviceClock:
         Parameters
         ----------
         ticks, counter : int or None
-            Device time and sequence number as sent.
+            Device time and sequence number in the message of the sample.
         arrival_ns : int
             Host time of the first byte, ns.
         tick_clock : TickClock or None
@@ -297,7 +299,7 @@ class DeviceClock:
         if last_u is None or u > last_u:
             return self._stamp(u, arrival_ns)
 
-        # a duplicate (u = last) or reordered sample, unused by the fit
+        # The fit uses neither a duplicate sample (u = last_u) nor a reordered sample.
         last_t = last_u if self._line.last_t is None else self._line.last_t
         sigma = inf if self.sigma_ns is None else self.sigma_ns
         return Stamp(last_t - (last_u - u), sigma, self._synced, self.epoch, u == last_u)
@@ -317,7 +319,7 @@ class DeviceClock:
     def _reader_for(
         self, ticks: int | None, counter: int | None, tick_clock: TickClock | None
     ) -> DeviceTime | None:
-        """Return the reader of the best available time; None if a sample lacks its usual time."""
+        """Return the reader of the best available time; None if the sample lacks its usual time."""
         if ticks is not None and tick_clock is not None:
             self._absent = 0
             if tick_clock is self._tick_clock and self._kind == _TICKS and self._reader is not None:
@@ -352,8 +354,8 @@ class DeviceClock:
         if abs(off_ns) <= slack_ns:
             return None
 
-        # Device time of its own starts at 0. A device that has counted for longer than the port was
-        # closed did not restart meanwhile: an adapter or a buffer delayed its samples.
+        # The device's own clock starts at 0. If it has counted for longer than the port was closed,
+        # the device did not restart; an adapter or a buffer delayed its samples.
         uptime_ns = u % turn_ns if turn_ns else u
         own = self._tick_clock is not None and self._tick_clock.scale == "own"
         counted = self._kind == _TICKS and own and uptime_ns > elapsed_ns + slack_ns
@@ -377,7 +379,7 @@ class DeviceClock:
         if envelope.settled:
             return doubts.feed(excess, envelope.sigma_ns(u), arrival_ns)
         if excess < 0.0:
-            # Earlier samples were stale bytes, late by up to seconds: discard the fit.
+            # Earlier samples came from stale bytes, up to seconds late, so the fit is discarded.
             self._envelope = MinimumDelayFilter(NOMINAL_RATE if self._kind != _TICKS else CRYSTAL)
         return None
 
@@ -422,7 +424,7 @@ class DeviceClock:
         return u + offset - self.latency_ns, envelope.skew, settled, sigma, delay
 
     def _directed(self, u: int, estimate: Estimate, direct: DirectTime) -> Estimate:
-        """Return the time by `direct`, unless `estimate` contradicts it."""
+        """Return the host time from `direct`, or `estimate` if it contradicts this time."""
         self._state_direct = direct.usable(u)
         if not self._state_direct:
             return estimate

@@ -1,8 +1,8 @@
 """Device time in nanoseconds from ticks, a sample counter, or arrivals.
 
-One reader is used from one restart of a device to the next. ``feed`` returns the device time u of a
-sample in ns; a reordered sample has a smaller device time. If the device must have restarted,
-``feed`` returns None, and a new reader must read the sample again.
+Each reader is used from one restart of a device to the next. ``feed`` returns the device time u of
+a sample in ns. A reordered sample has a smaller device time than the sample before. If ``feed``
+detects a restart of the device, it returns None; the caller then passes the sample to a new reader.
 """
 
 from __future__ import annotations
@@ -24,16 +24,18 @@ NS = 1_000_000_000
 FALL_NS = 500_000_000
 """Decrease of device time that indicates a restart instead of a reordered sample, ns."""
 BACKWARD_LIMIT = 4
-"""Consecutive samples with decreased time that indicate a restart, for any size of the decrease."""
+"""Number of consecutive samples with decreased time that indicates a restart."""
 COUNTER_WIDTHS = (1 << 8, 1 << 16, 1 << 32)
 """Moduli of sample counters."""
 
 _GAP = 1.5
-"""Intervals above this multiple of the usual one are compared with the counter."""
+"""Intervals above this multiple of the usual interval are compared with the counter."""
 _SLACK = 3
 """Counts by which time and counter may disagree."""
 _SILENCE_LEAST_NS = 500_000_000
-"""Least silence over which device time is compared with host time, ns: a busy host delays less."""
+"""Least silence over which device time is compared with host time, ns. A busy host causes shorter
+delays.
+"""
 _SILENCE_SHARE = 0.1
 """Largest difference of device time and host time over a silence, share of the silence."""
 _BACKLOG_NS = 100_000_000
@@ -73,8 +75,8 @@ def _backlog_ended(
 ) -> bool:
     """Return whether device time is ahead of the arrivals because the sample before was late.
 
-    A settled clock then still explains the sample: it does not arrive before its sampling instant.
-    After a jump of the device clock outside of a backlog, it would.
+    In that case the settled clock does not place the sampling instant after the arrival of the
+    sample. After a jump of the device clock without a backlog, the clock would place it there.
     """
     if ahead_ns <= _BACKLOG_NS:
         return False
@@ -87,9 +89,10 @@ def _backlog_ended(
 class TickTime:
     """Reader of device timestamps, with wraps and a consistency check against a sample counter.
 
-    A step forward shared by the counter is a gap in the same clock. A step not shared by the
-    counter is a restart, unless it equals the silence or the delay of a backlog that ended: the
-    device stopped sending, not its clock.
+    If device time and counter step forward together, samples are missing and the clock continues.
+    If only device time steps forward, the device restarted. An exception is a step that equals the
+    silence, or the delay of a backlog that ended: the device stopped sending, but its clock kept
+    running.
     """
 
     __slots__ = ("_arrival_ns", "_backward", "_clock", "_counter", "_last", "_step", "_turn_ns")
@@ -104,11 +107,11 @@ class TickTime:
 
     @property
     def turn_ns(self) -> int | None:
-        """Period of the ticks, ns; 0 if they never repeat."""
+        """Period after which the ticks repeat, ns; 0 if they never repeat."""
         return self._turn_ns
 
     def forget_counter(self) -> None:
-        """Skip the counter check for the next sample: devices do not count while configured."""
+        """Skip the next counter check, because devices do not count during configuration."""
         self._counter = None
 
     def to_ns(self, ticks: int) -> int:
@@ -125,7 +128,7 @@ class TickTime:
         self, ticks: int | None, counter: int | None, arrival_ns: int,
         envelope: MinimumDelayFilter, echo: EchoFit | None = None,
     ) -> int | None:  # fmt: skip
-        """Return the device time, ns, or None for a restart."""
+        """Return the device time, ns; None if the device restarted."""
         if ticks is None:
             return None
         last = self._last
@@ -234,11 +237,11 @@ class CounterTime:
 class ArrivalTime:
     """Numbering of the evenly spaced samples of a device without timestamps or counter.
 
-    A late sample is either part of a burst or follows lost samples. Only the next samples decide: a
-    burst catches up with the minimum-delay line, a loss does not. Numbers are therefore consecutive
-    until samples have stayed late for longer than the usual share of late samples explains. The
-    whole periods of their delay then count as lost. If the delay is not a multiple of the period,
-    numbering restarts.
+    A late sample is either part of a burst or follows lost samples. Only the next samples
+    distinguish the two causes: after a burst they return to the minimum-delay line, after a loss
+    they do not. Numbers are therefore consecutive until more successive samples are late than the
+    usual share of late samples explains. Their delay, in whole periods, is then the number of lost
+    samples. If the delay is not a multiple of the period, numbering restarts.
     """
 
     __slots__ = (
@@ -254,7 +257,7 @@ class ArrivalTime:
 
     @property
     def turn_ns(self) -> int | None:
-        """None: arrivals do not contain the device's own time."""
+        """None, because arrivals do not contain the device's own time."""
         return None
 
     def feed(
@@ -305,5 +308,6 @@ class ArrivalTime:
 DeviceTime = TickTime | CounterTime | ArrivalTime
 """Reader of the time of one device between two restarts.
 
-`turn_ns` is the period of its readings, ns; 0 if they never repeat, None without readings.
+`turn_ns` is the period after which the device readings repeat, ns. It is 0 if they never repeat,
+and None if the device sends no readings.
 """

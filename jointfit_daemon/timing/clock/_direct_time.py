@@ -1,12 +1,12 @@
-"""Direct time: sync edges stamped by two clocks, and clocks declared to be the host's.
+"""Direct time from sync edges with two timestamps, or from a clock declared to be the host clock.
 
 Direct time takes precedence over estimates from arrivals. If an estimate contradicts it, a
 ``clock`` event is published.
 
 A sync edge is one instant with two timestamps: u on the device clock, v on the reference clock. The
-line ``v(u)`` through the edges of the last minute relates the two clocks to microseconds. The
-mapping of v to host time then applies to u. The uncertainty of this mapping, including the minimum
-delay, is common to both clocks and cancels in differences between the clocks.
+line ``v(u)`` through the edges of the last minute relates the two clocks with an accuracy of
+microseconds. The conversion of v to host time then also applies to u. The error of this conversion,
+including the minimum delay, is common to both clocks and cancels in time differences.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SYNC_SKEW_SD = 100e-6
 SYNC_STALE_NS = 20_000_000_000
 """Age of the last edge after which the fit is unusable, ns."""
 KNOWN_SD_NS = 10_000.0
-"""Standard deviation of a clock declared to be the host's, ns."""
+"""Standard deviation of a clock declared to be the host clock, ns."""
 MARGIN_NS = 3_000_000
 """Tolerance, ns, beyond the prior of the minimum delay before a direct time is discarded."""
 LATEST_NS = 2_000_000_000
@@ -59,14 +59,14 @@ class HostTime(Protocol):
         """Whether ``host_ns`` is valid."""
 
     def host_ns(self, u: int) -> int:
-        """Return the host time of the clock's own time `u`, ns."""
+        """Return the host time at time `u` of this clock, ns."""
 
     def sigma_at(self, u: int) -> float:
         """Return the standard deviation of ``host_ns(u)``, ns."""
 
 
 class DeclaredOffset(NamedTuple):
-    """A device clock that is the host's clock plus a known offset."""
+    """A device clock that differs from the host clock by a known offset."""
 
     offset_ns: int
     """Host time minus device time."""
@@ -86,7 +86,7 @@ class DeclaredOffset(NamedTuple):
 
 
 class SyncEdgeFit:
-    """Relation of two clocks from the edges both stamped.
+    """Relation of two clocks, fitted to the edges that both have timestamps of.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class SyncEdgeFit:
         return self.reference.host_ns(self._reference_ns(u))
 
     def sigma_at(self, u: int) -> float:
-        """Return the standard deviation of ``host_ns(u)``, ns, the reference's included."""
+        """Return the standard deviation of ``host_ns(u)``, ns, with that of the reference."""
         own = sqrt(self._line.variance_at(u - self._ref[0]))
         return hypot(own, self.reference.sigma_at(self._reference_ns(u)))
 
@@ -160,7 +160,7 @@ DirectTime = DeclaredOffset | SyncEdgeFit
 
 
 def declared(clock: TickClock, unix_offset_ns: int | None) -> DeclaredOffset | None:
-    """Return the conversion of a clock declared to be the host's, or None.
+    """Return the conversion of a clock declared to be the host clock, or None for other clocks.
 
     Parameters
     ----------

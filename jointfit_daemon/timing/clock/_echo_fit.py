@@ -3,11 +3,11 @@
 An echo sent at a and received at b, answered with server time u, gives ``theta = u - (a + b)/2``
 with an error of at most half the round-trip time ``rho = b - a``. The echoes with round-trip times
 near the minimum are fitted by ``theta(m) = theta_0 + s (m - m_0)``: weighted least squares with
-Huber weights and a prior on s, which keeps the slope small in the first seconds. Half the path
+Huber weights and a prior on the skew s, which keeps s small in the first seconds. Half the path
 asymmetry remains in theta_0; ``bound_ns`` is its limit.
 
-Invariant: a single wrong or forged echo changes nothing. An echo that contradicts the fit is not
-used. If the next echo agrees with the contradicting echo, the server clock was restarted.
+Invariant: a single wrong or forged echo does not change the fit. An echo that contradicts the fit
+is not used. If the next echo agrees with the contradicting echo, the server clock was restarted.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SKEW_SD = 50e-6
 STALE_NS = 20_000_000_000
 """Age of the last echo after which the fit is reported as stale, ns."""
 JUMP_NS = 5_000_000
-"""Disagreement beyond an echo's own error bound that indicates a jump of the server clock, ns."""
+"""Difference beyond the error bound of an echo that indicates a jump of the server clock, ns."""
 
 
 class _Echo(NamedTuple):
@@ -91,7 +91,7 @@ class EchoFit:
         return abs(u - self.device_ns(middle)) > (received_ns - sent_ns) / 2 + JUMP_NS
 
     def confirms_restart(self, u: int, sent_ns: int, received_ns: int) -> bool:
-        """Store a contradicting echo; return whether the preceding one agrees with this echo."""
+        """Store a contradicting echo; return whether the preceding echo agrees with it."""
         middle = (sent_ns + received_ns) // 2
         before = self._doubtful
         self._doubtful = now = _Echo(middle, u - middle, received_ns - sent_ns)
@@ -101,7 +101,7 @@ class EchoFit:
         return abs(now.theta_ns - before.theta_ns) <= slack_ns
 
     def feed(self, u: int, sent_ns: int, received_ns: int) -> None:
-        """Add one echo: server time and host timestamps, ns; impossible ones are ignored."""
+        """Add an echo with server time and host timestamps, ns; an impossible echo is ignored."""
         if received_ns < sent_ns:
             return
         middle = (sent_ns + received_ns) // 2

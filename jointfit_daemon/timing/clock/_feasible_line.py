@@ -1,4 +1,4 @@
-"""Mean and covariance of the lines below a set of points with one-sided errors.
+"""Line below a set of points with one-sided errors: posterior mean and covariance.
 
 For points ``y = c + s u + D`` with delays D >= 0, a line (c, s) is *feasible* if it lies above no
 point. Near the minimum delay the points have a constant density G per nanosecond of height,
@@ -29,7 +29,7 @@ Point = tuple[int, int]
 """Device time u and difference y, ns."""
 
 _SUPPORTS = 2
-"""Number of points that define an edge of the hull."""
+"""Number of points at the ends of an edge of the hull."""
 _FINEST_NS = 1_000.0
 """Least mean height of the points above the edge, ns."""
 _JAM_NS = 25_000_000.0
@@ -37,13 +37,13 @@ _JAM_NS = 25_000_000.0
 _LEAST = 5
 """Smallest number of points below ``_JAM_NS`` for which higher points are excluded."""
 _LEAP = 20.0
-"""Ratio of consecutive ranked heights that separates congestion from jitter."""
+"""Ratio of two consecutive heights in ascending order that separates congestion from jitter."""
 _LEAP_NS = 3_000_000.0
-"""Least height of a point excluded by that ratio, ns."""
+"""Least height of a point that is excluded by this ratio, ns."""
 _LEAP_LEAST = 4
 """Least number of points below the gap; jitter alone produces such a gap once in 400 cases."""
 _LIKELY = 1e-3
-"""Largest slope of a device clock with a correct tick rate, dimensionless."""
+"""Largest plausible slope of a device clock whose declared tick rate is correct, dimensionless."""
 _TAIL = 14.0
 """Decrease of the log-likelihood at which the integral is cut off."""
 _PRIOR_TAIL = 6.0
@@ -65,7 +65,7 @@ def lower_hull(points: Iterable[Point]) -> list[Point]:
             if (u1 - u0) * (y - y0) > (y1 - y0) * (u - u0):
                 break
             hull.pop()
-        if hull and hull[-1][0] == u:  # same u and not lower, since the points are sorted
+        if hull and hull[-1][0] == u:  # same u, and not lower because of the sorting
             continue
         hull.append((u, y))
     return hull
@@ -101,7 +101,8 @@ def mean_feasible_line(
 
     mean_u = sum(at for at, _ in points) / len(points)
     (ua, ya), (ub, yb) = straddling_edge(hull, mean_u)
-    # Without a limit, a burst read at one instant (y = A - u) would be an edge of slope -1.
+    # The slope is limited, because a burst read at one arrival A (y = A - u) forms an edge of slope
+    # -1.
     most = max(_PRIOR_TAIL * prior_sd, _WILDEST)
     edge = min(max((yb - ya) / (ub - ua), prior - most), prior + most)
 
@@ -183,7 +184,7 @@ def _weighed(
     limits: tuple[float, float],
     prior: tuple[float, float],
 ) -> list[tuple[float, float, float]]:
-    """Return (slope, greatest feasible height, weight) over the relevant slopes."""
+    """Return (slope, greatest feasible height, weight) for each slope of a grid."""
     low, high = limits
     mean, sd = prior
     grid: list[tuple[float, float, float]] = []

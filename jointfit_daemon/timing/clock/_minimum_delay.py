@@ -5,7 +5,8 @@ D_min`` of unknown distribution. The filter fits the line below all points (``me
 This line depends on the fastest samples only. Jitter of any distribution therefore causes no bias
 other than the constant D_min, which one-way measurements cannot observe.
 
-Integer inputs, constant memory, constant time per sample except for the periodic refit.
+Inputs are integers. Memory is constant, and so is the time per sample, except for the periodic
+refit.
 """
 
 from __future__ import annotations
@@ -20,12 +21,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.clock._feasible_line import Point
 
 BUCKET_NS = 250_000_000
-"""Length of a bucket, ns; the fastest sample of each is used."""
+"""Length of a bucket, ns. The fastest sample of each bucket is used."""
 BUCKETS = 240
-"""Number of buckets: one minute, long against jitter and short against thermal drift of a crystal.
+"""Number of buckets. They span one minute, which is long compared with jitter and short compared
+with the thermal drift of a crystal.
 """
 YOUNG_NS = 10_000_000_000
-"""Span below which each bucket triggers a refit, ns; later one in four seconds does."""
+"""Span below which each bucket triggers a refit, ns. Above, the line is refitted every four
+seconds.
+"""
 SETTLED_NS = 2_000_000_000
 """Least span of a settled line, ns."""
 SETTLED_POINTS = 10
@@ -135,7 +139,7 @@ class MinimumDelayFilter:
         enough = len(points) >= SETTLED_POINTS and self._span >= SETTLED_NS
 
         self._sealed += 1
-        if not points:  # silence longer than the window: the last slope becomes the prior
+        if not points:  # after a silence longer than the window the last slope becomes the prior
             self._prior, self._prior_sd = self.skew, CRYSTAL / 10
             self._c, self._ref = float(y), u
             self._variance = (inf, 0.0, self._prior_sd**2)

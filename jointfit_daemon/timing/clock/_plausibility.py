@@ -1,10 +1,10 @@
 """Detection of samples that a fitted clock does not explain: too early, or permanently late.
 
-Delays are one-sided: a wire, a queue or a starved host may delay samples by any amount without a
-clock fault. Late samples therefore count only if the fastest ones agree with each other for two
-seconds, as after a pause of the device clock; in a traffic jam they do not. A sample cannot arrive
-before it was taken. A single early sample may carry a wrong timestamp; three in a row indicate a
-clock jump.
+A wire, a queue or an overloaded host may delay samples by any amount without a clock fault. Late
+samples therefore indicate a fault only if the delays of the fastest samples agree for two seconds.
+They agree after a pause of the device clock, but not during congestion. A sample cannot arrive
+before its sampling instant. A single early sample may have a wrong timestamp; three early samples
+in a row indicate a clock jump.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LATE_FOR_NS = 2_000_000_000
 LATE_SIGMAS = 20.0
 """Least delay that counts as late, in standard deviations of the clock estimate."""
 INTERVALS = 4
-"""Number of parts of that duration whose fastest samples must agree."""
+"""Number of parts of `LATE_FOR_NS` whose fastest samples must agree."""
 JITTER_NS = 25_000_000
 """Largest mean delay above the fastest samples, ns, that a paused clock explains."""
 EARLY_SAMPLES = 3
@@ -46,7 +46,7 @@ class _LateInterval(NamedTuple):
         return _LateInterval(least, total, self.samples + 1)
 
     def agrees(self, least: float) -> bool:
-        """Return whether all samples but jitter are late by `least` ns."""
+        """Return whether all samples are late by at least `least` ns, and their jitter is small."""
         return self.least - least <= STEP_NS and self.total / self.samples - least <= JITTER_NS
 
 
@@ -60,7 +60,7 @@ class PlausibilityMonitor:
         """Whether the last sample was implausible."""
 
         self.early = 0
-        """Number of early samples in a row; the following ones decide the cause."""
+        """Number of early samples in a row; the samples that follow determine the cause."""
         self._until_ns: int | None = None
         self._intervals: list[_LateInterval] = []
         self._interval = _LateInterval(0.0, 0.0, 1)
@@ -75,7 +75,7 @@ class PlausibilityMonitor:
         Parameters
         ----------
         excess_ns : float
-            Delay beyond the fastest samples, ns; negative: too early.
+            Delay relative to the fastest samples, ns; a negative value is too early.
         sigma_ns : float
             Standard deviation of the clock estimate, ns.
         arrival_ns : int

@@ -1,8 +1,8 @@
-"""Host timestamps of one device: monotonic, and slewed toward the clock estimate.
+"""Host timestamps of one device, monotonic and slewed toward the clock estimate.
 
 Invariants: a timestamp in device order never decreases. Once synced, a timestamp approaches its
-estimate by at most 500 ppm of the elapsed time. A larger error is a step, which the caller gets
-returned.
+estimate by at most 500 ppm of the elapsed time. A larger error is a step, which is returned to the
+caller.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Stamp(NamedTuple):
     synced: bool
     """Whether the clock has settled."""
     epoch: int
-    """Incremented when earlier and later times must not be combined."""
+    """Number that is incremented when earlier and later timestamps must not be combined."""
     duplicate: bool = False
     """Whether the sample has the same device time as the preceding sample."""
 
@@ -54,7 +54,7 @@ class MonotonicStamps:
         self.last_u: int | None = None
         """Device time of the last sample in order, ns; None after a restart."""
         self.last_t: int | None = None
-        """Timestamp of that sample, ns; it survives a restart, so time never runs backwards."""
+        """Last timestamp, ns. A restart does not reset it, so that timestamps never decrease."""
         self._newest: int | None = None  # includes samples without device time
 
     @property
@@ -76,14 +76,14 @@ class MonotonicStamps:
         skew : float
             Slope of host minus device time, dimensionless.
         slew : bool
-            Limit the correction to ``SLEW``.
+            Whether the rate of the correction is limited to ``SLEW``.
 
         Returns
         -------
         t_ns : int
             Timestamp, later than every timestamp before.
         step_ns : int
-            Error too large to be slewed, ns; 0 if the timestamp continues those before.
+            Error too large to be slewed, ns; 0 if the timestamp continues the previous timestamps.
         """
         last_t, last_u, step = self.last_t, self.last_u, 0
         if last_t is not None and last_u is not None:
@@ -99,7 +99,7 @@ class MonotonicStamps:
             else:
                 target = max(target, last_t + min(passed, self._period_ns) // 2)
 
-        newest = self._newest  # inlined `forward`: the call would cost as much as the rest
+        newest = self._newest  # `forward` is inlined: its call would cost as much as the rest
         t = target if newest is None or target > newest else newest + 1
         self.last_u, self.last_t, self._newest = u, t, t
         return t, step

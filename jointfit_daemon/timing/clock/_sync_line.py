@@ -1,8 +1,8 @@
-"""Matching of sync edges: which edge of a device is which instant of the reference.
+"""Matching of the sync edges of a device to the instants of the reference clock.
 
 All devices on a sync line stamp the same physical edges. Arrival-based clock estimates are accurate
-to a few milliseconds. So two stamps belong to the same edge if their estimates are close compared
-with the interval between edges.
+to a few milliseconds. Two timestamps therefore belong to the same edge if their estimated host
+times are close compared with the interval between edges.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _WAITING = 64
 
 
 class Edge(NamedTuple):
-    """One edge as stamped by one device."""
+    """One edge with the timestamp of one device."""
 
     t_ns: int
     """Estimated host time, ns."""
@@ -38,7 +38,7 @@ class SyncLine:
         self._instants: list[Edge] = []
         self._waiting: dict[str, list[Edge]] = {}
         self.unmatched = 0
-        """Number of edges without a match, or with an ambiguous one."""
+        """Number of edges without a match, or with an ambiguous match."""
 
     def instant(self, edge: Edge) -> None:
         """Add the next instant of the reference: a camera frame or an edge."""

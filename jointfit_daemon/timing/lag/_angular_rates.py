@@ -1,7 +1,8 @@
 """Angular rates from orientations or gyros, and their zero-phase low-pass filter.
 
 Invariant: no function shifts a signal in time. A rate is timestamped in the middle of its interval
-and every filter is symmetric. A timestamp at the left end would shift the lag by half a sample.
+and every filter is symmetric. A timestamp at the start of the interval would shift the lag by half
+a sample.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 KERNEL_HALF_S = 0.08
-"""Half length of the low-pass kernel, s; the loss at both ends of a run."""
+"""Half length of the low-pass kernel, s. Each run loses this time at both ends."""
 GAP = 1.5
 """Interval in nominal periods above which samples are missing."""
 BRIDGE_S = 0.035
-"""Longest gap bridged by its mean rate, s: exact in integral, symmetric, and below the cut-off
-period. Longer gaps split the track.
+"""Longest gap that is filled with its mean rate, s. The integral is then exact, the filling is
+symmetric, and the gap is shorter than the cut-off period. Longer gaps split the track.
 """
 
 _KAISER = 5.0

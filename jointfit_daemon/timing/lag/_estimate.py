@@ -9,9 +9,9 @@ Two rigidly connected bodies have the same angular rate up to a constant rotatio
 .. math:: g(t + \tau) = R\,\omega(t) + b + n ,
 
 with g and omega in their respective body frames. The lag tau is **IMU timestamp minus mocap
-timestamp of the same event**: positive when the IMU is later. Subtract the lag from IMU timestamps.
-The lag contains all delays that the clocks cannot observe: constant transport delay, filters in
-both systems, and exposure conventions.
+timestamp of the same event**: positive when the IMU is later. To align the systems, subtract the
+lag from the IMU timestamps. The lag contains all delays that the clocks cannot observe: constant
+transport delay, filters in both systems, and exposure conventions.
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ _CANDIDATE = 0.5
 _CANDIDATES = 4
 """Largest number of fitted maxima."""
 _TIE = 1e-3
-"""Correlation difference below which lags are not ranked: periodic motion has equal maxima, which
-rounding would order. The three-axis fits decide between them.
+"""Correlation difference below which lags are not ranked. Periodic motion has equal maxima, whose
+order would depend on rounding errors. The three-axis fits then select the lag.
 """
 _SAME_S = 0.01
 """Distance below which two fitted lags are the same solution, s."""
 _RIVAL = 1.5
 """Ratio of residual variances below which two solutions cannot be distinguished."""
 _AGREE = 0.005
-"""Relative accuracy to which two systems agree on a rate."""
+"""Relative difference of the rates that two correct systems measure."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +79,8 @@ class LagSettings:
     """Low-pass cut-off for both rates, Hz; at most 0.4 of the lower sample rate."""
     bridge_s: float = BRIDGE_S
     stamp_sd_ns: float = 144_000.0
-    """Standard deviation of the sawtooth error of the stamps, ns: a tick of 0.5 ms over sqrt(12).
-    Zero if the stamps are exact.
+    """Standard deviation of the sawtooth error of the timestamps, ns. The default is a tick of 0.5
+    ms divided by sqrt(12). Use 0 if the timestamps are exact.
     """
     min_rate: float = radians(30.0)
     """Least RMS angular rate of the reference, rad/s."""
@@ -91,14 +91,14 @@ class LagSettings:
     ordinary motion, so that windows are not selected by chance.
     """
     min_r2: float = 0.98
-    """Least R²: correct data on one rigid body reach 0.998, sensors on soft tissue less."""
+    """Least R². Correct data on one rigid body reach 0.998; sensors on soft tissue reach less."""
     low_r2: str = (
         "different motions or a wrong convention; check that the sensor is on this body and "
         "attached firmly"
     )
     """Likely cause of a smaller R², and its remedy."""
     min_weight: float = 0.7
-    """Least mean Huber weight; below, the fit depends on a minority of the data."""
+    """Least mean Huber weight. Below this value the fit depends on a minority of the data."""
     min_valid: float = 0.8
     """Least fraction of the window without gaps."""
     max_bias: float = radians(10.0)
@@ -112,7 +112,8 @@ class LagEstimate:
     lag_ns: float
     """IMU timestamp minus reference timestamp of the same event, ns; NaN without a fit."""
     sigma_ns: float
-    """Standard deviation, ns, valid for correlated residuals and slowly varying stamp errors."""
+    """Standard deviation, ns, valid for correlated residuals and slowly varying timestamp errors.
+    """
     r2: float
     """Coefficient of determination R², 1 - sum |residual|² / sum |omega|²."""
     refused: str | None
@@ -159,7 +160,7 @@ def estimate_lag(
     Returns
     -------
     LagEstimate
-        ``refused`` contains the reason if the data do not determine the lag.
+        Lag. If the data do not determine it, ``refused`` contains the reason.
     """
     settings = settings or LagSettings()
     if min(np.size(imu_t_ns), np.size(ref_t_ns)) == 0:
@@ -174,7 +175,7 @@ def estimate_lag(
     if not estimate.r2 < settings.min_r2:
         return estimate
 
-    # A failed R² is the sign of quaternions in the inverse convention.
+    # A low R² is typical of quaternions in the inverse convention.
     turned = rates(ref_t_ns, rotation.conjugate(ref_q))
     if estimate_lag_of_rates(imu, turned, settings).refused is not None:
         return estimate
@@ -240,7 +241,7 @@ def estimate_in_steps(
 
 
 def _judged(seen: LagEstimate, fits: list[LagFit], settings: LagSettings) -> LagEstimate:
-    """Return the best of the fits, with the reason for a rejection."""
+    """Return the estimate from the best fit, with the reason if it is rejected."""
     fit, rival = _best_and_rival(fits, seen)
     estimate = replace(
         seen,
@@ -325,10 +326,10 @@ def coarse_lags(
 ) -> tuple[tuple[float, ...], str | None]:
     """Return candidate lags, s, best first, and the reason if there are none.
 
-    Candidates are maxima of the correlation of both rate magnitudes, which need no rotation. The
-    best one must lie inside the search range; a maximum at the border means that the lag is
-    outside. Maxima that differ by less than ``_TIE`` are ranked by the size of the lag, those at
-    the border included.
+    Candidates are maxima of the correlation of both rate magnitudes, which needs no rotation
+    between the systems. The best maximum must lie inside the search range. A maximum at the border
+    means that the lag is outside the range. Maxima that differ by less than ``_TIE`` are ranked by
+    the size of the lag, including maxima at the border.
     """
     step, reach = settings.step_s, round(settings.span_s / settings.step_s)
     scores = _correlations(imu, ref, step, reach)
@@ -382,7 +383,7 @@ def _correlations(imu: Rates, ref: Rates, step: float, reach: int) -> Floats:
 
 
 def _magnitude(rates: Rates, t: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return |rate| at instants `t`, by linear interpolation, and where it is valid."""
+    """Return |rate| at instants `t` by linear interpolation, and whether each value is valid."""
     _, inside = Interpolant(rates).locate(t)
     return np.interp(t, rates.t_s, np.linalg.norm(rates.w, axis=1)), inside
 

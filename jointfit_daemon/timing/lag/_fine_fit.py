@@ -1,4 +1,4 @@
-"""Fine fit of the lag: rotation, bias and lag in one solve, on three axes."""
+"""Fine fit of the lag, simultaneous with rotation and bias, on three axes."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag._angular_rates import Floats, Rates
 
 HUBERS = (1.5, 2.4, np.inf)
-"""Huber thresholds tried, in standard deviations of the norm of three components (median 1.538). A
-low one suits bursts of optical errors; a high one suits errors that grow with the motion, where the
-largest residuals contain the most information.
+"""Candidate Huber thresholds, for the norm of three components in standard deviations per axis
+(median 1.538). A low threshold suits bursts of optical errors. A high threshold suits errors that
+grow with the motion, where the largest residuals contain the most information.
 """
 CHOICES = 6
-"""Iterations in which the threshold of the least lag variance is chosen; then it is fixed."""
+"""Iterations in which the threshold with the least lag variance is selected; then it is fixed."""
 MEDIAN_NORM = 1.538
 """Median norm of a standard normal vector of three components."""
 STEP_S = 0.020
@@ -55,7 +55,7 @@ class LagFit:
     r2: float
     residual_rms: float
     mean_weight: float
-    """Mean Huber weight at the threshold 2.4, whichever threshold was used."""
+    """Mean Huber weight at the threshold 2.4, even if the fit used another threshold."""
     pairs: int
     converged: bool
 
@@ -81,7 +81,7 @@ def fit_lag(
     start_s : float
         Coarse lag, s.
     stamp_sd_s : float
-        Standard deviation of the slowly varying error of the stamps, s.
+        Standard deviation of the slowly varying error of the timestamps, s.
 
     Yields
     ------
@@ -93,7 +93,7 @@ def fit_lag(
     LagFit or None
         None if the overlap is too short.
     """
-    # The faster track is interpolated; if that is the reference, g and omega are exchanged.
+    # The faster track is interpolated. If the reference is faster, g and omega are exchanged.
     swapped = imu.period_s > ref.period_s
     fast, slow = (ref, imu) if swapped else (imu, ref)
     cubic = Interpolant(fast)
@@ -139,7 +139,7 @@ def fit_lag(
 
 
 def _start(cubic: Interpolant, slow: Rates, tau: float) -> _State | None:
-    """Return the initial rotation by SVD of the covariance, means removed, with zero bias."""
+    """Return the initial state: zero bias, and the rotation from an SVD of the covariance."""
     g, _, ok = cubic(slow.t_s + tau)
     if ok.sum() < LEAST_PAIRS:
         return None
@@ -152,7 +152,7 @@ def _start(cubic: Interpolant, slow: Rates, tau: float) -> _State | None:
 def _linearize(
     cubic: Interpolant, slow: Rates, state: _State, clip: float | None
 ) -> LinearizedLag | None:
-    """Return the problem about a state, with Huber's weights; None if the overlap is too short."""
+    """Return the problem linearized at a state; None if the overlap of the tracks is too short."""
     g, slope, ok = cubic(slow.t_s + state.tau)
     if ok.sum() < LEAST_PAIRS:
         return None
@@ -200,7 +200,7 @@ def _clipped(norm: Floats, clip: float) -> Floats:
 
 
 def _best_clip(linear: LinearizedLag) -> float:
-    r"""Return the threshold, rad/s, of the least variance :math:`\sum h\psi^2 / (\sum h\psi')^2`.
+    r"""Return the threshold, rad/s, with the least variance :math:`\sum h\psi^2 / (\sum h\psi')^2`.
 
     h is the information of a row about the lag. Correlations between residuals are neglected, since
     they are the same for all thresholds.

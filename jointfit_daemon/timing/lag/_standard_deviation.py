@@ -4,32 +4,33 @@ Residuals of low-pass filtered rates are correlated over the filter length. Wher
 systems disagree (soft tissue, lens, gyro scale), they are correlated over whole movements. The
 variance is therefore estimated in several ways, and the largest is used:
 
-* the delete-a-block jackknife (Tukey; Künsch 1989): the lag without each block of the window, with
-  at most 20 blocks, none shorter than the filter, then with half as many blocks repeatedly while
-  five remain. The jackknife needs no model of the residuals, and detects a single block that
-  determines the result;
-* Newey and West (1987), with residuals correlated over the shortest of these blocks.
+* the delete-a-block jackknife (Tukey; Künsch 1989): the lag is computed without each block of the
+window in turn. The window has at most 20 blocks, none shorter than the filter. The computation is
+repeated with half as many blocks while at least five remain. The jackknife needs no model of the
+residuals. It detects a single block that determines the result;
+* the estimator of Newey and West (1987), with residuals correlated over the shortest of these
+blocks.
 
 A variance from few blocks is uncertain itself. :math:`\nu + 1 = (\sum h)^2/\sum h^2` is the
 effective number of blocks that carry the information h about the lag. The finest scale is widened
 by the ratio of the Student t quantile with :math:`\nu` degrees of freedom to the normal quantile of
 equal probability. Coarser scales only detect long correlations; they are widened by
-:math:`\nu/(\nu-2)`, the variance of t. With a single tap in a window of rest the result is
-infinite.
+:math:`\nu/(\nu-2)`, the variance of t. If the window contains a single tap and otherwise rest, the
+result is infinite.
 
-Residuals cannot reveal an error of the stamps that is common to all samples that carry the
-information. Devices sample on ticks of an internal clock. The rounding error of their stamps is a
-sawtooth: the error drifts through one tick and jumps back. The mean error over time is part of the
-lag, but a short passage of fast motion contains only a part of the sawtooth. For a random phase the
-variance is
+Residuals do not show an error of the timestamps that is common to all samples with information
+about the lag. Devices sample on ticks of an internal clock. The rounding error of their timestamps
+is a sawtooth: the error drifts through one tick and jumps back. The mean error over time is part of
+the lag, but a short passage of fast motion contains only a part of the sawtooth. For a random phase
+the variance is
 
 .. math:: \sigma_s^2 G, \quad G = \frac{6}{\pi^2} \sum_{k=1}^{3} \frac{|H(k/P)|^2}{k^2}, \quad
           H(f) = \frac{\sum h_j e^{2\pi i f t_j}}{\sum h_j},
 
 the power of the harmonics of a sawtooth of period P, weighted with the information h. The jackknife
-already contains its scatter between blocks, :math:`\sigma_s^2 (1 - G) \sum p_b^2`, where p_b is the
-fraction of the information in a block. The difference is added; it is zero for motion that is even
-over the window.
+already contains the scatter of the sawtooth between blocks, :math:`\sigma_s^2 (1 - G) \sum p_b^2`,
+where p_b is the fraction of the information in a block. The difference of the two variances is
+added. It is zero if the motion is uniform over the window.
 """
 
 from __future__ import annotations
@@ -44,13 +45,14 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag._angular_rates import Floats
 
 RIDGE = 1e-9
-"""Relative ridge on the rotation, which motion about one axis leaves undetermined about that axis.
+"""Relative ridge on the rotation. Motion about one axis does not determine the rotation about that
+axis.
 """
 LEAST_BLOCKS = 5
 """Least number of blocks."""
 MOST_BLOCKS = 20
-"""Largest number of blocks. Shorter blocks would overrate orientation noise, whose rate is
-anticorrelated over short times.
+"""Largest number of blocks. Shorter blocks would overestimate the effect of orientation noise,
+whose rate is anticorrelated over short times.
 """
 SIGMAS = 2.8
 """Normal quantile at which the tail probabilities are matched."""
@@ -58,11 +60,11 @@ STAMP_PERIODS_S = (1.95, 3.9)
 """Periods of the sawtooth error of the stamps, s; the larger variance is used.
 
 The period is the tick divided by the relative skew, 0.5 ms by 257 ppm in recordings
-(``lag-all-trials``); the second one is that of half the skew. A slower sawtooth is a constant of
-most windows, and part of their lag.
+(``lag-all-trials``); the second period belongs to half the skew. A slower sawtooth is nearly
+constant in most windows, and is then part of their lag.
 """
 _HARMONICS = np.arange(1, 4)
-"""Harmonics of the sawtooth; these contain 83 % of its power."""
+"""Numbers of the harmonics of the sawtooth that are used; they contain 83 % of its power."""
 _LEAST_FREEDOM = 2.0
 """Degrees of freedom below which the variance of Student's t does not exist."""
 _TINY = 1e-12
@@ -78,8 +80,9 @@ class LinearizedLag(NamedTuple):
     weight: Floats
     """Huber weights, shape (n,)."""
     give: Floats
-    """``-d log(weight) / d log |residual|``, shape (n,): 0 where the weight stays 1, 1 where Huber
-    clips. A clipped residual constrains the lag only across its own direction."""
+    """``-d log(weight) / d log |residual|``, shape (n,): 0 where the weight is 1, and 1 where the
+    Huber weight is below 1. Such a residual constrains the lag only across its own direction.
+    """
     rate: Floats
     """Rate of the slower track, rad/s, shape (n, 3)."""
     t_s: Floats
@@ -94,7 +97,7 @@ def lag_sigma(solved: LinearizedLag, memory_s: float, stamp_sd_s: float = 0.0) -
     solved : LinearizedLag
         Linearization at the solution.
     memory_s : float
-        Time over which the filter correlates residuals, s.
+        Time over which the low-pass filter correlates residuals, s.
     stamp_sd_s : float
         Standard deviation of the slowly varying error of the stamps, s.
     """
@@ -107,7 +110,7 @@ def lag_sigma(solved: LinearizedLag, memory_s: float, stamp_sd_s: float = 0.0) -
     if information.sum() <= _TINY:
         return float("inf")
 
-    # blocks no shorter than the filter, at most `MOST_BLOCKS`
+    # At most `MOST_BLOCKS` blocks, none shorter than the filter.
     t_s = solved.t_s
     block = np.floor((t_s - t_s[0]) / memory_s).astype(np.int64)
     period, memory = float(np.median(np.diff(t_s))), memory_s
@@ -139,7 +142,7 @@ def _unobserved_sawtooth(t_s: Floats, information: Floats, memory_s: float) -> f
 
 
 def _curvature(solved: LinearizedLag) -> tuple[Floats, Floats]:
-    """Return each row's contribution to the normal matrix, (n, 7, 7), and the gradient, (n, 7)."""
+    """Return the contribution of each row to the normal matrix, (n, 7, 7), and gradient, (n, 7)."""
     jacobian, residual, weight, give, *_ = solved
     weighted = jacobian * weight[:, None, None]
     gradient = np.einsum("nij,ni->nj", weighted, residual)
@@ -181,7 +184,8 @@ def _newey_west(score: Floats, lags: int) -> float:
 def _jackknife(table: Floats, whole: Floats) -> float:
     """Return the jackknife variance of the lag.
 
-    One Gauss-Newton step from the solution, with fixed weights, for each deleted block.
+    For each deleted block the lag is computed by one Gauss-Newton step from the solution, with
+    fixed weights.
     """
     rest = whole - table[:, :49].reshape(-1, 7, 7)
     pull = table[:, 49:56]

@@ -1,8 +1,8 @@
 r"""Running lag estimate from many windows, with detection of steps.
 
-A Kalman filter on :math:`(\tau, \dot\tau)`, one update per window. With both clocks mapped to host
-time the lag is constant, so the drift is small by assumption. A step indicates that a device
-restarted or changed a filter.
+A Kalman filter estimates the lag and its drift, :math:`(\tau, \dot\tau)`, with one update per
+window. With both clocks mapped to host time the lag is constant, so the drift is small by
+assumption. A step indicates that a device restarted or changed a filter.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ DRIFT_NOISE = 0.02e-6
 DRIFT_SD = 5e-6
 """Prior standard deviation of the drift of two mapped clocks, dimensionless."""
 GATE_SIGMAS = 4.0
-"""Innovation, in standard deviations, above which a window may be the begin of a step.
-
-The thresholds for a single window are `LagSettings`."""
+"""Innovation, in standard deviations, above which a window may be the beginning of a step.
+`LagSettings` contains the thresholds for a single window.
+"""
 STEP_WINDOWS = 3
 """Consistent windows in a row beyond the threshold that count as a step."""
 AGREE_NS = 500_000.0
@@ -104,7 +104,7 @@ class LagTracker:
     def widen(self, sd_ns: float) -> None:
         """Increase the uncertainty of the lag by `sd_ns` after a clock restart.
 
-        The next window then moves the lag without counting as a step.
+        The next window can then change the lag without being detected as a step.
         """
         self._tt += (sd_ns * 1e-9) ** 2
         self._refused = []
