@@ -1,7 +1,7 @@
-"""Entry point of the `jointfit` command line: registers one command for each module or package.
+"""Entry point of the `jointfit` command line, which registers all commands.
 
 Invariant: numpy is not imported before a command runs, because OpenBLAS reads its number of threads
-on import.
+during the import.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def _shared_options(
 def main() -> None:
     """Run the command line with one OpenBLAS thread unless the environment sets a number.
 
-    The matrices of all commands are small: with more threads, `jointfit fuse fit` takes ten times
-    the CPU time, spent on waiting.
+    The matrices of all commands are small. With more threads, `jointfit fuse fit` takes ten times
+    the CPU time, because threads wait actively for each other.
     """
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     app()

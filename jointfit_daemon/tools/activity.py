@@ -1,4 +1,4 @@
-"""A moving bar on the terminal during work whose remaining time is unknown."""
+"""A moving bar on the terminal during a computation whose remaining time is unknown."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @contextmanager
 def show_activity(label: str) -> Iterator[Callable[[str], None]]:
-    """Show a moving bar and the elapsed time on standard error if that is a terminal.
+    """Show a moving bar and the elapsed time if standard error is a terminal.
 
     The context manager yields a function that prints a line on standard error, above the bar.
     """

@@ -76,7 +76,7 @@ def check(
 
 
 def _calibration_lines(sources: Iterable[Source]) -> Iterator[str]:
-    """Yield a line for each sensor whose readings are corrected."""
+    """Yield a line for each sensor whose readings the gateway corrects."""
     from jointfit_daemon.sensor_calibration import calibration_of
 
     for source in sources:
@@ -87,7 +87,7 @@ def _calibration_lines(sources: Iterable[Source]) -> Iterator[str]:
 
 
 def _rate(source: Source) -> str:
-    """Return the configured rate; cameras without a rate key send at their own rate."""
+    """Return the configured rate as text; cameras without the key send at their own rate."""
     if source.kind == "mocap" and not hasattr(source.settings, "rate_hz"):
         return "its own"
     return f"{source.rate_hz:g} Hz"

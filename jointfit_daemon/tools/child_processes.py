@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 READY_S = 30.0
-"""Time limit for a process to become ready, s; a Raspberry Pi needs 10 s to import SciPy."""
+"""Time limit for the start of a process, s. A Raspberry Pi needs 10 s to import SciPy."""
 STOP_S = 10.0
-"""Time limit for a process to end after SIGTERM, s. A process that exceeds the limit is killed."""
+"""Time limit for the end of a process after SIGTERM, s. At this limit, the process is killed."""
 
 
 class ProcessExitedError(Exception):
@@ -36,7 +36,7 @@ async def time_limit(seconds: float, step: str) -> AsyncIterator[None]:
     Raises
     ------
     DemoTimeoutError
-        The block took longer than `seconds`.
+        The ``with`` block took longer than `seconds`.
     """
     try:
         async with asyncio.timeout(seconds):
@@ -103,7 +103,7 @@ class ChildProcess:
 
 
 class Simulator(ChildProcess):
-    """``jointfit-sim play``: reads commands from standard input and replies in JSON lines."""
+    """Process ``jointfit-sim play``, which reads commands and replies in JSON lines."""
 
     async def ready(self) -> dict[str, Any]:
         """Wait until the simulated hardware is ready; return its description."""
@@ -142,7 +142,7 @@ class Simulator(ChildProcess):
 
 
 def simulator(folder: Path, port: int, base: str, options: Sequence[str]) -> Simulator:
-    """Return the simulator process, not started yet."""
+    """Return the simulator process; the ``async with`` statement starts it."""
     words = [
         *(sys.executable, "-m", "jointfit_simulators", "play", "--directory", str(folder)),
         *("--mqtt-port", str(port), "--mqtt-base", base, *options),
@@ -151,7 +151,7 @@ def simulator(folder: Path, port: int, base: str, options: Sequence[str]) -> Sim
 
 
 def daemon(folder: Path, rig: Path) -> ChildProcess:
-    """Return the daemon process for a rig written by the simulator, not started yet."""
+    """Return the daemon process for a rig that the simulator wrote; ``async with`` starts it."""
     words = [sys.executable, "-m", "jointfit_daemon", "--config", str(rig)]
     state = {"STATE_DIRECTORY": str(folder / "state"), "OPENBLAS_NUM_THREADS": "1"}
     return ChildProcess("daemon", words, folder, state)

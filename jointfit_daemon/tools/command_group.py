@@ -1,4 +1,4 @@
-"""Error handling of the `jointfit` commands: one line on standard error, and an exit code.
+"""Error handling of the `jointfit` commands, which prints one line on standard error and exits.
 
 Invariant: every command reports errors through `CommandGroup`. Other exceptions are bugs and are
 shown with their traceback.
@@ -55,7 +55,7 @@ ON_DEMAND_ERRORS = (
 
 
 def join_lines(text: str) -> str:
-    """Join the lines of each paragraph; lists and indented examples are unchanged."""
+    """Join the lines of each paragraph; leave lists and indented examples unchanged."""
     paragraphs = inspect.cleandoc(text).split("\n\n")
     return "\n\n".join(
         paragraph if any(line[:1] in " -*\b" for line in paragraph.split("\n") if line)
@@ -85,7 +85,7 @@ class CommandGroup(TyperGroup):
 
     @override
     def shell_complete(self, ctx: Any, incomplete: str) -> list[Any]:
-        """Return the completions that are one word; a shell would split a name of two words."""
+        """Return the completions without blanks; a shell would split the others."""
         found = super().shell_complete(ctx, incomplete)
         return [item for item in found if " " not in item.value]
 
@@ -128,7 +128,7 @@ def _known_error(error: Exception) -> tuple[int, str] | None:
     if isinstance(error, OSError | ValueError):
         return EXIT_MISUSE, str(error)
 
-    # A module that is not loaded cannot have raised the error.
+    # Only a loaded module can have raised the error.
     for code, module, name in ON_DEMAND_ERRORS:
         loaded = sys.modules.get(module)
         if loaded is not None and isinstance(error, getattr(loaded, name)):

@@ -1,7 +1,7 @@
-"""Words that a shell offers after Tab, by argument.
+"""Completions that a shell offers at the Tab key, for each type of argument.
 
-The module of a list is imported only on request of a shell, because most lists need the packages of
-the daemon.
+The module that provides a list is imported only when a shell requests the list, because most lists
+need the packages of the daemon.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def complete_rig_or_command(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return rig files and second words of a command that begin with `incomplete`.
+    """Return the rig files and the second words of command names that begin with `incomplete`.
 
     If no second word matches, the result is empty and the shell completes paths.
     """
@@ -28,7 +28,7 @@ def complete_rig_or_command(ctx: typer.Context, incomplete: str) -> list[str]:
 
 
 def complete_sensor(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Return the sensors that begin with `incomplete`; none if the rig cannot be read."""
+    """Return the sensor ids that begin with `incomplete`; none if the rig cannot be read."""
     from jointfit_daemon.files.text import parse_toml
 
     try:

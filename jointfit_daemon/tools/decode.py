@@ -35,12 +35,12 @@ class CaptureSummary:
     """Counts of decoded and rejected items of one capture."""
 
     corrupt: int = 0
-    """Number of runs of bytes that belong to no message."""
+    """Number of runs of successive bytes that belong to no message."""
     rejected: int = 0
     """Number of messages with unusable content."""
     rejected_bytes: int = 0
     reasons: Counter[str] = field(default_factory=Counter)
-    """Rejected messages by reason."""
+    """Number of rejected messages, by reason."""
     quaternions: int = 0
     first_quaternion: tuple[float, ...] | None = None
     last_quaternion: tuple[float, ...] | None = None
@@ -76,7 +76,7 @@ class CaptureSummary:
         self.last_quaternion = q
 
     def table(self, decoder: Decoder) -> dict[str, object]:
-        """Return the counts of decoder and items by name."""
+        """Return the counts of the decoder and of the decoded items, by name."""
         found: dict[str, object] = {
             "messages": decoder.messages + self.rejected,
             "rejected": self.rejected,
@@ -149,9 +149,13 @@ def decode(
 def _read(
     file: Path, driver: type[Driver], decoder_of: Callable[[], Decoder] | None = None
 ) -> Iterator[Chunk]:
-    """Return the chunks of a capture; an error of another wire lists the drivers for it.
+    """Return the chunks of a capture.
 
-    With `decoder_of` the connection in which its decoder finds most messages is chosen.
+    If the capture is of another type of connection, the error message lists the drivers for that
+    type.
+
+    If the capture contains several network connections, the decoder from `decoder_of` selects the
+    one with the most messages.
     """
     from jointfit_daemon.files.captures import UnreadableCaptureError, read_capture
     from jointfit_daemon.tools.discovery import installed_drivers
@@ -175,7 +179,7 @@ def _count_messages(decoder_of: Callable[[], Decoder], chunks: Iterable[Chunk]) 
 
 
 def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
-    """Return why a capture has no message of `driver`, with the driver that decodes it, if any."""
+    """Return why `driver` found no message in a capture, and a driver that finds messages."""
     from jointfit_daemon.files.captures import frame_sizes
     from jointfit_daemon.tools.discovery import decode_frames, decode_stream
 
@@ -206,7 +210,9 @@ def _why_nothing_found(file: Path, driver: type[Driver], name: str) -> str:
 
 
 def _toml(key: str, value: Any) -> str:
-    from jointfit_daemon.files.text import toml_value  # numpy takes a quarter of the start
+    from jointfit_daemon.files.text import (
+        toml_value,
+    )  # loads numpy slowly
 
     return toml_value(value, hexadecimal=key == "ids")
 
@@ -251,7 +257,7 @@ def _settings(driver: type[Driver], name: str, pairs: list[str]) -> Any:
             raise ValueError(
                 f"--set {key[:SHOWN]}: nested more than {MAX_NESTING} levels deep"
             ) from None
-        except ValueError:  # a word without quotes is text
+        except ValueError:  # a value without quotes is text
             table = {key: value}
         if fault := find_structure_fault(table):
             raise ValueError(f"--set {fault}")

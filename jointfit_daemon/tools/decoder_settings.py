@@ -1,4 +1,4 @@
-"""Driver settings for decoding without a device: keys of the connection get placeholders."""
+"""Driver settings for decoding without a device; the connection keys have placeholder values."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def decoder_settings(driver: type[Driver], name: str, given: Mapping[str, Any]) 
     Raises
     ------
     ValueError
-        A value in `given` is invalid; the message names the keys.
+        A value in `given` is invalid. The message names the key.
     """
     table: dict[str, Any] = {"driver": name, **given}
     for key, info in driver.Settings.model_fields.items():
@@ -31,8 +31,8 @@ def decoder_settings(driver: type[Driver], name: str, given: Mapping[str, Any]) 
             if CanBusSettings in models:
                 table[key] = {"interface": "virtual", "channel": "file"}
             elif get_origin(info.annotation) is Literal and 1 not in get_args(info.annotation):
-                continue  # a required choice without a placeholder is missing
-            elif not models and get_origin(info.annotation) is not dict:  # no description of data
+                continue  # no placeholder, so the validation reports the key
+            elif not models and get_origin(info.annotation) is not dict:  # not a data description
                 table[key] = "file" if str in kinds else 1
     try:
         return driver.Settings.model_validate(table)

@@ -1,7 +1,7 @@
 """MQTT 5 broker for the demo and for tests, listening on the loopback interface.
 
-Invariant: no other module imports iotcore. The broker is not meant for installations; see
-docs/mqtt.md.
+Invariant: no other module imports the broker package iotcore. The broker is unsuitable for real
+installations; see docs/mqtt.md.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 START_S = 10.0
-"""Time limit for the broker to listen, s."""
+"""Time limit for the start of the broker, s."""
 
-# With keyword arguments instead of a file, iotcore listens on all interfaces and supports MQTT
-# 3.1.1 only.
+# If iotcore is configured by keyword arguments instead of a file, it listens on all interfaces and
+# supports MQTT 3.1.1 only.
 _CONFIG = """id = 0
 [router]
 id = 0
@@ -45,7 +45,7 @@ class BrokerMissingError(ImportError):
 
 
 def free_port() -> int:
-    """Return a TCP port of the loopback interface that is free at the moment."""
+    """Return a TCP port of the loopback interface that is currently free."""
     with socket.socket() as probe:
         probe.bind((HOST, 0))
         return int(probe.getsockname()[1])
@@ -53,12 +53,12 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def embedded_broker(folder: Path) -> Iterator[int]:
-    """Run a broker for the duration of the block; yield its port.
+    """Run a broker during the ``with`` block; yield its port.
 
     Raises
     ------
     BrokerMissingError
-        iotcore is not installed; it is part of the extra ``demo``.
+        The package iotcore is not installed. The extra ``demo`` contains it.
     TimeoutError
         The broker did not listen within `START_S`.
     """

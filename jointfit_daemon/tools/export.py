@@ -76,12 +76,12 @@ def export(
 
 
 def load_data(file: Path) -> SessionData:
-    """Return the session of a recording or its folder, or of a file or folder to import.
+    """Return the session in a recording, in its folder, or in a file or folder to import.
 
     Raises
     ------
     ValueError
-        Not a file of a known kind, or damaged.
+        The file is damaged, or its type is unknown.
     """
     recorded = any(file.glob("*.mcap*")) if file.is_dir() else ".mcap" in file.suffixes
     if recorded:
@@ -95,12 +95,13 @@ def load_data(file: Path) -> SessionData:
 
 
 def _read_names(given: Sequence[str], session: SessionData) -> dict[str, str]:
-    """Return the column names of option ``--name``.
+    """Return the column names that the option ``--name`` sets.
 
     Raises
     ------
     ValueError
-        Not of the form ID=NAME, an unknown sensor or segment, or one name for two of them.
+        The text is not ID=NAME, the sensor or segment is unknown, or two of them have the same
+        name.
     """
     from jointfit_daemon.nearest_name import unknown_name
 

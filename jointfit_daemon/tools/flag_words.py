@@ -1,7 +1,7 @@
 """Sentences that describe the flags of poses.
 
-The dashboard's page has the same sentences (``page/js/words.js``). Invariant: every flag has a
-sentence.
+The web page of the dashboard has the same sentences (``page/js/words.js``). Invariant: every flag
+has a sentence.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ _FLAGS = {
     "gimbal": "Gimbal lock: flexion and rotation cannot be separated.",
 }
 _MINOR = {"extrapolating", "headings_from_static", "origin_fixed", "uncorrected"}
-"""Flags that need no action."""
+"""Flags that require no action of the user."""
 
 
 def flag_sentence(flag: str) -> str:
-    """Return the sentence of a flag of a pose; an unknown flag is returned unchanged."""
+    """Return the sentence that describes a flag of a pose; return an unknown flag unchanged."""
     kind, _, name = flag.partition(":")
     return _FLAGS.get(kind, flag).replace("%", name.replace("_", " "))
 
 
 def serious_flags(flags: list[str]) -> list[str]:
-    """Return the flags that may need an action."""
+    """Return the flags that may require an action of the user."""
     return [flag for flag in flags if flag.partition(":")[0] not in _MINOR]

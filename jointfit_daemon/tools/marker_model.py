@@ -1,4 +1,4 @@
-"""Trials in a model's marker order, for the commands on marker trials.
+"""Conversion of marker trials to the marker order of a chain model.
 
 Positions of markers that are missing in a trial are NaN.
 """
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def motion_trial(name: str, trial: MarkerTrial, chain: ChainModel) -> MotionTrial:
-    """Return the markers of the model in a trial, NaN where missing."""
+    """Return the positions of the model's markers in a trial; missing markers are NaN."""
     count = len(trial.trajectories.t_s)
     targets = np.full((count, len(chain.markers), 3), np.nan)
     for at, marker in enumerate(chain.marker_names):

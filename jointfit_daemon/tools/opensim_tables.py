@@ -1,4 +1,4 @@
-"""Report of the outcome of tables written for OpenSim, for all commands."""
+"""Reports on the tables that the commands write for OpenSim."""
 
 from __future__ import annotations
 

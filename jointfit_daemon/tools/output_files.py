@@ -18,12 +18,13 @@ PLOTS = (".png", ".svg", ".pdf")
 
 
 def check_output(option: str, path: Path | None, endings: Sequence[str]) -> None:
-    """Check that `path` can be written; None (option not given) is accepted.
+    """Check that `path` can be written; accept None, which is a missing option.
 
     Raises
     ------
     ValueError
-        Unsupported extension, missing folder, path of a folder, or no write permission.
+        The extension is unsupported, the folder is missing, `path` is a folder, or writing is not
+        permitted.
     """
     if path is None:
         return
@@ -53,7 +54,7 @@ def check_plot(path: Path | None) -> None:
     Raises
     ------
     ValueError
-        As `check_output`.
+        The errors of `check_output`.
     PlottingUnavailableError
         Matplotlib is not installed.
     """
@@ -63,7 +64,7 @@ def check_plot(path: Path | None) -> None:
 
 
 def replace_file(path: Path, text: str) -> None:
-    """Write a text file as a whole; after an error the old file is unchanged."""
+    """Write a text file atomically; if an error occurs, the old file is unchanged."""
     partial = path.with_name(f"{path.name}.part")
     try:
         with partial.open("w", encoding="utf-8", newline="") as file:

@@ -83,14 +83,14 @@ def mark(
 def send_request(
     rig: Path, name: str, arguments: Mapping[str, Any], timeout_s: float = 10.0
 ) -> dict[str, Any]:
-    """Return the answer of the daemon of `rig`.
+    """Send a request to the daemon of `rig`, and return its answer.
 
     Raises
     ------
     ConfigError
-        `rig` is faulty.
+        The file `rig` is invalid.
     BrokerLostError, NoAnswerError
-        There is no broker, or no daemon answers.
+        The broker cannot be reached, or no daemon answers.
     """
     from jointfit_daemon.config import load_rig
     from jointfit_daemon.outputs.mqtt import MqttClient
@@ -109,7 +109,7 @@ def send_request(
 
 
 def exit_if_refused(answer: Mapping[str, Any]) -> None:
-    """Print the faults of an answer, one per line, and exit; return without faults."""
+    """If an answer contains faults, print one fault per line and exit."""
     if answer.get("status") != "error":
         return
     error: Mapping[str, Any] = answer.get("error") or {}
@@ -122,7 +122,7 @@ def exit_if_refused(answer: Mapping[str, Any]) -> None:
 
 
 def _lines(answer: Mapping[str, Any]) -> list[str]:
-    """Return the data of an answer as text, with one line for each value or list entry."""
+    """Return the data of an answer as lines of text, one for each value or list entry."""
     data: Mapping[str, Any] = answer.get("data") or {}
     lines = []
     if "checks" in data:

@@ -21,7 +21,7 @@ def sample(
     json: Annotated[bool, typer.Option("--json", help="Print the list as JSON.")] = False,
 ) -> None:
     """Write sample data: short trials of a simulated leg, a chain model, captures and a rig."""
-    # The simulator is a separate program: it shares no code with the estimators.
+    # The simulator is a separate program that shares no code with the estimators.
     words = [sys.executable, "-m", "jointfit_simulators", "sample", str(folder)]
     words += ["--seed", str(seed), *(["--force"] if force else [])]
     with show_activity("simulating"):

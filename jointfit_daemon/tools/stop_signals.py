@@ -1,6 +1,6 @@
 """Stop signals converted to a task cancellation, so that a command can clean up.
 
-Invariant: the ``with`` block restores the signal handlers.
+Invariant: the previous signal handlers are restored at the end of the ``with`` block.
 """
 
 from __future__ import annotations
@@ -15,14 +15,16 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that Ctrl-C, a service manager or `kill`, and a closed terminal send."""
+"""Signals that stop a command: of Ctrl-C, of a service manager or `kill`, and of a closed terminal.
+"""
 _EXIT_BASE = 128
-"""Exit code of a process stopped by signal N is 128 + N, the convention of shells."""
+"""Offset of the exit code. By the convention of shells, a process that signal N stops has the code
+128 + N."""
 
 
 @dataclass(slots=True)
 class StopRequest:
-    """First stop signal received, if any."""
+    """First stop signal that was received, if any."""
 
     number: signal.Signals | None = None
 
@@ -41,7 +43,7 @@ class StopRequest:
 def cancel_on_signal() -> Iterator[StopRequest]:
     """Cancel the current task when a stop signal arrives.
 
-    Signals that the parent process ignores remain ignored (``nohup``).
+    A signal that the parent process ignores remains ignored, as with ``nohup``.
     """
     task, loop = asyncio.current_task(), asyncio.get_running_loop()
     request = StopRequest()

@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 
 def echo_json(data: Any) -> None:
-    """Print one JSON object in a line; NaN and infinity become null."""
+    """Print one JSON object on one line; NaN and infinity become null."""
     typer.echo(orjson.dumps(data, option=orjson.OPT_SERIALIZE_NUMPY))
 
 
 def echo_wrapped(text: str, *, err: bool = False) -> None:
-    """Print lines; on a terminal, long lines are broken at blanks and indented."""
+    """Print lines; on a terminal, long lines are wrapped at blanks and indented."""
     if not (sys.stderr if err else sys.stdout).isatty():
         typer.echo(text, err=err)
         return
@@ -35,7 +35,7 @@ def echo_wrapped(text: str, *, err: bool = False) -> None:
 
 
 def align_columns(rows: Sequence[Sequence[str]], right: Collection[int] = ()) -> str:
-    """Return rows as text columns; columns whose numbers are in `right` are right-aligned."""
+    """Return rows as text columns; the column indices in `right` are right-aligned."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
 
     def line(row: Iterable[str]) -> str:
@@ -54,7 +54,7 @@ def join_choices(names: Sequence[str]) -> str:
 
 
 def check_choice(option: str, value: str | None, choices: Sequence[str]) -> None:
-    """Check the value of an option; None (option not given) is accepted.
+    """Check the value of an option; accept None, which is a missing option.
 
     Raises
     ------

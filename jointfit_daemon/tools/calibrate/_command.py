@@ -1,8 +1,8 @@
 """Command `jointfit calibrate`: requests calibration phases over MQTT and reports their result.
 
-Invariants: only the result goes to stdout; prompts, progress and warnings go to stderr. A phase
-that this command started is aborted before the command ends, unless the broker or the daemon is
-unreachable.
+Invariants: only the result is written to stdout; prompts, progress and warnings are written to
+stderr. If the broker and the daemon are reachable, a phase that this command started is aborted
+before the command ends.
 """
 
 from __future__ import annotations
@@ -39,9 +39,10 @@ if TYPE_CHECKING:
 EXIT_REJECTED = 3
 """Exit code if the new calibration is worse than the stored one."""
 ABORT_S = 2.0
-"""Longest wait for the daemon to answer an abort, s."""
+"""Longest wait for the daemon's answer to an abort request, s."""
 LONGEST_S = 600.0
-"""Longest phase that can be requested, s, as in the request's schema."""
+"""Longest phase that a request can specify, s. The JSON Schema of the request has the same limit.
+"""
 ORDER = ("align", "static", "functional")
 IMMEDIATE_REQUESTS = {
     "abort": "the running phase, if any, was aborted; current state: ",
@@ -209,7 +210,7 @@ async def _guide_phases(
                     if seconds is not None:
                         arguments["seconds"] = seconds
                     async with _track_progress(client, console) as tracker:
-                        # Each subscription delivers the retained status, which is not the result.
+                        # Each subscription delivers the retained status, which precedes the result.
                         await client.subscribe(*TOPICS)
                         await tracker.wait_for_retained()
                         status = await _run_phase(client, tracker, arguments, config)
@@ -227,7 +228,7 @@ async def _run_phase(
 
     name = str(arguments["phase"])
     tracker.begin()
-    # The request runs in its own task: the answer is needed even if a signal cancels this one.
+    # The request runs in its own task, so its answer arrives even if a signal cancels this task.
     request = asyncio.create_task(client.request("calibrate", arguments), name="calibrate request")
     try:
         answer = await _await_answer(client, tracker, request, name)
@@ -246,13 +247,13 @@ async def _run_phase(
 async def _await_answer(
     client: MqttClient, tracker: PhaseTracker, request: asyncio.Task[dict[str, Any]], name: str
 ) -> dict[str, Any]:
-    """Return the answer to `request`, or an empty answer if only status messages show success.
+    """Return the answer to `request`; without an answer, return {} if the status shows success.
 
     Raises
     ------
     NoAnswerError
-        Neither an answer nor a status of the phase arrived. A request that the daemon may still
-        receive is followed by an abort.
+        Neither an answer nor a status of the phase arrived. If the daemon may still receive the
+        request, an abort request is sent.
     """
     from jointfit_daemon.outputs.mqtt import BrokerLostError, NoAnswerError
 
@@ -276,9 +277,11 @@ async def _abort_phase(
     request: asyncio.Task[dict[str, Any]],
     config: Path,
 ) -> None:
-    """Abort the phase that this command started and report the outcome.
+    """Abort the phase that this command started, and report the outcome.
 
-    A phase that ended before the abort arrived is reported with the daemon's final status.
+    If the phase ends before the daemon receives the abort, the final status is reported. If the
+    daemon refused the request, a running phase belongs to another client and is not aborted. The
+    abort request runs in its own task because the current task is already cancelled.
 
     A refused request started no phase, so the running phase belongs to another client and is not
     aborted. The request runs in its own task because the current task is already cancelled.
@@ -291,7 +294,7 @@ async def _abort_phase(
     ending = asyncio.create_task(client.request("calibrate", {"phase": "abort"}), name="abort")
     await asyncio.wait([ending], timeout=ABORT_S)
     if ending.done() and not ending.cancelled() and ending.exception() is None:
-        # The answer does not contain whether a phase was running; the status does.
+        # The status shows whether a phase was running; the answer does not.
         final = asyncio.create_task(tracker.wait_for_final(name), name="final status")
         await asyncio.wait([final], timeout=ABORT_S)
         status: Mapping[str, Any] = {}
@@ -318,7 +321,10 @@ def _print_note(text: str) -> None:
 
 @asynccontextmanager
 async def _track_progress(client: MqttClient, console: Console) -> AsyncIterator[PhaseTracker]:
-    """Track calibration messages: a progress bar on a terminal, periodic lines elsewhere."""
+    """Track calibration messages, and show their progress.
+
+    The progress is a bar on a terminal, and periodic lines elsewhere.
+    """
     from rich.console import Group
     from rich.live import Live
     from rich.progress import Progress
@@ -367,7 +373,7 @@ async def _track_progress(client: MqttClient, console: Console) -> AsyncIterator
 
 
 def handle_message(tracker: PhaseTracker, topic: str, payload: dict[str, Any]) -> str | None:
-    """Pass a message to the tracker; return a line that must be shown at once, if any."""
+    """Pass a message to the tracker; return a line to show at once, or None."""
     text = str(payload.get("text", ""))
     if topic == "calibration":
         tracker.on_status(payload)

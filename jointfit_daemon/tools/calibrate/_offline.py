@@ -21,11 +21,11 @@ def calibrate_offline(recording: Path, rig: Path | None, out: Path | None) -> di
     Parameters
     ----------
     recording
-        The recording.
+        Path of the recording.
     rig
-        The rig.toml to use instead of the recorded one.
+        A rig.toml that replaces the recorded rig.toml.
     out
-        File of the result; None: a new version in the calibration store of the rig.
+        File of the result. The default is a new version in the calibration store of the rig.
 
     Returns
     -------
@@ -64,12 +64,12 @@ def calibrate_offline(recording: Path, rig: Path | None, out: Path | None) -> di
 
 
 def store_offline_calibration(found: OfflineCalibration, out: Path | None = None) -> str:
-    """Write the calibration to `out` or to the rig's store; return a sentence with the place.
+    """Write the calibration to `out` or to the rig's store; return a sentence with the location.
 
     Raises
     ------
     OSError
-        The medium is full, read-only or missing; no partial file is left.
+        The medium is full, read-only or missing. No partial file remains.
     """
     from jointfit_daemon.calibration.record import CalibrationStore, calibration_text
     from jointfit_daemon.supervisor.state_directory import PRIVATE_UMASK, state_directory

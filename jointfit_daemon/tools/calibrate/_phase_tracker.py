@@ -1,6 +1,7 @@
-"""Follows a calibration phase from its request to its stored result, from MQTT messages.
+"""Tracks a calibration phase from its request to its stored result, by means of MQTT messages.
 
-`jointfit calibrate` and `jointfit demo` both use it; the caller owns the MQTT client.
+The commands `jointfit calibrate` and `jointfit demo` use this module. The caller provides the MQTT
+client.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ if TYPE_CHECKING:
 STORING_S = 1.5
 """Longest wait for the version number of a stored result, s."""
 RETAINED_S = 1.0
-"""Longest wait for the retained status after a subscription, s."""
+"""Longest wait for the retained status after the subscription, s."""
 OFFLINE_S = 60.0
-"""Longest wait for an offline daemon, s. A restart on a Raspberry Pi takes less."""
+"""Longest wait until an offline daemon is online again, s. A restart on a Raspberry Pi takes less.
+"""
 
 
 def is_not_stored(status: Mapping[str, Any]) -> bool:
@@ -35,14 +37,14 @@ class RequestRefusedError(Exception):
 
 
 def raise_if_refused(answer: Mapping[str, Any]) -> None:
-    """Raise `RequestRefusedError` with the message of the daemon if it rejected the request."""
+    """Raise `RequestRefusedError` if the daemon rejected the request, with the daemon's message."""
     if answer.get("status") == "error":
         raise RequestRefusedError(str((answer.get("error") or {}).get("message")))
 
 
 @dataclass(slots=True)
 class PhaseTracker:
-    """Collects calibration messages and lets a task wait for the end of a phase."""
+    """Collects calibration messages, and notifies a waiting task of the end of a phase."""
 
     show: Callable[[str, float, str], None]
     """Callback for phase, progress (0 to 1) and text of each progress message."""
@@ -51,17 +53,17 @@ class PhaseTracker:
     status: Mapping[str, Any] = field(default_factory=dict)
     _changed: asyncio.Event = field(default_factory=asyncio.Event)
     _unread: list[Mapping[str, Any]] = field(default_factory=list)
-    """Status messages to process; a status without a phase marks an interruption."""
+    """Status messages to process. A status without a phase represents an interruption."""
     _failure: Exception | None = None
     _waiting: bool = False
     """Whether a task waits for the end of a phase."""
     _offline_until: float | None = None
-    """Time at which the wait for the daemon ends, s of the event loop; None while the daemon is
-    online."""
+    """Time at which the wait for the daemon ends, in seconds of the event loop's clock. None while
+    the daemon is online."""
     _requested: bool = False
-    """Whether the phase was requested; earlier messages are retained or belong to other phases."""
+    """Whether the phase was requested. Earlier messages are retained or belong to other phases."""
     _phase_before: object = None
-    """Phase of the last status before the request."""
+    """Phase in the last status before the request."""
     _status_before: object = None
     """The last status before the request."""
 
@@ -78,7 +80,7 @@ class PhaseTracker:
         return self._requested
 
     def has_begun(self, phase: str) -> bool:
-        """Return whether a status since the request shows that the request started `phase`."""
+        """Return whether a status after the request shows that the request started `phase`."""
         began = any(status.get("phase") == phase for status in self._unread)
         return began and self._phase_before != phase
 
@@ -118,7 +120,7 @@ class PhaseTracker:
                     await self._next_message()
 
     def begin(self) -> None:
-        """Discard the messages received so far."""
+        """Discard all messages received before the request."""
         self._requested, self._phase_before = True, self.status.get("phase")
         self._status_before = self.status
         self._unread.clear()
@@ -126,9 +128,10 @@ class PhaseTracker:
         self._waiting = False
 
     async def wait_for_end(self, phase: str) -> Mapping[str, Any]:
-        """Wait until `phase` has begun and ended; return the status message that ended it.
+        """Wait until `phase` has begun and ended; return the status at the end of the phase.
 
-        Messages before the first one of `phase` are ignored: a retained status may arrive late.
+        A retained status may arrive late, so all messages before the first message of `phase` are
+        ignored.
 
         Raises
         ------
@@ -164,14 +167,14 @@ class PhaseTracker:
             await self._next_message()
 
     async def wait_for_final(self, phase: str) -> Mapping[str, Any]:
-        """Return the status in which a requested `phase` has ended and its result is stored."""
+        """Return the first status after the end of `phase` in which its result is stored."""
         while self.status is self._status_before or self.status.get("phase") in (phase, "fitting"):
             await self._next_message()
         ended = self.status
         return ended if ended.get("phase") == "aborted" else await self.wait_for_store(ended)
 
     async def wait_for_store(self, ended: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the status with the stored version or a failure; `ended` if both are late."""
+        """Return the status with the stored version or the failure, or `ended` after a timeout."""
         with suppress(TimeoutError):
             async with asyncio.timeout(STORING_S):
                 while self.status.get("version") == ended.get("version"):

@@ -10,15 +10,15 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 MOVED_M = 0.008
-"""Displacement, m, above which a marker was probably knocked. Soft tissue moves markers by about 5
-mm."""
+"""Displacement of a marker, m, above which an impact is the probable cause. Soft tissue moves
+markers by about 5 mm."""
 
 
 def report(quality: Mapping[str, Any]) -> list[str]:
     """Return one line for each result in `quality` of topic ``calibration``.
 
     Orientation and flexion errors are RMS differences from the optical reference over the last part
-    of the trial, which is excluded from the fit. Missing entries are omitted.
+    of the trial. The fit does not use this part. Missing entries are omitted.
     """
     holdout: Mapping[str, Any] = quality.get("holdout") or {}
     method = str(holdout.get("method", ""))
@@ -31,7 +31,7 @@ def report(quality: Mapping[str, Any]) -> list[str]:
         for name, by_method in (holdout.get("flexion_deg") or {}).items()
     ]
 
-    # Marker refinement by body part, and the markers with large displacement.
+    # List the marker refinement by body part, and the markers with a large displacement.
     markers: Mapping[str, Any] = quality.get("markers") or {}
     for name, part in (markers.get("parts") or {}).items():
         before, after = (1000 * part[key] for key in ("before_m", "after_m"))
@@ -72,8 +72,8 @@ def report(quality: Mapping[str, Any]) -> list[str]:
 def movement_lines(data: Mapping[str, Any]) -> list[str]:
     """Return one line for each joint in ``data`` of topic ``calibration/progress``.
 
-    The first number is the predicted error with soft-tissue artefact. The second number is the
-    random part of this error, which decreases with more movement.
+    The first number is the predicted error including the soft-tissue artefact. The second number is
+    the random part of this error, which decreases with more movement.
     """
     lines = []
     for name, joint in (data.get("joints") or {}).items():
@@ -93,10 +93,10 @@ def movement_lines(data: Mapping[str, Any]) -> list[str]:
 
 @dataclass(slots=True)
 class ProgressLines:
-    """Rate-limited progress lines for logs and pipes."""
+    """Progress lines at a limited rate, for logs and pipes."""
 
     interval_s: float = 5.0
-    """Least time between two reports of the same phase, s."""
+    """Minimum time between two lines about the same phase, s."""
     _run_phase: str = ""
     _line: str = ""
     _next_s: float = 0.0
@@ -116,7 +116,7 @@ class ProgressLines:
 
 
 def _chain_lines(chain: Mapping[str, Any]) -> list[str]:
-    """Return the result of the refinement of the chain model, and markers with large errors."""
+    """Return lines about the refinement of the chain model, and about markers with large errors."""
     name = f"chain model {chain.get('model')!r}"
     if chain.get("refused"):
         return [f"{name}: markers not refined: {chain['refused']}"]

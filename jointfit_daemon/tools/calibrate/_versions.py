@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def list_versions(config: Path, *, json: bool) -> None:
-    """Print the stored calibrations, the newest first; ``*`` marks the one in force."""
+    """Print the stored calibrations, newest first; ``*`` marks the active calibration."""
     answer = send_request(config, "calibrations", {})
     exit_if_refused(answer)
     data: Mapping[str, Any] = answer["data"]
@@ -46,7 +46,7 @@ def list_versions(config: Path, *, json: bool) -> None:
 
 
 def use_version(config: Path, version: int | None, *, json: bool) -> None:
-    """Use a stored version again; None selects the version before the one in force."""
+    """Activate a stored version; None selects the version before the active version."""
     arguments = {"revert": True} if version is None else {"version": version}
     answer = send_request(config, "use-calibration", arguments)
     exit_if_refused(answer)

@@ -1,4 +1,4 @@
-"""`jointfit calibrate sensor`: errors of one sensor's raw readings, by guided movements."""
+"""Command `jointfit calibrate sensor`: estimates the errors of one sensor's raw readings."""
 
 from jointfit_daemon.tools.calibrate_sensor._command import calibrate_sensor
 

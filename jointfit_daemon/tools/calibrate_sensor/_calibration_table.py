@@ -1,7 +1,7 @@
-"""The table ``[imu.sensor_calibration]`` from estimates, and its place in the text of a rig.toml.
+"""Content of the table ``[imu.sensor_calibration]``, and its insertion in a rig.toml.
 
-Only the lines of this table change; comments and order of the file remain. The changed text is
-parsed and compared with the expected content before it is returned.
+Only the lines of this table change; comments and the order of the file remain. The changed text is
+parsed and compared with the expected content before the function returns it.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def make_calibration(
     serial: str | None,
     before: SensorCalibrationSettings | None,
 ) -> SensorCalibrationSettings:
-    """Return the calibration of a sensor; parts without an estimate are taken from `before`.
+    """Return the calibration of a sensor; `before` provides the parts without an estimate.
 
-    If the serial number shows that `before` belongs to another sensor, none of its parts are taken.
+    If the serial number shows that `before` belongs to another sensor, `before` is ignored.
     """
     values: dict[str, Any] = {}
     if before is not None and before.serial in {None, serial}:
@@ -67,7 +67,7 @@ def table_lines(calibration: SensorCalibrationSettings) -> list[str]:
 
 
 def insert_table(text: str, name: str, calibration: SensorCalibrationSettings) -> str | None:
-    """Return the text of a rig.toml with the table of a sensor; None if it cannot be edited.
+    """Return the text of a rig.toml with the table of a sensor; None if the text cannot be edited.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def insert_table(text: str, name: str, calibration: SensorCalibrationSettings) -
     name
         Id of the sensor.
     calibration
-        Its calibration, which replaces an older one.
+        Calibration of the sensor, which replaces an older calibration.
     """
     wanted = tomllib.loads(text)
     numbers = [at for at, imu in enumerate(wanted["imu"]) if imu.get("id") == name]
@@ -85,7 +85,7 @@ def insert_table(text: str, name: str, calibration: SensorCalibrationSettings) -
     if len(numbers) != 1 or len(begins) != len(wanted["imu"]):
         return None
 
-    # The table of the sensor ends at the next header outside of this table.
+    # The table of the sensor ends at the next header that is not part of this table.
     begin = begins[numbers[0]]
     end = begin + 1
     while end < len(lines) and not (
@@ -105,7 +105,7 @@ def insert_table(text: str, name: str, calibration: SensorCalibrationSettings) -
 
 
 def _without_own(lines: list[str]) -> list[str]:
-    """Return the lines of a sensor without the lines of the older calibration."""
+    """Return the lines of a sensor's table without the lines of the old calibration."""
     out: list[str] = []
     inside = False
     for line in lines:

@@ -1,6 +1,6 @@
-"""Command `jointfit calibrate sensor`: guides through the movements and writes the result.
+"""Command `jointfit calibrate sensor`: guides the user through movements and writes the result.
 
-Invariant: rig.toml is replaced as a whole after the last step, or not at all.
+Invariant: rig.toml is either replaced as a whole after the last step, or unchanged.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def _complete_steps(incomplete: str) -> list[str]:
-    """Return the completions of a list of steps that begin with `incomplete`."""
+    """Return the possible completions of a partly typed list of steps."""
     from jointfit_daemon.tools.calibrate_sensor._guided_steps import STEPS
 
     given = incomplete.split(",")[:-1]
@@ -131,7 +131,7 @@ def _sensor(rig: Rig, name: str) -> Source:
 
 
 def _calibratable(rig: Rig, name: str, configured: Source) -> Source:
-    """Return the sensor to calibrate, if the gateway computes the orientation of this sensor."""
+    """Return the sensor to calibrate, whose orientation the gateway must compute."""
     from jointfit_daemon.sensor_calibration import CalibratableSettings
 
     for source in (configured, _sensor(rig, name)):
@@ -149,7 +149,7 @@ def _calibratable(rig: Rig, name: str, configured: Source) -> Source:
 
 
 def _named_steps(steps: str | None) -> list[str] | None:
-    """Return the steps of the option; checked first, so that no other fault hides a wrong name."""
+    """Return the steps in the option ``--steps``; raise ValueError for an unknown step."""
     from jointfit_daemon.tools.calibrate_sensor._guided_steps import STEPS
     from jointfit_daemon.tools.text_output import join_choices
 
@@ -164,7 +164,7 @@ def _named_steps(steps: str | None) -> list[str] | None:
 
 
 def _possible_steps(named: list[str] | None, source: Source) -> list[str]:
-    """Return the steps of the option, or else all steps that the sensor supports."""
+    """Return the given steps, or all steps that the sensor supports if none are given."""
     from jointfit_daemon.tools.calibrate_sensor._guided_steps import STEPS
 
     magnetic = bool(source.settings.magnetometer)
@@ -215,7 +215,10 @@ def _take_recording(source: Source, names: list[str], recording: Path) -> Sensor
 def _write(
     rig: Path, name: str, calibration: SensorCalibrationSettings, *, print_only: bool
 ) -> tuple[list[str], bool]:
-    """Write the table into rig.toml if possible; return its lines, and whether it was written."""
+    """Write the calibration table into rig.toml if possible.
+
+    Return the lines of the table, and whether they were written.
+    """
     from jointfit_daemon.tools.calibrate_sensor._calibration_table import insert_table, table_lines
     from jointfit_daemon.tools.output_files import replace_file
 

@@ -1,6 +1,6 @@
 """Guided steps of a sensor calibration, live or from a recording.
 
-The driver runs as in the daemon; its decoder returns raw readings instead of orientations.
+The driver runs as in the daemon, but its decoder returns raw readings instead of orientations.
 """
 
 from __future__ import annotations
@@ -47,9 +47,10 @@ INSTRUCTIONS = {
     "each of its sides has pointed in every direction.",
 }
 GYROSCOPE_SCALE = "gyroscope_scale"
-"""Name of the estimate from the turns between the poses of the accelerometer."""
+"""Name of the gyroscope estimate from the rotations between the static poses of the accelerometer.
+"""
 _SHOW_S = 0.25
-"""Interval between two displays of the progress, s."""
+"""Time between two updates of the displayed progress, s."""
 
 
 @dataclass(slots=True)
@@ -58,13 +59,13 @@ class SensorFindings:
 
     estimates: dict[str, Estimate] = field(default_factory=dict)
     refused: dict[str, str] = field(default_factory=dict)
-    """Reasons of steps without a result."""
+    """Reason why a step has no result, by step."""
     not_estimated: dict[str, str] = field(default_factory=dict)
-    """Reason why the additional quantity of a step is not estimated."""
+    """Reason why an additional quantity is not estimated, by step."""
     serial: str | None = None
     """Serial number, if the sensor reported one."""
     warnings: list[str] = field(default_factory=list)
-    """Warnings of the device."""
+    """Warnings about the device."""
 
     def finish(self, name: str, step: Step) -> None:
         """Add the result of a step, or the reason why the step has no result."""
@@ -89,7 +90,7 @@ class Display(Protocol):
         """Show the instruction of the next step."""
 
     def show(self, progress: StepProgress) -> None:
-        """Show the progress of the present step."""
+        """Show the progress of the current step."""
 
 
 class ReadingStream:
@@ -98,16 +99,16 @@ class ReadingStream:
     Parameters
     ----------
     source
-        Sensor of a rig with calibratable settings.
+        Sensor of a rig with settings that support calibration.
     findings
-        Receives serial number and warnings.
+        Object that stores the serial number and the warnings.
     """
 
     def __init__(self, source: Source, findings: SensorFindings) -> None:
         self._decoder: Decoder = source.driver_class(source.settings.for_readings()).decoder()
         self._findings = findings
         self.samples_without_rate = 0
-        """Number of samples that contain an orientation only."""
+        """Number of samples that contain an orientation but no raw readings."""
 
     def feed(self, chunk: Chunk) -> list[SensorReading]:
         """Return the readings that a chunk completes."""
@@ -130,18 +131,18 @@ class ReadingStream:
 async def run_steps(
     source: Source, names: Sequence[str], display: Display, *, step_s: float
 ) -> SensorFindings:
-    """Guide through the steps on a live sensor.
+    """Guide the user through the calibration steps of a live sensor.
 
     Parameters
     ----------
     source
-        Sensor of a rig with calibratable settings.
+        Sensor of a rig with settings that support calibration.
     names
         Steps, keys of `STEPS`.
     display
-        Shows instructions and progress.
+        Display of instructions and progress.
     step_s
-        Longest time for a step, s; a step ends earlier once it is complete.
+        Time limit of a step, s; a step ends earlier if it is complete.
 
     Raises
     ------
@@ -180,7 +181,7 @@ async def run_steps(
 async def _wait_for(
     step: Step, reading: asyncio.Task[None], display: Display, step_s: float, name: str
 ) -> None:
-    """Wait until a step is complete, its time is over, or the device is lost."""
+    """Wait until a step is complete, its time limit is exceeded, or the device is lost."""
     loop = asyncio.get_running_loop()
     end_s = loop.time() + step_s
     while not step.is_complete and loop.time() < end_s:
@@ -196,16 +197,16 @@ async def _wait_for(
 
 
 def take_recorded(source: Source, names: Sequence[str], chunks: Iterable[Chunk]) -> SensorFindings:
-    """Take the readings of all steps from recorded chunks, in any order of the movements.
+    """Process recorded chunks in all steps; the movements may have any order.
 
     Parameters
     ----------
     source
-        Sensor of the recorded rig, with calibratable settings.
+        Sensor of the recorded rig with settings that support calibration.
     names
         Steps, keys of `STEPS`.
     chunks
-        Its chunks, in order.
+        Recorded chunks of the sensor, in the order of time.
     """
     findings = SensorFindings()
     stream = ReadingStream(source, findings)

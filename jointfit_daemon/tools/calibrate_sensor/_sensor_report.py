@@ -1,4 +1,4 @@
-"""Figures of a sensor calibration, as text and as JSON."""
+"""Results of a sensor calibration, as text and as JSON."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def report_lines(name: str, findings: SensorFindings) -> list[str]:
-    """Return the figures of each step, before and after the correction."""
+    """Return the errors of each step before and after the correction, as lines of text."""
     serial = "" if findings.serial is None else f" (serial {findings.serial})"
     lines = [f"{name}{serial}"]
     for estimate in findings.estimates.values():
@@ -73,7 +73,7 @@ def _lines(estimate: Estimate) -> list[str]:
 
 
 def report_data(name: str, findings: SensorFindings) -> dict[str, Any]:
-    """Return the figures as JSON data; arrays are lists, unknown numbers null."""
+    """Return the results as JSON data; arrays become lists, and unknown numbers become null."""
     parts = {part: asdict(estimate) for part, estimate in findings.estimates.items()}
     for part, estimate in findings.estimates.items():
         if isinstance(estimate, GyroscopeEstimate):

@@ -1,4 +1,4 @@
-"""Display of the calibration steps: a progress bar on a terminal, lines elsewhere."""
+"""Display of the calibration steps, as a progress bar on a terminal and as lines elsewhere."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.inertial_sensor import StepProgress
 
 _EVERY_S = 5.0
-"""Interval between two lines without change, s."""
+"""Time between two lines if nothing has changed, s."""
 
 
 class StepDisplay:
@@ -56,7 +56,7 @@ class StepDisplay:
             typer.echo(instruction, err=self._err)
 
     def show(self, progress: StepProgress) -> None:
-        """Show the progress of the present step."""
+        """Show the progress of the current step."""
         missing = f"missing: {list_names(progress.missing)}" if progress.missing else "complete"
         text = "; ".join(filter(None, (progress.note, missing)))
         if self._terminal:

@@ -41,11 +41,11 @@ def reconstruct_chain(
     Raises
     ------
     typer.Exit
-        A joint is refused; its positions are missing in the files.
+        A joint is refused. The files then contain no positions of this joint.
     """
     asked = [marker for segment in options.segments for marker in segment]
     for read in filter(None, (trial, source)):
-        read.points(asked)  # report all unknown names at once
+        read.points(asked)  # this call reports all unknown names together
 
     names = joint_names(len(options.segments) - 1, options.joints)
     found = chain_joints(

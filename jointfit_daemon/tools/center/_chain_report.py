@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.center.chain import ChainJoint
 
 ENDINGS = (".trc", ".csv")
-"""File extensions of trajectories."""
+"""File extensions of trajectory files."""
 _CENTERS = ("joint", "seen from", "center, mm", "error, mm", "arc", "residual, mm", "T", "")
 _TRAJECTORIES = ("joint", "known", "longest gap, s", "error, mm", "sides apart, mm")
 
 
 def text(trial: MarkerTrial, joints: Sequence[ChainJoint]) -> str:
-    """Return the joint centres as a table, and the summary of the trajectories as another."""
+    """Return two tables as text: the joint centres, and a summary of the trajectories."""
     data = trial.trajectories
     centers = [_CENTERS]
     for joint in joints:
@@ -109,9 +109,10 @@ def as_json(trial: MarkerTrial, joints: Sequence[ChainJoint]) -> dict[str, Any]:
 
 
 def write_trajectories(path: Path, trial: MarkerTrial, joints: Sequence[ChainJoint]) -> None:
-    """Write the joint positions in the axes of the file; gaps are empty cells.
+    """Write the joint positions in the axes of the marker file; missing positions are empty.
 
-    ``.trc``: the joints as markers. ``.csv``: positions and their predicted RMS errors, m.
+    A ``.trc`` file contains the joints as markers. A ``.csv`` file contains positions and their
+    predicted RMS errors, m.
     """
     data = trial.trajectories
     positions = np.stack([joint.trajectory.positions for joint in joints], axis=1)

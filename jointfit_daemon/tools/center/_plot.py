@@ -1,7 +1,7 @@
 """Plot of child markers in the parent frame with the estimated centre, in three projections.
 
-Both axes have equal scales, and the 95 % ellipse is drawn to scale. If the position along a
-direction is unobservable, the direction is drawn as a line and the ellipse covers the rest.
+Both axes have equal scales, and the 95 % ellipse has the same scale. An unobservable direction is
+drawn as a line. The ellipse then covers the remaining directions.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 _MM = 1000.0
 _MOST_POINTS = 600
-"""Most plotted samples of a marker, to keep vector graphics small."""
+"""Largest number of plotted samples of a marker. It limits the size of vector graphics."""
 _END_ON = 0.1
-"""Length of a projected unit vector below which the view is treated as along this vector."""
+"""If the projection of a unit vector is shorter, the view is treated as parallel to this vector."""
 
 
 def draw_center(
@@ -33,7 +33,7 @@ def draw_center(
     found: Sequence[WindowEstimate],
     title: str,
 ) -> None:
-    """Write one figure; the file extension selects the format."""
+    """Write one figure; the file extension determines the format."""
     points = reduced.movement.points
     if points is None:
         return

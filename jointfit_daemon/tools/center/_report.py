@@ -41,7 +41,7 @@ _WINDOW_HEAD = (
 def head(
     trial: MarkerTrial, parent: Sequence[str], markers: Sequence[str], reduced: ParentFrameMotion
 ) -> str:
-    """Return trial, visibility of the markers, and the definition of the parent frame."""
+    """Return a description of the trial, the visibility of the markers, and the parent frame."""
     data = trial.trajectories
     seen = np.isfinite(trial.points(markers)).all(axis=-1).mean(axis=0)
     whole = np.isfinite(reduced.poses.q).all(axis=-1).mean()

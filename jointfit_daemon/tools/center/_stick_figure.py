@@ -1,7 +1,7 @@
-"""Stick figure of a chain over time, from one or two sides, with the paths of the joints.
+"""Stick figure of a chain over time, in one or two views, with the paths of the joints.
 
-Both axes have equal scales. The ends of the figure are the mean of the markers of the first and of
-the last segment, because a chain has no joint there.
+Both axes have equal scales. A chain has no joint at its ends, so the figure ends at the mean of the
+markers of the first and of the last segment.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _MM = 1000.0
 _POSTURES = 12
-"""Postures drawn over the trial."""
+"""Number of drawn postures, distributed over the trial."""
 
 
 def draw_stick_figure(
@@ -40,14 +40,14 @@ def draw_stick_figure(
     line = np.stack([ends[0], *(j.trajectory.positions for j in joints), ends[1]], axis=1)
 
     complete = np.flatnonzero(np.isfinite(line).all(axis=(1, 2)))
-    if complete.size == 0:  # draw the visible parts
+    if complete.size == 0:  # no frame is complete, so draw the visible parts
         complete = np.arange(len(line))
     shown = complete[np.linspace(0, complete.size - 1, _POSTURES).round().astype(int)]
     colors = colormaps["viridis"](np.linspace(0.0, 0.9, len(shown)))
 
     up = "xyz".index(trial.up_axis)
     sides = [k for k in range(3) if k != up and "xyz"[k] != plane]
-    if plane == trial.up_axis:  # from above
+    if plane == trial.up_axis:  # the movement is horizontal, so draw the view from above
         sides, up = sides[:1], sides[1]
     figure = new_figure(5.6 * len(sides) + 1.4, 5.6)
     for axes, across in zip(figure.subplots(1, len(sides), squeeze=False)[0], sides, strict=True):

@@ -1,8 +1,8 @@
-"""Joints of a chain of segments from one marker trial: centres, and their trajectories.
+"""Joint centres of a chain of segments and their trajectories, from one marker trial.
 
-Each joint centre is estimated in the coordinates of the adjacent segments whose markers define a
-frame. A segment at an end of the chain needs no frame: in a plane, one marker on this segment
-suffices.
+Each joint centre is estimated in the frames of the two adjacent segments, if their markers define a
+frame. A segment at an end of the chain needs no frame. One marker on it suffices for planar
+movement.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ _LEAST_SEGMENTS = 2
 
 @dataclass(frozen=True, slots=True)
 class ChainSide:
-    """Centre of a joint in the coordinates of one of its segments."""
+    """Joint centre in the frame of one of the two segments of the joint."""
 
     parent: Sequence[str]
-    """Markers that define the coordinates."""
+    """Markers that define the frame."""
     answer: WindowEstimate
     rms: float
-    """RMS residual of the rigid fit to these markers, m."""
+    """RMS residual of the rigid fit to the markers `parent`, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +55,11 @@ class ChainJoint:
     trajectory: JointTrajectory
     """Positions of the joint in the axes of the trial file."""
     faults: Sequence[str]
-    """Segments that lack an expected frame, each with the reason."""
+    """Error messages for the segments that have enough markers but yielded no frame or centre."""
 
     @property
     def refused(self) -> bool:
-        """Return whether neither segment has a usable centre."""
+        """Whether the centres in both segments were refused."""
         return all(side.answer.estimate.refused is not None for side in self.sides)
 
 
@@ -69,7 +69,7 @@ def joint_names(count: int, names: Sequence[str]) -> list[str]:
     Raises
     ------
     UnsuitableTrialError
-        Another number of names, or one name twice.
+        The number of names does not match, or a name occurs twice.
     """
     if not names:
         return [f"joint{i}" for i in range(1, count + 1)]
@@ -92,7 +92,7 @@ def chain_joints(
     method: str,
     source: MarkerTrial | None = None,
 ) -> list[ChainJoint]:
-    """Estimate all joints of a chain, and their positions in every frame of a trial.
+    """Estimate all joint centres of a chain, and their positions in every frame of a trial.
 
     Parameters
     ----------
@@ -107,12 +107,13 @@ def chain_joints(
     method : str
         Estimator of the centres.
     source : MarkerTrial, optional
-        Trial with the same marker placement that the centres are estimated from; `trial` if None.
+        Trial from which the centres are estimated, with the same marker placement. The default is
+        `trial`.
 
     Raises
     ------
     UnsuitableTrialError
-        Too few markers, a marker named twice, or a joint whose segments both lack a frame.
+        Too few markers, a marker named twice, or a joint without a frame in either segment.
     """
     least = MIN_MARKERS if plane is None else LEAST_PLANAR
     _check_segments(segments, names, least)
@@ -174,7 +175,7 @@ def _check_segments(segments: Sequence[Sequence[str]], names: Sequence[str], lea
 
 
 def _refuse_other_segment(answer: WindowEstimate, child: Sequence[str]) -> WindowEstimate:
-    """Refuse a centre if the child's markers do not move on circles or spheres about it."""
+    """Refuse a centre if the distance of the child's markers to the centre varies."""
     e = answer.estimate
     if not MAX_FIT_RMS_M < e.residual < inf:
         return answer

@@ -1,8 +1,8 @@
-"""Centres of rotation from a marker trial: parent frame, estimates over windows, world position.
+"""Centres of rotation from a marker trial: parent frame, estimates by window, world positions.
 
-The parent frame is defined by its markers: origin at their mean, x from the first to the second, z
-normal to the plane of the first three (planar movement: y normal to x). The parent frame is
-therefore the same in all trials with the same marker placement.
+The parent frame is defined by the parent's markers. The origin is their mean, x extends from the
+first to the second marker, and z is normal to the plane of the first three. For planar movement, y
+is normal to x. The parent frame is therefore the same in all trials with the same marker placement.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 
 CHI2_95 = {1: 3.841, 2: 5.991, 3: 7.815}
-"""95 % quantile of the chi-squared distribution, by degrees of freedom: the ratio of the squared
-semi-axis to the variance."""
+"""95 % quantile of the chi-squared distribution, by degrees of freedom. It equals the ratio of the
+squared semi-axis to the variance."""
 STILL_M = 0.005
 """RMS movement of the child markers, m, below which the centre is unobservable."""
 _SEGMENT_M = (0.005, 2.0)
@@ -54,20 +54,21 @@ class ParentFrameMotion:
     """Child markers in the parent's coordinates, and the transformation back to the world."""
 
     movement: Movement
-    """Marker positions of all frames, m, in the parent frame."""
+    """Positions of the child markers in the parent frame in all frames of the trial, m."""
     rms: float
     """RMS residual of the rigid fit to the parent markers, m."""
     poses: BodyPoses
-    """Parent poses in the world (z up). In a plane, only the rotation about the normal of the
-    plane."""
+    """Parent poses in the world (z up). For planar movement, the rotation is about the normal only.
+    """
     basis: Array
-    """Matrix from parent coordinates (d,) to the coordinates of `poses` (3,), with d the number of
-    dimensions: the identity, or the basis of the plane."""
+    """Matrix from parent coordinates (d,) to the coordinates of `poses` (3,); d is the number of
+    dimensions. In space the matrix is the identity; for planar movement it is the basis of the
+    plane."""
     template: Array
     """Parent markers in the parent frame, m, shape (number of markers, d)."""
 
     def to_world(self, center: Array) -> Array:
-        """Return the world position of a parent point at the mean parent pose, m, shape (3,)."""
+        """Return the world position of a parent point, m, shape (3,), at the mean parent pose."""
         known = visible(self.poses.q) & visible(self.poses.t)
         mean = BodyPoses(
             rotation.average(self.poses.q[known])[None], self.poses.t[known].mean(axis=0)[None]
@@ -83,7 +84,7 @@ class WindowEstimate:
     end_s: float
     estimate: CenterEstimate
     world: Array
-    """Centre at the mean parent pose of the trial, m, in the axes of the file, shape (3,)."""
+    """Position of the centre, m, shape (3,), at the mean parent pose, in the axes of the file."""
 
     @property
     def semi_axes(self) -> Array:
@@ -112,16 +113,16 @@ def reduce(
     ----------
     trial : MarkerTrial
     parent, markers : sequence of str
-        Marker names; at least three parent markers in space, two in a plane.
+        Marker names. The parent needs at least three markers in space, and two in a plane.
     plane : {"x", "y", "z"} or None
         Axis of the file normal to the plane of movement; None for spatial movement.
     option : str
-        Option that named the parent markers, for messages.
+        Command-line option that named the parent markers, for error messages.
 
     Raises
     ------
     UnsuitableTrialError
-        Too few parent markers, collinear ones, or no frame that contains all of them.
+        Too few or collinear parent markers, or no frame with all of them.
     """
     if both := sorted(set(parent) & set(markers)):
         raise UnsuitableTrialError(
@@ -204,7 +205,7 @@ def _check_parent(trial: MarkerTrial, parent: Sequence[str], least: int, option:
 def _check_planar_parent(
     flat: Array, trial: MarkerTrial, parent: Sequence[str], option: str
 ) -> None:
-    """Raise an error if the trial exchanges the names of the first two parent markers."""
+    """Raise an error if the names of the first two parent markers are exchanged in the trial."""
     along = flat[:, 1] - flat[:, 0]
     whole = np.flatnonzero(np.isfinite(flat).all(axis=(1, 2)))
     step = np.angle(np.exp(1j * np.diff(np.arctan2(along[whole, 1], along[whole, 0]))))
@@ -234,12 +235,13 @@ def _poses(template: Array, seen: Array) -> tuple[BodyPoses, float]:
 
 
 def _reduce_planar(seen: Array, child: Array, basis: Array, interval: float) -> ParentFrameMotion:
-    """Transform child markers to the parent frame in the plane with `basis`, shape (3, 2)."""
+    """Transform child markers to the parent frame in the plane spanned by `basis`, shape (3, 2)."""
     flat = seen @ basis
     z = flat[..., 0] + 1j * flat[..., 1]
     whole = np.flatnonzero(np.isfinite(z).all(axis=1))
     middle = z.mean(axis=1)
-    # Template: median over frames, each rotated so that the second marker is along x of the first
+    # Template: median over the frames after the second marker is rotated onto the x axis of the
+    # first
     turned = (z - middle[:, None]) * np.exp(-1j * np.angle(z[:, 1] - z[:, 0]))[:, None]
     template = np.median(turned[whole].real, axis=0) + 1j * np.median(turned[whole].imag, axis=0)
     template -= template.mean()
@@ -290,7 +292,7 @@ def answers(
     for first in range(0, len(points), size):
         part = slice(first, min(first + size, len(points)))
         if part.stop - first < min(size, len(points)) // 2:
-            return  # a rest shorter than half a window has no estimate
+            return  # the last part of the trial is shorter than half a window
         window = replace(
             movement,
             points=points[part],

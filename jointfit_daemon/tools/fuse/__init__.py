@@ -1,4 +1,4 @@
-"""`jointfit fuse`: redundant sensors of a limb, fitted, evaluated and applied to recordings."""
+"""Command `jointfit fuse`: fits, evaluates and applies the fusion of redundant sensors."""
 
 from jointfit_daemon.tools.fuse._command import app
 

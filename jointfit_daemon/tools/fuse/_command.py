@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.fuse._trial import LimbDescription
 
 METHODS_WITHOUT_MOTION = ("mean", "single")
-"""Methods whose fit needs no movement."""
+"""Methods that can be fitted without movement."""
 
 app = typer.Typer(
     name="fuse",
@@ -236,7 +236,7 @@ def apply(
 
 
 def _read_model(path: Path) -> Calibration:
-    """Return the calibration in a model file; raise ValueError for any other file."""
+    """Return the calibration in a model file; raise ValueError if the file contains none."""
     from jointfit_daemon.calibration.record import MOST_BYTES, calibration_of
     from jointfit_daemon.files.text import read_json
 
@@ -259,7 +259,7 @@ def _inputs(
     markers: Sequence[str] | None,
     up: str,
 ) -> tuple[LimbDescription, list[OfflineTrial], dict[str, Any] | None, list[str]]:
-    """Return limb, trials, sensor alignments (None: estimated later) and warnings."""
+    """Return limb, trials, sensor alignments and warnings; alignments to be estimated are None."""
     from jointfit_daemon.calibration.phases import trial_warnings
     from jointfit_daemon.tools.fuse import _trial
 

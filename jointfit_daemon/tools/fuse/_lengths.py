@@ -1,7 +1,7 @@
 """Segment lengths and the position of the first joint, from options and from reference files.
 
-The forward kinematics of fusion needs both to compute joint positions. Lengths in m, positions in
-the world of the project, z up.
+Forward kinematics needs both to compute joint positions. Lengths are in m, and positions are in the
+world of the project (z up).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def parse_lengths(texts: Sequence[str], segments: Sequence[str]) -> dict[str, fl
     Raises
     ------
     UnusableInputError
-        Unknown or repeated segment, or a value that is not a length in metres.
+        The segment is unknown or repeated, or the value is not a length in metres.
     """
     found: dict[str, float] = {}
     for text in texts:
@@ -67,12 +67,12 @@ def parse_lengths(texts: Sequence[str], segments: Sequence[str]) -> dict[str, fl
 
 
 def parse_origin(text: str | None) -> Vector | None:
-    """Parse the ``--origin X,Y,Z`` option, m; None if it is not given.
+    """Parse the option ``--origin X,Y,Z``, m; return None if the option is missing.
 
     Raises
     ------
     UnusableInputError
-        Not three finite numbers.
+        The text does not consist of three finite numbers.
     """
     if text is None:
         return None
@@ -93,7 +93,7 @@ def segment_lengths(
     Parameters
     ----------
     texts
-        The options, see `parse_lengths`.
+        Values of the options ``--length``, see `parse_lengths`.
     trials
         Sensor file and, if separate, reference file of each trial.
     limb
@@ -102,7 +102,8 @@ def segment_lengths(
     Raises
     ------
     UnusableInputError
-        As `parse_lengths`, or the distances of the bone origins are no segment lengths in metres.
+        The errors of `parse_lengths`, or distances between bone origins that are not plausible
+        segment lengths in metres.
     """
     given = parse_lengths(texts, limb.chain.segments)
     references = (reference or sensors for sensors, reference in trials)
@@ -162,7 +163,7 @@ def placed_joints(chain: Chain, lengths: Sequence[float | None]) -> dict[int, st
 
 
 def left_out_positions(chain: Chain, lengths: Sequence[float | None]) -> str | None:
-    """Return a note on joints without position, with the remedy; None if all are known."""
+    """Return a note on the joints without position, with its remedy; None without such joints."""
     known = dict(zip(chain.segments, lengths, strict=True))
     unknown = [segment for segment, length in known.items() if length is None]
     if not unknown:
@@ -177,7 +178,7 @@ def left_out_positions(chain: Chain, lengths: Sequence[float | None]) -> str | N
 
 
 def _number(text: str) -> float | None:
-    """Return the number in a text; None if it is no finite number."""
+    """Return the number in a text; None if the text is not a finite number."""
     try:
         number = float(text)
     except ValueError:

@@ -10,22 +10,23 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
 
 LARGEST_LAG_DIFFERENCE_NS = 1_000_000
-"""Largest lag difference without a note: at 360 deg/s, 1 ms amounts to 0.4 deg."""
+"""Largest difference between lags that is not reported. At 360 deg/s, 1 ms corresponds to 0.4 deg.
+"""
 
 
 def calibration_notes(
     calibration: Calibration, sensors: Collection[str], *, left: bool
 ) -> tuple[str, ...]:
-    """Return notes on quantities that are not applied or not stored, with remedies.
+    """Return notes, with remedies, on quantities that fusion does not apply or the model lacks.
 
     Parameters
     ----------
     calibration
         Model of `jointfit fuse fit`, or calibration stored by the daemon.
     sensors
-        Fused sensors.
+        Names of the sensors to fuse.
     left
-        Whether the limb is a left limb, from the option ``--left``.
+        Value of the option ``--left``: whether the limb is a left limb.
     """
     notes = []
     lags = {name: ns for name, ns in calibration.lag_ns.items() if name in sensors}
@@ -38,7 +39,7 @@ def calibration_notes(
             " interpolate each sensor at t + lag first"
         )
 
-    # A model of `jointfit fuse fit` has no side either, but the user of this command chose the
+    # A model of `jointfit fuse fit` stores no side either, but the user of this command chose the
     # signs.
     known = left or bool(calibration.left_joints) or "offline" in calibration.quality
     if not known:

@@ -1,6 +1,6 @@
 """Applies a model to recorded sensors; writes orientations, joint angles and joint positions.
 
-Invariant: runs the fusion of the daemon frame by frame, so results equal those of a live rig.
+Invariant: the fusion of the daemon runs frame by frame, so the results equal those of a live rig.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ class FusedAngles:
     """Angles of one joint over time, rad; NaN where unknown."""
 
     anatomical: Array
-    """Angles of the convention, shape (n, 3)."""
+    """Joint angles as defined by `convention`, rad, shape (n, 3)."""
     main_sd: Array
-    """Standard deviation of flexion, or of elevation, shape (n,)."""
+    """Standard deviation of the main angle (flexion or elevation), rad, shape (n,)."""
     inner: Array
-    """Angle between the two segments, shape (n,)."""
+    """Inner angle between the two segments, rad, shape (n,)."""
     patent: Array
-    """The angles `PATENT_ANGLES` from `read_patent`, shape (n, 4)."""
+    """The angles `PATENT_ANGLES` that `read_patent` returns, rad, shape (n, 4)."""
     patent_gimbal: Array
     """Whether the angles in `patent` are in gimbal lock, 1 or 0, shape (n,)."""
     convention: AngleConvention
@@ -88,14 +88,14 @@ class FusedTrial:
     sd: Mapping[str, Array]
     """Standard deviation of each segment, rad, shape (n,)."""
     angles: Mapping[str, FusedAngles]
-    """Joints between two segments."""
+    """Angles of each joint between two segments, by joint."""
     positions: Mapping[str, FusedPosition]
-    """Joints from proximal to distal as far as lengths are known; empty if the first length is
-    unknown."""
+    """Positions of the joints, by joint. The list ends at the first segment of unknown length, and
+    is empty if the first length is unknown."""
     flags: Mapping[str, float]
     """Share of frames with each flag, 0 to 1."""
     notes: tuple[str, ...] = ()
-    """Missing quantities and remedies."""
+    """Notes on missing quantities, each with its remedy."""
 
     @property
     def known(self) -> dict[str, float]:
@@ -110,7 +110,7 @@ def chain_of(
     lengths: Mapping[str, float] | None = None,
     origin: Vector | None = None,
 ) -> Chain:
-    """Return the kinematic chain of a calibration; `lengths` (m) override its lengths."""
+    """Return the kinematic chain of a calibration; `lengths` (m) replace its stored lengths."""
     given = lengths or {}
     return Chain(
         calibration.joints,
@@ -125,13 +125,13 @@ def chain_of(
 
 
 def fuse_trial(calibration: Calibration, table: OrientationRecording, chain: Chain) -> FusedTrial:
-    """Fuse recorded sensors frame by frame; NaN orientations count as missing sensors.
+    """Fuse recorded sensors frame by frame; a NaN orientation is a missing sensor.
 
     Parameters
     ----------
     calibration : Calibration
     table : OrientationRecording
-        Sensors of the trial.
+        Sensor orientations of the trial.
     chain : Chain
         Kinematic chain of the calibration, see `chain_of`.
     """
@@ -144,8 +144,8 @@ def fuse_trial(calibration: Calibration, table: OrientationRecording, chain: Cha
         t_ns = round(t_s * 1e9)
         states.append(fuser.fuse(t_ns, t_ns, k, alive))
 
-    # A joint position needs the lengths of all segments up to the joint. If only the first joint is
-    # known, it is the origin and needs no column.
+    # A joint position needs the lengths of all segments up to the joint. If only the first joint
+    # has a known position, this joint is the origin and needs no column.
     configured = [configured_length(chain, i) for i in range(len(chain.segments))]
     lengths = [
         calibration.segment[name].length if length is None else length
@@ -201,16 +201,16 @@ def _joint_over_time(states: Sequence[LimbState], joint: InnerJoint) -> FusedAng
 def write_fused(
     path: Path, found: FusedTrial, table: OrientationRecording, up: Axis
 ) -> list[WrittenTable]:
-    """Write a fused trial in the format of the file extension; return an outcome for each file.
+    """Write a fused trial in the format of the file extension; return one result for each file.
 
-    ``.sto``: orientations, joint angles in a second file ``NAME_angles.sto`` (degrees) and, where
-    known, joint positions in a third file ``NAME_positions.sto`` (m).
-    ``.mot``: joint angles (degrees) and positions (m) in one table; a cell of a MOT file contains
-    one number, so orientations are left out.
-    ``.npz``: readable by `read_orientations_npz`; joint quantities by name, rad and m.
+    ``.sto``: orientations. Joint angles (degrees) are in a second file, ``NAME_angles.sto``. Known
+    joint positions (m) are in a third file, ``NAME_positions.sto``.
+    ``.mot``: joint angles (degrees) and positions (m) in one table. Orientations are omitted,
+    because a cell of a MOT file contains one number.
+    ``.npz``: a file for `read_orientations_npz`, with joint quantities by name, rad and m.
     ``.csv``: all columns in one table.
 
-    STO and MOT files contain the known part of their table, see `files.orientations`.
+    An STO or MOT file contains the part of its table that is known, see `files.orientations`.
     """
     kind = path.suffix.lower()
     if kind in {".npz", ".csv"}:

@@ -19,7 +19,7 @@ ROW_INCHES = 3.2
 
 
 def draw_evaluation(path: Path, found: MethodEvaluation) -> None:
-    """Write one figure with a row per joint and trial; the file extension selects the format."""
+    """Write one figure with a row per joint and trial; the file extension determines the format."""
     joints = [*found.rows[0].joints] or [""]
     lines = [(trial, joint) for trial in found.reference for joint in joints]
     figure = new_figure(13.0, ROW_INCHES * len(lines) + 0.6)
@@ -29,7 +29,7 @@ def draw_evaluation(path: Path, found: MethodEvaluation) -> None:
         rows = [row for row in found.rows if row.trial == trial]
         if joint:
             _flexions(left, found, rows, joint)
-        else:  # single segment without inner joint
+        else:  # a single segment has no joint between segments
             left.set_axis_off()
         if joint == joints[0]:
             _bars(right, rows)

@@ -1,7 +1,7 @@
 """Reads orientation recordings (NPZ, STO) and checks units, order and sampling times.
 
-Invariants: returned orientations have z up. Implausible units, component order or times raise
-`UnusableInputError` and are never converted.
+Invariants: returned orientations have z up. An implausible unit, component order or time raises
+`UnusableInputError`; the values are never corrected.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SLOWEST_HZ, FASTEST_HZ = 5.0, 20_000.0
 """Range of plausible sampling rates, Hz; other rates indicate times in another unit than
 seconds."""
 NORM_SLACK = 0.05
-"""Largest deviation of the median quaternion norm from 1."""
+"""Largest accepted deviation of the median quaternion norm from 1."""
 FEWEST = 30
 """Smallest number of common samples of sensors and reference."""
 
@@ -49,8 +49,8 @@ class OrientationRecording:
     q: Mapping[str, Array]
     """Sensor orientations q_world_sensor by sensor, shape (n, 4) each; NaN where missing."""
     bones: Mapping[str, Array]
-    """Segment orientations q_world_segment by bone, shape (n, 4) each; equal to `q` for an STO
-    file."""
+    """Segment orientations q_world_segment by bone, shape (n, 4) each. For an STO file, they are
+    equal to `q`."""
     origins: Mapping[str, Array] = field(default_factory=dict)
     """Proximal joint center of each bone, m, shape (n, 3); NaN where missing."""
 
@@ -61,7 +61,7 @@ def read_recording(path: Path, up: Axis) -> OrientationRecording:
     Raises
     ------
     UnusableInputError
-        Unsupported file type, or values that are not unit quaternions over seconds.
+        The file type is unsupported, or the values are not unit quaternions with times in seconds.
     """
     kind = path.suffix.lower()
     if kind == ".npz":
@@ -123,7 +123,7 @@ def _check_times(path: Path, t_s: Array) -> None:
 def select_sensors(
     table: OrientationRecording, names: Sequence[str], path: Path
 ) -> dict[str, Array]:
-    """Return the orientations of `names`; raise `UnusableInputError` for missing or empty ones."""
+    """Return the orientations of `names`; raise `UnusableInputError` if one is missing or empty."""
     if missing := [name for name in names if name not in table.q]:
         free = [name for name in table.q if name not in names]
         problems = "; ".join(
@@ -144,7 +144,7 @@ def select_sensors(
 def select_references(
     table: OrientationRecording, names: Sequence[str], path: Path
 ) -> dict[str, Array]:
-    """Return the reference orientations of `names`; raise `UnusableInputError` for missing ones."""
+    """Return the reference orientations of `names`, or raise `UnusableInputError`."""
     if missing := [name for name in names if name not in table.bones]:
         problems = [unknown_name("reference of segment", name, table.bones) for name in missing]
         raise UnusableInputError(

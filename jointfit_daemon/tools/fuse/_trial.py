@@ -1,7 +1,7 @@
 """Reads the trials of `jointfit fuse`: sensor orientations and reference segment orientations.
 
-Invariant: returned trials have z up and the time axis of the sensors; reference orientations are
-interpolated to it.
+Invariant: returned trials have z up. Reference orientations are interpolated to the sample times of
+the sensors.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ STILL = np.deg2rad(3.0)
 
 @dataclass(frozen=True, slots=True)
 class LimbDescription:
-    """Limb as described on the command line."""
+    """Limb that the command-line options describe."""
 
     chain: Chain
     bones: Mapping[str, str]
@@ -76,7 +76,7 @@ class StaticMarkers:
 def read_limb(
     segments: Sequence[str], joints: str | None, markers: Sequence[str], up: Axis
 ) -> LimbDescription:
-    """Parse the ``--segment``, ``--joints`` and ``--markers`` options; segments proximal first."""
+    """Parse the options ``--segment``, ``--joints`` and ``--markers``, proximal segment first."""
     names: list[str] = []
     sensors: list[tuple[str, ...]] = []
     bones: dict[str, str] = {}
@@ -124,7 +124,7 @@ def _markers(texts: Sequence[str], segments: Sequence[str]) -> dict[str, tuple[s
 def read_trial(
     sensors: Path, reference: Path | None, limb: LimbDescription, static: StaticMarkers | None
 ) -> OfflineTrial:
-    """Read one trial: sensors from one file, reference from the same or another file.
+    """Read one trial; the reference is in the file of the sensors or in a separate file.
 
     Raises
     ------
@@ -165,17 +165,17 @@ def read_trial(
 
 
 def sensors_of(chain: Chain) -> list[str]:
-    """Return the names of all sensors, segment by segment."""
+    """Return the names of all sensors of a chain, segment by segment."""
     return [name for group in chain.sensors for name in group]
 
 
 def name_trials(trials: Sequence[OfflineTrial], paths: Sequence[Path]) -> list[OfflineTrial]:
-    """Return the trials; files with equal stems are named by their full path.
+    """Return the trials with unique names; files with equal stems are named by their full path.
 
     Raises
     ------
     UnusableInputError
-        A file is given twice, which would put hold-out data into the fit.
+        A file is given twice, so the hold-out data would be part of the fit.
     """
     if twice := sorted({str(path) for path in paths if paths.count(path) > 1}):
         raise UnusableInputError(f"{', '.join(twice)}: given more than once: give each trial once")
@@ -195,7 +195,7 @@ def read_available_sensors(
     Raises
     ------
     UnusableInputError
-        A sensor that is missing from the file, or a name in `without` that the chain lacks.
+        A sensor is missing from the file, or the chain has no sensor with a name in `without`.
     """
     sensors = sensors_of(chain)
     if strange := [name for name in without if name not in sensors]:
@@ -216,13 +216,13 @@ def read_static(
 ) -> tuple[dict[str, Array], StaticMarkers | None]:
     """Estimate sensor alignments from a static trial, and the marker positions on the segments.
 
-    With markers, or without any reference, segment axes equal world axes in the static pose. A JSON
-    file of alignments replaces the static trial of the sensors.
+    With markers, or without a reference, segment axes equal world axes in the static pose. A JSON
+    file of alignments can replace the sensor file of the static trial.
 
     Raises
     ------
     UnusableInputError
-        As `read_trial`, or the subject moved.
+        The errors of `read_trial`, or the subject moved.
     """
     by_markers = reference is not None and reference.suffix.lower() in MARKER_FILES
     markers = None
@@ -288,7 +288,7 @@ def _ns(t_s: Array) -> NDArray[np.int64]:
 
 
 def _at(t_s: Array, q: Array, wanted_s: Array) -> Array:
-    """Interpolate orientations to `wanted_s`, but not across gaps."""
+    """Interpolate orientations to the times `wanted_s`; times in gaps become NaN."""
     if len(t_s) == len(wanted_s) and np.array_equal(t_s, wanted_s):
         return q
     return orientations_at(_ns(t_s), q, _ns(wanted_s))
@@ -303,7 +303,7 @@ def _optical(path: Path, limb: LimbDescription) -> tuple[OpticalTrack, Calibrati
 
     trial = read_marker_trial(path)
     names = tuple(dict.fromkeys(name for group in limb.markers.values() for name in group))
-    positions = trial.points(names)  # report all unknown names at once
+    positions = trial.points(names)  # this call reports all unknown names together
     for segment in limb.chain.segments:
         seen = positions[:, [names.index(name) for name in limb.markers[segment]]]
         seen = seen[visible(seen).all(axis=1)]

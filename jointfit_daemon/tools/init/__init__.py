@@ -1,6 +1,6 @@
 """Command `jointfit init`: a dialogue that writes a checked rig.toml.
 
-Questions are data, and the engine that selects them is pure: it has no terminal, clock or device.
+Questions are data. The engine that selects them is pure: it has no terminal, clock or device.
 """
 
 from jointfit_daemon.tools.init._command import init, rig_path

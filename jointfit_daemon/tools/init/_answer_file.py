@@ -1,6 +1,6 @@
-"""Answer files: the state of an interrupted dialogue, and the input of scripts.
+"""Answer files, which store an interrupted dialogue or contain the input of a script.
 
-A question that is asked once is a key. A question that is asked for several subjects is a table
+A question that is asked once has a key. A question that is asked for several subjects has a table
 with a key for each subject::
 
     limb = "knee"
@@ -31,7 +31,7 @@ def read_answers(path: Path) -> Answers:
     Raises
     ------
     ValueError
-        The file is not TOML in UTF-8.
+        The file is not valid TOML in UTF-8.
     OSError
         The file cannot be read.
     """

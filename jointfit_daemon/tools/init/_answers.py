@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.init._limbs import Limb
 
 Key = tuple[str, str]
-"""Key of a question and its subject: a segment, a sensor, a body part, or an empty text."""
+"""Key of an answer: the key of the question, and its subject. The subject is a segment, a sensor, a
+body part, or an empty text."""
 Answers = dict[Key, Any]
 """Answers in the order in which they were given."""
 
@@ -28,7 +29,7 @@ _LAST_PORT = 65535
 
 
 def limb_of(answers: Mapping[Key, Any]) -> Limb:
-    """Return the limb that was chosen."""
+    """Return the limb that the user chose."""
     return LIMBS[answers["limb", ""]]
 
 
@@ -41,7 +42,7 @@ def sensors_of(answers: Mapping[Key, Any]) -> dict[str, str]:
 
 
 def wiring_of(answers: Mapping[Key, Any], device: str) -> str:
-    """Return ``serial`` for a serial port or an open place; ``can`` for a CAN bus or adapter."""
+    """Return the wiring of a device: ``can`` for a bus or an adapter, ``serial`` otherwise."""
     if device == LATER:
         return "serial"
     return "serial" if "/" in device and device not in answers["can_adapters", ""] else "can"
@@ -76,7 +77,7 @@ def driver_of(answers: Mapping[Key, Any], found: Found, sensor: str) -> ImuDrive
 
 
 def free_sensors(answers: Mapping[Key, Any], found: Found, sensor: str) -> list[CanSensor]:
-    """Return the sensors received on the bus of `sensor` whose identifiers no other sensor has."""
+    """Return the received sensors on the bus of `sensor` whose identifiers are not in use."""
     bus = answers.get(("device", sensor))
     used = {number for each in ids_of_others(answers, sensor) for number in each}
     return [each for each in found.can_sensors.get(str(bus), ()) if used.isdisjoint(each.ids)]
@@ -94,14 +95,14 @@ def ids_of_others(answers: Mapping[Key, Any], sensor: str) -> list[tuple[int, ..
 
 
 def chosen_settings(answers: Mapping[Key, Any], sensor: str) -> dict[str, str]:
-    """Return the answers about the settings of `sensor`, by key."""
+    """Return the answers to the questions on settings of `sensor`, by key."""
     settings = {subject: value for (key, subject), value in answers.items() if key == "setting"}
     names = ((subject.rpartition("."), value) for subject, value in settings.items())
     return {key: str(value) for (owner, _, key), value in names if owner == sensor}
 
 
 def settings_asked(answers: Mapping[Key, Any], found: Found) -> tuple[str, ...]:
-    """Return ``SENSOR.KEY`` for every required driver key with few values."""
+    """Return ``SENSOR.KEY`` for every required driver key that has few values."""
     return tuple(
         f"{name}.{choice.key}"
         for name in sensors_of(answers)
@@ -111,14 +112,14 @@ def settings_asked(answers: Mapping[Key, Any], found: Found) -> tuple[str, ...]:
 
 
 def choice_of(answers: Mapping[Key, Any], found: Found, subject: str) -> KeyChoice:
-    """Return the key of a subject ``SENSOR.KEY``."""
+    """Return the driver key that the subject ``SENSOR.KEY`` names."""
     sensor, _, key = subject.rpartition(".")
     choices = driver_of(answers, found, sensor).choices
     return next(choice for choice in choices if choice.key == key)
 
 
 def previous_answer(answers: Mapping[Key, Any], found: Found, question: str, subject: str) -> Any:
-    """Return the answer for the last sensor with the same driver; None without such a sensor.
+    """Return the answer for the last sensor with the same driver; None if there is none.
 
     `subject` is a sensor, or ``SENSOR.KEY`` for a key of its driver.
     """

@@ -106,7 +106,7 @@ def _new_dialogue(
     *,
     network: bool,
 ) -> Dialogue:
-    """Return the dialogue with answers from a file or from an interrupted dialogue."""
+    """Return a dialogue with the answers of a file or of an interrupted dialogue."""
     from jointfit_daemon.tools.init._answer_file import read_answers, write_answers
     from jointfit_daemon.tools.init._dialogue import Dialogue
     from jointfit_daemon.tools.init._search import DeviceSearch
@@ -133,12 +133,12 @@ def _new_dialogue(
 
 
 def rig_path(folder: Path, config: Path | None = None, *, force: bool = False) -> Path:
-    """Return the path of the rig.toml, whose folder is created if missing.
+    """Return the path of the new rig.toml; create its folder if necessary.
 
     Raises
     ------
     ValueError
-        The file exists and is not to be replaced, or it cannot be written.
+        The file exists and `force` is False, or the file cannot be written.
     """
     path = folder / "rig.toml" if config is None else config
     if config is None:
@@ -197,7 +197,7 @@ def _finished(dialogue: Dialogue, state: Path) -> Answers:
 
 
 def _write_password(path: Path, given: Answers, show: Callable[[str], None]) -> str | None:
-    """Write the broker's password to its file; return the path, or None without an account."""
+    """Write the broker's password; return the path of its file, or None without an account."""
     from jointfit_daemon.tools.init._writing import write_password
 
     name = given.get(("password_file", ""))
@@ -211,6 +211,6 @@ def _write_password(path: Path, given: Answers, show: Callable[[str], None]) -> 
     if not password and sys.stdin.isatty():
         password = typer.prompt("Password for the broker", hide_input=True, err=True)
     if not password:
-        return str(file)  # the check warns about the missing file
+        return str(file)  # without a password, the check warns that the file is missing
     write_password(file, password)
     return str(file)

@@ -1,4 +1,4 @@
-"""The dialogue on lines of text: shows questions, reads answers, and starts searches.
+"""The text dialogue, which shows questions, reads answers and starts searches.
 
 Invariant: only `Dialogue.read_line` waits for the user, and every accepted answer is stored at
 once.
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.init._search import DeviceSearch
 
 HELP, BACK, FIND = "?", "<", "find"
-"""Words that are commands instead of answers: explain the question, return to the previous
+"""Commands that a user can type instead of an answer: explain the question, return to the previous
 question, start a search."""
 
 
@@ -34,7 +34,7 @@ class UnansweredError(ValueError):
 
 @dataclass
 class Dialogue:
-    """One dialogue that asks questions until all answers are known."""
+    """One dialogue, which asks questions until all answers are known."""
 
     search: DeviceSearch
     show: Callable[[str], None]
@@ -48,14 +48,15 @@ class Dialogue:
     prepared: dict[Key, Any] = field(default_factory=dict)
     """Values of an answer file."""
     is_script: bool = False
-    """Whether no user is asked: a question without a prepared answer takes its default or fails."""
+    """Whether the input is a script. A question without a prepared answer then takes its default or
+    raises an error."""
     answers: Answers = field(default_factory=dict)
     _stored: Answers = field(default_factory=dict)
-    """Answers of an interrupted dialogue to questions that were not asked again yet."""
+    """Answers of an interrupted dialogue to questions that this dialogue has not reached."""
 
     @property
     def known(self) -> Answers:
-        """All answers: accepted answers, and stored answers to questions that still follow."""
+        """All answers: the accepted answers, and the stored answers to later questions."""
         return {**self._stored, **self.answers}
 
     def run(self) -> Answers:
@@ -64,7 +65,7 @@ class Dialogue:
         Raises
         ------
         UnansweredError
-            Only in a script: an answer is missing, or not accepted.
+            Only in a script, if an answer is missing or not accepted.
         """
         while (asked := self.next()) is not None:
             if asked.key in self.prepared:
@@ -80,7 +81,7 @@ class Dialogue:
             else:
                 self._ask(asked)
 
-        # Answers to questions that were not asked are probably misspelled.
+        # A prepared answer to a question that was not asked is probably misspelled.
         for key, subject in self.prepared.keys() - self.answers.keys() if self.is_script else ():
             name = f"{key}.{subject}" if subject else key
             known = [f"{k}.{s}" if s else k for k, s in self.answers]
@@ -90,7 +91,7 @@ class Dialogue:
         return self.answers
 
     def next(self) -> Asked | None:
-        """Return the next question; the list of devices is the current one."""
+        """Return the next question; a list of devices is updated first."""
         asked = self.asked()
         if asked is None or asked.question.kind != "device":
             return asked
@@ -98,14 +99,14 @@ class Dialogue:
         return self.asked()
 
     def asked(self) -> Asked | None:
-        """Return the next question; ports of stored answers to later questions are not offered."""
+        """Return the next question; omit ports that stored answers to later questions use."""
         stored = {value for (key, _), value in self._stored.items() if key == "device"}
         taken = stored - {*self.answers.get(("can_adapters", ""), ())}
         free = tuple(port for port in self.found.ports if port.address not in taken)
         return next_question(self.answers, replace(self.found, ports=free))
 
     def resume(self, stored: Answers) -> None:
-        """Accept stored answers; ask again for open places and for answers that became invalid."""
+        """Accept stored answers; ask again if an answer was postponed or became invalid."""
         self._stored = {key: value for key, value in stored.items() if value != LATER}
         self._take_stored()
 

@@ -1,4 +1,4 @@
-"""The engine of the dialogue: the next question, and the check of an answer.
+"""The engine of the dialogue, which selects the next question and checks an answer.
 
 Invariant: all functions are pure. Equal answers and findings yield the same question, and every
 completed dialogue yields a rig that `jointfit check` accepts.
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """A question with its subject and its text."""
+    """A question for one subject, with the text that the user reads."""
 
     question: Question
     subject: str
     text: str
     default: Any
-    """Proposed answer if nothing is typed; None without a proposal."""
+    """Answer that is used if the user types nothing; None if there is no proposal."""
     choices: tuple[FoundDevice, ...]
     optional: bool
     help: str
@@ -50,18 +50,18 @@ class Asked:
 
     @property
     def proposal(self) -> Any:
-        """Answer of the Enter key: the default, ``later`` for an open place, or None."""
+        """Answer of the Enter key: the default, ``later`` for a postponable answer, or None."""
         is_open = self.default is None and self.question.postponable and not self.optional
         return LATER if is_open else self.default
 
     @property
     def entered(self) -> Any:
-        """Value for `accept` if nothing was typed: None accepts the default."""
+        """Value for `accept` if the user types nothing; None selects the default."""
         return "" if self.proposal is None else (None if self.default is not None else LATER)
 
     @property
     def name(self) -> str:
-        """Name of the key in an answer file."""
+        """Name of the answer in an answer file."""
         return f"{self.question.key}.{self.subject}" if self.subject else self.question.key
 
 
@@ -86,7 +86,7 @@ def _is_optional(question: Question, answers: Mapping[Key, Any], subject: str) -
 
 
 def _spoken(answers: Mapping[Key, Any], subject: str) -> str:
-    """Return a segment or body part as words; names that a user typed stay as they are."""
+    """Return the subject as readable words; names that a user typed remain unchanged."""
     if not subject:
         return ""
     limb = limb_of(answers)
@@ -112,12 +112,12 @@ def _in_order(answers: Mapping[Key, Any], found: Found) -> Iterator[tuple[Questi
 
 
 def _owner(question: Question, subject: str) -> str:
-    """Return the subject by which a question is grouped, such as the sensor of a key."""
+    """Return the subject of the group: the sensor if the subject is ``SENSOR.KEY``."""
     return subject.rpartition(".")[0] if question.is_of_keys else subject
 
 
 def answered(answers: Mapping[Key, Any], found: Found) -> list[tuple[str, Any]]:
-    """Return text and answer of every question that was answered, in their order."""
+    """Return the text and the answer of every answered question, in the order of the dialogue."""
     given = []
     for question, subject in _in_order(answers, found):
         if (question.key, subject) not in answers:
@@ -128,7 +128,7 @@ def answered(answers: Mapping[Key, Any], found: Found) -> list[tuple[str, Any]]:
 
 
 def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -> Answers:
-    """Return the answers with a further answer.
+    """Return the answers together with a new answer.
 
     Parameters
     ----------
@@ -142,8 +142,8 @@ def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -
     Raises
     ------
     AnswerError
-        The answer has another type, or yields a rig that `jointfit check` refuses. The message is
-        the message of the check.
+        The answer has another type, or yields a rig that `jointfit check` rejects. The error then
+        has the message of the check.
     """
     if given is None:
         value = asked.default
@@ -173,13 +173,13 @@ def accept(asked: Asked, given: Any, answers: Mapping[Key, Any], found: Found) -
 
 
 _PORT_WITHOUT_FOLDER = re.compile(r"tty\w+|COM\d+", re.IGNORECASE)
-"""Names of serial ports without their folder."""
+"""Names of serial ports that are given without a folder."""
 
 
 def complete(answers: Mapping[Key, Any], found: Found) -> Answers:
-    """Return an answer to every question: missing ones are defaults or stand-ins."""
+    """Return an answer to every question; defaults or stand-ins replace missing answers."""
     filled = dict(answers)
-    for question, subject in _in_order(filled, found):  # reads the answers that this loop adds
+    for question, subject in _in_order(filled, found):  # later questions depend on `filled`
         key = question.key, subject
         if key not in filled:
             value = question.default(filled, found, subject)
@@ -190,14 +190,14 @@ def complete(answers: Mapping[Key, Any], found: Found) -> Answers:
 
 
 def without_open_places(answers: Mapping[Key, Any], found: Found) -> Answers:
-    """Return complete answers with stand-ins in the open places."""
+    """Return complete answers; stand-ins replace the postponed answers (``later``)."""
     return complete({key: value for key, value in answers.items() if value != LATER}, found)
 
 
 def rig_faults(answers: Mapping[Key, Any], found: Found) -> set[str]:
-    """Return the faults of the rig that the answers and defaults for the others yield.
+    """Return the faults of the rig that follows from the answers and the remaining defaults.
 
-    An open place is none.
+    A postponed answer (``later``) is not a fault.
     """
     try:
         parse_rig(rig_table(complete(answers, found), found))

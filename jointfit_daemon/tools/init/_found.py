@@ -1,4 +1,4 @@
-"""Devices, drivers and names that were found on this machine: the second input of the engine."""
+"""Devices, drivers and names that were found on this machine, the second input of the engine."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 Wiring = Literal["serial", "can"]
-"""Connection of an IMU."""
+"""Type of connection of an IMU."""
 
 
 @dataclass(frozen=True, slots=True)
 class KeyChoice:
-    """A key without default that has few values."""
+    """A required driver key that has few values."""
 
     key: str
     values: tuple[Any, ...]
@@ -22,7 +22,7 @@ class KeyChoice:
     """Description of the key."""
 
     def meaning(self, value: Any) -> str:
-        """Return the part of the description that begins with `value`; empty if there is none."""
+        """Return the part of the description that begins with `value`, or an empty text."""
         starts = [(self.help.find(f"{mark}:"), mark) for mark in (f"`{value}`", f"{value}")]
         at, mark = max(starts)
         if at < 0:
@@ -50,7 +50,7 @@ class CanSensor:
         return f"{self.driver} {' '.join(map(hex, self.ids))}{settings}"
 
     def agrees(self, driver: str, settings: Mapping[str, str]) -> bool:
-        """Return whether this sensor has the given driver and settings, as text."""
+        """Return whether this sensor has the given driver and, compared as text, settings."""
         pairs = ((str(value), settings.get(key)) for key, value in self.settings.items())
         return driver == self.driver and all(given in {own, None} for own, given in pairs)
 
@@ -62,43 +62,45 @@ class ImuDriver:
     name: str
     wiring: Wiring
     baud: int | None = None
-    """Default of the driver's key ``baud``; None without that key."""
+    """Default of the driver's key ``baud``; None if the driver has no such key."""
     ids: Mapping[str, int] = field(default_factory=dict)
-    """Names and defaults of the CAN identifiers in the driver's table ``ids``; empty without that
-    table."""
+    """Names and defaults of the CAN identifiers in the driver's table ``ids``; empty if the driver
+    has no such table."""
     text: str = ""
     """Description of the devices that the driver reads."""
     choices: tuple[KeyChoice, ...] = ()
-    """Keys of the driver that have no default and few values."""
+    """Required keys of the driver that have few values."""
     needs_layout: bool = False
-    """Whether the driver's table describes the frames of the device."""
+    """Whether the user must describe the frames of the device in the ``[[imu]]`` table."""
     possible: tuple[CanSensor, ...] = ()
-    """Possible sensors with their identifiers, if the driver's identifiers have no default."""
+    """Sensors that the driver can recognize, with their identifiers; empty if the identifiers have
+    defaults."""
 
 
 @dataclass(frozen=True, slots=True)
 class MocapDriver:
-    """An installed driver of motion capture."""
+    """An installed motion-capture driver."""
 
     name: str
     port: int | None = None
-    """Default of the driver's key `port_key`; None without that key."""
+    """Default of the driver's key `port_key`; None if the driver has no such key."""
     up_axis: str = "y"
     """Default of the driver's key ``up_axis``; ``auto`` if the server announces the axis."""
     port_key: str = "command_port"
-    """Key with the port of the server."""
+    """Name of the driver's key that contains the port of the server."""
     text: str = ""
     """Description of the motion-capture systems that the driver reads."""
 
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
-    """A serial port, a CAN interface, or a server of motion capture."""
+    """A serial port, a CAN interface, or a motion-capture server."""
 
     address: str
-    """Path, name of the interface, or HOST:PORT."""
+    """Path of the port, name of the interface, or HOST:PORT of the server."""
     text: str = ""
-    """Description: maker and product, state of the interface, name of the application."""
+    """Description for the user: maker and product, state of the interface, or name of the
+    application."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,19 +113,19 @@ class Found:
     interfaces: tuple[FoundDevice, ...] = ()
     servers: tuple[FoundDevice, ...] = ()
     can_sensors: Mapping[str, tuple[CanSensor, ...]] = field(default_factory=dict)
-    """Recognized sensors, by CAN bus."""
+    """Recognized sensors, by the name of their CAN bus."""
     bauds: Mapping[str, int] = field(default_factory=dict)
-    """Speeds at which devices answered, by serial port, baud."""
+    """Serial speeds at which devices answered, baud, by serial port."""
     recognized: Mapping[str, str] = field(default_factory=dict)
     """Drivers that decoded the data of a device, by serial port."""
     server_drivers: Mapping[str, str] = field(default_factory=dict)
-    """Drivers of the servers that were found, by their address."""
+    """Drivers of the found motion-capture servers, by server address."""
     layouts: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Keys of ``[[imu]]`` that describe frames, by the file that they were read from."""
+    """Keys of ``[[imu]]`` that describe frames, by the path of the file that contains them."""
     markers: tuple[str, ...] = ()
-    """Names of the markers in the stream of the cameras."""
+    """Names of the markers in the motion-capture stream."""
     bodies: tuple[str, ...] = ()
-    """Names of the rigid bodies in the stream of the cameras."""
+    """Names of the rigid bodies in the motion-capture stream."""
 
     @property
     def addresses(self) -> frozenset[str]:

@@ -1,4 +1,4 @@
-"""Limbs that the dialogue offers; they correspond to the rigs in the folder ``examples``."""
+"""Limbs that the dialogue offers, corresponding to the rigs in the folder ``examples``."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Limb:
-    """One limb: its segments from proximal to distal, and proposals for sensors and markers."""
+    """One limb with its segments from proximal to distal, and proposals for sensors and markers."""
 
     text: str
     """Description for the list of choices."""
     places: Mapping[str, tuple[str, ...]]
-    """Proposed places of sensors on each segment; the keys are the segment names."""
+    """Proposed sensor positions on each segment, by segment name."""
     prefixes: Mapping[str, tuple[str, ...]]
-    """Usual first letters of marker names on each body part; the first letters are proposed."""
+    """Usual prefixes of marker names on each body part. The first prefix is proposed."""
     joints: tuple[str, ...] = ()
     """Joints from proximal to distal; empty for a branched limb."""
     branches: tuple[Mapping[str, str], ...] = ()
-    """Tables ``[[chain.joint]]`` of a branched limb."""
+    """Tables ``[[chain.joint]]`` of a branched limb; empty for other limbs."""
     ends: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
-    """Body parts with markers only: ``proximal`` and ``distal``."""
+    """Body parts that have markers but no sensors, by the keys ``proximal`` and ``distal``."""
     lengths_m: Mapping[str, float] = field(default_factory=lambda: _NOTHING)
-    """Proposed lengths of segments that cameras do not measure, m."""
+    """Proposed lengths of the segments that motion capture does not measure, m."""
     has_side: bool = True
     """Whether the limb is on one side of the body."""
     is_planar: bool = False
@@ -42,13 +42,13 @@ class Limb:
 
     @property
     def optional_parts(self) -> tuple[str, ...]:
-        """Body parts next to the segments, whose markers are not required."""
+        """Body parts adjacent to the limb. Their markers are not required."""
         children = [joint.get("child") for joint in self.branches]
         parts = [*self.ends.values(), *children]
         return tuple(part for part in parts if part and part not in self.places)
 
     def end_of(self, segment: str) -> str | None:
-        """Return the body part distal of `segment`; None if there is none."""
+        """Return the body part distal to `segment`; None at the end of the limb."""
         for joint in self.branches:
             if joint["parent"] == segment:
                 return joint.get("child")

@@ -23,9 +23,9 @@ TURN_RAD = math.radians(40.0)
 REST_SHARE = 0.5
 """Largest rotation of every other sensor, as a share of the rotation of the turned sensor."""
 CONNECT_S, LAST_S, TURN_S = 12.0, 4.0, 30.0
-"""Three time limits, s: for connecting all devices, for a further device after the last connection,
-and for turning the sensor. Ports without a sensor are common, so the second limit ends the wait
-early."""
+"""Three time limits, s: to connect all devices, to wait for a further device after a connection,
+and to turn the sensor. Ports without a sensor are common, so the second limit ends the wait early.
+"""
 _POLL_S = 0.1
 _RETRY_S = 0.3
 _USUAL_BAUDS = (115_200, 921_600, 460_800, 230_400, 2_000_000)
@@ -33,7 +33,7 @@ _USUAL_BAUDS = (115_200, 921_600, 460_800, 230_400, 2_000_000)
 
 @dataclass
 class _Listener:
-    """One connected device: the rotation since the start, and the reason why it sends no data."""
+    """One connected device, with its rotation or the reason why it sends no data."""
 
     table: dict[str, Any]
     reason: str = "no answer yet"
@@ -41,7 +41,7 @@ class _Listener:
     turned_rad: float = 0.0
 
     def take(self, q: tuple[float, ...]) -> None:
-        """Update the rotation, the angle between the first orientation and this one."""
+        """Update the rotation angle between the first orientation and `q`."""
         if self.start is None:
             self.start = q
         dot = abs(sum(a * b for a, b in zip(self.start, q, strict=True)))
@@ -49,7 +49,7 @@ class _Listener:
         self.turned_rad = max(self.turned_rad, 2.0 * math.atan2(cross, dot))
 
     async def run(self, rate_hz: float) -> None:
-        """Read the device until cancelled; every attempt tries another speed."""
+        """Read the device until cancelled; each attempt to connect uses another speed."""
         driver_class = find_driver(self.table["driver"])
         has_baud = "baud" in driver_class.Settings.model_fields
         speeds = getattr(driver_class, "usual_bauds", _USUAL_BAUDS) if has_baud else (None,)
@@ -80,7 +80,7 @@ async def find_moved(
     rate_hz: float,
     show: Callable[[str], None],
 ) -> tuple[str, dict[str, Any]]:
-    """Return address and table of the device that is turned while all other devices rest.
+    """Return the address and table of the device that is turned while the other devices rest.
 
     Parameters
     ----------
@@ -91,12 +91,12 @@ async def find_moved(
     rate_hz
         Rate to which the devices are set, Hz.
     show
-        Prints a line.
+        Function that prints a line.
 
     Raises
     ------
     AnswerError
-        No device sends orientations, or none was turned alone.
+        No device sends orientations, or no device was turned while the others rested.
     """
     listeners = {address: _Listener(dict(table)) for address, table in tables.items()}
     tasks = [asyncio.create_task(each.run(rate_hz)) for each in listeners.values()]

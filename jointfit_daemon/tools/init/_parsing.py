@@ -1,4 +1,4 @@
-"""Conversion of a typed text, or of a value of an answer file, to the value of an answer."""
+"""Conversion of a typed text, or of a value from an answer file, to the value of an answer."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 Kind = Literal["text", "names", "number", "yes_no", "choice", "device", "address", "ids"]
-"""Kind of an answer."""
+"""Type of the value that a question expects."""
 
 NEEDED = "an answer is needed here: '?' explains the question, Ctrl-C stores the others for later"
-"""Message for an empty answer without a proposal."""
+"""Error message if the user types nothing and there is no proposal."""
 _YES, _NO = ("y", "yes", "true", "1"), ("n", "no", "false", "0")
 
 
@@ -32,18 +32,18 @@ def parse_answer(
     Parameters
     ----------
     kind
-        Kind of the question.
+        Type of the value that the question expects.
     given
         A typed text, or a value of TOML.
     choices
-        Values of the displayed list. Their numbers, from 1, are also accepted.
+        Values of the displayed list. The number of a value in this list, from 1, is also accepted.
     optional
         Whether an empty answer is accepted.
 
     Raises
     ------
     AnswerError
-        `given` is not an answer of this kind.
+        `given` cannot be converted to this type.
     """
     if isinstance(given, str):
         given = given.strip()
@@ -96,7 +96,7 @@ def _yes_no(given: Any, _choices: Sequence[str]) -> bool:
 
 
 def _device(given: Any, choices: Sequence[str]) -> str:
-    """Return the choice that a number selects; other texts are returned unchanged."""
+    """Return the listed choice if the text is its number; return other texts unchanged."""
     word = str(given)
     if word.isascii() and word.isdigit():
         if not 1 <= int(word) <= len(choices):
@@ -106,7 +106,7 @@ def _device(given: Any, choices: Sequence[str]) -> str:
 
 
 def _choice(given: Any, choices: Sequence[str]) -> str:
-    if str(given) in choices:  # before its position in the list, if it is a number
+    if str(given) in choices:  # a number that is itself a choice is not a position in the list
         return str(given)
     chosen = _device(given, choices)
     if chosen not in choices:

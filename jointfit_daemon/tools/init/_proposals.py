@@ -28,10 +28,9 @@ if TYPE_CHECKING:
 Given = Mapping[Key, Any]
 
 _USUAL_BAUDS = (115_200, 230_400, 460_800, 921_600, 2_000_000)
-"""Speeds that are proposed, in this order, baud."""
+"""Usual serial speeds, baud, in the order in which they are proposed."""
 _BITS_PER_SAMPLE = 600
-"""Upper estimate of the bit rate of one sensor at 1 Hz, bit/s: a message of orientation and raw
-readings."""
+"""Number of bits per sample: an upper estimate for a message with orientation and raw readings."""
 _MARKERS = 4
 """Number of proposed markers: three, and a fourth because one marker may be hidden."""
 _LEAST_MARKERS = 3
@@ -40,13 +39,13 @@ _ID_STEP = 0x100
 
 
 def sensor_rate(answers: Given, _found: Found, _subject: str) -> Any:
-    """Return the rate of the poses, if a sensor supports this rate."""
+    """Return the rate of the poses, Hz, if a sensor supports this rate."""
     rate = answers["output_rate_hz", ""]
     return rate if rate in (50, 100, 200, 400) else 100
 
 
 def sensors(answers: Given, _found: Found, segment: str) -> tuple[str, ...]:
-    """Return a name for each usual place on `segment`."""
+    """Return a sensor name for each usual sensor position on `segment`."""
     used = {*sensors_of(answers)}
     names = []
     for place in limb_of(answers).places[segment]:
@@ -68,21 +67,21 @@ def devices(answers: Given, found: Found, _sensor: str) -> tuple[FoundDevice, ..
 
 
 def device(answers: Given, found: Found, sensor: str) -> str | None:
-    """Return the device if only one is left; None otherwise."""
+    """Return the device if exactly one device is unused; None otherwise."""
     listed = devices(answers, found, sensor)
     waiting = [name for name in sensors_of(answers) if not is_connected(answers, name)]
     return listed[0].address if len(listed) == 1 and len(waiting) == 1 else None
 
 
 def unused_port(answers: Given, found: Found, _sensor: str) -> str:
-    """Return a path that no sensor uses."""
+    """Return a port path that no sensor uses."""
     used = {value for (key, _), value in answers.items() if key == "device"}
     used |= {*answers["can_adapters", ""], *found.addresses}
     return next(f"/dev/sensor{k}" for k in count() if f"/dev/sensor{k}" not in used)
 
 
 def baud(answers: Given, found: Found, sensor: str) -> int:
-    """Return the speed at which the device answered, or the lowest sufficient usual speed."""
+    """Return the speed at which the device answered, or else the lowest sufficient usual speed."""
     known = found.bauds.get(answers["device", sensor])
     if known is not None:
         return known
@@ -93,7 +92,7 @@ def baud(answers: Given, found: Found, sensor: str) -> int:
 
 
 def setting(answers: Given, found: Found, subject: str) -> str | None:
-    """Return the received value, or the value of the last sensor with the same driver, or None."""
+    """Return the value received from the device, or the value of the last sensor of that driver."""
     sensor, _, key = subject.rpartition(".")
     name, given = driver_of(answers, found, sensor).name, chosen_settings(answers, sensor)
     for received in free_sensors(answers, found, sensor):
@@ -104,7 +103,10 @@ def setting(answers: Given, found: Found, subject: str) -> str | None:
 
 
 def layout(answers: Given, found: Found, sensor: str) -> str | None:
-    """Return the file of the last sensor with the same driver; on CAN, identifiers differ."""
+    """Return the layout file of the last sensor with the same driver, or None on a CAN bus.
+
+    Sensors on a CAN bus have different identifiers, so they cannot share a layout file.
+    """
     if driver_of(answers, found, sensor).wiring == "can":
         return None
     value = previous_answer(answers, found, "layout", sensor)
@@ -112,14 +114,14 @@ def layout(answers: Given, found: Found, sensor: str) -> str | None:
 
 
 def ids(answers: Given, found: Found, sensor: str) -> tuple[int, ...] | None:
-    """Return the first received identifiers that fit the driver and that no other sensor has."""
+    """Return the first received identifiers that match the driver and that no other sensor uses."""
     name, given = driver_of(answers, found, sensor).name, chosen_settings(answers, sensor)
     free = free_sensors(answers, found, sensor)
     return next((each.ids for each in free if each.agrees(name, given)), None)
 
 
 def unused_ids(answers: Given, found: Found, sensor: str) -> tuple[int, ...]:
-    """Return identifiers that no other sensor on the bus has."""
+    """Return identifiers that no other sensor on the bus uses."""
     used = {number for each in ids_of_others(answers, sensor) for number in each}
     driver, given = driver_of(answers, found, sensor), chosen_settings(answers, sensor)
     for possible in driver.possible:
@@ -145,10 +147,10 @@ def _markers_in_use(answers: Given) -> set[str]:
 
 
 def markers(answers: Given, found: Found, part: str) -> tuple[str, ...] | None:
-    """Return the markers of the stream whose names fit `part`, or usual names without a stream.
+    """Return the streamed marker names that match `part`; without a stream, return usual names.
 
-    Names that differ only in their last digits form a group. The group belongs to a part if it has
-    the name of the part, or begins with the usual letters of the part.
+    Marker names that differ only in their last digits form a group. A group matches a body part if
+    its name equals the name of the part or one of the usual prefixes of the part.
     """
     if not found.markers:
         return unused_markers(answers, found, part)
@@ -170,7 +172,7 @@ def _stem(name: str) -> str:
 
 
 def unused_markers(answers: Given, _found: Found, part: str) -> tuple[str, ...]:
-    """Return the usual names of markers on `part`; used names get other numbers."""
+    """Return the usual marker names on `part`; the numbers skip names that are in use."""
     used = _markers_in_use(answers)
     prefix = limb_of(answers).prefixes[part][0]
     numbered = (f"{prefix}{k}" for k in count(1))
@@ -179,13 +181,13 @@ def unused_markers(answers: Given, _found: Found, part: str) -> tuple[str, ...]:
 
 
 def is_optional(answers: Given, part: str) -> bool:
-    """Return whether `part` may be without markers."""
+    """Return whether the markers of `part` may be omitted."""
     limb = limb_of(answers)
     return not limb.is_planar and part in limb.optional_parts and part in marked_parts(answers)
 
 
 def plate(_answers: Given, found: Found, _subject: str) -> str | None:
-    """Return the rigid body with a name like ``plate``; without a stream the usual name."""
+    """Return the rigid body whose name contains ``plate``; without a stream, return ``Plate``."""
     if not found.bodies and not found.markers:
         return "Plate"
     return next((body for body in found.bodies if "plate" in body.casefold()), None)

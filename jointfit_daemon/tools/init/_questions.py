@@ -1,7 +1,7 @@
-"""The questions of the dialogue, in their order.
+"""The questions of the dialogue, in the order in which they are asked.
 
-Invariant: questions are frozen data. Every default and every stand-in is a valid answer, for any
-earlier answers.
+Invariant: questions are frozen data. Whatever the earlier answers are, every default and every
+stand-in is a valid answer.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.init._parsing import Kind
 
 Finder = Literal["movement", "traffic", "identifiers", "stream"]
-"""Search that the word ``find`` starts: a sensor by its movement, its driver by its data,
-identifiers on a CAN bus, names in the stream of the cameras."""
+"""Search that the command ``find`` starts. The search identifies a sensor by its movement, a driver
+by the received data, the identifiers on a CAN bus, or the names in a motion-capture stream."""
 
 Given = Mapping[Key, Any]
 Propose = Callable[[Given, Found, str], Any]
@@ -48,34 +48,38 @@ def _nothing(_answers: Given, _found: Found, _subject: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """One question; it is asked once, or for each of its subjects."""
+    """One question, which is asked once or once for each subject."""
 
     key: str
     """Key in answer files."""
     kind: Kind
     text: str
-    """Text with a place for the subject."""
+    """Text of the question, with a placeholder for the subject."""
     help: str
     group: str = ""
-    """Name of a group. Adjacent questions of a group are asked subject by subject."""
+    """Name of a group of adjacent questions. All questions of the group are asked for one subject
+    before the next subject."""
     subjects: Callable[[Given, Found], tuple[str, ...]] = lambda _answers, _found: ONCE
-    """Subjects of the question; none if earlier answers exclude the question."""
+    """Function that returns the subjects; it returns none if earlier answers exclude the question.
+    """
     default: Propose = _nothing
-    """Proposal; None without one."""
+    """Function that returns the proposed answer, or None if there is no proposal."""
     stand_in: Propose = _nothing
-    """Valid answer that replaces a missing default when earlier answers are checked."""
+    """Function that returns a valid answer for the checks of earlier answers, used if there is no
+    default."""
     choices: Callable[[Given, Found, str], tuple[FoundDevice, ...]] = lambda *_: ()
-    """Entries of the list that is shown."""
+    """Function that returns the entries of the displayed list."""
     optional: bool = False
     """Whether the answer may be empty."""
     postponable: bool = False
-    """Whether the word ``later`` is an answer; it is then also the proposal if there is no other
-    proposal."""
+    """Whether the user may answer ``later``. This word is also the proposal if there is no default.
+    """
     finder: Finder | None = None
     explain: Propose = _nothing
-    """Help text for one subject; None to use `help`."""
+    """Function that returns the help text for one subject, or None if `help` applies."""
     is_of_keys: bool = False
-    """Whether the question is asked for keys of the subjects of its group, such as ``S1.mode``."""
+    """Whether the subjects are keys of the subjects of the group, such as ``S1.mode`` for ``S1``.
+    """
 
 
 def _if(condition: Callable[[Given], bool]) -> Callable[[Given, Found], tuple[str, ...]]:
@@ -108,7 +112,7 @@ def _list(*entries: tuple[str, str]) -> Callable[..., tuple[FoundDevice, ...]]:
 
 
 def _identifiers(answers: Given, found: Found, sensor: str) -> tuple[FoundDevice, ...]:
-    """Return the names of the identifiers, each with an example."""
+    """Return the names of a sensor's CAN identifiers, each with an example value."""
     names, numbers = driver_of(answers, found, sensor).ids, _proposals.unused_ids
     pairs = zip(names, numbers(answers, found, sensor), strict=True)
     return tuple(FoundDevice(name, f"{number:#05x}") for name, number in pairs)
@@ -416,4 +420,4 @@ QUESTIONS: tuple[Question, ...] = (
         default=_always("mqtt-password"),
     ),
 )
-"""All questions, in their order."""
+"""All questions, in the order in which they are asked."""

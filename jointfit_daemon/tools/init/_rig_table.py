@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 Given = Mapping[Key, Any]
 
 AXES_CHECK_HZ = 10
-"""Rate of the topic that the axis check of the dashboard needs, Hz."""
+"""Rate of the topic that the dashboard needs for its check of the sensor axes, Hz."""
 
 
 def rig_table(answers: Given, found: Found) -> dict[str, Any]:
-    """Return the tables of a rig.toml, in the order of its text.
+    """Return the tables of a rig.toml, in the order in which the file contains them.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def _mocap(answers: Given, found: Found) -> dict[str, Any]:
     table: dict[str, Any] = {"driver": driver.name, "server": host}
     if port and driver.port is not None:
         table[driver.port_key] = port
-    if driver.up_axis != "auto":  # otherwise the driver reads it from the stream
+    if driver.up_axis != "auto":  # with "auto", the driver reads the axis from the stream
         table["up_axis"] = answers["up_axis", ""]
     if answers.get(("plate", "")) is not None:
         table["plate"] = answers["plate", ""]
@@ -160,7 +160,7 @@ def _mqtt(answers: Given) -> dict[str, Any]:
     if not limb_of(answers).is_planar:
         table["sensors_hz"] = AXES_CHECK_HZ
 
-    # These keys are absent for a broker on this machine.
+    # These keys have no answers if the broker runs on this machine.
     encryption = answers.get(("encryption", ""))
     if encryption == "none":
         table["insecure"] = True

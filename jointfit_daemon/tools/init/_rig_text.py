@@ -1,6 +1,6 @@
-"""Text of a rig.toml with comments.
+"""Conversion of a rig to the text of a rig.toml with comments.
 
-Invariant: the text is TOML whose content equals the table.
+Invariant: a TOML parser reads the original table from the text.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Searches of the dialogue: installed drivers, ports, servers, and sensors that move.
+"""Searches of the dialogue for installed drivers, ports, servers, and sensors that move.
 
 Invariant: a device is opened only by a search that the user starts.
 """
@@ -43,8 +43,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.init._answers import Answers
 
 _DIALOGUE_KEYS = {"id", "segment", "driver", "port", "can", "ids", "fields", "server"}
-"""Keys without default that the dialogue can answer, in addition to those with few values. A driver
-with other required keys is not offered."""
+"""Required keys that the dialogue asks for, in addition to keys with few values. The dialogue does
+not offer a driver that has other required keys."""
 _LAYOUT_KEYS = (
     "frame", "text", "ids", "extended_ids", "sequence", "dbc", "fields", "byte_order", "world",
     "direction", "orientation", "magnetometer",
@@ -53,7 +53,7 @@ _LAYOUT_KEYS = (
 _CONNECTION_KEYS = {"driver", "can", "ids"}
 """Keys of ``[[imu]]`` that locate a sensor on CAN."""
 _PROPOSED_FIRST = ("xbus", "xcdi", "natnet")
-"""Drivers that lead the list of their kind; the others follow by name."""
+"""Drivers at the start of the offered list. The other drivers follow in alphabetical order."""
 LISTEN_S = 1.0
 """Time to receive at each speed of a serial port, s."""
 SERVER_WAIT_S = 1.0
@@ -61,7 +61,7 @@ SERVER_WAIT_S = 1.0
 
 
 def drivers_found() -> Found:
-    """Return the installed drivers whose required keys the dialogue knows."""
+    """Return the installed drivers whose required keys the dialogue can ask for."""
     imu, mocap = [], []
     known = sorted(installed_drivers(), key=lambda each: each[0] not in _PROPOSED_FIRST)
     for name, driver in known:
@@ -91,11 +91,11 @@ def drivers_found() -> Found:
 
 
 _ARTICLES = ("One ", "The ``[mocap]`` table for ")
-"""Beginnings of the descriptions of driver tables; the devices follow."""
+"""First words of the docstrings of driver settings. The names of the devices follow them."""
 
 
 def _devices_of(driver: type[Driver]) -> str:
-    """Return the description of a driver's devices, from the description of its table."""
+    """Return the devices that a driver reads, from the docstring of its settings."""
     text = (driver.Settings.__doc__ or "").strip().partition("\n")[0].rstrip(".")
     for article in _ARTICLES:
         text = text.removeprefix(article)
@@ -115,7 +115,10 @@ def _imu_driver(name: str, fields: Mapping[str, FieldInfo]) -> ImuDriver:
 def _with_identifiers(
     about: ImuDriver, driver: type[Driver], fields: Mapping[str, FieldInfo]
 ) -> ImuDriver:
-    """Return the driver with the sensors that it recognizes on a bus that has all identifiers."""
+    """Return `about` with the sensors that the driver can recognize on a CAN bus.
+
+    The simulated bus carries every 11-bit identifier, so the driver proposes all possible sensors.
+    """
     names = tuple(getattr(fields["ids"].annotation, "model_fields", ()))
     propose = getattr(driver, "candidate_tables", None)
     if not names or propose is None:
@@ -137,24 +140,24 @@ _CAN_BYTES, _STANDARD_IDS = 8, 0x800
 
 
 def _can_sensor(driver: str, table: Mapping[str, Any], names: Sequence[str]) -> CanSensor:
-    """Return the sensor that a table describes; its identifiers are in the order of `names`."""
+    """Return the sensor in a driver table; its identifiers have the order of `names`."""
     others = {key: value for key, value in table.items() if key != "ids"}
     return CanSensor(driver, tuple(table["ids"][name] for name in names), others)
 
 
 @dataclass
 class DeviceSearch:
-    """Searches on this machine and its networks."""
+    """Searches for devices on this machine and in its networks."""
 
     show: Callable[[str], None]
     """Function that prints a line."""
     ports: tuple[str, ...] = ()
-    """Serial ports that are not found by themselves, such as pseudo-terminals."""
+    """Serial ports to offer although the search does not find them, such as pseudo-terminals."""
     network: bool = True
     """Whether to search for motion-capture servers in the networks of this machine."""
 
     def start(self, servers: Sequence[FoundDevice] | None = None) -> Found:
-        """Return drivers and devices; `servers` are the servers of an earlier search."""
+        """Return the drivers and devices; `servers` come from an earlier search, if any."""
         known = {os.path.abspath(port): "named by --port" for port in self.ports}  # noqa: PTH100 - keeps links
         known = {**known, **{info.path: info.description for info in find_serial_ports()}}
         interfaces = [
@@ -223,7 +226,9 @@ class DeviceSearch:
         return known, f"{port}: {device.driver} at {traffic.baud} baud"
 
     def layout(self, found: Found, path: str, driver: str) -> Found:
-        """Return `found` with the layout in a TOML file, or in a rig for `driver`.
+        """Return `found` with the frame layout from a TOML file.
+
+        The file contains the layout keys alone, or a rig with a sensor of `driver`.
 
         Raises
         ------
@@ -251,7 +256,7 @@ class DeviceSearch:
         return replace(found, layouts={**found.layouts, path: layout})
 
     def stream_names(self, found: Found, host: str, port: int) -> tuple[Found, str]:
-        """Return the names in the stream of a server, and a description of the result."""
+        """Return `found` with the marker names of a server's stream, and a text for the user."""
         if not self.network:
             return found, f"{host} was not asked for its markers (--no-network)"
         try:
@@ -303,12 +308,15 @@ class DeviceSearch:
     def moved_device(
         self, found: Found, answers: Answers, sensor: str, choices: Sequence[FoundDevice]
     ) -> tuple[Found, str]:
-        """Return the address of the device that the user turns, and its speed or identifiers.
+        """Find the device that the user turns.
+
+        Return `found` with the speed or the identifiers of the device, and the address of the
+        device.
 
         Raises
         ------
         AnswerError
-            No device, several devices, or none that moved.
+            No device was found, several devices moved, or no device moved.
         """
         tables = self._tables(found, answers, choices)
         if not tables:
@@ -333,7 +341,7 @@ class DeviceSearch:
     def _tables(
         self, found: Found, answers: Answers, choices: Sequence[FoundDevice]
     ) -> dict[str, dict[str, Any]]:
-        """Return keys of ``[[imu]]`` of every free port, and of every free sensor on a bus."""
+        """Return the ``[[imu]]`` keys of every free port and of every free sensor on a CAN bus."""
         used = {value for (key, _), value in answers.items() if key == "ids"}
         serial = [driver.name for driver in found.imu_drivers if driver.wiring == "serial"]
         names = {driver.name: driver.ids for driver in found.imu_drivers}

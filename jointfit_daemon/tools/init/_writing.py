@@ -1,4 +1,4 @@
-"""Files of a complete dialogue: rig and password; and the commands that follow."""
+"""Writes the files of a complete dialogue (rig and password) and lists the commands to run next."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 
 _USUAL_BROKERS = ("mqtt://127.0.0.1:1883", "mqtt://localhost:1883")
-"""Broker that `jointfit dashboard` uses without an option."""
+"""Addresses of the broker that `jointfit dashboard` uses by default."""
 
 
 def state_of(path: Path) -> Path:
-    """Return the file with the answers of an interrupted dialogue."""
+    """Return the path of the file that stores the answers of an interrupted dialogue."""
     return path.with_suffix(".answers.toml")
 
 
@@ -44,27 +44,27 @@ def write_password(path: Path, password: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class WrittenRig:
-    """A rig.toml that was written."""
+    """Result of writing a rig.toml."""
 
     path: Path
     table: dict[str, Any]
     open_places: tuple[str, ...]
-    """Keys with the word ``later``, as ``imu[S1].port``."""
+    """Keys whose value is still ``later``, such as ``imu[S1].port``."""
     warnings: tuple[str, ...]
     """Warnings of the check."""
     next_commands: dict[str, str]
-    """Commands that follow, with their use."""
+    """Commands to run next, each with its purpose."""
 
 
 def write_rig(path: Path, given: Answers, found: Found) -> WrittenRig:
-    """Write the rig; the stored answers are deleted once the rig has no open places."""
+    """Write the rig; delete the stored answers if no answer was postponed."""
     table = rig_table(given, found)
     replace_file(path, rig_text(table))
     open_places: list[str] = []
     try:
         rig = load_rig(path)
     except ConfigError as error:
-        # The check accepted every answer, so only open places remain.
+        # The check accepted every answer, so only the value ``later`` causes faults here.
         open_places += [fault.key for fault in error.faults if fault.value == LATER]
         if len(open_places) < len(error.faults):
             raise

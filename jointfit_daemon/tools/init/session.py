@@ -1,6 +1,6 @@
-"""The dialogue of `jointfit init` for a page: messages in, states out, both as JSON objects.
+"""The dialogue of `jointfit init` for a web page, with JSON objects as input and output.
 
-Invariant: a state contains everything that the page shows, so that a reloaded page continues.
+Invariant: each output contains everything that the page shows, so a reloaded page can continue.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ class SetUpSession:
     search: DeviceSearch = field(default_factory=lambda: DeviceSearch(lambda _: None))
     notes: list[str] = field(default_factory=list)
     on_note: Callable[[str], None] = lambda _note: None
-    """Function that receives each note of a search at once; called in the thread of `handle`."""
+    """Function that receives each progress note of a search at once, in the thread of `handle`."""
     _dialogue: Dialogue | None = None
     _written: dict[str, Any] | None = None
 
     def handle(self, message: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the state after a message.
+        """Process a message from the page, and return the new state.
 
         Parameters
         ----------
@@ -61,7 +61,7 @@ class SetUpSession:
 
     @property
     def dialogue(self) -> Dialogue:
-        """The dialogue; it begins with the answers of an interrupted dialogue."""
+        """The dialogue, which begins with the answers of an interrupted dialogue."""
         if self._dialogue is None:
             self.search.show = self._note
             state = state_of(self.path)
@@ -102,7 +102,7 @@ class SetUpSession:
         Raises
         ------
         ValueError
-            Questions are open, or the file exists.
+            A question is not answered, or the file exists.
         """
         dialogue = self.dialogue
         if next_question(dialogue.answers, dialogue.found) is not None:
@@ -119,7 +119,7 @@ class SetUpSession:
         }  # fmt: skip
 
     def _password_file(self) -> Path | None:
-        """Return the file in which a password is missing, if an account is used."""
+        """Return the path of the password file to write; None if no file is needed."""
         name = self.dialogue.answers.get(("password_file", ""))
         if name is None or os.path.lexists(self.path.absolute().parent / name):
             return None

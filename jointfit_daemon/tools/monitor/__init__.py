@@ -1,4 +1,4 @@
-"""`jointfit monitor`: limb, joint angles, sensors and calibration of a rig in a terminal."""
+"""Command `jointfit monitor`: shows limb, angles, sensors and calibration in a terminal."""
 
 from jointfit_daemon.tools.monitor._command import MonitorUnavailableError, monitor
 

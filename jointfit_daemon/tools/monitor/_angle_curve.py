@@ -17,26 +17,25 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.monitor._rig_view import AngleChoice, AngleSample, RigView
 
 _MARGIN = 6
-"""Number of cells for the numbers of the axis."""
+"""Width of the numbers at the axis, cells."""
 _LONG = 66
-"""Smallest number of columns for the longest time range; a narrower curve shows half of this
-range."""
+"""Smallest width for the longest time range, cells. A narrower curve shows half of this range."""
 _GAP_US = 400_000
-"""Longest time between two points that a line connects, µs."""
+"""Longest time between two connected points, µs."""
 _LEAST_HALF_DEG = 10.0
 """Half of the smallest range of the axis, degrees."""
 _LEAST_PAIRS = 20
 """Smallest number of points from which the difference from the cameras is computed."""
 _PAIR_US = 60_000
-"""Largest time between an angle of the sensors and an angle of the cameras in the difference,
-µs."""
+"""Longest time between two angles, one from the sensors and one from the cameras, whose difference
+is computed, µs."""
 _Point = tuple[int, float]
 
 
 def curve_lines(
     rig: RigView, choice: AngleChoice, width: int, rows: int, *, unicode: bool
 ) -> list[Line]:
-    """Return the curve with its axis and a caption: `rows` lines and one more."""
+    """Return the curve in `rows` lines with its axis, and a caption in one more line."""
     columns = max(1, width - _MARGIN)
     shown_s = SHOWN_S if columns >= _LONG else SHOWN_S / 2
     newest_us = rig.poses[-1].t_us if rig.poses else 0
@@ -46,8 +45,8 @@ def curve_lines(
     span = _angle_range(values)
     front, back = (DotCanvas(columns, rows, unicode) for _ in range(2))
     column_us = shown_s * 1e6 / front.width
-    # The curve moves by whole cells. If it moved by single dots, every cell of the curve would be
-    # sent again.
+    # The curve moves by whole cells. A movement by single dots would change every cell of the
+    # curve.
     cell_us = column_us * front.width / columns
     newest = (math.floor(newest_us / cell_us) + 1) * (front.width // columns) - 1
     for canvas, points, every in ((front, imu, 1), (back, optical, 2)):
@@ -89,7 +88,7 @@ def _draw(
     span: tuple[float, float],
     every: int,
 ) -> None:
-    """Draw points; `newest` is the number of the last column since 1970."""
+    """Draw points; `newest` is the index of the last column, counted since 1970."""
     low, high = span
 
     def dot(point: _Point) -> tuple[int, int]:
@@ -129,7 +128,7 @@ def _caption(
 
 
 def _difference(imu: list[_Point], optical: list[_Point]) -> float | None:
-    """Return the RMS difference of angles at nearly the same instants, degrees."""
+    """Return the RMS difference between simultaneous angles of sensors and cameras, degrees."""
     squares, at = [], 0
     for t_us, value in imu:
         while at + 1 < len(optical) and abs(optical[at + 1][0] - t_us) <= abs(

@@ -1,4 +1,4 @@
-"""The Textual program: shows the state at a limited rate and passes keys to it."""
+"""The Textual program, which shows the state at a limited rate and passes keys to the state."""
 
 from __future__ import annotations
 
@@ -34,32 +34,32 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.monitor._monitor_state import Action
 
 MOST_UPDATES_HZ = 10.0
-"""Largest rate of updates of the terminal, Hz."""
+"""Maximum update rate of the terminal, Hz."""
 _LONGEST_MARK = 200
-"""Maximum number of characters of a mark, as in the request."""
+"""Maximum number of characters of a mark; the JSON Schema of the request has the same limit."""
 
 
 def present() -> Moment:
-    """Return the clocks of this machine."""
+    """Return the current time."""
     return Moment(time.monotonic(), time.time_ns() / 1000.0)
 
 
 class MonitorApp(App[int]):
     """The monitor.
 
-    Keys change the state at once; the screen follows at the next update, so that no sequence of
-    keys or messages causes more than `updates_hz` updates a second.
+    A key changes the state at once. The screen changes at the next update, so no sequence of keys
+    or messages causes more than `updates_hz` updates per second.
 
     Parameters
     ----------
     state
         Initial state.
     settings
-        Broker and account; None: no connection, as in tests.
+        Address and account of the broker; None for a program without connection, as in tests.
     updates_hz
-        Updates of the screen a second.
+        Number of screen updates per second.
     now
-        Clocks of this machine.
+        Function that returns the current time.
     """
 
     CSS = """
@@ -96,7 +96,7 @@ class MonitorApp(App[int]):
         yield mark
 
     def on_mount(self) -> None:
-        """Connect, and draw from now on."""
+        """Connect to the broker, and start the periodic updates of the screen."""
         self.theme = "ansi-dark" if "ansi-dark" in self.available_themes else "textual-ansi"
         self.screen_widget.focus()
         asyncio.get_running_loop().set_exception_handler(DisconnectErrorFilter())
@@ -109,7 +109,7 @@ class MonitorApp(App[int]):
         self.call_after_refresh(self.draw)
 
     def draw(self) -> None:
-        """Show the present state, and send the request that the view needs."""
+        """Show the current state, and send the request that the view needs."""
         width, height = self.screen_widget.size
         if width == 0 or height == 0:
             return
@@ -124,7 +124,7 @@ class MonitorApp(App[int]):
             self.act(action)
 
     def on_key(self, event: Key) -> None:
-        """Cancel the mark; other keys do not reach this method."""
+        """Cancel the input of a mark; this method receives no other keys."""
         if event.key == "escape":
             self._close_mark()
 
@@ -169,7 +169,7 @@ class MonitorApp(App[int]):
         self.state.take_answer(request.command, answer, self._now().monotonic_s)
 
     def _start(self, work: Coroutine[None, None, None]) -> None:
-        """Run a task until the task or the program ends; an error of the task ends the program."""
+        """Run a task until the task or the program ends; an error in the task ends the program."""
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._ended)

@@ -1,4 +1,4 @@
-"""Numbers three lines high, for the angle of the chosen joint."""
+"""Numbers with a height of three lines, for the angle of the chosen joint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Connection of the monitor to its broker: finds a rig, subscribes, reconnects, sends requests."""
+"""Connection of the monitor to its broker, which finds a rig, subscribes, and sends requests."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.monitor._rig_view import Moment
 
 RECONNECT_S = 1.0
-"""Pause before the next attempt, s."""
+"""Time before the next attempt to connect, s."""
 SEARCH_S = 1.2
-"""Time for the retained messages that describe rigs to arrive, s."""
+"""Time to wait for the retained messages that describe rigs, s."""
 
 
 class BrokerLink:
-    """Feeds a state with the messages of its rig until it is cancelled.
+    """Passes the messages of a rig to a `MonitorState` until the task is cancelled.
 
     Parameters
     ----------
     settings
-        Address and account of the broker; with an empty `base`, the link searches for a rig.
+        Address and account of the broker. If `base` is empty, the link searches for a rig.
     state
-        Changed by messages, connections and losses.
+        State that messages, connections and disconnections change.
     now
-        Clocks of this machine.
+        Function that returns the current time.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class BrokerLink:
             raise NoAnswerError(str(lost)) from lost
 
     async def _follow(self) -> None:
-        """Pass on the messages of the rig until the broker is lost."""
+        """Process the messages of the rig until the connection is lost."""
         try:
             async with MqttClient(self._settings) as client:
                 self._client = client

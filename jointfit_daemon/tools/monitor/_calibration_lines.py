@@ -1,4 +1,4 @@
-"""Calibration as text: phases, progress, predicted errors, missing movement, results, history."""
+"""The calibration view as text: phases, progress, predicted errors, results, and history."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _BAR = 30
 """Maximum number of cells of the progress bar."""
 _WIDE = 66
-"""Smallest width of the table of joint centres, cells."""
+"""Smallest width at which the joint centres are a table, cells."""
 _STEPS = (
     ("align", "a", "Align the sensors", True,
      "Fix all sensors to the plate. Turn it about all three axes until the time is over."),
@@ -40,7 +40,7 @@ _STEPS = (
      "Move every joint through its range in view of the cameras: walk, squat, sit down and stand"
      " up, circle the hip."),
 )  # fmt: skip
-"""Phase, key, title, whether it needs cameras, and instruction."""
+"""The calibration phases: name, key, title, whether the phase needs cameras, and instruction."""
 _NEXT = {"uncalibrated": "align", "aligned": "static", "posed": "functional"}
 
 
@@ -51,7 +51,7 @@ def calibration_lines(rig: RigView, width: int) -> list[Line]:
         return wrap("Waiting for the calibration state of the daemon.", width, "muted")
     lines = _running(calibration, rig.progress, width) if calibration.phase in RUNNING else []
     if not lines:
-        # List the phases with their keys; the next phase is marked.
+        # List the phases with their keys, and mark the next phase.
         cameras = rig.info is not None and any(
             each.kind == "mocap" for each in rig.info.devices.values()
         )
@@ -129,7 +129,7 @@ def _joint_lines(joints: Mapping[str, Any], width: int) -> list[Line]:
 
 
 def _result(calibration: CalibrationState, width: int) -> list[Line]:
-    """Return outcome and quality of the last phase; a rejected result has a remedy."""
+    """Return outcome and quality of the last phase, and a remedy for a rejected result."""
     lines = [Line.of(calibration_sentence(calibration), "strong")]
     if calibration.phase == "aborted":
         lines = wrap(f"✖ {calibration_sentence(calibration)}", width, "error", indent=2)
@@ -139,7 +139,12 @@ def _result(calibration: CalibrationState, width: int) -> list[Line]:
     quality = calibration.quality
     try:
         texts = report(quality)
-    except (KeyError, TypeError, ValueError, AttributeError):  # quality is of another version
+    except (
+        KeyError,
+        TypeError,
+        ValueError,
+        AttributeError,
+    ):  # format of another version
         texts = ["The quality of this calibration cannot be read: it is of another version."]
     for text in texts:
         lines += wrap(text, width, indent=2)
@@ -152,7 +157,7 @@ def _result(calibration: CalibrationState, width: int) -> list[Line]:
 
 
 def history_lines(state: MonitorState, width: int) -> list[Line]:
-    """Return the stored calibrations, the newest first, with a mark at the selected one."""
+    """Return the stored calibrations, newest first; a symbol marks the selected calibration."""
     if state.stored_fault:
         return wrap(f"✖ The list cannot be read: {state.stored_fault}", width, "error", indent=2)
     stored = state.stored

@@ -23,7 +23,7 @@ _DEFAULT_RIG = Path("rig.toml")
 _DEFAULT_BROKER = "mqtt://localhost:1883"
 _STOP_SIGNALS = (signal.SIGTERM, signal.SIGHUP)
 _SIMPLE_TERMINALS = ("linux", "vt100", "vt102", "vt220", "dumb")
-"""Terminals whose fonts lack Braille patterns: the Linux console, and old ones."""
+"""Types of terminals whose fonts lack Braille patterns, such as the Linux console."""
 
 
 class MonitorUnavailableError(ImportError):
@@ -120,12 +120,12 @@ def monitor(
 
 
 def _has_terminal() -> bool:
-    """Return whether Textual can read keys (standard input) and draw (standard error)."""
+    """Return whether standard input and standard error, which Textual uses, are terminals."""
     return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def shows_unicode(environment: Mapping[str, str]) -> bool:
-    """Return whether a terminal shows Unicode: by terminal type, and by locale if set."""
+    """Return whether a terminal shows Unicode, from its type and its locale."""
     if environment.get("TERM", "") in _SIMPLE_TERMINALS:
         return False
     # Python sets LC_CTYPE to C.UTF-8 in the locale C, so Python's own locale is not used here.
@@ -142,12 +142,12 @@ def _broker_settings(
     password_file: Path | None,
     request_key_file: Path | None,
 ) -> MqttSettings:
-    """Return the settings of the options.
+    """Return the broker settings from the command-line options.
 
     Raises
     ------
     ValueError
-        An option is invalid or contradicts another one, or a file is missing.
+        An option is invalid, two options contradict each other, or a file is missing.
     """
     from pydantic import ValidationError
 
@@ -195,7 +195,7 @@ async def _run(app: MonitorApp) -> int:
     for number in _STOP_SIGNALS:
         loop.add_signal_handler(number, app.exit, 128 + number)
     try:
-        # Without mouse reports, text of the screen can be selected and copied.
+        # Without mouse reports, the user can select and copy text on the screen.
         code = await app.run_async(mouse=False)
     finally:
         await app.stop_tasks()

@@ -1,4 +1,4 @@
-"""Decoding of the daemon's payloads with their published models.
+"""Decoding of the daemon's MQTT payloads with their published data models.
 
 Invariant: no other module of the monitor decodes payloads.
 """
@@ -17,18 +17,19 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 _DEEPEST = 12
-"""Deepest nesting of a payload; the quality of a calibration has 6 levels."""
+"""Maximum nesting depth of a payload. The quality of a calibration has 6 levels."""
 
 
 class UnreadablePayloadError(Exception):
-    """A payload does not fit its model; the message gives the key and the remedy."""
+    """A payload does not match its model; the message names the key and the remedy."""
 
 
 def decode(topic: str, payload: Any) -> BaseModel | None:
-    """Return the payload of a topic below the base as its model; None for an unknown topic.
+    """Return the payload as an object of its topic's model; None for an unknown topic.
 
-    Control characters in texts and names are replaced by escapes, so that no text of a message can
-    control the terminal. Unknown keys are ignored, as docs/mqtt.md asks.
+    The topic is relative to the base topic. Control characters in texts and names are replaced by
+    escapes, so no message can control the terminal. Unknown keys are ignored, as docs/mqtt.md
+    requires.
 
     Raises
     ------
@@ -40,7 +41,7 @@ def decode(topic: str, payload: Any) -> BaseModel | None:
 
 
 def decode_answer(command: str, data: Any) -> BaseModel:
-    """Return the ``data`` of an answer as its model; errors as for `decode`."""
+    """Return the ``data`` of an answer as its model; the errors are those of `decode`."""
     return _validated(ANSWERS[command], f"bridge/response/{command}", data)
 
 

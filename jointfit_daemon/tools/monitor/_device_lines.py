@@ -26,16 +26,16 @@ if TYPE_CHECKING:
 _RATE_SHARE = 0.95
 """Share of the output rate below which the rate of an IMU is reported as slow."""
 _WIDE = 72
-"""Smallest width of the table with all columns, cells."""
+"""Smallest width at which the table has all columns, cells."""
 _LONGEST_NAME = 14
-"""Maximum number of cells of a name in the table."""
+"""Maximum width of a device name in the table, cells."""
 _NAME = 12
-"""Maximum number of cells of a name in the narrow form."""
+"""Maximum width of a device name in a narrow terminal, cells."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceSummary:
-    """Texts about one device."""
+    """Texts and level that describe one device."""
 
     name: str
     place: str
@@ -49,7 +49,7 @@ class DeviceSummary:
 
 
 def summaries(rig: RigView, now: Moment) -> list[DeviceSummary]:
-    """Return the devices in the order of the rig."""
+    """Return a summary of each device, in the order of the rig."""
     names = [] if rig.info is None else [*rig.info.devices]
     return [_summary(rig, name, now) for name in names]
 
@@ -59,7 +59,7 @@ def _summary(rig: RigView, name: str, now: Moment) -> DeviceSummary:
     counts = None if rig.health is None else rig.health.devices.get(name)
     online = rig.availability.get(name) == "online" and rig.bridge == "online"
 
-    # Determine level and state. The level ``error`` means that a person must act.
+    # Determine level and state. The level ``error`` means that the user must act.
     availability = rig.availability.get(name, "unknown")
     flags = [] if rig.pose is None else rig.pose.flags
     sensor = None if counts is None else counts.sensor
@@ -114,13 +114,13 @@ def _event(rig: RigView, name: str, now: Moment) -> str:
 
 
 def marked(level: Level, text: str) -> tuple[str, Style]:
-    """Return a text with the mark of its level, and its style; a good state has no colour."""
+    """Return a text with the symbol and the style of its level; ``good`` has no colour."""
     style: Style = "" if level == "good" else level
     return f"{SYMBOLS[level]} {text}", style
 
 
 def device_lines(rig: RigView, width: int, now: Moment) -> list[Line]:
-    """Return the table of the live view: one line per device, more in a narrow terminal."""
+    """Return the device table of the live view: one line per device, more in a narrow terminal."""
     devices = summaries(rig, now)
     if not devices:
         return []

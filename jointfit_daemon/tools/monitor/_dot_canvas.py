@@ -1,7 +1,7 @@
-"""A canvas of dots for curves and stick figures: Braille patterns, or one character a cell.
+"""A canvas of dots for curves and stick figures, in Braille patterns or ASCII characters.
 
-A Braille cell has two columns and four rows of dots, so the dots have about equal distances in both
-directions. In ASCII a cell is one dot, about twice as high as wide.
+A Braille cell has two columns and four rows of dots, so the dots have nearly equal distances in
+both directions. An ASCII cell is one dot, whose height is about twice its width.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 _BRAILLE = 0x2800
 _BITS = ((0x01, 0x02, 0x04, 0x40), (0x08, 0x10, 0x20, 0x80))
-"""Bit of a dot by column and row (Unicode, Braille patterns)."""
+"""Bit of a dot in a Unicode Braille pattern, by column and row."""
 
 
 @dataclass(slots=True)
 class DotCanvas:
-    """Canvas of dots on `columns` by `rows` cells; the origin is the upper left."""
+    """Canvas of dots with `columns` by `rows` cells; the origin is the upper left corner."""
 
     columns: int
     rows: int
@@ -56,7 +56,7 @@ class DotCanvas:
             self._masks[y][x] = 1
 
     def line(self, start: tuple[int, int], end: tuple[int, int], *, every: int = 1) -> None:
-        """Set the dots of a straight line, or only one in `every` dots."""
+        """Set the dots of a straight line, or one of `every` dots."""
         (x0, y0), (x1, y1) = start, end
         steps = max(abs(x1 - x0), abs(y1 - y0), 1)
         if steps > 4 * (self.width + self.height):
@@ -65,14 +65,14 @@ class DotCanvas:
             self.plot(round(x0 + (x1 - x0) * k / steps), round(y0 + (y1 - y0) * k / steps))
 
     def mask(self, column: int, row: int) -> int:
-        """Return the dots of a cell as bits, 0 if it is empty."""
+        """Return the dots of a cell as bits; 0 is an empty cell."""
         return self._masks[row][column]
 
 
 def render(front: DotCanvas, style: Style, back: DotCanvas, back_style: Style) -> list[Line]:
-    """Return two canvases of the same size on top of each other, as lines.
+    """Return lines that show two canvases of the same size on top of each other.
 
-    A cell has one style: the style of the front canvas if the front has a dot in this cell.
+    A cell has the style of the front canvas if the front canvas has a dot in the cell.
     """
     lines = []
     for row in range(front.rows):
@@ -85,7 +85,7 @@ def render(front: DotCanvas, style: Style, back: DotCanvas, back_style: Style) -
             else:
                 character = "*" if above else "." if below else " "
 
-            # Adjacent cells of one style form one span, blank cells included.
+            # Adjacent cells of the same style form one span, which includes blank cells.
             chosen: Style = style if above else back_style if below else ""
             if spans and (spans[-1][1] == chosen or character == " "):
                 spans[-1] = (spans[-1][0] + character, spans[-1][1])

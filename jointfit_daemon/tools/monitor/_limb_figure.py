@@ -20,11 +20,13 @@ _Dot = tuple[int, int]
 _LEAST_REACH_M = 0.2
 """Smallest size of the drawn region, m."""
 _BRANCHED_TURN_DEG = 35.0
-"""Direction of view on a limb of two sides, degrees from the side. Both sides are visible."""
+"""Direction of view on a limb with two sides, degrees from the view from the side. Both sides are
+visible in this direction."""
 _LEAST_HORIZONTAL = 0.1
-"""Smallest horizontal part of a unit vector ahead at which the direction is used."""
+"""Smallest horizontal component of the unit vector ahead of the subject; shorter vectors are not
+used."""
 _LONGEST_LABEL = 12
-"""Maximum number of cells for the name of a joint next to the figure."""
+"""Maximum width of the name of a joint next to the figure, cells."""
 
 
 def limb_lines(
@@ -37,7 +39,7 @@ def limb_lines(
     turn_deg
         Direction of view about the vertical, degrees from the subject's right side.
     optical
-        Whether the newest pose of the cameras is drawn too, dotted.
+        Whether the newest pose from the cameras is also drawn, as a dotted figure.
     """
     pose, info = rig.pose, rig.info
     if pose is None or info is None:
@@ -74,7 +76,7 @@ def limb_lines(
 
 
 class _Scale:
-    """Conversion of metres to dots: the whole reach of the limb fits, with equal scales."""
+    """Conversion of metres to dots with equal scales; the whole reach of the limb fits."""
 
     def __init__(self, reach_m: list[float], canvas: DotCanvas, columns: int) -> None:
         across_m, low_m, high_m = reach_m
@@ -108,7 +110,7 @@ def _points(pose: Pose | OpticalPose) -> dict[str, list[float]]:
 
 
 def _forward(pose: Pose, info: Info) -> tuple[float, float]:
-    """Return the horizontal direction ahead: across the x axis of the first known segment."""
+    """Return the horizontal direction ahead, normal to the x axis of the first known segment."""
     for name in info.segments:
         segment = pose.segments.get(name)
         q = None if segment is None else known_vector(segment.q, 4)
@@ -123,7 +125,7 @@ def _forward(pose: Pose, info: Info) -> tuple[float, float]:
 
 
 def _bones(info: Info) -> list[tuple[str, str]]:
-    """Return the pairs of joints that a segment connects."""
+    """Return the pair of joints at the ends of each segment."""
     if not info.connections:
         return [*zip(info.joints, info.joints[1:], strict=False)]
     pairs = []
@@ -135,7 +137,7 @@ def _bones(info: Info) -> list[tuple[str, str]]:
 
 
 def _bone(canvas: DotCanvas, first: _Dot, last: _Dot) -> None:
-    """Draw a segment as a line of two dots in width."""
+    """Draw a segment as a line that is two dots wide."""
     canvas.line(first, last)
     if canvas.unicode:
         canvas.line((first[0] + 1, first[1]), (last[0] + 1, last[1]))
@@ -150,7 +152,7 @@ def _blob(canvas: DotCanvas, x: int, y: int) -> None:
 def _labelled(
     lines: list[Line], canvas: DotCanvas, joints: dict[str, _Dot], width: int
 ) -> list[Line]:
-    """Write the name of each joint at the right end of its row, where the row is free."""
+    """Write the name of each joint at the right end of its row if the row has space."""
     taken: set[int] = set()
     rows = canvas.height // canvas.rows
     for name, (_, y) in joints.items():
@@ -167,7 +169,7 @@ def _labelled(
 
 
 def _cut(line: Line, width: int) -> Line:
-    """Return the first `width` cells of a line; the removed cells are blank."""
+    """Return a line cropped to `width` characters."""
     spans, free = [], width
     for text, style in line.spans:
         spans.append((text[:free], style))

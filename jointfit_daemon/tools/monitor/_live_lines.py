@@ -1,4 +1,4 @@
-"""The live view: limb, angle of the chosen joint, its curve, and the devices."""
+"""The live view: the limb, the chosen angle with its curve, and the devices."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.monitor._rig_view import Moment, RigView
 
 STALE_S = 1.5
-"""Age of a pose, s, from which its values are no longer shown."""
+"""Age of a pose, s, at which its values disappear from the screen."""
 _OPTICAL_S = 0.6
-"""Age of the cameras' pose, s, from which it is no longer drawn."""
+"""Age of a pose from the cameras, s, at which this pose disappears from the screen."""
 _WIDE = 72
 """Smallest width at which the limb is to the left of the curve, cells."""
 _LEAST_CURVE, _MOST_CURVE = 3, 24
 """Smallest and largest number of rows of the curve."""
 _WITH_SD = ("flexion_deg", "elevation_deg", "inner_deg")
-"""Names of the angles to which `sd_deg` of a joint can belong."""
+"""Names of the angles whose standard deviation may be the `sd_deg` of a joint."""
 
 
 def pose_age_s(rig: RigView, now: Moment) -> float | None:
@@ -40,7 +40,7 @@ def pose_age_s(rig: RigView, now: Moment) -> float | None:
 
 
 def live_lines(state: MonitorState, width: int, height: int, now: Moment) -> list[Line]:
-    """Return the live view for a body of `height` lines; it may be longer with many devices."""
+    """Return the live view for `height` lines; many devices can need more lines."""
     rig, choice = state.rig, chosen_angle(state)
     devices = device_lines(rig, width, now)
     if rig.pose is None or rig.info is None or _is_uncalibrated(rig):
@@ -77,7 +77,7 @@ def live_lines(state: MonitorState, width: int, height: int, now: Moment) -> lis
 
 
 def _figure(state: MonitorState, width: int, rows: int, now: Moment) -> list[Line]:
-    """Return the drawing of the limb, in muted style once the pose is old."""
+    """Return the drawing of the limb; the style is muted if the pose is old."""
     rig = state.rig
     optical = rig.optical_s is not None and now.monotonic_s - rig.optical_s < _OPTICAL_S
     lines = limb_lines(rig, width, rows, state.turn_deg, optical=optical, unicode=state.unicode)
@@ -125,7 +125,7 @@ def _reason(rig: RigView, value: float | None, sd: float | None, age_s: float) -
     if age_s > STALE_S:
         return f"No pose for {age_s:.0f} s.", True
 
-    # List the most urgent flags first, then the reasons for an unknown value or standard deviation.
+    # The most urgent flags precede the reasons for an unknown value or standard deviation.
     flags = serious_flags([] if rig.pose is None else rig.pose.flags)
     if flags:
         return "▲ " + " ".join(map(flag_sentence, flags[:2])), True

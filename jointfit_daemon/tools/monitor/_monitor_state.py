@@ -1,7 +1,7 @@
-"""State of the monitor apart from the rig: connection, views, keys, and answers of the daemon.
+"""State of the monitor except the rig: connection, views, pressed keys, and answers of the daemon.
 
-Invariants: no clock, no I/O, no terminal. A key changes the state, or returns an action for the
-program.
+Invariants: the module uses no clock, I/O or terminal. A key press changes the state, or returns an
+action that the program executes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ViewName = Literal["live", "calibrate", "history", "health", "log"]
 VIEWS: tuple[ViewName, ...] = ("live", "calibrate", "history", "health", "log")
 _TURN_DEG = 15
 _PAGE = 10
-"""Number of lines of a page when scrolling."""
+"""Number of lines that the Page Up and Page Down keys scroll."""
 _NOTICE_S = 20.0
 """Time for which the answer to a request is shown, s."""
 
@@ -49,7 +49,7 @@ class ChooseRig:
 
 @dataclass(frozen=True, slots=True)
 class AskMark:
-    """Action: ask for the text of a mark."""
+    """Action: let the user type the text of a mark."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +80,14 @@ class MonitorState:
     base: str | None = None
     link: Literal["connecting", "searching", "connected", "lost"] = "connecting"
     reason: str = ""
-    """Reason of a lost link."""
+    """Reason why the connection was lost."""
     rigs: dict[str, str] = field(default_factory=dict)
-    """Names of the rigs on the broker by base topic, while none is chosen."""
+    """Names of the rigs on the broker, by base topic; empty after one of them is chosen."""
     rig: RigView = field(default_factory=RigView)
     view: ViewName = "live"
     choice: AngleChoice | None = None
     turn_deg: int = 0
-    """Direction of view about the vertical, degrees from the side."""
+    """Direction of view, degrees about the vertical from the view from the side."""
     cursor: int = 0
     """Index of the selected entry of the history or of the list of rigs."""
     scroll: int = 0
@@ -95,7 +95,7 @@ class MonitorState:
     stored: CalibrationsAnswer | None = None
     stored_fault: str = ""
     listed: tuple[object, ...] | None = None
-    """Calibration for which the stored versions were requested."""
+    """Current calibration at the time when the list of stored versions was requested."""
     notice: RequestOutcome | None = None
     asked_to_stop: bool = False
     """Whether the next press of the same key stops the recording."""
@@ -108,12 +108,12 @@ class MonitorState:
         self.choice, self.cursor, self.scroll = None, 0, 0
 
     def connected(self) -> None:
-        """Store that the broker is connected; retained messages follow."""
+        """Set the state to connected; the broker sends the retained messages next."""
         self.link, self.reason = ("connected" if self.base is not None else "searching"), ""
         self.rig.bridge, self.listed = "unknown", None
 
     def lost(self, reason: str) -> None:
-        """Store that the broker is lost."""
+        """Set the state to disconnected, and store the reason."""
         self.link, self.reason = "lost", printable(reason)
 
     def found_rigs(self, rigs: Mapping[str, str]) -> str | None:
@@ -136,11 +136,11 @@ class MonitorState:
             self.listed = None
 
     def refused(self, reason: str, now_s: float) -> None:
-        """Show why a request has no effect."""
+        """Show the reason why a request was not sent or had no answer."""
         self.notice = RequestOutcome(printable(reason), True, now_s + _NOTICE_S)
 
     def versions_unreadable(self, reason: str) -> None:
-        """Show why the stored calibrations cannot be read."""
+        """Show the reason why the stored calibrations cannot be read."""
         self.stored, self.stored_fault = None, printable(reason)
 
     def _take_versions(self, answer: Mapping[str, Any]) -> None:
@@ -171,7 +171,7 @@ class MonitorState:
         return self.stored.versions[min(self.cursor, len(self.stored.versions) - 1)]
 
     def press(self, key: str) -> Action | None:
-        """Change the state by a key; return an action for the program, if the key has one."""
+        """Change the state as the key requires; return the action of the key, if it has one."""
         if key in {"q", "ctrl+c", "ctrl+q"}:
             return Quit()
         if key != "R":
@@ -184,7 +184,7 @@ class MonitorState:
                 return ChooseRig(bases[min(self.cursor, len(bases) - 1)])
             return None
 
-        # Keys of a rig: views first, then selections within a view, then requests.
+        # The keys select a view, then an entry within the view, then a request.
         if key.isdecimal() and 1 <= int(key) <= len(VIEWS):
             self._show(VIEWS[int(key) - 1])
         elif key in {"tab", "shift+tab"}:
@@ -199,7 +199,7 @@ class MonitorState:
         return None
 
     def due_request(self) -> SendRequest | None:
-        """Return one request for the stored versions when the view needs the versions."""
+        """Return a request for the stored versions if the view shows them and they are outdated."""
         calibration = self.rig.calibration
         if self.view != "history" or self.link != "connected" or self.rig.bridge != "online":
             return None
@@ -225,7 +225,7 @@ class MonitorState:
         return SendRequest("use-calibration", {"revert": True}) if key == "r" else None
 
     def _move(self, key: str) -> bool:
-        """Scroll, turn the limb, or choose an angle; return whether the key does that."""
+        """Scroll, turn the limb, or choose an angle; return whether the key has such an effect."""
         steps = {"down": 1, "up": -1, "pagedown": _PAGE, "pageup": -_PAGE}
         if key in steps:
             self.scroll = max(0, self.scroll + steps[key])
@@ -243,7 +243,7 @@ class MonitorState:
         return True
 
     def _record(self) -> Action | None:
-        """Return the request that starts the recording, or stops it at the second key press."""
+        """Return the request to start the recording, or at the second press to stop it."""
         recording, asked = recording_of(self.rig), self.asked_to_stop
         self.asked_to_stop = recording is not None and recording.active and not asked
         if recording is None or self.asked_to_stop:
@@ -251,7 +251,7 @@ class MonitorState:
         return SendRequest("record", {"action": "stop" if recording.active else "start"})
 
     def _requested_by(self, key: str) -> Action | None:
-        """Return the request of a key; only the calibration view has keys for the other phases."""
+        """Return the request of a key; some keys work in the calibration view only."""
         if key == "m":
             return AskMark()
         if key == "R":

@@ -13,12 +13,12 @@ _GB = 1e9
 
 
 def recording_of(rig: RigView) -> RecordingState | None:
-    """Return the state of the recording; None while the state is unknown."""
+    """Return the state of the recording; None if the state is unknown."""
     return None if rig.health is None or rig.bridge != "online" else rig.health.recording
 
 
 def recording_mark(rig: RigView, now: Moment) -> tuple[str, Style]:
-    """Return the text for the header, at most 18 cells; empty while the state is unknown."""
+    """Return the text for the header, at most 18 cells; empty if the state is unknown."""
     recording = recording_of(rig)
     if recording is None:
         return "", ""
@@ -30,7 +30,7 @@ def recording_mark(rig: RigView, now: Moment) -> tuple[str, Style]:
 
 
 def recording_text(rig: RigView, now: Moment) -> tuple[str, Style]:
-    """Return the text with file, size, losses and free space."""
+    """Return the text for the health view, with file, size, losses and free space."""
     recording = recording_of(rig)
     if recording is None:
         return "", ""
@@ -53,7 +53,7 @@ def format_bytes(count: float) -> str:
 
 
 def _duration_s(rig: RigView, recording: RecordingState, now: Moment) -> float:
-    """Return the duration of the recording: of the message, plus the time since if active."""
+    """Return the duration in the message; add the time since the message if recording."""
     gateway_us = rig.gateway_us(now)
     if not recording.active or gateway_us is None or rig.health is None:
         return recording.duration_s
@@ -61,7 +61,7 @@ def _duration_s(rig: RigView, recording: RecordingState, now: Moment) -> float:
 
 
 def _stopwatch(seconds: float) -> str:
-    """Return hours, minutes and seconds: ``0:12:04``."""
+    """Return a duration in hours, minutes and seconds, such as ``0:12:04``."""
     minutes, whole_s = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{whole_s:02}"

@@ -1,6 +1,7 @@
-"""State of a rig, computed from the messages below its base topic.
+"""State of a rig, computed from the messages on the topics below its base topic.
 
-Invariants: no clock, no I/O, no terminal; memory is bounded for any sequence of messages.
+Invariants: the module uses no clock, I/O or terminal. Memory is bounded for any sequence of
+messages.
 """
 
 from __future__ import annotations
@@ -31,16 +32,17 @@ TOPICS = (
     "bridge/state", "bridge/info", "bridge/health", "bridge/event", "calibration",
     "calibration/progress", "device/+/availability", "pose/ui", "optical/pose",
 )  # fmt: skip
-"""Topics below the base that the monitor reads."""
+"""Topics below the base topic that the monitor reads."""
 SHOWN_S = 20.0
 """Longest time range of the curve, s."""
 _MOST_SAMPLES = 1000
-"""Number of stored points of a curve: 20 s of `pose/ui` at 30 Hz, or of `optical/pose` at 50 Hz."""
+"""Number of stored points of a curve. It suffices for 20 s of `pose/ui` at 30 Hz, or of
+`optical/pose` at 50 Hz."""
 _MOST_EVENTS = 300
 _MOST_DEVICES = 200
-"""Maximum number of stored devices and of stored event ids; a rig has fewer than 50 devices."""
+"""Maximum number of stored devices, and of stored event ids. A rig has fewer than 50 devices."""
 AngleChoice = tuple[str, str]
-"""Name of a joint, and key of an angle such as ``flexion_deg``."""
+"""Name of a joint, and payload key of an angle such as ``flexion_deg``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +55,7 @@ class AngleSample:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """Present time by the clocks of this machine."""
+    """Current time of the monotonic clock and of the UNIX clock of this machine."""
 
     monotonic_s: float
     unix_us: float
@@ -75,7 +77,7 @@ class RigView:
     optical_s: float | None = None
     availability: dict[str, str] = field(default_factory=dict)
     last_events: dict[str, EventMessage] = field(default_factory=dict)
-    """Newest event of each id."""
+    """Newest event for each event id."""
     events: deque[EventMessage] = field(default_factory=lambda: deque(maxlen=_MOST_EVENTS))
     """Events, the newest first."""
     poses: deque[AngleSample] = field(default_factory=lambda: deque(maxlen=_MOST_SAMPLES))
@@ -83,15 +85,15 @@ class RigView:
     faults: dict[str, str] = field(default_factory=dict)
     """Reason why the last message of a topic could not be decoded."""
     reach_m: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    """Largest horizontal distance from the first joint, and lowest and highest point relative to
-    this joint, m."""
+    """Largest horizontal distance of a joint from the first joint, and the lowest and highest
+    position relative to the first joint, m."""
     clock_offset_us: float | None = None
-    """UNIX time of the gateway minus monotonic time of this machine, µs."""
+    """UNIX time of the gateway minus monotonic time of this machine, µs; None if unknown."""
     clock_error_us: float = 0.0
     """UNIX time of the gateway minus UNIX time of this machine, µs."""
 
     def take(self, topic: str, payload: Any, now: Moment) -> None:
-        """Process one message; `topic` is below the base topic."""
+        """Process one message; `topic` is relative to the base topic."""
         kind = "device" if topic.startswith("device/") else topic
         try:
             message = decode(topic, payload)
@@ -150,8 +152,8 @@ class RigView:
                 pass
 
     def _take_pose(self, pose: Pose, now: Moment) -> None:
-        # An instant before the last one means that the daemon restarted or its clock was set: the
-        # curve restarts.
+        # A time before the previous time means that the daemon restarted or its clock was set. The
+        # curve then restarts.
         if self.pose is not None and pose.t_us < self.pose.t_us:
             self.poses.clear()
             self.opticals.clear()
@@ -160,8 +162,8 @@ class RigView:
         _append(self.poses, _angles(pose))
         self._extend_reach(pose)
 
-        # The smallest difference between instant and receipt converts the time of this machine to
-        # gateway time.
+        # The smallest difference between time stamp and time of receipt converts the time of this
+        # machine to gateway time.
         offset_us = pose.t_us - now.monotonic_s * 1e6
         if self.clock_offset_us is None or offset_us > self.clock_offset_us:
             self.clock_offset_us = offset_us
@@ -196,7 +198,7 @@ def known_vector(vector: list[float | None] | None, length: int) -> list[float] 
 
 
 def _angles(pose: Pose | OpticalPose) -> AngleSample:
-    """Return the angles of a pose."""
+    """Return the angles of all joints in a pose."""
     return AngleSample(
         pose.t_us,
         {
@@ -209,7 +211,7 @@ def _angles(pose: Pose | OpticalPose) -> AngleSample:
 
 
 def _append(samples: deque[AngleSample], sample: AngleSample) -> None:
-    """Append a sample; remove those that the curve no longer shows."""
+    """Append a sample; remove samples that are older than the curve."""
     samples.append(sample)
     oldest_us = sample.t_us - SHOWN_S * 1e6
     while samples[0].t_us < oldest_us:
@@ -217,7 +219,7 @@ def _append(samples: deque[AngleSample], sample: AngleSample) -> None:
 
 
 def _bounded_set(table: dict[str, Any], key: str, value: Any) -> None:
-    """Set a key as the newest of a table; remove the oldest keys beyond `_MOST_DEVICES`."""
+    """Set a key of a table; remove the oldest keys beyond `_MOST_DEVICES`."""
     table.pop(key, None)
     table[key] = value
     if len(table) > _MOST_DEVICES:

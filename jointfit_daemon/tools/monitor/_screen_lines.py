@@ -1,7 +1,7 @@
-"""The whole screen as lines: header, tabs, banner, the chosen view, notice, and keys.
+"""The whole screen as text lines: header, tabs, banner, the chosen view, notice, and keys.
 
-Invariant: `screen_lines` is a pure function; it returns exactly as many lines as the terminal has,
-each with exactly its width.
+Invariant: `screen_lines` is a pure function. The number and the width of its lines equal those of
+the terminal.
 """
 
 from __future__ import annotations
@@ -31,11 +31,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.monitor._words import Level
 
 _WIDE = 60
-"""Smallest width for the header in one line, cells."""
+"""Smallest width at which the header is one line, cells."""
 _LOSS_LINES = 3
 """Maximum number of lines of a banner or a notice."""
 _CLOCK_ERROR_S = 5.0
-"""Difference of the clocks of gateway and this machine, s, above which it is shown."""
+"""Threshold of the difference between the clocks of gateway and this machine, s. A larger
+difference is displayed."""
 _TITLES = {
     "live": "Live", "calibrate": "Calibrate", "history": "History", "health": "Health",
     "log": "Log",
@@ -53,7 +54,7 @@ _STOPPED = (
 
 
 def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> list[Line]:
-    """Return the screen; the scroll position of `state` is limited to the length of the view."""
+    """Return the lines of the screen; limit the scroll position of `state` to the view's length."""
     level, words, loss = page_state(state, now)
     top = _header(state, level, words, width, now)
     if state.base is not None:
@@ -92,7 +93,7 @@ def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> l
     if state.unicode:
         return [line.fit(width) for line in lines]
 
-    # In ASCII, a point replaces the ellipsis of a cropped line.
+    # In ASCII, a full stop replaces the ellipsis of a cropped line.
     fitted = [line.to_ascii().fit(width) for line in lines]
     return [
         Line(tuple((text.replace("…", "."), style) for text, style in line.spans))
@@ -101,7 +102,7 @@ def screen_lines(state: MonitorState, width: int, height: int, now: Moment) -> l
 
 
 def page_state(state: MonitorState, now: Moment) -> tuple[Level, str, str]:
-    """Return level and text of link, daemon and calibration, and the loss for the banner."""
+    """Return level and text of the overall state, and a banner text, empty without a fault."""
     rig = state.rig
     if state.link == "lost":
         return "error", "Broker lost", f"{state.reason}. Trying again."
@@ -133,7 +134,7 @@ def page_state(state: MonitorState, now: Moment) -> tuple[Level, str, str]:
 
 
 def _header(state: MonitorState, level: Level, words: str, width: int, now: Moment) -> list[Line]:
-    """Return rig and state on the left; broker and clock of the gateway on the right."""
+    """Return the header: rig and state on the left, broker and gateway clock on the right."""
     rig = state.rig
     name = rig.info.rig if rig.info is not None else (state.base or "jointfit monitor")
     style: Style = "" if level in ("good", "muted") else level
@@ -156,7 +157,7 @@ def _header(state: MonitorState, level: Level, words: str, width: int, now: Mome
 
 
 def _spread(left: Line, right: Line, width: int) -> Line:
-    """Return a left and a right-aligned part; the left part is cropped to fit."""
+    """Return a line with a left and a right part; the left part is cropped if necessary."""
     free = width - right.width - 1
     return left.fit(free).add(" ") + right if free > 0 else left.fit(width)
 
@@ -188,7 +189,7 @@ def _body(state: MonitorState, width: int, height: int, now: Moment) -> list[Lin
 
 
 def _waiting_lines(state: MonitorState, width: int) -> list[Line]:
-    """Return the help for starting a daemon, shown while the broker has no rig."""
+    """Return the instructions for starting a daemon, which appear while the broker has no rig."""
     if state.link not in ("searching", "connected"):
         return []
     base = "" if state.base is None else f" below {state.base}"
@@ -239,7 +240,7 @@ def _notice(state: MonitorState, width: int, now: Moment) -> list[Line]:
 
 
 def _keys(state: MonitorState) -> list[tuple[str, str]]:
-    """Return the keys that have an effect now, each with a description."""
+    """Return the keys that currently have an effect, each with a description."""
     if state.base is None:
         choose = [("↑↓", "select"), ("Enter", "show")] if len(state.rigs) > 1 else []
         return [*choose, ("q", "quit")]

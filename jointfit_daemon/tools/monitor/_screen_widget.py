@@ -1,6 +1,7 @@
-"""Textual widget that shows lines and redraws only the cells that changed.
+"""Textual widget that shows lines and redraws only the cells that have changed.
 
-Over ssh every redrawn cell costs bytes: a full screen takes kilobytes, a changed digit a few bytes.
+Over ssh, every redrawn cell costs bytes. A full screen needs kilobytes, and a changed digit needs a
+few bytes.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ _STYLES: dict[Style, RichStyle] = {
     "optical": RichStyle(color="magenta"),
     "chosen": RichStyle(reverse=True),
 }
-"""Colours of the terminal's own palette, so that they fit its background."""
+"""Colours of the styles. They are from the terminal's own palette, so they match its background."""
 _Cell = tuple[str, "RichStyle | None"]
 
 
@@ -51,7 +52,7 @@ class ScreenWidget(Widget):
         """Number of updates that changed at least one cell."""
 
     def show(self, lines: list[Line]) -> None:
-        """Show lines, each with the width of the widget."""
+        """Show lines; each line has the width of the widget."""
         if lines == self._lines:
             return
 
@@ -71,7 +72,7 @@ class ScreenWidget(Widget):
         self.refresh(*[region for region in regions if region])
 
     def on_key(self, event: Key) -> None:
-        """Pass a key on before Textual processes it."""
+        """Pass a key to `press` before Textual processes the key."""
         event.stop()
         printable = event.character is not None and event.is_printable
         self._press(str(event.character) if printable else event.key)

@@ -1,7 +1,7 @@
 """Styled lines of a terminal: width in cells, cropping, wrapping, columns, and an ASCII form.
 
-A style is a word; `_screen_widget.py` maps the word to a colour. Invariant: no line contains
-control characters, and a fitted line has exactly its width.
+A style is a word that `_screen_widget.py` maps to a colour. Invariant: no line contains control
+characters. A line from `Line.fit` has exactly the given width.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _ASCII = {
     "▲": "!", "✖": "x", "●": "*", "○": "o", "▶": ">", "█": "#", "░": "-", "─": "-", "│": "|",
     "“": '"', "”": '"', "’": "'", "↑": "^", "↓": "v", "←": "<", "→": ">", "σ": "sigma",
 }  # fmt: skip
-"""Replacements for terminals without Unicode."""
+"""Replacements of characters on terminals without Unicode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Line:
         return cls(((text, style),))
 
     def add(self, text: str, style: Style = "") -> Line:
-        """Return the line with a further text at its end."""
+        """Return a new line with `text` appended."""
         return Line((*self.spans, (text, style)))
 
     def __add__(self, other: Line) -> Line:
@@ -84,7 +84,7 @@ def to_ascii(text: str) -> str:
 
 
 def fit_text(text: str, width: int, *, right: bool = False) -> str:
-    """Return `text` with exactly `width` cells."""
+    """Return `text`, padded or cropped to exactly `width` cells."""
     missing = width - cell_len(text)
     if missing < 0:
         return set_cell_size(text, max(0, width - 1)) + "…"[:width]
@@ -113,7 +113,7 @@ def wrap(text: str, width: int, style: Style = "", *, indent: int = 0) -> list[L
 
 
 def beside(left: Sequence[Line], width: int, right: Sequence[Line], gap: int = 2) -> list[Line]:
-    """Return two blocks of lines side by side; `width` is the width of the left block."""
+    """Return two blocks of lines side by side; the left block has `width` cells."""
     rows = max(len(left), len(right))
     empty = Line()
     return [
@@ -135,7 +135,7 @@ class Column:
 def table(
     columns: Sequence[Column], rows: Iterable[Sequence[tuple[str, Style]]], width: int
 ) -> list[Line]:
-    """Return a table whose last column takes the remaining width."""
+    """Return a table; the width of its last column is the remaining width."""
     rows = [*rows]
     titles: list[tuple[str, Style]] = [(column.title, "muted") for column in columns]
     every = [titles, *rows]

@@ -1,6 +1,7 @@
-"""Numbers, ages, states and flags in words. Unknown is ``–``, never 0 and never an old value.
+"""Conversion of numbers, ages, states and flags to text.
 
-The dashboard's page has the same words (``page/js/words.js``).
+An unknown value is ``–``, never 0 and never an old value. The web page of the dashboard has the
+same texts (``page/js/words.js``).
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ if TYPE_CHECKING:
 UNKNOWN = "–"
 Level = Literal["good", "warning", "error", "muted"]
 SYMBOLS: dict[Level, str] = {"good": "✔", "warning": "▲", "error": "✖", "muted": "○"}
-"""Mark of a level, so that no meaning depends on colour."""
+"""Symbol of each level. Because of the symbols, no meaning depends on colour."""
 RUNNING = frozenset({"align", "static", "functional", "fitting"})
-"""Calibration phases during which the daemon records or fits."""
+"""Calibration phases in which the daemon records or fits."""
 LARGE_SIGMA_US = 2000.0
 """Standard deviation of a device clock, µs, above which a warning is shown."""
 _MINUTE_S = 60.0
@@ -61,7 +62,7 @@ def format_duration(seconds: float) -> str:
 
 
 def format_clock(microseconds: float | None, timezone: tzinfo | None = None) -> str:
-    """Return the time of day of a UNIX time, µs; `timezone` None is the local one."""
+    """Return the time of day of a UNIX time, µs; the default of `timezone` is the local zone."""
     if microseconds is None:
         return UNKNOWN
     try:
@@ -72,7 +73,7 @@ def format_clock(microseconds: float | None, timezone: tzinfo | None = None) -> 
 
 
 def format_date(text: str | None, timezone: tzinfo | None = None) -> str:
-    """Return date and time of an ISO 8601 text; the text itself otherwise."""
+    """Return date and time of an ISO 8601 text, or the unchanged text if it is invalid."""
     if text is None:
         return UNKNOWN
     try:
@@ -85,18 +86,18 @@ def format_date(text: str | None, timezone: tzinfo | None = None) -> str:
 
 
 def title_of(name: str) -> str:
-    """Return a name for headings: ``left_knee`` as ``Left knee``."""
+    """Return a name as a heading: ``left_knee`` becomes ``Left knee``."""
     words = name.replace("_", " ")
     return words[:1].upper() + words[1:]
 
 
 def angle_name(key: str) -> str:
-    """Return the name of an angle from its key: ``flexion_deg`` as ``flexion``."""
+    """Return the name of an angle from its key: ``flexion_deg`` becomes ``flexion``."""
     return "inner angle" if key == "inner_deg" else key.removesuffix("_deg").replace("_", " ")
 
 
 def calibration_sentence(calibration: CalibrationState | None, now_us: float | None = None) -> str:
-    """Return the state of the calibration as text, with its age at a gateway UNIX time."""
+    """Return the state of the calibration as text, with its age at the gateway time `now_us`."""
     if calibration is None:
         return "Waiting for the calibration state"
     phase = str(calibration.phase)
@@ -112,7 +113,7 @@ def calibration_sentence(calibration: CalibrationState | None, now_us: float | N
 
 
 def _age_words(created_utc: str | None, now_us: float | None) -> str:
-    """Return the time since a date as text; empty if unknown."""
+    """Return the time since a date as text, or an empty text if it is unknown."""
     if created_utc is None or now_us is None:
         return ""
     try:
@@ -122,7 +123,7 @@ def _age_words(created_utc: str | None, now_us: float | None) -> str:
     age_s = (now_us - created_us) / 1e6
     if age_s < _MINUTE_S:
         return ", just now"
-    # Round to whole minutes, so that the text does not change every second.
+    # The age is rounded to minutes, so the text does not change every second.
     return f", {format_duration(age_s) if age_s >= 1.5 * _MINUTE_S else '1 min'} ago"
 
 

@@ -1,4 +1,4 @@
-"""`jointfit report`: a session as one HTML page."""
+"""Command `jointfit report`: writes a session as one HTML page."""
 
 from jointfit_daemon.tools.report._command import report
 

@@ -1,4 +1,4 @@
-"""Sections about the movement: angles, gait cycles, range of motion, difference to cameras."""
+"""Sections about the movement: angles, gait cycles, range of motion, and camera differences."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ if TYPE_CHECKING:
 _DETAIL_S = 10.0
 """Duration of the section of a long session that is drawn in detail, s."""
 _UNSHOWN = 0.1
-"""If no angles exist in the first part of a session, for example during calibration, the curves
-begin later. This is the smallest such share of the session."""
+"""Share of the session. If no angles exist in a longer part at the beginning, for example during
+calibration, the curves begin at the first angle."""
 _PANEL, _HALF = 320.0, 450.0
-"""Widths of a panel with three and with two panels in a row, px."""
+"""Widths of a panel, px, in a row of three and in a row of two panels."""
 _MOST_POINTS = 800
 """Maximum number of points of a scatter plot."""
 _IMU_LEGEND = [("imu", "from the sensors"), ("band", "95 % interval")]
@@ -108,7 +108,7 @@ def angles_section(results: SessionResults) -> str:
 
 
 def _detail_start(results: SessionResults) -> float | None:
-    """Return the start of the detailed section, s: the first walking, or the largest movement."""
+    """Return the start of the detailed section, s: the first walking or the largest movement."""
     if results.end_s - results.start_s < 3.0 * _DETAIL_S:
         return None
     first = _first_cycle(results)
@@ -327,7 +327,7 @@ def _range_bar(found: MotionRange, limits: tuple[float, float]) -> Drawing:
 
 
 def comparison_section(results: SessionResults) -> str:
-    """Return the differences between sensors and cameras."""
+    """Return the section on the angle differences between sensors and cameras."""
     if not results.differences:
         text = "There is no reference: the cameras saw no joint angle in this session."
         return section("cameras", "Sensors against cameras", [paragraph(text)])
@@ -345,7 +345,7 @@ def comparison_section(results: SessionResults) -> str:
     ]
     head = ("Angle", "RMS", "Bias", "SD", "Limits of agreement", "Largest", "Inside interval")
 
-    # Draw a panel for the first angle of every joint: flexion or elevation.
+    # Draw one panel for each joint, with its first angle (flexion or elevation).
     shown: dict[str, AngleDifference] = {}
     for found in results.differences:
         shown.setdefault(found.joint, found)
@@ -374,7 +374,7 @@ def _difference_figure(found: AngleDifference) -> str:
     span = (float(found.t_s[0]), float(found.t_s[-1]))
     area = PlotArea(_HALF, 200.0, span, limits)
 
-    # Insert NaN where the cameras have a long gap, so that no line is drawn across the gap.
+    # A NaN in each long gap of the cameras prevents a line across the gap.
     t_s = found.t_s
     if len(t_s) > 1:
         wide = np.flatnonzero(np.diff(t_s) > 5.0 * np.median(np.diff(t_s))) + 1

@@ -80,7 +80,7 @@ def sources_section(results: SessionResults) -> str:
 
 
 def _loss(found: SeriesQuality, counts: Mapping[str, Any]) -> float:
-    """Return the share of lost samples as text, with the configured rate if it is known."""
+    """Return the share of lost samples, 0 to 1, relative to the configured rate if it is known."""
     rate_hz = counts.get("rate_hz")
     if not rate_hz or not np.isfinite(found.rate_hz):
         return found.lost_share
@@ -181,7 +181,7 @@ def timing_section(results: SessionResults) -> str:
 
 
 def calibration_section(results: SessionResults) -> str:
-    """Return the section on the errors that the calibration estimated."""
+    """Return the section on the calibration, with its estimated errors."""
     tables = [
         event.data["quality"]
         for event in results.session.events

@@ -1,6 +1,6 @@
-"""Charts as SVG text: axes, lines, bands, points; the style sheet gives colours and fonts.
+"""Charts as SVG text: axes, lines, bands and points. The style sheet defines colours and fonts.
 
-Invariant: no text of a caller is written without escaping, and no element refers to another file.
+Invariant: every text of a caller is escaped, and no element refers to another file.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 WIDE, NARROW = 920.0, 343.0
-"""Widths of the two drawings of a chart, CSS pixels: for screens and paper, and for phones."""
+"""Widths of the two drawings of a chart, CSS pixels. Screens and paper show the first; phones show
+the second."""
 _TICK_STEPS = (1.0, 2.0, 5.0, 10.0)
 _TIME_STEPS_S = (
     0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0, 900.0, 1800.0,
@@ -32,27 +33,27 @@ _MINUTES_FROM_S = 180.0
 
 @dataclass(frozen=True, slots=True)
 class PlotArea:
-    """Plot area within an image, and its scales."""
+    """Plot area within an image, with the scales of its axes."""
 
     width: float
     height: float
     x: tuple[float, float]
-    """Values at the left and right edge."""
+    """Values of the horizontal axis at the left and the right edge."""
     y: tuple[float, float]
-    """Values at the lower and upper edge."""
+    """Values of the vertical axis at the lower and the upper edge."""
     left: float = 44.0
     right: float = 8.0
     top: float = 24.0
     bottom: float = 26.0
 
     def x_px(self, values: Array | float) -> Array:
-        """Return horizontal positions, px."""
+        """Return the horizontal positions of values, px."""
         span = (self.x[1] - self.x[0]) or 1.0
         inner = self.width - self.left - self.right
         return self.left + (np.asarray(values) - self.x[0]) / span * inner
 
     def y_px(self, values: Array | float) -> Array:
-        """Return vertical positions, px."""
+        """Return the vertical positions of values, px."""
         span = (self.y[1] - self.y[0]) or 1.0
         inner = self.height - self.top - self.bottom
         return self.top + (self.y[1] - np.asarray(values)) / span * inner
@@ -72,12 +73,12 @@ def image(width: float, height: float, label: str, parts: Iterable[str], kind: s
 
 
 def responsive(draw: Callable[[float, str], str]) -> str:
-    """Return a chart drawn twice: `draw` receives width and CSS class."""
+    """Return a chart in two drawings; `draw` receives the width and CSS class of each drawing."""
     return draw(WIDE, "wide") + draw(NARROW, "narrow")
 
 
 def nice_ticks(low: float, high: float, most: int) -> list[float]:
-    """Return about `most` round values, or fewer, from `low` to `high`."""
+    """Return round values from `low` to `high`, about `most` or fewer."""
     span = high - low
     if not isfinite(span) or span <= 0.0:
         return [low]
@@ -88,13 +89,13 @@ def nice_ticks(low: float, high: float, most: int) -> list[float]:
 
 
 def time_ticks(low: float, high: float, most: int) -> list[float]:
-    """Return round instants from `low` to `high`, s."""
+    """Return round times from `low` to `high`, s."""
     step = next((s for s in _TIME_STEPS_S if (high - low) / s <= most), _TIME_STEPS_S[-1])
     return [k * step for k in range(ceil(low / step - 1e-9), floor(high / step + 1e-9) + 1)]
 
 
 def time_text(t_s: float, span_s: float) -> str:
-    """Return an instant as text in seconds; in a long session as minutes and seconds."""
+    """Return a time as text: in seconds, or in minutes and seconds if `span_s` is long."""
     if span_s < _MINUTES_FROM_S:
         return f"{t_s:g}"
     minutes, seconds = divmod(round(t_s), 60)
@@ -102,7 +103,7 @@ def time_text(t_s: float, span_s: float) -> str:
 
 
 def padded(low: float, high: float, share: float = 0.08, least: float = 1.0) -> tuple[float, float]:
-    """Return limits of an axis that leave a margin at both ends."""
+    """Return the limits of an axis with a margin at both ends."""
     if not (isfinite(low) and isfinite(high)):
         return 0.0, 1.0
     margin = max(share * (high - low), 0.5 * max(0.0, least - (high - low)), 1e-6)
@@ -115,7 +116,7 @@ def frame(
     y_ticks: Iterable[tuple[float, str]],
     y_title: str = "",
 ) -> str:
-    """Return grid, tick labels and the title of the vertical axis."""
+    """Return the grid, the tick labels, and the title of the vertical axis."""
     x0, x1 = area.left, area.width - area.right
     y0 = area.height - area.bottom
     parts = []
@@ -165,7 +166,7 @@ def second_ticks(area: PlotArea, unit: str = " s") -> list[tuple[float, str]]:
 
 
 def number(value: float) -> str:
-    """Return a number with a real minus sign; a dash if unknown."""
+    """Return a number with a typographic minus sign, or a dash if it is unknown."""
     if not isfinite(value):
         return "–"
     text = f"{value:.6g}"
@@ -208,7 +209,7 @@ def points(area: PlotArea, x: Array, y: Array, kind: str) -> str:
 
 
 def runs(known: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return start and end of every run of true values."""
+    """Return the start and the end of every run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], known.astype(np.int8), [0]))))
     return [(int(start), int(end)) for start, end in edges.reshape(-1, 2)]
 
@@ -216,7 +217,7 @@ def runs(known: NDArray[np.bool_]) -> list[tuple[int, int]]:
 def column_extremes(
     area: PlotArea, x: Array, low: Array, high: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the lowest of `low` and the highest of `high` in every pixel column, NaN if empty."""
+    """Return x, minimum of `low` and maximum of `high` in every pixel column, NaN if empty."""
     column = np.clip((area.x_px(x) - area.left).astype(np.int64), 0, area.columns - 1)
     lowest, highest = np.full(area.columns, np.inf), np.full(area.columns, -np.inf)
     known = np.isfinite(low) & np.isfinite(high)

@@ -6,11 +6,11 @@ from math import degrees, isfinite
 
 UNKNOWN = "–"
 _PERCENT_OF_NONE = 0.0005
-"""Smallest share that is written as a number; a smaller share is written as a limit."""
+"""Smallest share that is displayed as a number. A smaller share is displayed as ``< 0.1 %``."""
 
 
 def joint_angle(joint: str, angle: str) -> str:
-    """Return the title of an angle: ``Right knee flexion``."""
+    """Return the title of an angle, such as ``Right knee flexion``."""
     return f"{title(joint)} {angle.replace('_', ' ')}"
 
 
@@ -21,7 +21,7 @@ def title(name: str) -> str:
 
 
 def decimal(value: float, places: int = 1) -> str:
-    """Return a number with a real minus sign, or a dash for an unknown value."""
+    """Return a number with a typographic minus sign, or a dash if it is unknown."""
     if not isfinite(value):
         return UNKNOWN
     text = f"{value:.{places}f}"
@@ -29,17 +29,17 @@ def decimal(value: float, places: int = 1) -> str:
 
 
 def degree(value_rad: float, places: int = 1) -> str:
-    """Return an angle in degrees, or a dash for an unknown angle."""
+    """Return an angle in degrees, or a dash if it is unknown."""
     return f"{decimal(degrees(value_rad), places)}°" if isfinite(value_rad) else UNKNOWN
 
 
 def with_sd(value_rad: float, sd_rad: float) -> str:
-    """Return an angle, with the standard deviation if that is known."""
+    """Return an angle, together with its standard deviation if that is known."""
     return degree(value_rad) + (f" ± {degree(sd_rad)}" if isfinite(sd_rad) else "")
 
 
 def percent(share: float) -> str:
-    """Return a share in percent; a small share is written as a limit."""
+    """Return a share in percent; a very small share is displayed as a limit."""
     if not isfinite(share):
         return UNKNOWN
     if 0.0 < share < _PERCENT_OF_NONE:
@@ -48,7 +48,7 @@ def percent(share: float) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Return a duration: ``42.5 s``, ``12 min 5 s``, ``1 h 20 min``."""
+    """Return a duration, such as ``42.5 s``, ``12 min 5 s`` or ``1 h 20 min``."""
     if seconds < 60.0:  # noqa: PLR2004 - a minute
         return f"{decimal(seconds)} s"
     minutes, rest = divmod(round(seconds), 60)
@@ -57,5 +57,5 @@ def duration(seconds: float) -> str:
 
 
 def counted(count: int, one: str, many: str = "") -> str:
-    """Return a count with its noun: ``1 gap``, ``2 gaps``."""
+    """Return a count with its noun, such as ``1 gap`` or ``2 gaps``."""
     return f"{count} {one if count == 1 else many or one + 's'}"

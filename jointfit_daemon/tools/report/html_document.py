@@ -1,7 +1,7 @@
 """HTML pages without scripts: the document, sections, tables, lists of facts.
 
-Invariant: all text is escaped, and the content security policy of a page forbids everything but its
-own style sheet.
+Invariant: all text is escaped. The content security policy of a page forbids everything except the
+page's own style sheet.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def document(title: str, body: str) -> str:
 
 
 def footer(text: str) -> str:
-    """Return the end of a page, with the version of the software."""
+    """Return the footer of a page, which contains the version of the software."""
     return f"<footer><p>{escape(text)}</p><p>Made by jointfitd {__version__}.</p></footer>"
 
 
@@ -74,12 +74,12 @@ def section(anchor: str, title: str, parts: Iterable[str]) -> str:
 
 
 def paragraph(text: str, kind: str = "") -> str:
-    """Return a paragraph; `kind` is its class."""
+    """Return a paragraph; `kind` is its CSS class."""
     return f"<p{_class(kind)}>{escape(text)}</p>"
 
 
 def facts(pairs: Iterable[tuple[str, str]], kind: str = "facts") -> str:
-    """Return names and values as a description list."""
+    """Return name and value pairs as a description list."""
     rows = "".join(
         f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs
     )
@@ -87,7 +87,7 @@ def facts(pairs: Iterable[tuple[str, str]], kind: str = "facts") -> str:
 
 
 def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], text: int = 1) -> str:
-    """Return a table; the first column names the row, the first `text` columns are left-aligned."""
+    """Return a table with row names in the first column; `text` columns are left-aligned."""
 
     def cell(number: int, value: str) -> str:
         kind = "" if number < text else ' class="number"'
@@ -113,7 +113,7 @@ def table(caption: str, head: Sequence[str], rows: Iterable[Sequence[str]], text
 
 
 def figure(drawing: str, caption: str, legend: Sequence[tuple[str, str]] = ()) -> str:
-    """Return a drawing with caption and legend; the legend is pairs of CSS class and text."""
+    """Return a drawing with caption and legend; a legend entry is a CSS class and a text."""
     keys = "".join(
         f'<span class="key"><svg class="swatch" viewBox="0 0 22 12" aria-hidden="true">'
         f"{_SWATCHES[kind]}</svg>{escape(text)}</span>"

@@ -1,6 +1,6 @@
-"""The report of a session as one HTML page without scripts and without references to other files.
+"""The report of a session as one HTML page without scripts and references to other files.
 
-Invariant: equal sessions give equal bytes.
+Invariant: equal sessions produce identical bytes.
 """
 
 from __future__ import annotations
@@ -61,9 +61,9 @@ _DESCRIBED = (
     ("recording", "File"),
     ("source", "Source"),
 )
-"""Keys of the description of a session, and their names on the page."""
+"""Keys of a session's description, and the names of the keys on the page."""
 _MUCH_LOSS = 0.05
-"""Share of lost samples above which a value is marked."""
+"""Share of lost samples above which the page highlights the value."""
 _DISCLAIMER = (
     "jointfitd is not a medical device. Angles and their uncertainty were estimated by software"
     " from body-worn sensors; a diagnosis must not rest on them alone."
@@ -107,7 +107,7 @@ def _header(results: SessionResults) -> str:
 
 
 def _summary(results: SessionResults) -> str:
-    """Return the tiles with the most important results."""
+    """Return the boxes with the most important results."""
     count = results.faults
     faults = "see the list below" if count else "none reported"
     tiles = [

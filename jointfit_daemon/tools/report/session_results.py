@@ -1,4 +1,4 @@
-"""All results of a session that the page shows, computed once."""
+"""All results of a session that the page of the report shows, computed once."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ class SessionResults:
     start_s: float
     end_s: float
     sources: Mapping[str, SeriesQuality]
-    """Completeness of every sensor by id, and of the cameras as ``cameras``."""
+    """Completeness of the data of every sensor, by id. The id of the cameras is ``cameras``."""
     ranges: tuple[MotionRange, ...]
     differences: tuple[AngleDifference, ...]
     gait: Mapping[str, GaitCycles]
-    """Gait cycles by side: ``right``, ``left``, or empty for a limb of one side."""
+    """Gait cycles by side: ``right``, ``left``, or an empty text for a limb without sides."""
 
     @property
     def angles(self) -> list[tuple[JointSeries, str]]:
-        """Joints and the names of their angles that are known at some instant."""
+        """Pairs of joint and angle name, for the angles that are known at some time."""
         return [
             (joint, angle)
             for joint in self.session.joints
@@ -62,7 +62,7 @@ class SessionResults:
         return next((j for j in self.session.optical_joints if j.name == name), None)
 
     def values(self, kind: str) -> dict[str, Mapping[str, Any]]:
-        """Return the data of the last event of a kind by id."""
+        """Return the data of the last event of `kind` for each event id."""
         return {event.id: event.data for event in self.session.events if event.kind == kind}
 
     @property
@@ -107,12 +107,12 @@ def analyze_session(session: SessionData) -> SessionResults:
 
 
 def is_fault(event: TimelineEvent) -> bool:
-    """Return whether an event reports a fault: by its level, or because data are missing."""
+    """Return whether an event reports a fault, which follows from its level or missing data."""
     return event.data.get("level") in FAULT_LEVELS or event.kind == "gap"
 
 
 def side_of(name: str) -> str:
-    """Return the side that a segment or joint name contains: ``right``, ``left`` or empty."""
+    """Return the side in the name of a segment or joint: ``right``, ``left`` or an empty text."""
     words = name.lower().replace("-", "_").split("_")
     for side in ("right", "left"):
         if side in words or words[-1] == side[0] or words[0] == side[0]:

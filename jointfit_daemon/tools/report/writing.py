@@ -25,9 +25,9 @@ def write_report(recording: Path, page: Path) -> SessionData:
     Raises
     ------
     ValueError
-        As `load_data`.
+        The errors of `load_data`.
     OSError
-        The recording cannot be read, or the page not written.
+        The recording cannot be read, or the page cannot be written.
     """
     session = load_data(recording)
     write_page(session, page)
@@ -35,5 +35,5 @@ def write_report(recording: Path, page: Path) -> SessionData:
 
 
 def write_page(session: SessionData, page: Path) -> None:
-    """Write the page of a session; an existing page is replaced when the new page is complete."""
+    """Write the page of a session; a complete new page replaces an existing page."""
     replace_file(page, render_report(session))
