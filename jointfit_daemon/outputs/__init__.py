@@ -1,1 +1,1 @@
-"""Outputs of the daemon: MQTT topics, the log, and the recording of input events."""
+"""Outputs of the daemon: MQTT topics, the log, recordings, metrics and LSL streams."""

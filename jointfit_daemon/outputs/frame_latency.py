@@ -1,7 +1,7 @@
-"""Latency of frames by stage: from the arrival of the last chunk to the socket of the broker.
+"""Latency of frames by processing stage, from the arrival of the last chunk to the broker's socket.
 
-Invariant: a chunk of bytes costs one reading of the clock. A frame costs four more readings, one
-addition to a histogram per stage, and two small objects.
+Invariant: a chunk costs one reading of the clock. A frame costs four more readings, one addition to
+a histogram per stage, and two small objects.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
 _UNIT_BITS = 10
-"""Number of bits by which times, ns, are shifted: the unit of the counts is 1024 ns, and a shift is
-faster than a division."""
+"""Number of bits by which times in ns are shifted, so that the unit of the histogram is 1024 ns. A
+shift is faster than a division."""
 _OCTAVE_BITS = 2
-"""Each octave has four buckets, so an upper limit exceeds a time by at most a quarter."""
+"""Binary logarithm of the number of buckets per octave. With four buckets, an upper limit exceeds a
+time by at most a quarter."""
 _BUCKETS = 100
-"""Number of buckets; the last one contains all times from 60 s on."""
+"""Number of buckets. The last bucket contains all times of 60 s and more."""
 
 
 class LatencyHistogram:
@@ -44,7 +45,7 @@ class LatencyHistogram:
     def quantile_ns(self, share: float) -> int | None:
         """Return the quantile `share` of the times, ns, rounded up; None without times.
 
-        The result is the upper limit of a bucket, but never more than the longest time.
+        The result is the upper limit of a bucket, but at most the longest time.
         """
         left = share * self.total
         for bucket, count in enumerate(self.counts):
@@ -72,27 +73,27 @@ class StageLatency:
 
 @dataclass(frozen=True, slots=True)
 class LatencyHealth:
-    """Latency of the frames of one interval between health messages."""
+    """Latency of the frames in one interval between two health messages."""
 
     frames: int
-    """Number of frames fused."""
+    """Number of fused frames."""
     stages: Mapping[str, StageLatency | None]
     """Latency by stage, in the order of processing; None for a stage that no frame has passed."""
 
 
 STAGES = ("decoded", "aligned", "fused", "encoded", "written", "total")
-"""Stages of a frame. The latency of a stage is the time since the end of the stage before. The
-latency of ``decoded`` is the time since the arrival. ``total`` is the time from the arrival to the
-end of ``written``."""
+"""Processing stages of a frame. The latency of a stage is the time since the end of the previous
+stage. The latency of ``decoded`` is the time since the arrival. ``total`` is the time from the
+arrival to the end of ``written``."""
 
 
 class FrameLatency:
-    """Measures the stages of every frame; a `StageObserver` of the core.
+    """Measures the processing stages of every frame; a `StageObserver` of the core.
 
     Parameters
     ----------
     clock
-        Function that returns the present instant, CLOCK_MONOTONIC ns.
+        Function that returns the current instant, CLOCK_MONOTONIC ns.
     """
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
@@ -100,7 +101,8 @@ class FrameLatency:
         self._histograms = {stage: LatencyHistogram() for stage in STAGES}
         self._arrival_ns = self._decoded_ns = self._aligned_ns = 0
         self._fused: deque[tuple[int, int]] = deque()
-        """Instants of the beginning and the fusion of each frame that is not encoded yet, ns."""
+        """Instants at which processing began and fusion ended, ns, for each frame not encoded
+        yet."""
         self.end_interval()
 
     def end_interval(self) -> None:
@@ -116,7 +118,7 @@ class FrameLatency:
         self.health = LatencyHealth(found["fused"].total, stages)
 
     def mark_decoded(self, arrival_ns: int) -> None:
-        """Store the instant at which a chunk was decoded."""
+        """Store the instant at which decoding of a chunk ended."""
         self._arrival_ns, self._decoded_ns = arrival_ns, self._clock()
 
     def mark_aligned(self) -> None:
@@ -125,7 +127,7 @@ class FrameLatency:
         self._fused.clear()  # states of the previous event that no output encoded
 
     def mark_fused(self, deadline_ns: int | None) -> None:
-        """Count the stages of a frame up to its limb state."""
+        """Count the latency of the stages of a frame up to the fusion."""
         found, fused_ns = self._histograms, self._clock()
         if deadline_ns is None:
             began_ns, decoded_ns = self._arrival_ns, self._decoded_ns
@@ -138,10 +140,10 @@ class FrameLatency:
         self._fused.append((began_ns, fused_ns))
 
     def mark_encoded(self) -> Callable[[], None] | None:
-        """Count the encoding of a frame; return the function to call once the frame is written.
+        """Count the encoding of a frame, and return the function to call when the frame is written.
 
-        Frames are encoded in the order of their fusion. The result is None for a state whose fusion
-        was not observed.
+        Frames are encoded in the order of their fusion. The result is None if the fusion of the
+        frame was not observed.
         """
         if not self._fused:
             return None

@@ -1,7 +1,7 @@
 """Device discovery by Home Assistant: one retained message describes the rig and its entities.
 
-Invariant: every entity reads a topic of docs/mqtt.md that is published at most once a second.
-Format: Home Assistant's documentation of MQTT discovery, "device discovery payload".
+Invariant: every entity reads a topic of docs/mqtt.md with at most one message per second. The
+format is described in Home Assistant's documentation of MQTT discovery, "device discovery payload".
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings, Rig
 
 _SILENCE_MESSAGES = 5
-"""Number of missing messages after which an angle is unavailable."""
+"""Number of missing messages after which Home Assistant shows an angle as unavailable."""
 _BUTTONS = {
     "static": ("Static pose", "static", {}, "mdi:human-handsup"),
     "calibrate": ("Calibrate by movement", "calibrate", {"phase": "functional"}, "mdi:run"),
@@ -47,7 +47,7 @@ def discovery_payload(rig: Rig) -> dict[str, Any]:
     Parameters
     ----------
     rig
-        Provides joints, sensors, topics and rates.
+        Rig whose joints, sensors, topics and rates the message describes.
     """
     base, device = rig.mqtt.base, topics.client_identifier(rig.mqtt.base)
     components = dict([*_angles(rig), *_calibration(base), *_problems(rig)])
@@ -81,7 +81,7 @@ def discovery_payload(rig: Rig) -> dict[str, Any]:
 
 
 def _angles(rig: Rig) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield entities for the angles and the standard deviation of each inner joint."""
+    """Yield entities for the angles of each inner joint and their standard deviation."""
     if rig.chain.planar:  # A planar chain is published as optical/sticks, without angles.
         return
     for joint in inner_joints(rig.chain):
@@ -136,7 +136,7 @@ def _calibration(base: str) -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def _problems(rig: Rig) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield a problem sensor for each device: disconnected, silent or stuck."""
+    """Yield a binary sensor of class ``problem`` for each device: disconnected, silent or stuck."""
     for source in rig.sources:
         device = f"value_json.devices[{json.dumps(source.id)}]"  # escaped as in Jinja templates
         yield (

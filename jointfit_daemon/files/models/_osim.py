@@ -209,7 +209,7 @@ class _Tree:
         return path
 
     def kept(self, keep: set[str]) -> list[Segment]:
-        """Return the segments to keep; roots without their parents move freely."""
+        """Return the segments to keep. A root whose parent is omitted moves freely."""
         left = [name for name in self.segments if name not in keep]
         if left:
             self.remarks.append(f"left out, no marker needs them: {', '.join(left)}")
@@ -238,7 +238,7 @@ def _vector(v: Array) -> Vector:
 
 
 def _path(path: Array, placed: Array) -> tuple[Sample, ...]:
-    """Return the samples of a coupled joint in the axes of chain models."""
+    """Return the samples of a coupled joint, converted to the axes of chain models."""
     turns = rotation.multiply(rotation.from_matrix(placed), path[:, 1:5])
     shifts = path[:, 5:] @ placed.T
     return tuple(

@@ -1,6 +1,6 @@
 """Coordinates of OpenSim joints as functions of the pose of a chain model.
 
-Values have OpenSim's names, signs and axes, because the functions of the file are evaluated.
+Values have the names, signs and axes of OpenSim, because the functions of the file are evaluated.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import Segment
 
 _X, _Y, _Z = to_z_up(np.eye(3)).argmax(axis=1).tolist()
-"""Axes of the chain that OpenSim calls x, y and z."""
+"""Indices of the chain axes that correspond to OpenSim's x, y and z."""
 
 
 def joint_coordinates(segment: Segment, joint: OsimJoint, placed: Array) -> JointCoordinates:
@@ -32,9 +32,9 @@ def joint_coordinates(segment: Segment, joint: OsimJoint, placed: Array) -> Join
     segment
         Segment of the chain model that the joint moves.
     joint
-        Joint as written.
+        Joint as read from the file.
     placed
-        Pose of the joint's parent body in the segment that contains this body, OpenSim's axes,
+        Pose of the joint's parent body in the segment that contains this body, in OpenSim's axes,
         shape (4, 4).
     """
     motion = JointMotion(joint)
@@ -55,7 +55,7 @@ def joint_coordinates(segment: Segment, joint: OsimJoint, placed: Array) -> Join
 
 
 def unnamed_coordinates(segment: str) -> JointCoordinates:
-    """Return the coordinates of a body without a joint to the world, in OpenSim's axes."""
+    """Return the coordinates of a body that no joint connects to the world, in OpenSim's axes."""
     return euler_coordinates(segment, is_free=True, order=(_X, _Y, _Z))
 
 

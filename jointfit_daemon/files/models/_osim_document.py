@@ -1,7 +1,7 @@
 """Content of an OpenSim file as plain data in its own axes: bodies, joints, frames, markers.
 
 Only names, numbers and frames are interpreted. A document type declaration is rejected before any
-expansion, so no entity can grow or refer to other files.
+expansion. Entities can therefore neither grow nor refer to other files.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LARGEST = 64 << 20
 """Largest size of a model file, bytes."""
 GROUND = "ground"
 _OPENSIM_4 = 40000
-"""Attribute ``Version`` of the first documents of OpenSim 4."""
+"""Smallest attribute ``Version`` of an OpenSim 4 document."""
 _METRES = "meters"
 
 
@@ -34,7 +34,7 @@ class OffsetFrame:
 
     body: str
     transform: Array
-    """Frame axes to body axes, shape (4, 4)."""
+    """Transform from frame axes to body axes, shape (4, 4)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,21 +50,21 @@ class Coordinate:
 
 @dataclass(frozen=True, slots=True)
 class OsimJoint:
-    """A joint as written."""
+    """A joint as written in the file."""
 
     name: str
     kind: str
-    """XML tag of the joint: CustomJoint, PinJoint, ……"""
+    """XML tag of the joint, such as CustomJoint or PinJoint."""
     parent: OffsetFrame
     child: OffsetFrame
     coordinates: tuple[Coordinate, ...]
     spatial: ET.Element | None
-    """SpatialTransform of a CustomJoint."""
+    """Element SpatialTransform of a CustomJoint; None for other joints."""
 
 
 @dataclass(frozen=True, slots=True)
 class OsimMarker:
-    """A marker as written."""
+    """A marker as written in the file."""
 
     name: str
     body: str
@@ -140,7 +140,7 @@ def read_document(path: Path) -> OsimDocument:
 
 
 def read_xml(path: Path) -> ET.Element:
-    """Return the root of an XML file without a document type; `MalformedFileError` otherwise."""
+    """Return the root of an XML file; raise `MalformedFileError` for a document type."""
     reject_device(path)
     if path.stat().st_size > LARGEST:
         raise MalformedFileError(
@@ -182,7 +182,7 @@ def read_xml(path: Path) -> ET.Element:
 
 
 class _LocatedElement(ET.Element):
-    """An element that knows its line."""
+    """An XML element with the number of its first line."""
 
     line = 0
 
@@ -216,12 +216,12 @@ def numbers_of(element: ET.Element, tag: str, count: int | None = None) -> Array
 
 
 def body_of(socket: str) -> str:
-    """Return the last name of a path such as ``/bodyset/femur_r``."""
+    """Return the last part of a path such as ``/bodyset/femur_r``."""
     return socket.strip().rpartition("/")[2]
 
 
 def fixed_xyz(angles: Array) -> Array:
-    """Return the matrix (3, 3) of rotations, rad, shape (3,): about x, new y and new z."""
+    """Return the matrix (3, 3) of rotations about x, new y and new z; angles (3,), rad."""
     turns = []
     for axis, angle in enumerate(angles):
         j, k = (axis + 1) % 3, (axis + 2) % 3

@@ -1,15 +1,16 @@
 r"""Approximation of an OpenSim joint by a joint of the chain model.
 
-A rotation by one coordinate becomes a hinge if the axis is fixed, or else a coupled joint with
-samples of the motion. A rotation by two or three coordinates becomes a ball joint. A_i and t_i are
-rotation and translation of sample i, φ_i is its angle, and A_rest is the rotation at zero angle.
-The axis a, and the centers c in the child and C in the parent, minimize the error over the range of
-the coordinates:
+A rotation by one coordinate becomes a hinge if its axis is fixed. Otherwise it becomes a coupled
+joint with samples of the motion. A rotation by two or three coordinates becomes a ball joint.
+
+A_i and t_i are the rotation and translation of sample i, φ_i is its angle, and A_rest is the
+rotation at angle zero. The axis a and the centers (c in the child, C in the parent) minimize the
+error over the range of the coordinates:
 
 .. math:: A_i \approx A_{rest}\exp(a\varphi_i), \qquad
           \min_{c, C} \sum_i |t_i + A_i c - C|^2
 
-The remaining error is reported in a remark.
+A remark states the remaining error.
 """
 
 from __future__ import annotations
@@ -30,39 +31,39 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import JointKind
 
 _ALL = 3
-"""Number of axes in space."""
+"""Number of rotation axes of a ball joint."""
 _SAMPLES = 61
 """Number of samples over the range of a coordinate."""
 _AT_HOME = 0.05
-"""Regularization of a center toward the joint's own frame: 1 cm of distance counts as 0.5 mm of
-error.
-"""
+"""Weight that regularizes a center toward the origin of the joint's own frame. A distance of 1 cm
+costs as much as an error of 0.5 mm."""
 _WIDEST = np.pi / 2
-"""Range that is evaluated on both sides of the default of a coordinate with a wider range, rad."""
+"""Half of the evaluated range about the default of a coordinate with a wider range, rad."""
 _BEYOND = 0.3
-"""Extension of the samples of a coupled joint beyond its range, rad. It is necessary because not
-all programs clamp coordinates to their range."""
+"""Extension of the samples of a coupled joint beyond its range, rad. Some programs do not clamp
+coordinates to their range."""
 _TELL_M, _TELL_RAD = 1e-4, 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class NearestJoint:
-    """Joint of the chain model, or none (``weld``), in OpenSim's axes."""
+    """Joint of the chain model in OpenSim's axes; the kind ``weld`` means no joint."""
 
     kind: JointKind | None
     rest: Array
-    """Child body axes to parent body axes, at the joint's zero; shape (4, 4)."""
+    """Transform from child body axes to parent body axes at the joint's zero, shape (4, 4)."""
     center_in_parent: Array
     center: Array
     axis: Array
     limits: tuple[float, float] | None
     remarks: tuple[str, ...]
     path: Array | None = None
-    """Samples of a coupled joint: coordinate, quaternion, shift of its center; shape (n, 8)."""
+    """Samples of a coupled joint: coordinate, quaternion, displacement of its center; shape (n,
+    8)."""
 
 
 def nearest_joint(joint: OsimJoint) -> NearestJoint:
-    """Return the approximating joint, with remarks on the differences.
+    """Return the approximating joint, with remarks on the differences from the original joint.
 
     Raises
     ------
@@ -122,8 +123,8 @@ def sampled_joint(
 def _centers(joint: OsimJoint, turns: Array, shifts: Array) -> tuple[Array, Array, float]:
     """Return the center in the parent and in the child, m, and the largest error.
 
-    Where the motion does not determine the center, for example along an axis, the point nearest to
-    the joint's own frame is chosen.
+    The motion may leave the center undetermined, for example along an axis. In this case the point
+    nearest to the joint's own frame is chosen.
     """
     own = joint.child.transform[:3, 3]
     seen = shifts + turns @ own
@@ -162,7 +163,7 @@ def _ball(
 def _about_one(
     joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
 ) -> NearestJoint:
-    """Return the hinge of one coordinate, or the coupled joint if the axis is not fixed."""
+    """Return the hinge of one coordinate; a coupled joint if the axis is not fixed."""
     span = _span(coordinate)
     zero = min(max(0.0, span[0]), span[1])
     values = np.concatenate(([zero, *span], np.linspace(*span, _SAMPLES)))
@@ -190,7 +191,7 @@ def _about_one(
 def _coupled(
     joint: OsimJoint, motion: JointMotion, coordinate: Coordinate, welded: NearestJoint
 ) -> NearestJoint:
-    """Return a joint as samples of its motion, extended beyond the range, with the errors."""
+    """Return a joint as samples of its motion, which extend beyond its range, with the errors."""
     low, high = _span(coordinate)
     zero = min(max(0.0, low), high)
     values = np.linspace(low - _BEYOND, high + _BEYOND, 2 * _SAMPLES - 1)
@@ -200,7 +201,7 @@ def _coupled(
     above = seen[-1]
     path = np.column_stack((values, rotation.from_matrix(turns[:-1]), seen[:-1] - above))
 
-    # Every second sample defines the curve; the samples in between measure the error of the curve.
+    # Every second sample defines the curve. The other samples measure the error of the curve.
     turned, found = CoupledCurve.through(path[::2].tolist()).at(values)
     missed = float(np.linalg.norm(found[:, 1:4] - path[:, 5:], axis=1).max())
     bent = float(np.linalg.norm(turned - turns[:-1], axis=(1, 2)).max() / np.sqrt(2.0))
@@ -219,11 +220,11 @@ def _coupled(
 
 
 def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
-    """Return rest, axis, angles and largest deviation from the axis, of rotations (n, 3, 3).
+    """Return rest, axis, angles and largest deviation from the axis, for rotations (n, 3, 3).
 
-    Rest and axis are computed alternately: the mean of the part that the hinge does not explain,
-    then the principal direction of the rotations relative to this rest. The angle of the first
-    rotation is zero.
+    Rest and axis are computed alternately. The rest is the mean of the part of the rotations that
+    the hinge does not explain. The axis is the principal direction of the rotations relative to
+    this rest. The angle of the first rotation is zero.
     """
     q = rotation.from_matrix(turns)
     rest = q[0]
@@ -232,7 +233,7 @@ def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
         rest = rotation.average(rotation.multiply(q, rotation.exp(-angles[:, None] * axis)))
         axis, angles = _turned_about(rest, q)
 
-    # Positive direction: the angle increases with the coordinate.
+    # The angle increases with the coordinate; otherwise the axis is reversed.
     if angles[-1] < angles[1]:
         axis, angles = -axis, -angles
     rest = rotation.multiply(rest, rotation.exp(angles[0] * axis))
@@ -242,7 +243,7 @@ def _axis(turns: Array) -> tuple[Array, Array, Array, float]:
 
 
 def _turned_about(rest: Array, q: Array, axis: Array | None = None) -> tuple[Array, Array]:
-    """Return `axis`, or the principal axis of the rotations from `rest`, and the angles, rad."""
+    """Return the axis and the angles, rad; without `axis`, the principal axis of the rotations."""
     v = rotation.log(rotation.multiply(rotation.conjugate(rest), q))
     if axis is None:
         axis = np.asarray(np.linalg.svd(v, full_matrices=False)[2][0])

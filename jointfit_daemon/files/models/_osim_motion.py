@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _X, _Y, _Z = np.eye(3)
 _TURNING = 3
-"""Number of rotational transform axes; the same number of translational axes follows."""
+"""Number of rotational axes of a transform. The same number of translational axes follows them."""
 _CUBIC = 4
 """Smallest number of points of a cubic spline."""
 _TURNS: dict[str, list[Array]] = {
@@ -84,7 +84,7 @@ class JointMotion:
 
     @property
     def second_rotation(self) -> str:
-        """Coordinate of the second rotation, or an empty string."""
+        """Coordinate of the second rotation; empty if there is none."""
         return self._axes[1][0]
 
     @property
@@ -102,7 +102,7 @@ class JointMotion:
         return frozenset(name for name, _, f in axes if name and np.ptp(f(probe)) > 0.0)
 
     def at(self, values: dict[str, Array]) -> tuple[Array, Array]:
-        """Return R, shape (n, 3, 3), and t, m, shape (n, 3), of the child's frame in the parent's.
+        """Return R, shape (n, 3, 3), and t, m, shape (n, 3), from child frame to parent frame.
 
         Parameters
         ----------
@@ -170,9 +170,10 @@ def _scalar(element: Element, tag: str, default: float) -> float:
 def _through_points(element: Element) -> Function:
     """Return a curve through points, extrapolated linearly.
 
-    The ends of a SimmSpline follow the cubic through their four nearest points; here they follow
-    the cubic of the two nearest pieces. The difference is micrometres, in the end pieces only.
-    OpenSim evaluates a NaturalCubicSpline as a SimmSpline, too.
+    In OpenSim, the ends of a SimmSpline follow the cubic through their four nearest points. Here
+    they follow the cubic of the two nearest pieces. The difference is micrometres and occurs only
+    in the end pieces. OpenSim evaluates a NaturalCubicSpline as a SimmSpline, and so does this
+    function.
     """
     x, y = numbers_of(element, "x"), numbers_of(element, "y")
     if x.size != y.size or x.size <= 1 or not (np.diff(x) > 0.0).all():

@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class IkSetup:
-    """Content of a set-up file that inverse kinematics uses."""
+    """Part of a set-up file that inverse kinematics uses."""
 
     weights: dict[str, float]
     """Weight of each marker task; 0 for tasks that are not applied."""
     time_range: tuple[float, float] | None
-    """First and last time, s."""
+    """First and last time of the trial to evaluate, s; None if the file contains no range."""
     ignored: tuple[str, ...]
-    """Names of the coordinate tasks, which are ignored."""
+    """Names of the coordinate tasks; the program ignores these tasks."""
 
 
 def read_ik_setup(path: Path) -> IkSetup:

@@ -1,7 +1,7 @@
-"""Writes tables that OpenSim can read: STO and MOT files without empty cells.
+"""Writer of tables that OpenSim can read: STO and MOT files without empty cells.
 
-OpenSim rejects empty cells, and its `Storage` misreads NaN. Invariant: all cells of a written table
-are known; columns that are mostly unknown are left out first, then frames with unknown values.
+OpenSim rejects empty cells, and its class `Storage` misreads NaN. Invariant: all cells of a written
+table are known. Columns that are mostly unknown are omitted first, then frames with unknown values.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LEAST_KNOWN = 0.5
-"""Smallest share of known frames in a written column, relative to the frames with any known
-value."""
+"""Smallest share of known values in a written column, relative to the frames with at least one
+known value."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenTable:
-    """Outcome of writing one table."""
+    """Result of writing one table."""
 
     path: Path
     frames: int
     """Number of written frames; 0 if no file was written."""
     notes: tuple[str, ...] = ()
-    """Omitted columns and frames."""
+    """Descriptions of the omitted columns and frames."""
 
 
 def write_known_values(path: Path, table: TimeTable) -> WrittenTable:
-    """Write the known part of a table, see `complete_part`; no file without a complete frame."""
+    """Write the known part of a table (see `complete_part`); no file if no frame is complete."""
     rows, columns = complete_part(np.isfinite(table.values))
     if rows.any():
         names = tuple(np.array(table.columns)[columns].tolist())
@@ -52,7 +52,7 @@ def write_known_values(path: Path, table: TimeTable) -> WrittenTable:
 
 
 def write_known_orientations(path: Path, table: OrientationTable) -> WrittenTable:
-    """Write the known part of a table of orientations, as `write_known_values`."""
+    """Write the known part of a table of orientations, in the same way as `write_known_values`."""
     rows, columns = complete_part(np.asarray(np.isfinite(table.quaternions).all(axis=-1)))
     if rows.any():
         names = tuple(np.array(table.names)[columns].tolist())
@@ -64,20 +64,21 @@ def write_known_orientations(path: Path, table: OrientationTable) -> WrittenTabl
 
 
 def complete_part(known: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the rows and columns of a table without unknown cells.
+    """Return the largest part of a table without unknown cells, as rows and columns to keep.
 
-    A column remains if it is known in at least `LEAST_KNOWN` of the rows with any known cell. A row
-    remains if all remaining columns are known.
+    A column is kept if it is known in at least `LEAST_KNOWN` of the rows with any known cell. A row
+    is kept if all kept columns are known in it.
 
     Parameters
     ----------
     known
-        Cells with a value, shape (T, K).
+        Mask of the cells that have a value, shape (T, K).
 
     Returns
     -------
     rows, columns
-        Masks, shapes (T,) and (K,). Without remaining columns, no row remains.
+        Masks of the kept rows and columns, shapes (T,) and (K,). If no column is kept, no row is
+        kept.
     """
     count = int(known.any(axis=1).sum())
     columns: NDArray[np.bool_] = known.sum(axis=0) >= max(LEAST_KNOWN * count, 1)

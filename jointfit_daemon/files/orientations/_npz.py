@@ -1,12 +1,12 @@
-"""NPZ files: orientations of sensors and, with a reference system, of bones.
+"""NPZ files: orientations of sensors and, if measured by a reference system, of bones.
 
-World and segment frames are returned in the axes of the project (z up, x right, y forward), for any
-axes of the file. Arrays of a file with n instants::
+World and segment frames are returned in the axes of the project (z up, x right, y forward),
+whatever the axes of the file. A file with n instants contains these arrays::
 
     t        (n,)     seconds
     ID_quat  (n, 4)   orientation of sensor ID, (w, x, y, z), sensor to world
     q_BONE   (n, 4)   orientation of a bone, bone to world
-    p_BONE   (n, 3)   its origin, m
+    p_BONE   (n, 3)   origin of the bone, m
     up       ()       "y" or "z": the vertical axis; default y, with x forward (OpenSim)
 
 A y-up file is converted as `jointfit_daemon.files.axes` describes: a quaternion (w, x, y, z)
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
 
 _GIB = 1 << 30
 LARGEST = _GIB
-"""Largest uncompressed size of all arrays of a file, bytes: 15 hours of four sensors at 100 Hz."""
+"""Largest uncompressed size of all arrays of a file, bytes. It corresponds to 15 hours of four
+sensors at 100 Hz."""
 _KINDS = "biufU"
 """Accepted kinds of NumPy arrays: Booleans, numbers, and text for ``up``."""
 _SENSOR = "_quat"
@@ -54,7 +55,7 @@ class OrientationTrial:
     bones: Mapping[str, NDArray[np.float64]]
     """Segment orientations q_world_segment by bone, shape (n, 4), unit."""
     origins: Mapping[str, NDArray[np.float64]]
-    """Origin of each bone (its proximal joint center), m, shape (n, 3)."""
+    """Origin of each bone (the proximal joint center), m, shape (n, 3)."""
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
@@ -117,7 +118,8 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
     Raises
     ------
     MalformedFileError
-        As `read_arrays`; or the file has no ``t``, or neither a sensor nor a bone.
+        For the reasons given at `read_arrays`; or the file has no ``t``, or neither a sensor nor a
+        bone.
     """
     arrays = read_arrays(path)
     names = [name.removesuffix(_SENSOR) for name in arrays if name.endswith(_SENSOR)]
@@ -150,7 +152,7 @@ def read_orientations_npz(path: Path) -> OrientationTrial:
 def _numbers(
     path: Path, arrays: Mapping[str, NDArray[Any]], name: str, shape: tuple[int, int] | None
 ) -> NDArray[np.float64]:
-    """Return an array of `shape` (None: one-dimensional) as floats; else `MalformedFileError`."""
+    """Return an array of `shape` (None: one-dimensional) as floats, or raise an error."""
     array = arrays[name]
     if array.dtype.kind == "U":
         raise MalformedFileError(f"{path}: {name} holds text, expected numbers: save it as float64")
@@ -164,7 +166,7 @@ def _numbers(
 
 
 def write_orientations_npz(path: Path, trial: OrientationTrial) -> None:
-    """Write a trial, z up, compressed."""
+    """Write a trial with z up, compressed."""
     arrays: dict[str, ArrayLike] = {"t": trial.t_s, "up": np.array("z")}
     arrays |= {name + _SENSOR: values for name, values in trial.sensors.items()}
     arrays |= {_BONE + bone: values for bone, values in trial.bones.items()}

@@ -1,8 +1,9 @@
-"""STO and MOT files: OpenSim's tables over time, and STO tables of orientations.
+"""STO and MOT files of OpenSim: tables over time, and tables of orientations.
 
 Numbers, including angles, are returned as written; ``in_degrees`` defines the unit of angles. A
-file has free header lines and ``key=value`` lines up to ``endheader``, then the column names, then
-rows. In a table of orientations (``DataType=Quaternion``) every cell is ``w,x,y,z``, body to world.
+file begins with free header lines and ``key=value`` lines up to ``endheader``. The column names and
+the rows follow. In a table of orientations (``DataType=Quaternion``) every cell is ``w,x,y,z``, a
+rotation from body to world.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ _COLUMN_KEYS = ("ncolumns", "datacolumns")
 _FIXED_KEYS = {
     *_ROW_KEYS, *_COLUMN_KEYS, "indegrees", "version", "datarate", "datatype", "opensimversion",
 }  # fmt: skip
-"""Keys of the header that belong to the format, in lower case."""
+"""Header keys that belong to the format, in lower case."""
 _QUATERNION = 4
 _UNKNOWN = "nan,nan,nan,nan"
-"""Cell of an unknown orientation: OpenSim rejects empty cells, and ignores a sensor with NaN."""
+"""Cell of an unknown orientation. OpenSim rejects empty cells, but ignores a sensor with NaN."""
 _SHOWN = 60
 """Maximum number of characters of a cell quoted in a message."""
 
@@ -63,7 +64,7 @@ class TimeTable:
     """Further ``key=value`` lines; keys in lower case."""
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """Return one column, shape (n,); ValueError if there is no such column."""
+        """Return one column, shape (n,); raise ValueError if there is no such column."""
         return self.values[:, self.columns.index(name)]
 
 
@@ -114,7 +115,7 @@ def read_orientations_sto(path: Path) -> OrientationTable:
     Raises
     ------
     MalformedFileError
-        As `read_sto`, or a cell without four numbers.
+        For the reasons given at `read_sto`, or because a cell does not contain four numbers.
     """
     _, header, columns, separator, body = _open(path)
     if header.get("datatype", "").lower() != "quaternion" or separator == ",":
@@ -193,7 +194,7 @@ def _further(header: Mapping[str, str]) -> dict[str, str]:
 
 
 def write_sto(path: Path, table: TimeTable) -> None:
-    """Write a STO or MOT file: tab-separated, 8 significant digits, empty cells for missing."""
+    """Write a STO or MOT file: tabs, 8 significant digits, empty cells for missing values."""
     rows = [
         table.name or path.stem,
         "version=1",
@@ -211,7 +212,7 @@ def write_sto(path: Path, table: TimeTable) -> None:
 
 
 def write_orientations_sto(path: Path, table: OrientationTable) -> None:
-    """Write a STO file of quaternions as OpenSim's OpenSense reads them."""
+    """Write a STO file of quaternions that OpenSim's tool OpenSense can read."""
     rows = [
         *([f"DataRate={written(table.rate_hz)}"] if table.rate_hz else []),
         "DataType=Quaternion",

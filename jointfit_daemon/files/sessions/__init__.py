@@ -1,4 +1,4 @@
-"""Sessions in the file formats of the field: export, and import for offline work."""
+"""Sessions in file formats of biomechanics: export, and import for offline processing."""
 
 from jointfit_daemon.files.sessions._formats import (
     SESSION_FORMATS,

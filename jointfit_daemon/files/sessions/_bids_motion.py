@@ -1,11 +1,11 @@
-"""Sessions as Motion-BIDS data sets.
+"""Sessions as data sets of Motion-BIDS, the Brain Imaging Data Structure for motion.
 
-A folder with one subject: ``_motion.tsv`` (numbers without column names), ``_channels.tsv``,
-``_motion.json`` and ``_channels.json`` for each tracking system, and events. Series with the same
-times form one tracking system; its first channel (LATENCY) is the time since the start of the
-session. Angles of joints are in degrees, orientations are quaternions, unknown values are ``n/a``.
-Source: Brain Imaging Data Structure 1.10, "Motion"; Jeung et al. 2024, doi
-10.1038/s41597-024-03559-8.
+A data set is a folder with one subject. Each tracking system has the files ``_motion.tsv`` (numbers
+without column names), ``_channels.tsv``, ``_motion.json`` and ``_channels.json``; events have a
+file of their own. Series with the same times form one tracking system. Its first channel (LATENCY)
+is the time since the start of the session. Joint angles are in degrees, orientations are
+quaternions, and unknown values are ``n/a``. Source: Brain Imaging Data Structure 1.10, "Motion";
+Jeung et al. 2024, doi 10.1038/s41597-024-03559-8.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ _LEVELS = {
 
 
 def write_bids_session(session: SessionData, folder: Path) -> WrittenSession:
-    """Write the data set ``NAME_bids``."""
+    """Write the data set into the new folder ``NAME_bids``."""
     root = folder / f"{session.name}_bids"
     motion = root / _SUBJECT / "motion"
     motion.mkdir(parents=True)
@@ -148,7 +148,7 @@ def write_bids_session(session: SessionData, folder: Path) -> WrittenSession:
 
 
 def _label(name: str) -> str:
-    """Return a name as a label of BIDS: letters and digits only."""
+    """Return a name as a BIDS label, which contains letters and digits only."""
     return re.sub(r"[^0-9A-Za-z]", "", name) or "session"
 
 
@@ -253,13 +253,14 @@ def _write_json(path: Path, content: Any) -> None:
 def read_bids_session(root: Path) -> SessionData:
     """Return the session of a Motion-BIDS data set with one subject and task.
 
-    In a foreign data set, tracking systems with positions become markers, and tracking systems with
-    quaternions become sensors.
+    In a data set that another program wrote, tracking systems with positions become markers, and
+    tracking systems with quaternions become sensors.
 
     Raises
     ------
     MalformedFileError
-        Not a data set with motion, or with several subjects or tasks; missing or wrong files.
+        The folder is no data set with motion, contains several subjects or tasks, or files are
+        missing or wrong.
     """
     files = sorted(root.glob("sub-*/**/motion/*_motion.tsv"))
     recordings = {path.name.split("_tracksys-")[0] for path in files}
@@ -346,7 +347,7 @@ def _read_motion(path: Path, width: int) -> Any:
 
 
 def _channel_of(row: Mapping[str, str]) -> StreamColumn | None:
-    """Return an own channel by its description, a foreign one by its type; None if unknown."""
+    """Return the column of a channel by its own description, or else its type; or None."""
     quantity, _, component = row.get("description", "").partition(" ")
     item = row.get("tracked_point", "")
     placement = row.get("placement", _MISSING)

@@ -1,7 +1,8 @@
 """A session as streams of described channels, for XDF, Motion-BIDS and LSL.
 
 Every channel names the object to which it belongs (sensor, marker, segment or joint), its quantity,
-its component and its unit. Invariant: `session_of` of the streams of `streams_of` is the session.
+its component and its unit. Invariant: `session_of` converts the streams of `streams_of` back to the
+same session.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ UNITS = {
     ANGLE: "rad",
     ANGLE_SD: "rad",
 }
-"""Unit of every quantity; empty if there is no unit or the sensor defines it."""
+"""Unit of every quantity. It is empty if the quantity has no unit, or if the sensor defines the
+unit."""
 _INERTIAL = ("angular_velocity", "acceleration", "magnetic_field")
 
 
@@ -53,13 +55,13 @@ class StreamColumn(NamedTuple):
     """Description of one column of a stream."""
 
     object: str
-    """Sensor, marker, segment or joint."""
+    """Name of the sensor, marker, segment or joint."""
     quantity: str
     """Key of `UNITS`."""
     component: str = ""
     """``w``, ``x``, ``y``, ``z``, or the name of an angle; empty for a scalar."""
     placement: str = ""
-    """Segment that carries a sensor."""
+    """Name of the segment that carries the sensor; empty for other objects."""
 
     @property
     def unit(self) -> str:
@@ -74,11 +76,11 @@ class StreamColumn(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelStream:
-    """Channels with common times."""
+    """Channels that share their sample times."""
 
     group: Group
     name: str
-    """Name of the object, or of the group if the stream contains several objects."""
+    """Name of the object; the name of the group if the stream contains several objects."""
     t_s: Array
     """Instants since the start of the session, s, shape (n,)."""
     channels: tuple[StreamColumn, ...]
@@ -118,7 +120,7 @@ def streams_of(session: SessionData) -> list[ChannelStream]:
 
 
 def merge_streams(streams: Sequence[ChannelStream]) -> list[ChannelStream]:
-    """Return the streams; the streams of a group with common times are merged into one."""
+    """Merge the streams of a group that have common times; return all streams."""
     merged = []
     for group in GROUPS:
         own = [stream for stream in streams if stream.group == group]
@@ -138,7 +140,7 @@ def session_of(
     events: Sequence[TimelineEvent] = (),
     description: Mapping[str, str] | None = None,
 ) -> SessionData:
-    """Return the session of some streams."""
+    """Return the session that consists of the given streams."""
     found: dict[str, list[Any]] = {group: [] for group in GROUPS}
     markers: MarkerSeries | None = None
     for stream in streams:
@@ -164,7 +166,7 @@ def session_of(
 
 
 def _series(stream: ChannelStream, item: str) -> SensorSeries | SegmentSeries | JointSeries:
-    """Return the series of one object of a stream."""
+    """Return the time series of one object of a stream."""
     count = len(stream.t_s)
     if stream.group in ("joints", "optical_joints"):
         return JointSeries(
@@ -208,7 +210,7 @@ def _stream(
 
 
 def _named(stream: ChannelStream, item: str, quantity: str) -> dict[str, Array]:
-    """Return the columns of an object and a quantity by component."""
+    """Return the columns of one object and one quantity, by component."""
     return {
         channel.component: stream.values[:, k]
         for k, channel in enumerate(stream.channels)

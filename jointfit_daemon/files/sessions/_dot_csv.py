@@ -1,11 +1,11 @@
-"""CSV files of Xsens / Movella DOT sensors, written by app or exporter, one sensor per file.
+"""CSV files of Xsens / Movella DOT sensors, written by the app or the exporter, one per sensor.
 
-Lines ``NAME:,VALUE`` precede the column names: ``DeviceTag``, ``OutputRate`` and ``SyncStatus`` are
-read. ``SampleTimeFine`` numbers the rows: 32 bit, 1 µs, so it wraps after 71.6 minutes. Angular
-rates are in degrees a second. The world is east, north, up; quaternions map sensor to world. Modes
-without rates contain an increment for each row, ``dq`` and ``dv``, which becomes the mean rate over
-its period. Source: header and columns as in published files and programs; no own recording was
-available.
+Lines ``NAME:,VALUE`` precede the column names. The reader uses ``DeviceTag``, ``OutputRate`` and
+``SyncStatus``. ``SampleTimeFine`` numbers the rows with 32 bits in units of 1 µs, so it wraps after
+71.6 minutes. Angular rates are in degrees per second. The world is east, north, up; quaternions
+convert from sensor to world. Output modes without rates contain increments ``dq`` and ``dv`` for
+each row. An increment divided by its period is the mean rate. Source: header and columns of
+published files and programs; no recording of the project was available.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ _TIME, _COUNTER = "SampleTimeFine", "PacketCounter"
 _TURN = 1 << 32
 _TICK_S = 1e-6
 _HEADER_LINES = 40
-"""Number of lines within which the column names must be found."""
+"""Largest number of lines before the column names."""
 _HZ = re.compile(r"([0-9.]+)\s*Hz", re.IGNORECASE)
 _WORDS = ("Quat", "Euler", "FreeAcc", "Acc", "Gyr", "Mag", "dq", "dv", "Status")
 
 
 class _DotFile(NamedTuple):
-    """One sensor, and the values in the header of its file."""
+    """Data of one sensor, and the values in the header of its file."""
 
     first_ticks: float
     synchronized: bool
@@ -65,14 +65,14 @@ def is_dot_csv(path: Path) -> bool:
 def read_dot_session(files: Sequence[Path], name: str) -> SessionData:
     """Return the sensors of one recording, from one CSV file for each sensor.
 
-    Files of synchronized sensors have a common time; the earliest row of all files is at 0 s.
-    Otherwise every sensor begins at 0 s. The id of a sensor is its ``DeviceTag``, or the name of
-    the file.
+    Files of synchronized sensors have a common time, whose 0 s is the earliest row of all files.
+    Without synchronization, every sensor begins at 0 s. The id of a sensor is its ``DeviceTag``, or
+    the file name if there is none.
 
     Raises
     ------
     MalformedFileError
-        Without column names, without times, or without any signal.
+        A file has no column names, no times, or no signal.
     """
     read = [_read_sensor(path) for path in files]
     together = len(read) == 1 or all(one.synchronized for one in read)
@@ -101,7 +101,7 @@ def read_dot_session(files: Sequence[Path], name: str) -> SessionData:
 
 
 def _is_names(line: str) -> bool:
-    """Return whether a line contains the column names."""
+    """Return whether a line contains column names."""
     cells = cells_of(line, separator_of(line))
     return _TIME in cells and any(cell.startswith(_WORDS) for cell in cells)
 
@@ -144,7 +144,7 @@ def _read_sensor(path: Path) -> _DotFile:
 
 
 def _period_s(header: Mapping[str, str], t_s: Array) -> float:
-    """Return the period of the increments, s; lost rows do not change the period."""
+    """Return the period over which an increment was measured, s; lost rows do not change it."""
     hz = _HZ.search(header.get("outputrate", ""))
     try:
         rate_hz = float(hz[1]) if hz else 0.0

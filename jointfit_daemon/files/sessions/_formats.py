@@ -1,4 +1,4 @@
-"""Formats in which sessions are written and read, by name and by file extension."""
+"""Registry of the formats in which sessions are written and read, by name and file extension."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ if TYPE_CHECKING:
     Writer = Callable[[SessionData, Path], WrittenSession]
 
 _FORBIDDEN = '/\\:*?"<>|'
-"""Characters that not all systems permit in file names."""
+"""Characters that some operating systems do not permit in file names."""
 
 
 @dataclass(frozen=True, slots=True)
 class SessionFormat:
-    """A format in which sessions are written."""
+    """A format in which sessions can be written."""
 
     contents: str
     """Description of the content of the files."""
@@ -73,7 +73,7 @@ SESSION_FORMATS: Mapping[str, SessionFormat] = {
     "bids-motion": SessionFormat("all, as a data set", write_bids_session),
     "mcap-foxglove": SessionFormat("all, for viewers", write_foxglove_session),
 }
-"""Formats by the name of option ``--to``."""
+"""Formats by their name, which is the argument of the option ``--to``."""
 
 
 def write_session(
@@ -84,7 +84,7 @@ def write_session(
     names: Mapping[str, str] | None = None,
     overwrite: bool = False,
 ) -> WrittenSession:
-    """Write a session in a format; all of its files, or none if it fails.
+    """Write a session in a format: all of its files, or none if an error occurs.
 
     Parameters
     ----------
@@ -95,14 +95,14 @@ def write_session(
     to
         Key of `SESSION_FORMATS`.
     names
-        Column names in ``sto`` files by sensor or segment.
+        Column names in ``sto`` files, by name of the sensor or segment.
     overwrite
-        Replace existing files.
+        Whether existing files are replaced.
 
     Raises
     ------
     NothingToWriteError
-        The session has no data that the format can contain.
+        The session contains no data that the format can store.
     FileExistsError
         A file exists and `overwrite` is false.
     MissingPackageError
@@ -114,7 +114,7 @@ def write_session(
     name = "".join("_" if char in _FORBIDDEN else char for char in session.name).strip(". ")
     session = replace(session, name=name or "session")
 
-    # The files become visible together, after the last byte of the last file is written.
+    # The files become visible together, after all of them were written completely.
     with tempfile.TemporaryDirectory(prefix=".jointfit-export-", dir=folder) as staging:
         written = write(session, Path(staging))
         entries = [(entry, folder / entry.name) for entry in sorted(Path(staging).iterdir())]
@@ -132,7 +132,7 @@ def write_session(
 
 
 def _read_npz_session(path: Path) -> SessionData:
-    """Return sensors and bones of an NPZ file of orientations; bones are the reference."""
+    """Return the sensors and bones of an NPZ file of orientations; the bones are the reference."""
     trial = read_orientations_npz(path)
     return SessionData(
         path.stem,
@@ -144,7 +144,7 @@ def _read_npz_session(path: Path) -> SessionData:
 
 
 def _read_csv_file(path: Path) -> SessionData:
-    """Return the session of a table of `jointfit export`, or of a file of a DOT sensor."""
+    """Return the session of a CSV file, written by `jointfit export` or by a DOT sensor."""
     return read_dot_session([path], path.stem) if is_dot_csv(path) else read_csv_session(path)
 
 
@@ -184,16 +184,16 @@ _READERS: Mapping[str, Callable[[Path], SessionData]] = {
     ".txt": _read_text_session,
 }
 SESSION_SUFFIXES = tuple(_READERS)
-"""Extensions of files that `read_session` reads."""
+"""File extensions that `read_session` accepts."""
 
 
 def read_session(path: Path) -> SessionData:
-    """Return the session of a file, by its extension, or of a folder (Motion-BIDS, Xsens).
+    """Return the session of a file (by its extension) or of a folder (Motion-BIDS or Xsens).
 
     Raises
     ------
     MalformedFileError
-        Another kind of file, a damaged one, or times that run backwards.
+        The file has another format or is damaged, or its times decrease.
     MissingPackageError
         The format needs an optional package.
     """

@@ -7,7 +7,8 @@
 | ``/joints/NAME`` | JSON | angles and standard deviations in degrees, position in m |
 | ``/events`` | Log | events |
 
-Unknown orientations and occluded markers are left out. Topics from markers begin with ``/optical``.
+Unknown orientations and occluded markers are omitted. Topics of data from the markers begin with
+``/optical``.
 """
 
 from __future__ import annotations
@@ -48,12 +49,12 @@ object."""
 
 
 def write_foxglove_session(session: SessionData, folder: Path) -> WrittenSession:
-    """Write ``NAME.foxglove.mcap``, messages in the order of their times.
+    """Write ``NAME.foxglove.mcap`` with messages in the order of their times.
 
     Raises
     ------
     MissingPackageError
-        The packages of the extra foxglove are not installed.
+        The packages of the optional extra ``foxglove`` are not installed.
     """
     builder = _MessageBuilder(session.start_unix_ns or 0)
     messages = [
@@ -90,7 +91,7 @@ def write_foxglove_session(session: SessionData, folder: Path) -> WrittenSession
 
 
 class _MessageBuilder:
-    """Converts series to messages; imports the optional schemas once."""
+    """Converts series to messages, and imports the optional schemas once."""
 
     def __init__(self, start_unix_ns: int) -> None:
         self._start_unix_ns = start_unix_ns
@@ -105,7 +106,7 @@ class _MessageBuilder:
         return max(self._start_unix_ns + round(t_s * 1e9), 0)
 
     def register(self, writer: Writer, name: str, content: Any) -> int:
-        """Register the schema of a message; return its number."""
+        """Register the schema of a message, and return the number of the schema."""
         if isinstance(content, dict):
             return int(writer.register_schema(name, "jsonschema", orjson.dumps(_JOINT_SCHEMA)))
         return int(self._register(writer, type(content)))
@@ -129,9 +130,10 @@ class _MessageBuilder:
     def _poses(
         self, world: str, name: str, t_s: Array, q: Array | None, place: Array | None
     ) -> Iterator[_Message]:
-        """Yield the known poses of a frame.
+        """Yield the poses of a coordinate frame at all instants with known values.
 
-        None means no rotation, or a position at the origin of the world.
+        If `q` is None, the frame is not rotated. If `place` is None, it is at the origin of the
+        world.
         """
         turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(t_s), 1)) if q is None else q
         places = np.zeros((len(t_s), 3)) if place is None else place
@@ -158,7 +160,7 @@ class _MessageBuilder:
             yield t, "/markers", "foxglove.PosesInFrame", message
 
     def joints(self, topic: str, joints: Sequence[JointSeries]) -> Iterator[_Message]:
-        """Yield angles and position of every joint."""
+        """Yield the angles and positions of all joints."""
         for joint in joints:
             angles = {name: np.rad2deg(values) for name, values in joint.angles.items()}
             sds = {name: np.rad2deg(values) for name, values in joint.angle_sd.items()}

@@ -1,7 +1,7 @@
 """Markers of a session as TRC and C3D files.
 
 TRC files have the axes of OpenSim (y up). C3D files have the axes of the project (z up) and declare
-them. Frames are uniform in both: missing rows are frames without markers.
+them. Both formats have a uniform frame rate: missing rows become frames without markers.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _START, _FIRST, _RATE = "START_UNIX_NS", "FIRST_S", "RATE_HZ"
 
 
 def write_trc_session(session: SessionData, folder: Path) -> WrittenSession:
-    """Write ``NAME.trc``: marker positions in m, y up, empty cells where a marker is occluded."""
+    """Write ``NAME.trc``: marker positions in m, y up; occluded markers are empty cells."""
     markers = _markers_of(session, "TRC")
     axis = UniformAxis([markers.t_s])
     positions = from_z_up(axis.values("markers", markers.t_s, markers.positions), "y")
@@ -46,19 +46,20 @@ def write_trc_session(session: SessionData, folder: Path) -> WrittenSession:
 
 
 def read_trc_session(path: Path) -> SessionData:
-    """Return the markers of a TRC file; the axes of OpenSim (y up) are assumed."""
+    """Return the markers of a TRC file, assuming the axes of OpenSim (y up)."""
     return SessionData(path.stem, markers=_read_markers(path))
 
 
 def write_c3d_session(session: SessionData, folder: Path) -> WrittenSession:
-    """Write ``NAME.c3d``: marker positions in mm, z up, residual -1 where occluded, and events."""
+    """Write ``NAME.c3d``: events, and marker positions in mm, z up, residual -1 where occluded."""
     markers = _markers_of(session, "C3D")
     axis = UniformAxis([markers.t_s])
     positions = axis.values("markers", markers.t_s, markers.positions)
     path = folder / f"{session.name}.c3d"
     notes = axis.note(path.name)
 
-    # Frame 1 is at 0 s. A parameter of the group JOINTFIT contains the remainder below a period.
+    # Frame 1 is at 0 s. A parameter of the group JOINTFIT stores the remainder of less than a
+    # period.
     first_s = float(axis.t_s[0]) if len(axis.t_s) else 0.0
     first_frame = round(first_s * axis.rate_hz) + 1
     if not 1 <= first_frame <= _LATEST_FRAME:

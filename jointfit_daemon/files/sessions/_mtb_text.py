@@ -1,8 +1,8 @@
-"""Text files that Xsens programs (MT Manager, MTw) export: one sensor in each file.
+"""Text files that Xsens programs (MT Manager, MTw) export, one file per sensor.
 
-Lines beginning with ``//`` are comments; only ``// Update Rate: 100.0Hz`` is used. The next lines
-contain column names and rows, separated by tabs. The packet counter (16 bit) or the sample time
-(32 bit, 0.1 ms) number the rows, so lost packets are gaps in time.
+Lines that begin with ``//`` are comments; only ``// Update Rate: 100.0Hz`` is used. The next lines
+contain column names and rows, separated by tabs. The rows are numbered by the packet counter (16
+bit) or the sample time (32 bit, 0.1 ms), so lost packets appear as gaps in time.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _SERIAL = re.compile(r"([0-9A-F]{8})$", re.IGNORECASE)
 
 
 def is_mtb_text(path: Path) -> bool:
-    """Return whether a text file begins as an export of an Xsens program."""
+    """Return whether a text file begins in the same way as the exports of Xsens programs."""
     with path.open("rb") as file:
         head = file.read(4096)
     return head.startswith(b"//") or b"PacketCounter" in head.split(b"\n")[0]
@@ -49,13 +49,13 @@ def is_mtb_text(path: Path) -> bool:
 def read_mtb_session(files: Sequence[Path], name: str) -> SessionData:
     """Return the sensors of one recording, from one exported text file for each sensor.
 
-    The counters of all sensors have a common start, so the earliest row of all files is at 0 s. The
-    id of a sensor is the serial number at the end of the file name.
+    The counters of all sensors have a common start, so 0 s is the earliest row of all files. The id
+    of a sensor is the serial number at the end of the file name.
 
     Raises
     ------
     MalformedFileError
-        Without column names, without times, or without any signal.
+        A file has no column names, no times, or no signal.
     """
     read = [(path, *_read_sensor(path)) for path in files]
     first_s = min(start_s for _, start_s, _ in read)
@@ -69,7 +69,7 @@ def read_mtb_session(files: Sequence[Path], name: str) -> SessionData:
 
 
 def _read_sensor(path: Path) -> tuple[float, SensorSeries]:
-    """Return the first time on the recording's counter, s, and the sensor with times from 0 s."""
+    """Return the counter's time at the first row, s, and the sensor with times from 0 s."""
     lines = read_lines(path)
     at = next((k for k, line in enumerate(lines) if not line.startswith("//")), None)
     if at is None or (_COUNTER not in lines[at] and _SAMPLE_TIME not in lines[at]):
@@ -94,7 +94,7 @@ def _read_sensor(path: Path) -> tuple[float, SensorSeries]:
 
 
 def _times(path: Path, columns: Mapping[str, Array], rate_hz: float | None) -> tuple[float, Array]:
-    """Return the counter's time at the first row, s, and the time of each row since then, s."""
+    """Return the counter's time at the first row, s, and the time of every row since then, s."""
     ticks = columns.get(_SAMPLE_TIME)
     if ticks is not None and len(ticks) and np.isfinite(ticks).all():
         return float(ticks[0]) * _TICK_S, unwrapped(ticks, _SAMPLE_TIME_TURN) * _TICK_S

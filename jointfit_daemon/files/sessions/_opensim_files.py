@@ -1,10 +1,10 @@
-"""Orientations and joint angles of a session as files of OpenSim: STO and MOT.
+"""Orientations and joint angles of a session as OpenSim files: STO and MOT.
 
-Orientations are q_world_body with z up, as OpenSense expects for sensors. The set-up files of
-OpenSense rotate them by ``sensor_to_opensim_rotations`` = -pi/2 0 0. Positions in MOT files have
-the axes of OpenSim, y up. An unknown orientation is NaN, which OpenSense ignores. A MOT file has no
-unknown values: frames and columns with unknown values are left out, because OpenSim's Storage
-misreads NaN.
+STO files contain the orientations q_world_body with z up, as OpenSense expects for sensors. The
+set-up files of OpenSense rotate them by ``sensor_to_opensim_rotations`` = -pi/2 0 0. An unknown
+orientation is NaN, which OpenSense ignores. Positions in MOT files have the axes of OpenSim, y up.
+A MOT file has no unknown values, because OpenSim's class `Storage` misreads NaN. Frames and columns
+with unknown values are therefore omitted.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _POSITION_PARTS = (("_x", "_y", "_z"), ("_tx", "_ty", "_tz"))
-"""Endings of position columns: of this project, and of OpenSim's coordinates."""
+"""Endings of the names of position columns: of this project, and of OpenSim's coordinates."""
 _TRANSLATION = re.compile(r"_t?[xyz]$")
 _LATE_START_S = 1.0
-"""Longest part of a session before the start of its last series that orientation files omit, s."""
+"""Longest beginning of a session that orientation files omit until all series have started, s."""
 _SAME_INSTANT_S = 1e-6
 _GROUPS = ("sensors", "segments", "optical_segments")
 
@@ -53,11 +53,11 @@ def write_sto_session(
     Parameters
     ----------
     session, folder
-        A group without series gets no file. If the series of a group start within 1 s, frames
-        before the last start are left out.
+        Session to write, and existing folder for the files. A group without series gets no file. If
+        all series of a group start within 1 s, frames before the last start are omitted.
     names
-        Column names of sensors and segments, ``{"S1": "femur_r_imu"}`` for example. OpenSense finds
-        the body of a column by its name.
+        Column names of sensors and segments, for example ``{"S1": "femur_r_imu"}``. OpenSense finds
+        the body of a column by the column's name.
     """
     files: list[Path] = []
     notes: list[str] = []
@@ -76,7 +76,8 @@ def write_sto_session(
             else None,
         )
         quaternions = np.stack(columns, axis=1)
-        # Sensors rarely start in the same instant. IMUPlacer needs all of them in the first frame.
+        # Sensors rarely start at the same instant, but IMUPlacer needs all of them in the first
+        # frame.
         starts = [t_s[0] for _, t_s, _ in series]
         late_s = max(starts) if max(starts) - min(starts) <= _LATE_START_S else min(starts)
         rows = ~np.isnan(quaternions).all(axis=(1, 2))
@@ -95,9 +96,10 @@ def write_sto_session(
 
 
 def read_sto_session(path: Path) -> SessionData:
-    """Return the orientations of a STO file; other tables are read by `read_mot_session`.
+    """Return the orientations of a STO file.
 
-    Orientations of a foreign file become sensors with the names of the columns.
+    Orientations in files of other programs become sensors with the names of the columns. Tables
+    without orientations are read by `read_mot_session`.
     """
     if not any(line.lower().startswith("datatype=quaternion") for line in read_lines(path)[:40]):
         return read_mot_session(path)
@@ -119,10 +121,10 @@ def read_sto_session(path: Path) -> SessionData:
 
 
 def write_mot_session(session: SessionData, folder: Path) -> WrittenSession:
-    """Write ``NAME.mot`` and, from markers, ``NAME_optical.mot``: angles and positions of joints.
+    """Write ``NAME.mot`` and, from the markers, ``NAME_optical.mot``: joint angles and positions.
 
-    Columns are ``JOINT_ANGLE`` and ``JOINT_ANGLE_sd`` in degrees, ``JOINT_x``, ``_y``, ``_z`` and
-    ``JOINT_position_sd`` in m.
+    The columns are ``JOINT_ANGLE`` and ``JOINT_ANGLE_sd`` in degrees, and ``JOINT_x``, ``JOINT_y``,
+    ``JOINT_z`` and ``JOINT_position_sd`` in m.
     """
     files: list[Path] = []
     notes: list[str] = []
@@ -156,8 +158,8 @@ def write_mot_session(session: SessionData, folder: Path) -> WrittenSession:
 def read_mot_session(path: Path) -> SessionData:
     """Return the joints of a MOT or STO file with one number in each cell.
 
-    Every column of a foreign file becomes a joint with one angle, called ``angle``. The exception
-    are positions, ``NAME_tx``, ``NAME_ty`` and ``NAME_tz``, in m with y up.
+    In files of other programs, every column becomes a joint with one angle, called ``angle``.
+    Position columns are the exception: ``NAME_tx``, ``NAME_ty`` and ``NAME_tz``, in m with y up.
     """
     table = read_sto(path)
     facts = header_facts(table.header)

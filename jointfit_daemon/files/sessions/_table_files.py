@@ -1,6 +1,6 @@
-"""Sessions as tidy tables in files: ``NAME_TABLE.csv``, or ``NAME_TABLE.parquet``.
+"""Sessions as tidy tables in files ``NAME_TABLE.csv`` or ``NAME_TABLE.parquet``.
 
-A file of a session is read together with the other files of this session.
+To read a session, pass any one of its files; the others are read from the same folder.
 """
 
 from __future__ import annotations
@@ -32,14 +32,17 @@ if TYPE_CHECKING:
     from jointfit_daemon.session_data import SessionData
 
 _BLOCK_ROWS = 1 << 15
-"""Number of rows that are converted to text at a time; the number limits the memory."""
+"""Number of rows that are converted to text at a time, which limits the use of memory."""
 MOST_VALUES = 1 << 27
-"""Largest number of values that are read from a file; they take 1 GiB."""
+"""Largest number of values that are read from a file; this number takes 1 GiB of memory."""
 _NEEDS_QUOTES = frozenset(',"\n\r')
 
 
 def write_csv_session(session: SessionData, folder: Path) -> WrittenSession:
-    """Write the tables as CSV: units in the column names, 9 significant digits, times to 1 ns."""
+    """Write the tables as CSV.
+
+    Column names contain units, numbers 9 significant digits, times 1 ns.
+    """
     files = []
     for name, table in tables_of(session).items():
         path = folder / f"{session.name}_{name}.csv"
@@ -66,12 +69,12 @@ def _texts_of(name: str, values: NDArray[Any]) -> list[str]:
 
 
 def read_csv_session(path: Path) -> SessionData:
-    """Return the session of a CSV file of `write_csv_session` and the files next to it.
+    """Return the session of a CSV file of `write_csv_session` and of the files next to it.
 
     Raises
     ------
     MalformedFileError
-        Another table, missing columns, or a cell that is not a number.
+        The file contains another table, lacks columns, or has a cell that is not a number.
     """
     return _read_session(path, ".csv", _read_csv)
 
@@ -105,7 +108,7 @@ def _read_csv(path: Path, columns: Sequence[str]) -> Table:
 
 
 def write_parquet_session(session: SessionData, folder: Path) -> WrittenSession:
-    """Write the tables as Parquet; unknown values are null, texts are dictionaries.
+    """Write the tables as Parquet. Unknown values are null; texts are encoded as dictionaries.
 
     Raises
     ------
@@ -130,12 +133,12 @@ def write_parquet_session(session: SessionData, folder: Path) -> WrittenSession:
 
 
 def read_parquet_session(path: Path) -> SessionData:
-    """Return the session of a file of `write_parquet_session` and the files next to it.
+    """Return the session of a file of `write_parquet_session` and of the files next to it.
 
     Raises
     ------
     MalformedFileError
-        Not a Parquet file, or another table.
+        The file is not a Parquet file, or contains another table.
     MissingPackageError
         The package pyarrow is not installed.
     """
@@ -143,7 +146,7 @@ def read_parquet_session(path: Path) -> SessionData:
 
     def read(file: Path, columns: Sequence[str]) -> Table:
         try:
-            # Texts remain dictionaries, so a repeated long text is stored only once.
+            # Texts are read as dictionaries, so that a repeated long text is stored only once.
             texts = [name for name in columns if name in TEXT_COLUMNS]
             with parquet.ParquetFile(file, read_dictionary=texts) as opened:
                 _check_parquet(file, opened.schema_arrow.names, opened.metadata, columns)
@@ -163,9 +166,10 @@ def read_parquet_session(path: Path) -> SessionData:
 
 
 def _check_parquet(file: Path, names: list[str], metadata: Any, columns: Sequence[str]) -> None:
-    """Refuse unexpected columns, and more than `MOST_VALUES` values, before reading them.
+    """Reject unexpected columns, and more than `MOST_VALUES` values, before the file is read.
 
-    Repetitions take no space in a file, so a few bytes can represent any number of rows.
+    Repeated values take no space in a Parquet file, so a few bytes can represent any number of
+    rows.
     """
     if names != list(columns):
         raise MalformedFileError(
@@ -180,7 +184,7 @@ def _check_parquet(file: Path, names: list[str], metadata: Any, columns: Sequenc
 
 
 def _texts_in(file: Path, name: str, column: Any) -> NDArray[Any]:
-    """Return the texts of a column of dictionaries; equal texts are one object."""
+    """Return the texts of a dictionary-encoded column; equal texts are one object."""
     found = [
         np.array([*chunk.dictionary.to_pylist(), None], dtype=object)[
             chunk.indices.fill_null(-1).to_numpy(zero_copy_only=False)

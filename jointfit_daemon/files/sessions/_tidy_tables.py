@@ -1,7 +1,7 @@
 """A session as tidy tables for CSV and Parquet, with one row for each object and instant.
 
 Units are part of the column names. Unknown values are NaN; the writers leave their cells empty.
-Invariant: `session_of_tables` of the tables of `tables_of` is the session.
+Invariant: `session_of_tables` converts the tables of `tables_of` back to the same session.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ TEXT_COLUMNS = frozenset(
     {"sensor", "segment", "marker", "source", "joint", "angle", "kind", "id", "text", "data",
      "key", "value"}
 )  # fmt: skip
-"""Columns of text; all others are numbers."""
+"""Names of the columns that contain text; all other columns contain numbers."""
 TABLES: Mapping[str, tuple[str, ...]] = {
     "session": ("key", "value"),
     "sensors": (
@@ -53,14 +53,14 @@ TABLES: Mapping[str, tuple[str, ...]] = {
     "positions": ("t_s", "source", "joint", *_XYZ, "sd_m"),
     "events": ("t_s", "kind", "id", "text", "data"),
 }  # fmt: skip
-"""Columns of every table. Only the table ``session`` is always present."""
+"""Columns of every table. Only the table ``session`` is present in every session."""
 _SOURCES = {"imu": "", "optical": "optical_"}
-"""Prefix of the names of series groups, by source: sensors or markers."""
+"""Prefix in the names of groups of series, by the source of the data: sensors or markers."""
 _NAME, _START, _DESCRIPTION = "name", "start_unix_ns", "description."
 
 
 def tables_of(session: SessionData) -> dict[str, Table]:
-    """Return the tables of a session by name; empty ones are left out."""
+    """Return the tables of a session by name; empty tables are omitted."""
     parts: dict[str, list[Table]] = {name: [] for name in TABLES}
     facts = {_NAME: session.name}
     if session.start_unix_ns is not None:
@@ -126,7 +126,7 @@ def _degrees(values: Array | None) -> Array | None:
 
 
 def _filled(table: Mapping[str, Any]) -> Table:
-    """Return columns of full length; texts are repeated, and missing columns are NaN."""
+    """Return all columns with full length. Texts are repeated, and missing columns are NaN."""
     count = len(table["t_s"])
     filled: Table = {}
     for name, column in table.items():
@@ -140,7 +140,7 @@ def _filled(table: Mapping[str, Any]) -> Table:
 
 
 def session_of_tables(tables: Mapping[str, Table], name: str) -> SessionData:
-    """Return the session of some tables; `name` is used if the tables contain no name."""
+    """Return the session that the tables contain; `name` is used if they contain no name."""
     table = tables.get("session", {})
     facts = dict(zip(table.get("key", ()), table.get("value", ()), strict=True))
     series: dict[str, Any] = {
@@ -205,7 +205,7 @@ def _markers(tables: Mapping[str, Table]) -> MarkerSeries | None:
     found = _groups(tables, "markers", ("marker",))
     if not found:
         return None
-    # A foreign table may leave out the rows of an occluded marker.
+    # Tables of other programs may omit the rows of occluded markers.
     t_s = np.unique(np.concatenate([rows["t_s"] for _, rows in found]))
     positions = np.full((len(t_s), len(found), 3), np.nan)
     for k, (_, rows) in enumerate(found):
@@ -223,7 +223,7 @@ def _events(table: Table) -> Iterable[TimelineEvent]:
 def _groups(
     tables: Mapping[str, Table], name: str, keys: Sequence[str]
 ) -> list[tuple[tuple[str, ...], Table]]:
-    """Return the rows of every object of a table, in the order of their first row."""
+    """Return the rows of every object of a table, ordered by the first row of each object."""
     table = tables.get(name)
     if table is None or not len(table["t_s"]):
         return []

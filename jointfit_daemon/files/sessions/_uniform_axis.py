@@ -1,7 +1,7 @@
 """Series on one uniform time axis, for formats that have a single rate.
 
 If the instants of a series lie on the axis, its rows are used unchanged, and missing rows become
-unknown. Other series are interpolated linearly; orientations are interpolated along the shortest
+unknown values. Other series are interpolated linearly, and orientations along the shortest
 rotation.
 """
 
@@ -41,7 +41,7 @@ class UniformAxis:
         self.resampled: list[str] = []
 
     def orientations(self, name: str, t_s: Array, q: Array) -> Array:
-        """Return orientations of shape (n, 4) on the axis; NaN where unknown."""
+        """Return orientations of shape (n, 4), one per instant of the axis; NaN where unknown."""
         if not len(t_s):
             return self._empty((4,))
         if self._take(name, t_s):
@@ -49,7 +49,7 @@ class UniformAxis:
         return self._placed(t_s, q)
 
     def values(self, name: str, t_s: Array, values: Array) -> Array:
-        """Return values of shape (n, ...) on the axis; NaN where unknown."""
+        """Return values of shape (n, ...), one per instant of the axis; NaN where unknown."""
         if not len(t_s):
             return self._empty(values.shape[1:])
         if self._take(name, t_s):
@@ -57,7 +57,7 @@ class UniformAxis:
         return self._placed(t_s, values)
 
     def note(self, file: str) -> list[str]:
-        """Return a note that names the interpolated series, or none."""
+        """Return a list with a note that names the interpolated series; empty if there are none."""
         if not self.resampled:
             return []
         names = ", ".join(self.resampled)

@@ -10,13 +10,13 @@ if TYPE_CHECKING:
 
 
 class NothingToWriteError(ValueError):
-    """The session has no data that the format can contain; the message gives a remedy."""
+    """The session contains no data that the format can store; the message states the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class WrittenSession:
-    """Written files of one session in one format."""
+    """Files that were written for one session in one format."""
 
     files: tuple[Path, ...]
     notes: tuple[str, ...] = ()
-    """Notes on series that were left out, truncated or resampled."""
+    """Notes on series that were omitted, truncated or resampled."""

@@ -1,10 +1,10 @@
-"""Sessions as XDF files, the format of the Lab Streaming Layer.
+"""Sessions as XDF files, the file format of the Lab Streaming Layer.
 
 A file has one stream for each sensor, segment and joint, one stream for all markers, and one stream
 of events. Time stamps are seconds since the start of the session, and the clock offset of every
-stream is 0. The nominal rate is 0 (irregular) where rows are missing, so that readers do not move
-the time stamps. Channels are described as https://github.com/sccn/xdf/wiki/Mocap-Meta-Data
-proposes.
+stream is 0. If rows are missing, the nominal rate is 0 (irregular), so that readers do not change
+the time stamps. Channels are described as proposed at
+https://github.com/sccn/xdf/wiki/Mocap-Meta-Data.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _EVENTS = "events"
 _CHUNK_ROWS = 4096
 """Number of samples in a chunk."""
 _MOCAP_WORDS = {ORIENTATION: "Orientation", POSITION: "Position"}
-"""Channel types in the meta-data of motion capture, without the axis."""
+"""Channel types in the motion-capture meta-data of XDF, without the name of the axis."""
 
 
 def write_xdf_session(session: SessionData, folder: Path) -> WrittenSession:
@@ -100,7 +100,7 @@ def _file_header(session: SessionData) -> bytes:
 
 
 def stream_description(stream: ChannelStream) -> ET.Element:
-    """Return the element ``desc`` of a stream: group, and channels with units."""
+    """Return the XML element ``desc`` of a stream, which contains the group and the channels."""
     description = ET.Element("desc")
     _add(description, "group", stream.group)
     channels = ET.SubElement(description, "channels")
@@ -146,7 +146,7 @@ def _events_header() -> bytes:
 
 
 def _stream_end(number: int, t_s: Array) -> bytes:
-    """Return the chunks with the clock offsets of a stream, all 0, and with its footer."""
+    """Return the last chunks of a stream: the clock offsets, which are all 0, and the footer."""
     info, head = ET.Element("info"), struct.pack("<I", number)
     first, last = (float(t_s[0]), float(t_s[-1])) if len(t_s) else (0.0, 0.0)
     _add(info, "first_timestamp", repr(first))
@@ -167,16 +167,16 @@ def _add(parent: ET.Element, name: str, text: str) -> None:
 
 
 def read_xdf_session(path: Path) -> SessionData:
-    """Return the streams of an XDF file whose channels are described, and its events.
+    """Return the session of an XDF file: all streams with described channels, and the events.
 
-    Time stamps are corrected by the clock offsets. In a foreign file, streams of strings become
-    events, channels with the types PositionX to PositionZ markers, and channels with the types
-    OrientationX to OrientationW sensors; the first time stamp is 0 s.
+    Time stamps are corrected by the clock offsets. In files of other programs, streams of strings
+    become events. Channels with the types PositionX to PositionZ become markers, and channels with
+    the types OrientationX to OrientationW become sensors. The first time stamp becomes 0 s.
 
     Raises
     ------
     MalformedFileError
-        Not an XDF file, damaged, or without any such stream.
+        The file is not an XDF file, is damaged, or contains no such stream.
     """
     header, found = read_xdf_streams(path)
     start = (header.findtext("start_unix_ns") or "").strip()
@@ -196,7 +196,7 @@ def read_xdf_session(path: Path) -> SessionData:
             " types PositionX or OrientationW, or streams of strings: describe the channels"
         )
     if not start:
-        # Without a start of the session, the first time stamp is at 0 s.
+        # A file without the start time of the session begins at 0 s.
         firsts = [s.t_s[0] for s in numeric if len(s.t_s)] + [event.t_s for event in events]
         first = float(min(firsts, default=0.0))
         numeric = [replace(stream, t_s=stream.t_s - first) for stream in numeric]
@@ -219,7 +219,10 @@ def _read_description(header: ET.Element) -> dict[str, str]:
 
 
 def _corrected_times(path: Path, stream: XdfStream) -> Array:
-    """Return time stamps plus clock offset, s; the offset is a line fitted to its measurements."""
+    """Return time stamps plus clock offset, s.
+
+    The clock offset is a straight line, fitted to the measured offsets.
+    """
     t_s = np.concatenate(stream.t_s) if stream.t_s else np.empty(0)
     missing = np.isnan(t_s)
     if missing.any():
@@ -258,7 +261,7 @@ def _read_events(stream: XdfStream, t_s: Array) -> list[TimelineEvent]:
 
 
 def _read_channels(stream: XdfStream, t_s: Array) -> ChannelStream | None:
-    """Return the described channels of a stream; None if there are none."""
+    """Return the described channels of a stream; None if no channel is described."""
     elements = stream.header.findall("desc/channels/channel")[: stream.channels]
     columns: dict[StreamColumn, int] = {}
     for k, element in enumerate(elements):

@@ -1,10 +1,10 @@
 """Chunks of XDF files: reading of chunks, and of streams with samples and clock offsets.
 
-A file is ``XDF:`` followed by chunks. A chunk is the number of length bytes (1, 4 or 8), the length
-in these bytes, a 16-bit tag and content. Source: https://github.com/sccn/xdf/wiki/Specifications.
+A file is ``XDF:`` followed by chunks. A chunk consists of the number of length bytes (1, 4 or 8),
+the length, a 16-bit tag and the content. Source: https://github.com/sccn/xdf/wiki/Specifications.
 
-Invariants: memory grows with the size of the file, for any declared length; a truncated or foreign
-file raises `MalformedFileError`.
+Invariants: the memory used is proportional to the size of the file, whatever length a chunk
+declares. A truncated file, or a file of another format, raises `MalformedFileError`.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ if TYPE_CHECKING:
 MAGIC = b"XDF:"
 FILE_HEADER, STREAM_HEADER, SAMPLES, CLOCK_OFFSET, BOUNDARY, STREAM_FOOTER = range(1, 7)
 _LENGTHS = {1: "<B", 4: "<I", 8: "<Q"}
-"""Formats of a length, by number of bytes."""
+"""Format codes of a length (module `struct`), by the number of length bytes."""
 FORMATS = {
     "float32": "<f4", "double64": "<f8",
     "int8": "<i1", "int16": "<i2", "int32": "<i4", "int64": "<i8",
 }  # fmt: skip
 STRING = "string"
 _LARGEST_XML = 16 << 20
-"""Largest header of a stream, bytes."""
+"""Largest XML header of a stream, bytes."""
 _MOST_CHANNELS = 1 << 16
 
 
 @dataclass(slots=True)
 class XdfStream:
-    """A stream as written."""
+    """Content of a stream as written in the file."""
 
     header: ET.Element
     t_s: list[Array] = field(default_factory=list)
-    """Time stamps, s, on the clock of the sender; NaN if a time stamp follows from the nominal
+    """Time stamps, s, on the clock of the sender. A stamp is NaN if it follows from the nominal
     rate."""
     values: list[Array] = field(default_factory=list)
-    """Numbers, shape (n, channels) for each chunk."""
+    """Numbers of each chunk, shape (n, channels)."""
     texts: list[list[str]] = field(default_factory=list)
-    """Samples of a stream of strings."""
+    """Samples of a stream that contains strings."""
     offsets: list[tuple[float, float]] = field(default_factory=list)
-    """Pairs of time of measurement and clock offset, s."""
+    """Pairs of measurement time and clock offset, s."""
 
     def text(self, path: str) -> str:
         """Return the text of an element of the header; empty if missing."""
@@ -85,7 +85,7 @@ def pack_text(text: str) -> bytes:
 
 
 def pack_samples(t_s: Array, values: Array) -> bytes:
-    """Return the content of a chunk of samples of doubles, after the number of the stream."""
+    """Return the content of a chunk with samples of doubles, without the number of the stream."""
     rows = np.empty(
         len(t_s), dtype=[("stamped", "u1"), ("t_s", "<f8"), ("values", "<f8", values.shape[1:])]
     )
@@ -104,7 +104,7 @@ def read_xdf_streams(path: Path) -> tuple[ET.Element, list[XdfStream]]:
     Raises
     ------
     MalformedFileError
-        Not an XDF file, truncated, or with samples that contradict their stream.
+        The file is not an XDF file, is truncated, or contains samples that contradict their stream.
     """
     reject_device(path)
     data = path.read_bytes()
@@ -182,7 +182,7 @@ def _add(stream: XdfStream, tag: int, content: memoryview) -> None:
             stream.values.append(rows["values"].astype(np.float64).reshape(count, -1))
             return
 
-    # Some of the samples have no time stamp.
+    # At least one of the samples has no time stamp.
     at, times, values = 0, [], []
     for _ in range(count):
         t_s, at = _stamp(body, at)

@@ -22,9 +22,8 @@ _EULER = (("Roll", "Pitch", "Yaw"), ("Euler_X", "Euler_Y", "Euler_Z"))
 
 
 def unwrapped(counter: Array, turn: int) -> Array:
-    """Return a counter since its first row, ticks, shape (n,), with wraps removed."""
-    # A step of more than half the counter's range is a step back, which means that rows are not in
-    # order.
+    """Return a counter's increase since its first row, ticks, shape (n,), without wraps."""
+    # A step of more than half the range counts as a step back; the rows are then not in order.
     steps = np.mod(np.diff(counter) + turn / 2, turn) - turn / 2
     counted: Array = np.concatenate([[0.0], np.cumsum(steps)])[: len(counter)]
     return counted

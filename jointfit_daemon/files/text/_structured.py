@@ -1,7 +1,8 @@
 """Bounded reading of TOML and JSON files from untrusted sources.
 
-Invariant: a file raises nothing but `MalformedFileError`. Reading is limited to `most_bytes`, never
-waits for a writer, and yields no value that exceeds the recursion limit of a later reader.
+Invariant: the only exception that a file causes is `MalformedFileError`. Readers read at most
+`most_bytes`, never wait for a writer, and reject values nested so deeply that later code would
+exceed the recursion limit.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MOST_BYTES = 4 * 1024 * 1024
-"""Largest size of a TOML or JSON file, bytes; far above any file written by hand."""
+"""Largest size of a TOML or JSON file, bytes; files written by hand are far smaller."""
 MAX_NESTING = 32
 """Largest nesting depth; no format of the project needs ten levels."""
 _MOST_BITS = 64
@@ -37,12 +38,13 @@ _REFUSALS = {
     errno.ENOTDIR: "a parent of the path is a file: check the path",
     errno.EACCES: "cannot be read (permission denied): allow this user to read it: `chmod a+r`",
 }
-"""Message texts of common errors."""
+"""Message texts for common operating system errors."""
 _PART = r"""(?:[A-Za-z0-9_-]+|"(?:[^"\\\n]|\\.)*+"|'[^'\n]*')"""
 _DEEP_KEY = re.compile(
     rf"(?:^|[\[{{,])[ \t]*(?:{_PART}[ \t]*\.[ \t]*){{{MAX_NESTING}}}{_PART}", re.MULTILINE
 )
-"""Pattern of a dotted key of more than `MAX_NESTING` parts, as the key of a value or of a table."""
+"""Pattern of a dotted key with more than `MAX_NESTING` parts, before a value or in a table
+header."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
@@ -59,7 +61,7 @@ def read_toml(path: Path, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
 
 
 def read_json(path: Path, most_bytes: int = MOST_BYTES) -> Any:
-    """Return the value of a JSON file; NaN and infinity are rejected, as in the standard.
+    """Return the value of a JSON file; NaN and infinity are rejected, as the standard requires.
 
     Raises
     ------
@@ -133,7 +135,8 @@ def parse_toml(text: str) -> dict[str, Any]:
     RecursionError
         Nested too deeply.
     """
-    # The time and memory of tomllib grow with the square of the number of parts of a dotted key.
+    # tomllib needs time and memory that grow with the square of the number of parts of a dotted
+    # key.
     if _DEEP_KEY.search(text):
         raise RecursionError(f"a key of more than {MAX_NESTING} parts")
     return tomllib.loads(text)
@@ -177,10 +180,10 @@ def _parsed(path: Path, name: str, parse: Callable[[str], Any], text: str) -> An
 
 
 def find_structure_fault(value: object) -> str | None:
-    """Return the reason why a parsed value would make a later reader fail, or None.
+    """Return the reason why a parsed value would make later code fail; None if it would not.
 
-    Checks the nesting depth and integers beyond 64 bits. The check is iterative, since the value
-    may be deeper than the stack.
+    The function checks the nesting depth, and integers for the range of 64 bits. It is iterative,
+    because a recursive check could exceed the stack.
     """
     waiting: list[tuple[object, str, int]] = [(value, "", 0)]
 

@@ -1,8 +1,8 @@
 """Tables of numbers in text files, with cells separated by tab, comma or blanks.
 
-Invariants: every fault of a file raises `MalformedFileError`; memory grows with the size of the
-file, for any declared size. An empty cell and any spelling of NaN are missing values (NaN).
-Declared counts are often wrong in real files, so rows are counted.
+Invariants: every fault of a file raises `MalformedFileError`. The memory used is proportional to
+the size of the file, whatever size the file declares. An empty cell and any spelling of NaN are
+missing values (NaN). Declared counts are often wrong in real files, so rows are counted.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 _CELLS_PER_CHARACTER = 16
 """Maximum number of table cells per character of the file."""
 _FEW_CELLS = 1_000_000
-"""Number of cells up to which rows may be mostly missing; larger tables must contain data."""
+"""Number of cells up to which nearly all values may be missing. Larger tables must contain data."""
 _SHOWN = 40
 """Maximum number of characters of a cell quoted in a message."""
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 DIGITS = 8
-"""Number of significant digits written."""
+"""Number of significant digits of written numbers."""
 
 
 class MalformedFileError(ValueError):
-    """File with invalid content; the message names the file, the line and the remedy."""
+    """The content of a file is invalid; the message names the file, the line and the remedy."""
 
 
 def read_lines(path: Path) -> list[str]:
@@ -66,12 +66,12 @@ def reject_device(path: Path) -> None:
 
 
 def separator_of(line: str) -> str | None:
-    """Return the separator of a row of column names; None for runs of blanks."""
+    """Return the separator in a line of column names; None if the names are separated by blanks."""
     return "\t" if "\t" in line else "," if "," in line else None
 
 
 def cells_of(line: str, separator: str | None) -> list[str]:
-    """Return the stripped cells of a row; trailing empty cells remain (missing data)."""
+    """Return the stripped cells of a row, including empty cells at the end (missing data)."""
     if separator is None:
         return line.split()
     return [cell.strip() for cell in line.split(separator)]
@@ -91,7 +91,7 @@ def number(path: Path, at: int, cell: str) -> float:
     Raises
     ------
     MalformedFileError
-        The cell is not a number; the message identifies a decimal comma.
+        The cell is not a number. If it has a decimal comma, the message says so.
     """
     try:
         return float(cell) if cell else math.nan
@@ -114,7 +114,7 @@ def _is_number(cell: str) -> bool:
 
 
 def reject_sparse_table(path: Path, *, rows: int, columns: int, characters: int) -> None:
-    """Raise an error for a table that needs far more memory than its file.
+    """Raise an error for a table that would need far more memory than its file.
 
     Raises
     ------
@@ -148,12 +148,12 @@ def require_times(path: Path, t_s: NDArray[np.float64]) -> None:
 def read_columns(
     path: Path, lines: Sequence[str], at: int
 ) -> tuple[list[str], dict[str, NDArray[np.float64]]]:
-    """Return the names in the line with index `at`, and the columns below it by name, shape (n,).
+    """Return the column names in line `at`, and the columns below it by name, shape (n,).
 
     Raises
     ------
     MalformedFileError
-        As `rows_of_numbers`.
+        For the reasons given at `rows_of_numbers`.
     """
     separator = separator_of(lines[at])
     names = strip_trailing_empty(cells_of(lines[at], separator))
@@ -169,13 +169,13 @@ def rows_of_numbers(
     Parameters
     ----------
     path
-        File named in messages.
+        File that error messages name.
     lines
-        Line numbers and lines; empty rows (only separators) are skipped.
+        Line numbers and lines. Rows that contain only separators are skipped.
     separator
-        As returned by `separator_of`.
+        Separator as returned by `separator_of`.
     width
-        Number of columns; further cells are padding and ignored.
+        Number of columns. Further cells are padding, and are ignored.
 
     Raises
     ------
@@ -198,10 +198,10 @@ def rows_of_numbers(
 
 
 def written(value: float) -> str:
-    """Return a number as text: 8 significant digits, empty if missing."""
+    """Return a number as text with 8 significant digits; empty if the number is missing."""
     return "" if math.isnan(value) else f"{value:.{DIGITS}g}"
 
 
 def written_time(t_s: float) -> str:
-    """Return an instant as text: to the nanosecond, without trailing zeros."""
+    """Return an instant as text with a resolution of 1 ns, without trailing zeros."""
     return f"{t_s:.9f}".rstrip("0").rstrip(".")

@@ -19,7 +19,7 @@ def toml_key(name: str) -> str:
 
 
 def toml_value(value: Any, *, hexadecimal: bool = False) -> str:
-    """Return the TOML text of a value; mappings become inline tables without None values.
+    """Return the TOML text of a value. Mappings become inline tables; None values are omitted.
 
     Parameters
     ----------

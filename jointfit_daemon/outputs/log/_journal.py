@@ -1,6 +1,6 @@
-"""Log handler for the systemd journal: each entry has fields, so that it can be filtered by sensor.
+"""Log handler for the systemd journal. Entries have fields, so they can be filtered by sensor.
 
-Invariant: an entry that journald does not accept is written to standard error with its level.
+Invariant: an entry that journald does not accept is written to standard error with its log level.
 
 Source: https://systemd.io/JOURNAL_NATIVE_PROTOCOL.
 """
@@ -35,12 +35,12 @@ _INFO = 6
 
 
 def journal_fields(kind: str, name: str) -> dict[str, dict[str, str]]:
-    """Return the ``extra`` argument of a log call, with the journal fields of one object.
+    """Return the argument ``extra`` of a log call, with the journal fields of one object.
 
     Parameters
     ----------
     kind
-        Kind of the object, as in ``bridge/event``: ``device``, ``calibration`` …
+        Kind of the object, such as ``device`` or ``calibration``, as on the topic ``bridge/event``.
     name
         Id of the object.
     """
@@ -48,7 +48,7 @@ def journal_fields(kind: str, name: str) -> dict[str, dict[str, str]]:
 
 
 def is_journal(stream: TextIO) -> bool:
-    """Return whether `stream` is connected to the journal: $JOURNAL_STREAM holds its inode."""
+    """Return whether `stream` writes to the journal, identified by $JOURNAL_STREAM."""
     device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
     try:
         found = os.fstat(stream.fileno())
@@ -58,7 +58,7 @@ def is_journal(stream: TextIO) -> bool:
 
 
 def datagram(fields: Mapping[str, str]) -> bytes:
-    """Return `fields` in journald's native protocol: values with line ends have a length prefix."""
+    """Return `fields` in journald's protocol; values with line ends have a length prefix."""
     parts = []
     for name, value in fields.items():
         data = value.encode(errors="replace")
@@ -70,9 +70,9 @@ def datagram(fields: Mapping[str, str]) -> bytes:
 
 
 class LevelFormatter(logging.Formatter):
-    """Formatter that prefixes every line with its level as in sd-daemon(3).
+    """Formatter that puts the log level before every line, as described in sd-daemon(3).
 
-    The journal adds the time.
+    The journal adds the time to each line.
     """
 
     def __init__(self) -> None:
@@ -90,7 +90,7 @@ class JournalHandler(RateLimitedHandler):
     Parameters
     ----------
     rig
-        Name of the rig: a field of every entry.
+        Name of the rig, which becomes a field of every entry.
     limited
         Whether the rate is limited.
     address
@@ -118,7 +118,7 @@ class JournalHandler(RateLimitedHandler):
 
     @override
     def put(self, record: logging.LogRecord) -> None:
-        """Send one record to journald, or to standard error if journald does not accept it."""
+        """Send one record to journald, or write it to standard error if journald refuses it."""
         try:
             self._socket.sendto(datagram(self._fields(record)), self._address)
         except OSError:  # no journald, a full socket, or an entry longer than a datagram

@@ -1,4 +1,4 @@
-"""Log handler that passes warnings and errors to ``bridge/log``, at most five per second."""
+"""Log handler that publishes warnings and errors on ``bridge/log``, at most five per second."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 RATE_HZ = 5.0
-"""Permitted rate, and burst, of messages on ``bridge/log``, 1/s."""
+"""Permitted rate and burst of messages on ``bridge/log``, messages per second."""
 
 
 class MqttLogHandler(logging.Handler):
-    """Passes warnings and errors to `publish`, on the thread of the event loop.
+    """Passes warnings and errors to `publish` in the thread of the event loop.
 
     Parameters
     ----------
     publish
-        Called with level, logger, text, and the number of lines suppressed since the last call.
+        Function that is called with level, logger, text, and number of suppressed lines since the
+        last call.
     """
 
     def __init__(self, publish: Callable[[str, str, str, int], None]) -> None:
@@ -36,8 +37,8 @@ class MqttLogHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
         """Accept one record from any thread."""
-        # Records are counted before they reach the event loop: a library that logs without pause
-        # in a thread would fill the loop's queue and delay everything else.
+        # The limit applies before records reach the event loop. Otherwise a library that logs
+        # without pause in another thread would fill the loop's queue and delay all other work.
         if not self._bucket.take(time.monotonic()):
             self._suppressed += 1
             return

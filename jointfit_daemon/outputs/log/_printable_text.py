@@ -1,4 +1,4 @@
-"""Text from devices, servers, adapters and clients, with control characters escaped.
+"""Escaping of control characters in text from devices, servers, adapters and clients.
 
 Invariant: `printable` returns one line of limited length without control characters.
 """
@@ -12,15 +12,15 @@ from typing import Any
 from typing_extensions import override
 
 LONGEST = 2000
-"""Longest text, characters; the longest message of the daemon has about 600."""
+"""Longest text, characters. The longest message of the daemon has about 600 characters."""
 _DEEPEST = 4
-"""Deepest nesting of data; a deeper value is converted to text."""
+"""Largest nesting depth of data. A value at a deeper level is converted to text."""
 
 
 def printable(text: str, longest: int = LONGEST) -> str:
-    r"""Return `text` on one line: control and format characters as escapes (``\n``, ``\x1b``).
+    r"""Return `text` on one line, with control and format characters escaped (``\n``, ``\x1b``).
 
-    A text longer than `longest` characters ends in ``…``.
+    A text longer than `longest` characters is truncated and ends in ``…``.
     """
     if len(text) > longest:
         text = text[: longest - 1] + "…"
@@ -32,7 +32,7 @@ def printable(text: str, longest: int = LONGEST) -> str:
 
 
 def printable_data(data: Any, depth: int = 0) -> Any:
-    """Return `data` with `printable` applied to each text in it, keys included."""
+    """Return `data` in which `printable` was applied to each text, including keys."""
     if isinstance(data, str):
         return printable(data)
     if isinstance(data, Mapping | list | tuple) and depth >= _DEEPEST:
@@ -49,13 +49,13 @@ def printable_data(data: Any, depth: int = 0) -> Any:
 
 
 class PrintableRecord(logging.LogRecord):
-    """A log record whose further lines are indented behind a bar, so that no text forges an entry.
+    """A log record with further lines indented behind a bar, so that no text forges an entry.
 
-    The class is installed by ``logging.setLogRecordFactory``, so it applies to every handler.
+    The class is installed by ``logging.setLogRecordFactory``, so all handlers use it.
     """
 
     @override
     def getMessage(self) -> str:
-        """Return the message with printable lines."""
+        """Return the message; control characters are escaped and further lines indented."""
         lines = super().getMessage().splitlines()
         return "\n  | ".join(map(printable, lines))

@@ -1,8 +1,7 @@
 """Log handler with a limited rate.
 
-Invariant: errors are always written, and the number of omitted lines is logged. systemd limits
-services at 10 000 lines in 30 s. Even half of this rate would write gigabytes per day to a memory
-card.
+Invariant: errors are always written, and the number of omitted lines is logged. systemd permits a
+service 10 000 lines in 30 s. Even half of that rate would write gigabytes per day to a memory card.
 """
 
 from __future__ import annotations
@@ -18,13 +17,13 @@ if TYPE_CHECKING:
     from typing import TextIO
 
 RATE_HZ = 5.0
-"""Permitted mean rate, lines per second. It suffices for every state change of a rig."""
+"""Permitted mean rate, lines per second. It is sufficient for every state change of a rig."""
 BURST = 50.0
-"""Permitted number of lines at once. A start or a reload logs about twenty lines."""
+"""Permitted number of lines without waiting. A start or a reload logs about twenty lines."""
 
 
 class RateLimitedHandler(logging.StreamHandler["TextIO"]):
-    """Writes log lines to a stream at a limited rate; errors are exempt.
+    """Writes log lines to a stream at a limited rate. Errors are not limited.
 
     Parameters
     ----------
@@ -33,7 +32,7 @@ class RateLimitedHandler(logging.StreamHandler["TextIO"]):
     clock
         Function that returns monotonic time, s.
     bucket
-        Rate limit; default: `RATE_HZ` and `BURST`.
+        Rate limit. The default permits `RATE_HZ` and `BURST`.
     """
 
     def __init__(
@@ -48,7 +47,7 @@ class RateLimitedHandler(logging.StreamHandler["TextIO"]):
         self._omitted = 0
 
     def emit(self, record: logging.LogRecord) -> None:  # type: ignore[explicit-override]  # Python 3.12's
-        """Write `record`, preceded by the number of lines omitted before it."""
+        """Write `record` after a line that states how many lines were omitted before it."""
         if not self._bucket.take(self._clock()) and record.levelno < logging.ERROR:
             self._omitted += 1
             return
@@ -63,5 +62,5 @@ class RateLimitedHandler(logging.StreamHandler["TextIO"]):
         self.put(record)
 
     def put(self, record: logging.LogRecord) -> None:
-        """Write one record without a limit."""
+        """Write one record without limiting the rate."""
         super().emit(record)

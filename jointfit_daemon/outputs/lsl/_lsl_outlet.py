@@ -1,10 +1,10 @@
-"""Two streams of the Lab Streaming Layer: orientations of segments, and angles of joints.
+"""Two streams of the Lab Streaming Layer (LSL): orientations of segments, and joint angles.
 
 The stamp of a sample is the instant of its frame on the clock of LSL, not the instant of
 transmission. Receivers on other hosts correct the offset between their clocks and this clock.
 
-Invariant: a frame costs one call of the library for each stream; the library sends in its own
-threads, and drops samples of receivers that do not read.
+Invariant: a frame costs one call of the library for each stream. The library sends in its own
+threads, and drops samples for receivers that do not read.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 _NAN = math.nan
 _NAN_4, _NAN_3 = (_NAN,) * 4, (_NAN,) * 3
 _READINGS = 5
-"""Number of comparisons of both clocks. The comparison with the shortest duration is used."""
+"""Number of readings of the clock pair. The pair with the shortest duration is used."""
 _AGAIN_NS = 1_000_000_000
-"""Interval between comparisons of the clocks, ns."""
+"""Interval between measurements of the clock offset, ns."""
 _BUFFER_S = 60
-"""Duration of the samples that are stored for a receiver that does not read, s."""
+"""Duration of samples that are buffered for a receiver that does not read, s."""
 _Channels = list[tuple[str, str, str]]
 """Label, type and unit of each channel."""
 
 
 class LslError(Exception):
-    """The streams cannot be created; the message gives the remedy."""
+    """The streams cannot be created; the message states the remedy."""
 
 
 class LslOutlet:
@@ -42,7 +42,7 @@ class LslOutlet:
     Parameters
     ----------
     settings
-        ``[lsl]``: names of the streams.
+        Table ``[lsl]``, which contains the names of the streams.
     rig
         Name of the rig.
     rate_hz
@@ -79,10 +79,10 @@ class LslOutlet:
         self._lsl = pylsl
 
     def event(self, event: Event) -> None:
-        """Ignore input events."""
+        """Do nothing, because input events are not sent."""
 
     def output(self, output: Output) -> None:
-        """Send a frame."""
+        """Send the samples of a frame to both streams."""
         if type(output) is not LimbState:
             return
         layout = (
@@ -101,7 +101,7 @@ class LslOutlet:
         joints.push_sample(_joint_values(output.joints), at_s)
 
     def _open(self, contents: str, channels: _Channels) -> Any:
-        """Return the outlet of a stream with channel descriptions as in motion capture."""
+        """Return the outlet of a stream, with channels described as in motion capture."""
         info = self._lsl.StreamInfo(
             f"{self._name} {contents}",
             "MoCap",
@@ -121,7 +121,7 @@ class LslOutlet:
         return self._lsl.StreamOutlet(info, max_buffered=_BUFFER_S)
 
     def _clock_offset_s(self) -> float:
-        """Return the clock of LSL minus CLOCK_MONOTONIC, s; measured once a second."""
+        """Return the LSL clock minus CLOCK_MONOTONIC, s; it is measured once a second."""
         now_ns = time.monotonic_ns()
         if now_ns >= self._compare_ns:
             self._compare_ns = now_ns + _AGAIN_NS

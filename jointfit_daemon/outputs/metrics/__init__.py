@@ -1,4 +1,4 @@
-"""Metrics in the format of Prometheus, collected on request; off by default.
+"""Metrics in the format of Prometheus, collected at each HTTP request; off by default.
 
 ``prometheus_client`` is an optional dependency that only `MetricsServer.start` imports.
 """

@@ -1,7 +1,7 @@
-"""Health of the daemon as metric families: names and units by the conventions of Prometheus.
+"""Health of the daemon as metric families, with names and units by the conventions of Prometheus.
 
-Invariant: base units (seconds, bytes, hertz), ``_total`` only on counters; unknown values are
-absent, never 0. docs/integrations.md lists every family.
+Invariant: units are base units (seconds, bytes, hertz), and only counters end in ``_total``.
+Unknown values are absent, never 0. docs/integrations.md lists every family.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 _NS = 1e-9
 _CLOCK_STATES = ("settling", "direct", "echo", "passive", "arrival", "stale")
 _STARTED_S = time.time_ns() * _NS - time.process_time()
-"""UNIX time at which this process started, s. It is not read from /proc/stat, because systemd's
-ProcSubset hides this file."""
+"""UNIX time at which this process started, s. It is not read from /proc/stat, because the systemd
+option ProcSubset hides this file."""
 _Device = dict[str, tuple[str, "Callable[[DeviceHealth], float | None]"]]
 
 _COUNTERS: _Device = {
@@ -55,7 +55,7 @@ _COUNTERS: _Device = {
         lambda d: max(0, d.wire.opened - 1),
     ),
 }
-"""Names of the counters of a device, without prefix and suffix."""
+"""Counters of a device, by name without prefix and suffix."""
 
 _GAUGES: _Device = {
     "up": ("1 if the device is online.", lambda d: float(d.online)),
@@ -82,7 +82,7 @@ _GAUGES: _Device = {
         lambda d: None if d.clock.skew_ppm is None else d.clock.skew_ppm * 1e-6,
     ),
 }
-"""Gauges of a device by name without prefix; the value is None while unknown."""
+"""Gauges of a device, by name without prefix. The value is None while it is unknown."""
 
 
 def metric_families(rig: str, health: BridgeHealth, frames: FrameStatistics) -> Iterator[Metric]:
@@ -91,11 +91,11 @@ def metric_families(rig: str, health: BridgeHealth, frames: FrameStatistics) -> 
     Parameters
     ----------
     rig
-        Name of the rig, a label of ``jointfit_build_info``.
+        Name of the rig, which becomes a label of ``jointfit_build_info``.
     health
         Counters of this instant.
     frames
-        Latency histogram and date of the calibration.
+        Latency histogram and date of the calibration in force.
     """
     build = {"version": __version__, "rig": rig}
     yield InfoMetricFamily("jointfit_build", "Version of jointfitd and name of the rig.", build)
@@ -141,7 +141,7 @@ def _frames(health: BridgeHealth, frames: FrameStatistics) -> Iterator[Metric]:
 
 
 def _device_details(devices: Mapping[str, DeviceHealth]) -> Iterator[Metric]:
-    """Yield the families with a second label."""
+    """Yield the metric families of devices that have a second label."""
     samples = CounterMetricFamily(
         "jointfit_device_samples",
         "Samples by outcome: used, decimated, idle, late, duplicate, dropped.",

@@ -1,6 +1,6 @@
-"""Two statistics that no health counter contains: latency of frames, date of the calibration.
+"""Two statistics that are no health counters: the latency of frames, and the calibration date.
 
-A frame costs one search in a table of twelve limits, and no allocation.
+A frame costs one search in a table of twelve limits, and no allocation of memory.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class FrameStatistics:
 
     def __init__(self) -> None:
         self.counts = [0] * (len(_LIMITS_NS) + 1)
-        """Number of frames in each bucket, not cumulated."""
+        """Number of frames in each bucket, not cumulative."""
         self.sum_ns = 0
         self.calibrated_s: float | None = None
         """UNIX time at which the calibration in force was stored, s; None if unknown."""
 
     def event(self, event: Event) -> None:
-        """Store the date of a loaded calibration."""
+        """Store the date of a calibration that was loaded."""
         if type(event) is Configured or type(event) is CalibrationSelected:
             found = event.calibration
             self._note_date("" if found is None else found.created_utc)

@@ -1,7 +1,7 @@
-"""HTTP server of the metrics: one thread that requests a snapshot from the event loop.
+"""HTTP server of the metrics, with one thread that requests a snapshot from the event loop.
 
-Invariant: a client that sends nothing, or reads nothing, delays other scrapes by at most
-`_CLIENT_S`, and does not delay the event loop.
+Invariant: a client that sends or reads nothing delays requests of other clients by at most
+`_CLIENT_S`. It does not delay the event loop.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _POLL_S = 0.1
 
 
 class MetricsError(Exception):
-    """The metrics cannot be served; the message gives the remedy."""
+    """The metrics cannot be served; the message states the remedy."""
 
 
 class MetricsServer:
@@ -38,7 +38,7 @@ class MetricsServer:
     Parameters
     ----------
     settings
-        ``[metrics]``: the address.
+        Table ``[metrics]``, which contains the address.
     rig
         Name of the rig.
     health
@@ -59,14 +59,14 @@ class MetricsServer:
 
     @property
     def url(self) -> str:
-        """Address of the metrics, with the port in use."""
+        """Address of the metrics, including the port in use."""
         host = self._settings.host
         shown = f"[{host}]" if ":" in host else host
         port = self._settings.port if self._server is None else self._server.server_port
         return f"http://{shown}:{port}/metrics"
 
     def start(self) -> None:
-        """Listen on the address and serve in a thread.
+        """Start a thread that listens on the address and answers requests.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class MetricsServer:
             server.server_close()
 
     def _take(self) -> Iterator[Any]:
-        """Return the metrics of this instant; called in the thread of the server."""
+        """Return the metrics of this instant. The thread of the server calls this method."""
         from jointfit_daemon.outputs.metrics._families import (  # noqa: PLC0415 - an extra
             metric_families,
         )
@@ -122,18 +122,18 @@ class MetricsServer:
 
 
 class _Snapshot:
-    """A collector of ``prometheus_client``."""
+    """A collector of ``prometheus_client`` that returns one snapshot."""
 
     def __init__(self, take: Callable[[], Iterator[Any]]) -> None:
         self.collect = take
 
 
 class _Handler(WSGIRequestHandler):
-    """Handler without a log line per scrape."""
+    """HTTP handler that writes no log line for a request."""
 
     @override
     def log_message(self, format: str, *args: Any) -> None:
-        """Log nothing."""
+        """Do nothing, so that a request writes no log line."""
 
 
 def _server_of(host: str) -> type[WSGIServer]:
@@ -142,7 +142,7 @@ def _server_of(host: str) -> type[WSGIServer]:
 
         @override
         def finish_request(self, request: Any, client_address: Any) -> None:
-            """Serve one client, and end its connection at the time limit."""
+            """Answer one client, and end its connection at the time limit."""
             limit = threading.Timer(_CLIENT_S, _end, (request,))  # also for one that sends slowly
             limit.daemon = True
             limit.start()
@@ -153,7 +153,7 @@ def _server_of(host: str) -> type[WSGIServer]:
 
         @override
         def handle_error(self, request: Any, client_address: Any) -> None:
-            """Ignore a client that went away or was too slow."""
+            """Ignore a client that disconnected or was too slow."""
 
     return Server
 

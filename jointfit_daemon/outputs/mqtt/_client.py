@@ -29,16 +29,17 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 _UNREAD_CAPACITY = 2000
-"""Number of messages stored for a slow reader: about ten seconds of poses."""
+"""Number of messages that are stored for a slow reader, equal to about ten seconds of poses."""
 _LONGEST_BYTES = 1024 * 1024
-"""Largest incoming packet, bytes: the quality of a calibration takes a tenth of this size."""
+"""Largest incoming packet, bytes. The quality report of a calibration takes a tenth of this
+size."""
 _EXPIRY_S = 30
-"""Time after which the broker drops an undelivered request, s, because a late request must not be
+"""Time after which the broker drops an undelivered request, s. A late request must not be
 executed."""
 
 
 class NoAnswerError(Exception):
-    """No daemon answered the request in time."""
+    """No daemon answered the request within the time limit."""
 
 
 class MqttClient:
@@ -47,12 +48,13 @@ class MqttClient:
     Parameters
     ----------
     settings
-        ``[mqtt]`` of the rig: ``settings.base`` selects the daemon.
+        Table ``[mqtt]`` of the rig; ``settings.base`` selects the daemon.
 
     Raises
     ------
     BrokerLostError
-        On entering, from any method, and from iterating: the broker is absent or disconnected.
+        The broker is absent or disconnected. Entering the block, all methods and the iteration
+        raise it.
     """
 
     def __init__(self, settings: MqttSettings) -> None:
@@ -60,7 +62,7 @@ class MqttClient:
         self.dropped = 0
         """Number of messages dropped because the reader was too slow."""
         self._settings = settings
-        # One read of the socket may receive many messages before the task that reads the queue
+        # One read of the socket may receive many messages before the task that empties the queue
         # runs.
         self._connection = MqttConnection(
             settings, longest_bytes=_LONGEST_BYTES, most_unread=_UNREAD_CAPACITY
@@ -90,11 +92,11 @@ class MqttClient:
         await self._connection.__aexit__(None, None, None)
 
     async def subscribe(self, *names: str) -> None:
-        """Subscribe to topics below the base, such as ``pose`` or ``device/+/availability``."""
+        """Subscribe to topics given relative to the base, such as ``device/+/availability``."""
         await self._connection.subscribe([f"{self.base}/{name}" for name in names])
 
     async def messages(self) -> AsyncIterator[tuple[str, Any]]:
-        """Yield topic below the base, and decoded payload, of every message except responses."""
+        """Yield the relative topic and the decoded payload of every message except responses."""
         while True:
             while self._unread:
                 message = self._unread.popleft()
@@ -114,7 +116,7 @@ class MqttClient:
         Raises
         ------
         NoAnswerError
-            No answer arrived within `timeout_s`, or the key to sign with cannot be read.
+            No answer arrived within `timeout_s`, or the signing key cannot be read.
         """
         transaction = uuid.uuid4().hex
         answer: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()

@@ -1,19 +1,19 @@
-"""Detection of another daemon with the same client id, and the wait for its end.
+"""Detection of another daemon with the same client id, and the wait until that daemon ends.
 
 A broker ends the older of two connections with one client id, so two daemons with the same base
 topic would end each other's connection repeatedly. Before its first connection, a daemon therefore
-connects with another client id and looks for messages of another daemon. If it finds one, it
-publishes nothing and waits for its end.
+connects with another client id and waits for messages of another daemon. If it receives such a
+message, it publishes nothing until the other daemon ends.
 
-Two daemons that start together do not find each other, and the broker may have lost the state of a
-daemon. In these cases the daemon that was connected first takes its connection back. The newer
-daemon gives way: it connects with another client id and waits until the other daemon is gone.
+This check fails if two daemons start together, or if the broker has lost the state of a daemon. In
+these cases the daemon that was connected first connects again with its client id. The newer daemon
+must give way: it connects with another client id and waits until the other daemon is gone.
 
-Neither daemon knows when the other one connected. Each daemon compares the duration of its own
+Neither daemon knows when the other daemon connected. Each daemon compares the duration of its own
 first connection with a limit that doubles with every further loss. The first connection of the
-newer daemon lasts only until the first daemon reconnects, so the newer daemon is below the limit
-earlier. Only the disconnected daemon decides, while the other is connected, so the two daemons
-never give way together.
+newer daemon lasts only until the first daemon reconnects. The newer daemon is therefore the first
+whose duration is below the limit. Only the disconnected daemon decides, while the other daemon is
+connected, so the two daemons never give way at the same time.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 SHORT_S = 5.0
-"""Connection time after which a daemon is established and earlier losses are forgotten, s."""
+"""Connection time after which a daemon counts as established and earlier losses are ignored, s."""
 NEWCOMER_S = 0.25
-"""First limit of the first connection, s: several times the wait and the handshake of the other
-daemon's reconnection."""
+"""Limit for the duration of the first connection after one loss, s. It is several times the time
+that the other daemon needs to reconnect."""
 UNEXPLAINED = 3
-"""Number of short connections in a row, without a reason from the broker, that raise the suspicion.
-MQTT 3.1.1 has no reasons, and some MQTT 5 brokers send none."""
+"""Number of consecutive short connections, ended without a reason from the broker, that raise the
+suspicion. MQTT 3.1.1 has no reasons, and some MQTT 5 brokers send none."""
 STORED_S = 0.1
-"""Time to wait for the stored state of a daemon after two exchanges with the broker, s: some
-brokers send stored messages after the confirmation of the subscription."""
+"""Time to wait for the stored state of a daemon after two exchanges with the broker, s. Some
+brokers send stored messages only after they confirm the subscription."""
 GLANCE_S = 2.0
-"""Time to wait for a pose of a suspected daemon, s."""
+"""Time to wait for a pose of the suspected daemon, s."""
 SETTLED_S = 5.0
-"""Time without a message after which the state ``offline`` is accepted, s. The message ``offline``
-may be the will of this daemon's own last connection."""
+"""Time without another message after which the state ``offline`` is accepted, s. The message may be
+the will of this daemon's own last connection."""
 
 
 class TakeoverDetector:
@@ -55,24 +55,25 @@ class TakeoverDetector:
     def suspects(self, lasted_s: float, *, taken_over: bool) -> bool:
         """Return whether an older daemon probably ended the last connection.
 
-        The n-th short connection in a row raises the suspicion; without a reason from the broker,
-        the (n + 2)-th does. The first connection must have been shorter than
-        ``NEWCOMER_S * 2**(n - 1)``. An established daemon counts as connected for `SHORT_S`, so one
-        of two established daemons also gives way.
+        The n-th consecutive short connection raises the suspicion if the broker gave a reason.
+        Without a reason, the (n + 2)-th does. The first connection must have been shorter than
+        ``NEWCOMER_S * 2**(n - 1)``. An established daemon counts as connected for `SHORT_S`, so
+        that one of two established daemons also gives way.
 
         Parameters
         ----------
         lasted_s
             Duration of the connection, s; 0 if the connection failed.
         taken_over
-            Whether the broker gave the reason "session taken over".
+            Whether the broker stated the reason "session taken over".
         """
         if lasted_s <= 0.0 or lasted_s >= SHORT_S:
             self._first_s = max(self._first_s, min(lasted_s, SHORT_S))
             self._losses = 0
             return False
 
-        # Later connections of a series depend on the waits of both daemons, not on their age.
+        # Later connections of a series depend on the waits of both daemons, not on their start
+        # times.
         if self._losses == 0:
             self._first_s = max(self._first_s, lasted_s)
         self._losses += 1
@@ -86,10 +87,9 @@ class TakeoverDetector:
 
 
 async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
-    """Return whether a daemon publishes below this base: state is stored, a message arrives.
+    """Return whether another daemon publishes below this base: a stored state, or a new message.
 
-    If a daemon ends without disconnecting, the broker stores the state ``online`` for some seconds
-    longer.
+    If a daemon ends without disconnecting, the broker keeps the state ``online`` for some seconds.
 
     Raises
     ------
@@ -117,7 +117,7 @@ async def is_in_use(settings: MqttSettings, offline: bytes) -> bool:
 
 
 async def is_publishing(settings: MqttSettings, within_s: float) -> bool:
-    """Return whether a pose arrives below the base while this daemon is disconnected.
+    """Return whether a pose arrives below the base topic while this daemon is disconnected.
 
     Raises
     ------
@@ -135,9 +135,10 @@ async def is_publishing(settings: MqttSettings, within_s: float) -> bool:
 
 
 async def await_departure(settings: MqttSettings, offline: bytes) -> None:
-    """Return when the other daemon is offline or silent.
+    """Wait until the other daemon is offline or silent.
 
-    Silent means no pose and no health for more than two health intervals of this configuration.
+    Silent means that neither pose nor health arrives for more than two health intervals of this
+    configuration.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """One connection to an MQTT broker.
 
 Invariant: no other module of the daemon imports aiomqtt or paho, and every fault of a broker is
-raised as `BrokerLostError`. A connection object is used once.
+raised as `BrokerLostError`. A connection object can be used only once.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 KEEPALIVE_S = 5
-"""Keep-alive interval, s: an unresponsive broker is detected within 1.5 intervals."""
+"""Keep-alive interval, s. An unresponsive broker is detected within 1.5 intervals."""
 ANSWER_S = 3.0
 """Time limit of one exchange with the broker, s."""
 WINDOW = 16
-"""Number of messages that may be sent before the first message is acknowledged. Brokers usually
-allow 20 or more; a broker may announce a smaller number (MQTT 5.0, 3.2.2.3.3)."""
+"""Largest number of messages that are sent before the first of them is acknowledged. Brokers
+usually allow 20 or more; a broker may announce a smaller number (MQTT 5.0, 3.2.2.3.3)."""
 SUBSCRIBED_S = 30.0
-"""Time limit of a subscription, s: a broker may first send thousands of stored messages."""
+"""Time limit of a subscription, s. A broker may send thousands of stored messages first."""
 GOODBYE_S = 1.0
 """Time limit of an orderly disconnect, s."""
 _Properties: Any = Properties  # the constructor is not annotated, its attributes are dynamic
@@ -59,12 +59,12 @@ _REFUSED = 0x80
 _TAKEN_OVER = 0x8E
 """MQTT 5 reason code "session taken over"."""
 _PROTOCOL_ERROR = 0x82
-"""Reason code with which paho ends a connection whose answer refuses MQTT 3.1.1 (code 1)."""
+"""Reason code with which paho ends a connection that the broker refused with MQTT 3.1.1 code 1."""
 _CLOSED_EARLY = "the broker closed the connection during the handshake"
 _NOT_STORED = 2
-"""MQTT 5 retain handling: the broker sends no stored messages for a subscription."""
+"""MQTT 5 option "retain handling": the broker sends no stored messages for a subscription."""
 LONGEST_PACKET_BYTES = 32 * 1024
-"""Default limit of incoming packets, bytes: a request, or a pose of seventy segments."""
+"""Default limit of incoming packets, bytes. A pose of seventy segments is below this limit."""
 
 _SOCKET_OPTIONS = (
     (socket.IPPROTO_TCP, socket.TCP_NODELAY, 1),  # Nagle's algorithm delays by 40 ms
@@ -75,12 +75,15 @@ _SOCKET_OPTIONS = (
 
 
 class BrokerLostError(Exception):
-    """The broker is absent, refuses the connection, is silent or disconnected; a retry may help."""
+    """The broker is absent, refuses the connection, does not answer or disconnected.
+
+    A new attempt may succeed.
+    """
 
 
 @dataclass(frozen=True, slots=True)
 class Outgoing:
-    """One message to publish. The properties are sent with MQTT 5 only."""
+    """One message to publish. Its properties are sent only with MQTT 5."""
 
     topic: str
     payload: bytes
@@ -91,12 +94,12 @@ class Outgoing:
     response_topic: str | None = None
     correlation: bytes | None = None
     written: Callable[[], None] | None = field(default=None, compare=False)
-    """Called once the kernel has accepted the message; not at QoS 1, which waits for the broker."""
+    """Function called when the kernel has accepted the message; not used with QoS 1."""
 
 
 @dataclass(frozen=True, slots=True)
 class Incoming:
-    """One message received."""
+    """One received message."""
 
     topic: str
     payload: bytes
@@ -106,10 +109,10 @@ class Incoming:
 
 
 def stop_if_cancelled() -> None:
-    """Raise a cancellation that aiomqtt's ``wait_for`` may have suppressed in Python 3.11.
+    """Raise a cancellation that ``wait_for`` in aiomqtt may have suppressed (Python 3.11).
 
-    ``wait_for`` prefers a result that arrives at the same instant. Call this in leaf tasks only: a
-    task that contained a failed TaskGroup may appear cancelled from then on.
+    ``wait_for`` prefers a result that arrives at the same instant. Call this function in leaf tasks
+    only. A task that contained a failed TaskGroup may appear cancelled from then on.
     """
     task = asyncio.current_task()
     if task is not None and task.cancelling():
@@ -119,31 +122,34 @@ def stop_if_cancelled() -> None:
 class MqttConnection:
     """A connection that is open for the duration of the ``async with`` block.
 
-    Leaving the block by cancellation publishes `farewell` and disconnects. Any other exception
-    closes the socket at once, so that the broker publishes `will`.
+    If the block ends by cancellation, the connection publishes `farewell` and disconnects. Any
+    other exception closes the socket at once, so that the broker publishes `will`.
 
     Parameters
     ----------
     settings
         Address, user and MQTT version.
     identifier
-        Client id. With a fixed id, a new connection replaces a dead connection of an earlier
+        Client id. With a fixed id, a new connection replaces the dead connection of an earlier
         process.
     will, farewell
-        `will` is published by the broker if the connection breaks. `farewell` is published by the
-        client before it disconnects.
+        Messages for the end of the connection. The broker publishes `will` if the connection
+        breaks. The client publishes `farewell` before it disconnects.
     longest_bytes
-        Largest incoming packet, bytes: announced to the broker with MQTT 5, and enforced here.
+        Largest incoming packet, bytes. It is announced to the broker with MQTT 5, and enforced
+        here.
     admit
-        Called with topic and retain flag of each incoming message before it is decoded, which
-        takes 100 µs; False drops it. Only for subscriptions with `live`.
+        Function called with topic and retain flag of each incoming message before it is decoded,
+        because decoding takes 100 µs. If it returns False, the message is dropped. Use it only for
+        subscriptions with `live`.
     most_unread
-        Unread messages beyond which the newest are dropped.
+        Largest number of unread messages. Further messages are dropped.
 
     Raises
     ------
     BrokerLostError
-        From any method; the message names the broker and the operation.
+        Any method raises it if the connection fails; the message names the broker and the
+        operation.
     """
 
     def __init__(
@@ -196,7 +202,8 @@ class MqttConnection:
         try:
             if kind is not None and not issubclass(kind, asyncio.CancelledError):
                 return
-            # Publish the farewell and disconnect, each with a time limit; this cancels the will.
+            # Publish the farewell and disconnect, each with a time limit. The broker then discards
+            # the will.
             client.timeout = GOODBYE_S
             with contextlib.suppress(aiomqtt.MqttError, OSError):
                 if self._farewell is not None:
@@ -207,11 +214,11 @@ class MqttConnection:
 
     @property
     def oversized(self) -> int:
-        """Number of incoming packets dropped because of their size."""
+        """Number of incoming packets that were dropped because of their size."""
         return self._client.oversized
 
     async def publish(self, message: Outgoing) -> None:
-        """Publish; return once the broker (QoS 1) or the kernel (QoS 0) has accepted it."""
+        """Publish a message; return when the broker (QoS 1) or the kernel (QoS 0) accepted it."""
         with self._session_errors(f"{message.topic}: "):
             await self._publish(message)
 
@@ -225,28 +232,29 @@ class MqttConnection:
         )
 
     async def send(self, message: Outgoing, accepted: Callable[[str | None], None]) -> None:
-        """Send a message; return without its acknowledgement, in the order of the calls.
+        """Send a message in the order of the calls; return without waiting for its acknowledgement.
 
-        Waits while `WINDOW` messages, or fewer if the broker allows fewer, are unacknowledged. If
-        an acknowledgement does not arrive within `ANSWER_S`, `messages` raises the error.
+        The method waits while `WINDOW` messages are unacknowledged, or fewer if the broker allows
+        fewer. If an acknowledgement does not arrive within `ANSWER_S`, `messages` raises the error.
 
         Parameters
         ----------
         message
-            The message.
+            Message to send.
         accepted
-            Called once the broker (QoS 1) or the kernel (QoS 0) has accepted the message, with the
-            broker's reason for refusing it or None. The reason requires MQTT 5 and QoS 1. Not
-            called if the connection ends before.
+            Function called when the broker (QoS 1) or the kernel (QoS 0) has accepted the message.
+            Its argument is the broker's reason for refusing the message, or None. Brokers state a
+            reason only with MQTT 5 and QoS 1. The function is not called if the connection ends
+            first.
         """
         properties = self._properties(message) if self._modern else None
         with self._session_errors(f"{message.topic}: "):
             await self._client.send(message, properties, accepted)
 
     async def subscribe(self, topics: Sequence[str], *, live: bool = False) -> list[str]:
-        """Subscribe and return the topics that the broker refused.
+        """Subscribe, and return the topics that the broker refused.
 
-        With MQTT 5 a message that is sent with the retain flag arrives with this flag, even if it
+        With MQTT 5, a message that was sent with the retain flag arrives with this flag, even if it
         is new.
 
         Parameters
@@ -254,7 +262,8 @@ class MqttConnection:
         topics
             Topics or patterns.
         live
-            True: QoS 0 and, with MQTT 5, no stored messages. False: QoS 1 with stored messages.
+            True selects QoS 0 and, with MQTT 5, no stored messages. False selects QoS 1 with stored
+            messages.
         """
         qos = 0 if live else 1
         handling = _NOT_STORED if live else SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE
@@ -272,7 +281,7 @@ class MqttConnection:
 
     @contextlib.contextmanager
     def _session_errors(self, operation: str) -> Iterator[None]:
-        """Raise the errors of one exchange with the broker as `BrokerLostError`."""
+        """Convert the errors of one exchange with the broker to `BrokerLostError`."""
         try:
             yield
         except (aiomqtt.MqttError, ValueError) as error:
@@ -368,10 +377,10 @@ class MqttConnection:
 
 
 class _Client(aiomqtt.Client):
-    """aiomqtt's client with a limit on incoming packets and immediate detection of failures.
+    """Client of aiomqtt with a limit on incoming packets and immediate detection of failures.
 
     The client can be abandoned while it connects. It fails at once if the connection breaks during
-    the handshake. It sends several messages before the first message is acknowledged.
+    the handshake. It can send several messages before the first of them is acknowledged.
     """
 
     _abandoned = False
@@ -387,7 +396,7 @@ class _Client(aiomqtt.Client):
         super().__init__(*arguments, **options)
         self._encoder = PublishEncoder()
         self._unacknowledged: dict[int, tuple[float, Callable[[str | None], None]]] = {}
-        """Time limit, s, and callback of unacknowledged messages, by message id, oldest first."""
+        """Time limit (s) and callback of each unacknowledged message, by id, oldest first."""
         self._acknowledged = asyncio.Event()
         self._limit_timer: asyncio.TimerHandle | None = None
         self._window = WINDOW
@@ -402,13 +411,13 @@ class _Client(aiomqtt.Client):
 
     @property
     def oversized(self) -> int:
-        """Number of incoming packets above the size limit."""
+        """Number of incoming packets larger than the size limit."""
         return 0 if self._limited is None else self._limited.oversized
 
     async def __aenter__(self) -> Self:  # type: ignore[explicit-override]  # Python 3.12's
-        """Connect; fail if the connection ended at the moment of its acceptance.
+        """Connect, and fail if the connection ended at the moment of its acceptance.
 
-        aiomqtt ignores such an end of the connection, and would wait for messages without limit.
+        aiomqtt ignores such an end, and would wait for messages without limit.
         """
         ended = self._disconnected
         await super().__aenter__()
@@ -417,7 +426,10 @@ class _Client(aiomqtt.Client):
         return self
 
     def abandon(self) -> None:
-        """Close the socket at once; otherwise a failed attempt keeps it open for seconds."""
+        """Close the socket at once.
+
+        Otherwise the socket of a failed attempt stays open for seconds.
+        """
         self._abandoned = True
         if self._limit_timer is not None:
             self._limit_timer.cancel()
@@ -446,9 +458,9 @@ class _Client(aiomqtt.Client):
     def _on_disconnect(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
         self, client: Any, userdata: Any, flags: Any, reason_code: Any, properties: Any = None
     ) -> None:
-        """Store the reason, which the first of several failing tasks may not contain.
+        """Store the reason of a disconnect, because the error of a failing task may not contain it.
 
-        A connection that ends before its acceptance fails at once, without aiomqtt's timeout.
+        A connection that ends before its acceptance fails at once, without the timeout of aiomqtt.
         """
         code = getattr(reason_code, "value", None)
         self.taken_over |= code == _TAKEN_OVER
@@ -467,11 +479,11 @@ class _Client(aiomqtt.Client):
     def _on_socket_unregister_write(  # type: ignore[explicit-override]  # Python 3.12's
         self, client: Any, userdata: Any, sock: Any
     ) -> None:
-        """Make the kernel acknowledge the next data at once; called after sending.
+        """Make the kernel acknowledge the next data at once; paho calls this method after sending.
 
-        After a transmission such as a ping, the kernel delays an acknowledgement by 40 ms. For this
-        time a broker with Nagle's algorithm holds back its next messages (RFC 1122, 4.2.3.2 and
-        4.2.3.4).
+        After a transmission such as a ping, the kernel delays acknowledgements by up to 40 ms.
+        During this time a broker with Nagle's algorithm delays its next messages (RFC 1122, 4.2.3.2
+        and 4.2.3.4).
         """
         super()._on_socket_unregister_write(client, userdata, sock)
         with contextlib.suppress(OSError):  # closed, or not supported
@@ -480,14 +492,14 @@ class _Client(aiomqtt.Client):
     def _on_connect(  # type: ignore[explicit-override]  # typing.override is Python 3.12's
         self, client: Any, userdata: Any, flags: Any, reason_code: Any, properties: Any = None
     ) -> None:
-        """Store how many unacknowledged messages the broker allows."""
+        """Store the number of unacknowledged messages that the broker allows."""
         self._window = min(WINDOW, getattr(properties, "ReceiveMaximum", WINDOW))
         super()._on_connect(client, userdata, flags, reason_code, properties)
 
     async def send(
         self, message: Outgoing, properties: Any, accepted: Callable[[str | None], None]
     ) -> None:
-        """Send a message as soon as the window of unacknowledged messages has room."""
+        """Send a message as soon as the limit of unacknowledged messages permits it."""
         while len(self._unacknowledged) >= self._window:
             self._acknowledged.clear()
             await self._acknowledged.wait()
@@ -504,10 +516,10 @@ class _Client(aiomqtt.Client):
     def _write_at_once(
         self, message: Outgoing, properties: Any, accepted: Callable[[str | None], None]
     ) -> bool:
-        """Write a message at QoS 0 to the socket; return False if the library has to queue it.
+        """Write a message with QoS 0 to the socket; return False if the library must queue it.
 
-        The library would wake the event loop by a byte to itself, wait until the socket is
-        writable, and build the acknowledgement that QoS 0 does not have.
+        The library would wake the event loop by sending a byte to itself and wait until the socket
+        is writable. It would also build an acknowledgement, which QoS 0 does not have.
         """
         client: Any = self._client
         opened = client.socket()
@@ -529,13 +541,13 @@ class _Client(aiomqtt.Client):
         return True
 
     def _await_acceptance(self, mid: int, accepted: Callable[[str | None], None]) -> None:
-        """Wait for the acceptance of a message for at most `ANSWER_S`."""
+        """Expect the acceptance of a message within `ANSWER_S`."""
         self._unacknowledged[mid] = (self._loop.time() + ANSWER_S, accepted)
         if self._limit_timer is None:
             self._limit_timer = self._loop.call_later(ANSWER_S, self._check_limit)
 
     def _check_limit(self) -> None:
-        """End the connection if the oldest message has waited too long; else check again later.
+        """End the connection if the oldest message has waited too long, or check again later.
 
         All messages share one timer, because starting a timer takes longer than sending a message.
         """
@@ -560,7 +572,7 @@ class _Client(aiomqtt.Client):
 class DisconnectErrorFilter:
     """Exception handler of the event loop that drops two harmless errors of aiomqtt.
 
-    At a disconnect aiomqtt leaves an ``MqttError`` in a future that is no longer awaited, and a
+    At a disconnect, aiomqtt leaves an ``MqttError`` in a future that no task awaits. In addition, a
     callback on a closed socket fails with a bad file descriptor. These two errors are counted; all
     other errors are handled as usual.
     """
@@ -573,7 +585,7 @@ class DisconnectErrorFilter:
         error, message = context.get("exception"), str(context.get("message", ""))
         late = isinstance(error, aiomqtt.MqttError) and "never retrieved" in message
 
-        # The callback, or one of its arguments, belongs to aiomqtt.
+        # The callback belongs to aiomqtt, or one of its arguments does.
         handle = context.get("handle")
         functions = (getattr(handle, "_callback", None), *(getattr(handle, "_args", None) or ()))
         ours = any(str(getattr(f, "__module__", "")).startswith("aiomqtt") for f in functions)

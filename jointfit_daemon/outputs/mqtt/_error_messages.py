@@ -32,7 +32,7 @@ _SYSTEM_ERRORS = {
     -2: "unknown host name: correct host in [mqtt], or use an address",
     -3: "the host name cannot be resolved at present: check the network, or use an address",
 }
-"""Messages by errno; negative numbers are errors of name resolution."""
+"""Messages by errno. Negative numbers are errors of name resolution."""
 _VERSION = (
     'the broker does not support this version of MQTT: set version = "3.1.1" or "5" in [mqtt]'
 )
@@ -77,13 +77,13 @@ VERSION_REFUSED = (  # For an answer that is not MQTT, the library reports the s
     " host and port in [mqtt]"
 )
 _UNSPECIFIED = 128
-"""Reason code without a reason, to which paho converts every unknown code of MQTT 3.1.1."""
+"""Reason code "unspecified", to which paho converts all unknown codes of MQTT 3.1.1."""
 _SESSION_LOST = (4, 7, 128)
-"""Numbers of paho for "not connected" and "connection lost", and its default reason code."""
+"""Numbers that paho uses for "not connected" and "connection lost", and its default reason code."""
 
 
 def refusal_fault(error: BaseException) -> str:
-    """Return cause and remedy of a connection that the broker refused in its answer (CONNACK)."""
+    """Return cause and remedy of a connection that the broker refused in its answer CONNACK."""
     found = _CODE.search(str(error))
     if found is None:
         return broker_fault(error)
@@ -95,7 +95,7 @@ def refusal_fault(error: BaseException) -> str:
 
 
 def broker_fault(error: BaseException) -> str:
-    """Return cause and remedy of a failed connection; for an unknown `error` its text."""
+    """Return cause and remedy of a failed connection, or the text of an unknown `error`."""
     text = str(error)
     if found := _ERRNO.search(text):
         return _SYSTEM_ERRORS.get(int(found[1]), text)
@@ -110,8 +110,8 @@ def broker_fault(error: BaseException) -> str:
 def session_fault(error: BaseException) -> str:
     """Return cause and remedy of a failed operation on an established connection.
 
-    Error numbers of an operation are defined by paho: 4 means "not connected", not "wrong
-    password".
+    The error numbers of an operation are those of paho: 4 means "not connected", whereas the MQTT
+    reason code 4 means "wrong password".
     """
     text = str(error)
     if text == "Operation timed out":

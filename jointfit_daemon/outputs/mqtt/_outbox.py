@@ -1,16 +1,18 @@
-"""Messages waiting for publication.
+"""Queue of messages that wait for publication.
 
-Invariant: the size is limited, the oldest message is dropped first, and drops are counted.
+Invariant: the size is limited, the oldest message is dropped first, and dropped messages are
+counted.
 
-Five kinds wait separately and are sent in this order. A client waits for a response. State is
-retained: the last value of a topic replaces earlier ones, and all state is sent again on every
-connection. Events are sent in order. Stream messages are useless when late. Late messages come from
-the spool, which waits for their delivery. Responses, events and stream messages are dropped when
-they have waited longer than their expiry.
+There are five kinds of messages, which are sent in this order of priority. Responses come first,
+because a client waits for them. State messages are retained: the last value of a topic replaces
+earlier values, and all state is sent again on every connection. Events are sent in order. Stream
+messages are useless when late. Late messages come from the spool, which waits for their delivery.
+Responses, events and stream messages are dropped when they have waited longer than their expiry
+time.
 
-Several messages can be sent before the first message is acknowledged. After a loss of the
-connection, responses, events and late messages without an acknowledgement are sent again, so they
-may arrive twice.
+The outbox can send several messages before the first of them is acknowledged. After the connection
+is lost, responses, events and late messages without an acknowledgement are sent again. They may
+therefore arrive twice.
 """
 
 from __future__ import annotations
@@ -34,22 +36,23 @@ RESPONSE_EXPIRY_S = 30
 """Time after which the broker drops an undelivered event or response, s."""
 
 _STREAM_CAPACITY = 200
-"""Largest number of waiting stream messages: one to two seconds of poses and other streams."""
+"""Largest number of waiting stream messages, equal to one to two seconds of poses and other
+streams."""
 _EVENT_CAPACITY = 256
-"""Largest number of waiting events: several minutes of a rig with faults."""
+"""Largest number of waiting events, equal to several minutes of a rig with faults."""
 
 _Waiting = tuple[float, Outgoing]
-"""Time at which a message expires, s of the clock, and the message."""
+"""Time at which a message expires (s, on the clock of the outbox), and the message."""
 
 
 class Outbox:
-    """Messages for one broker, filled by any code on the event loop, emptied by one writer.
+    """Messages for one broker. Any code on the event loop adds messages; one task sends them.
 
     Parameters
     ----------
     state_topic
-        Topic of the daemon's own state. On a new connection it is sent after all other retained
-        messages, so that a subscriber of this topic can rely on the other messages.
+        Topic of the daemon's own state. On a new connection, this state is sent after all other
+        retained messages, so that its subscribers can rely on the other messages.
     clock
         Monotonic time, s, for the expiry of waiting messages.
     """
