@@ -108,6 +108,9 @@ class MocapFrame:
     counted: bool = True
     """Whether the server numbers its frames. Without frame numbers, lost frames are not
     detected."""
+    residuals: NDArray[np.float64] | None = None
+    """Residual of the cameras for each marker, m, shape (len(layout.markers),); NaN where the
+    server sent none. None if the protocol has no residuals."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -54,6 +54,9 @@ class OpticalTrack:
     """Positions of the rigid bodies in the optical world, m, shape (m, len(bodies), 3)."""
     body_orientations: NDArray[np.float64]
     """Orientations q_world_body of the rigid bodies, shape (m, len(bodies), 4)."""
+    residuals: NDArray[np.float64] | None = None
+    """Residuals of the cameras for the markers, m, shape (m, len(markers)); NaN where unknown. None
+    if no frame has one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -250,6 +250,7 @@ class NatNetDecoder:
                 found.body_positions,
                 found.body_orientations,
                 self._live,
+                residuals=found.residuals,
             )
         )
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np  # noqa: TC002 - mypyc evaluates the types of fields
+import numpy as np
 from numpy.typing import NDArray  # noqa: TC002 - mypyc evaluates the types of fields
 
 from jointfit_drivers.motion_capture import (
@@ -39,6 +39,8 @@ class FrameColumns(NamedTuple):
     markers: NDArray[np.float64]
     body_positions: NDArray[np.float64]
     body_orientations: NDArray[np.float64]
+    residuals: NDArray[np.float64]
+    """Residual of each labeled marker, m per camera ray; NaN if missing or zero."""
     suspicious: int
     """Bodies rejected because their quaternion is not normalised or their numbers are not finite.
     """
@@ -64,7 +66,7 @@ class PoseConverter:
         unknown: list[int] = []
 
         place = self._place
-        seen = self._labeled(frame, binding.known, unknown)
+        seen, errors = self._labeled(frame, binding.known, unknown)
         for asset in frame.assets:
             for number, x, y, z, _, params, _ in asset.markers:
                 if params & _QUALITY_BITS == MARKER_POINT_CLOUD_SOLVED and is_near(x, y, z):
@@ -78,22 +80,27 @@ class PoseConverter:
 
         bodies, suspicious = self._bodies(frame, binding, unknown)
         places = [bodies.get(key, ABSENT) for key in binding.columns.bodies]
+        residuals = np.array([errors.get(key, np.nan) for key in binding.columns.markers])
+        residuals[~(residuals > 0.0)] = np.nan
 
         return FrameColumns(
             rows_array([seen.get(key, NO_POSITION) for key in binding.columns.markers], 3),
             rows_array([place for place, _ in places], 3),
             rows_array([turn for _, turn in places], 4),
+            residuals,
             suspicious,
             tuple(unknown),
         )
 
     def _labeled(
         self, frame: FrameOfData, known: frozenset[ColumnKey], unknown: list[int]
-    ) -> dict[ColumnKey, Vector]:
+    ) -> tuple[dict[ColumnKey, Vector], dict[ColumnKey, float]]:
+        """Return positions and residuals of the usable labeled markers."""
         place, far = self._place, FARTHEST_M
         seen: dict[ColumnKey, Vector] = {}
+        errors: dict[ColumnKey, float] = {}
         twice: set[int] = set()
-        for number, x, y, z, _, params, _ in frame.markers:
+        for number, x, y, z, _, params, residual in frame.markers:
             if number not in known:
                 if number >> 16:  # model 0: a marker without a model
                     unknown.append(number)
@@ -107,10 +114,11 @@ class PoseConverter:
                 if number in seen:
                     twice.add(number)
                 seen[number] = place(x, y, z)
+                errors[number] = residual
 
         for number in twice:
-            del seen[number]
-        return seen
+            del seen[number], errors[number]
+        return seen, errors
 
     def _bodies(
         self, frame: FrameOfData, binding: Binding, unknown: list[int]

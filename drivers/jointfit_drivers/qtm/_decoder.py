@@ -252,6 +252,7 @@ class QtmDecoder:
                 found.body_positions,
                 found.body_orientations,
                 self._live,
+                residuals=found.residuals,
             )
         )
 

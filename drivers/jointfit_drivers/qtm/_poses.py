@@ -40,6 +40,8 @@ class QtmColumns(NamedTuple):
     markers: Array
     body_positions: Array
     body_orientations: Array
+    residuals: Array
+    """Residual of each marker, m; NaN if missing or zero."""
     suspicious: int
     """Bodies that have a position, but no valid rotation."""
 
@@ -95,14 +97,18 @@ class QtmPoseConverter:
         items = markers.items if isinstance(markers, ItemsComponent) else ()
         columns = binding.marker_places
         placed = np.full((len(columns), 3), np.nan)
+        residuals = np.full(len(columns), np.nan)
         if items:
-            positions = np.array(items, dtype=np.float64)[:, :3] * _MM
-            positions[~(np.abs(positions) <= FARTHEST_M).all(axis=1)] = np.nan
-            placed = positions[columns] @ self._rotation
+            numbers = np.array(items, dtype=np.float64) * _MM
+            numbers[~(np.abs(numbers[:, :3]) <= FARTHEST_M).all(axis=1)] = np.nan
+            placed = numbers[columns, :3] @ self._rotation
+            residuals = numbers[columns, 3]
+            residuals[~(residuals > 0.0)] = np.nan  # positions computed without cameras have zero
         return QtmColumns(
             placed,
             rows_array([place for place, _ in rows], 3),
             rows_array([turn for _, turn in rows], 4),
+            residuals,
             suspicious,
         )
 

@@ -97,7 +97,10 @@ def chosen_center(
     )
     points = parent.to_static(child.points)[::step] - start
     interval = step * float(np.median(np.diff(parent.t_ns))) / 1e9
-    movement = Movement(points, above, below, near=np.zeros(3), interval=interval)
+    residuals = None if child.residuals is None else child.residuals[::step]
+    movement = Movement(
+        points, above, below, residuals=residuals, near=np.zeros(3), interval=interval
+    )
     if METHODS[method].planar:
         hinge = estimate_center(movement, "sara")
         if hinge.axis is None or hinge.refused is not None:

@@ -64,6 +64,8 @@ class ClusterTrack:
     """RMS residual of the rigid fit, m, shape (m,)."""
     origin: Array
     """Origin of the cluster in the static world, m, shape (3,)."""
+    residuals: Array | None = None
+    """Residuals of the cameras for the markers, m, shape (m, k); NaN where unknown."""
 
     def to_static(self, x: Array) -> Array:
         """Transform current points, shape (m, ..., 3), to the static world of this part."""
@@ -183,14 +185,16 @@ def track_cluster(track: OpticalTrack, cluster: MarkerCluster) -> ClusterTrack:
         points = rotation.rotate(q[:, None], cluster.template) + p[:, None]
         return ClusterTrack(track.t_ns, q, p, points, np.zeros(len(q)), cluster.origin)
 
-    points = track.positions[:, _marker_columns(track, cluster.name, cluster.markers)]
+    chosen = _marker_columns(track, cluster.name, cluster.markers)
+    points = track.positions[:, chosen]
+    residuals = None if track.residuals is None else track.residuals[:, chosen]
     q, p, rms = steady_fit(cluster.template, points)
 
     # A larger residual means swapped or mislabeled markers: no pose.
     wrong = rms > MAX_FIT_RMS_M
     q[wrong], p[wrong] = np.nan, np.nan
     points = np.where(wrong[:, None, None], np.nan, points)
-    return ClusterTrack(track.t_ns, q, p, points, rms, cluster.origin)
+    return ClusterTrack(track.t_ns, q, p, points, rms, cluster.origin, residuals)
 
 
 def track_clusters(

@@ -30,6 +30,8 @@ def trials_digest(*trials: CalibrationTrial | None) -> str:
             names = "\n".join((*optical.markers, "", *optical.bodies))
             _add(sha, names, optical.t_ns, optical.positions)
             _add(sha, "bodies", optical.body_positions, optical.body_orientations)
+            if optical.residuals is not None:
+                _add(sha, "residuals", optical.residuals)
     return sha.hexdigest()
 
 

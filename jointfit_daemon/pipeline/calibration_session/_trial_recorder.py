@@ -77,6 +77,7 @@ def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
     positions = np.full((n, len(markers), 3), np.nan)
     body_positions = np.full((n, len(bodies), 3), np.nan)
     body_orientations = np.full((n, len(bodies), 4), np.nan)
+    residuals = np.full((n, len(markers)), np.nan)
     for layout in layouts:  # Copy once per layout; one copy per frame would block the core.
         rows = np.array([row for row, (_, frame) in enumerate(frames) if frame.layout == layout])
         seen = [frame for _, frame in frames if frame.layout == layout]
@@ -86,6 +87,10 @@ def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
         body_positions[np.ix_(rows, to_body)] = np.stack([frame.body_positions for frame in seen])
         body_orientations[np.ix_(rows, to_body)] = np.stack(
             [frame.body_orientations for frame in seen]
+        )
+        unknown = np.full(len(layout.markers), np.nan)
+        residuals[np.ix_(rows, to_marker)] = np.stack(
+            [unknown if frame.residuals is None else frame.residuals for frame in seen]
         )
 
     t_ns = np.array([t for t, _ in frames], dtype=np.int64)
@@ -97,4 +102,5 @@ def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
         bodies,
         body_positions[keep],
         body_orientations[keep],
+        residuals[keep] if np.isfinite(residuals[keep]).any() else None,
     )

@@ -318,7 +318,13 @@ def _optical(path: Path, limb: LimbDescription) -> tuple[OpticalTrack, Calibrati
 
     empty = np.empty((len(positions), 0, 3))
     track = OpticalTrack(
-        _ns(trial.trajectories.t_s), names, positions, (), empty, np.empty((len(positions), 0, 4))
+        _ns(trial.trajectories.t_s),
+        names,
+        positions,
+        (),
+        empty,
+        np.empty((len(positions), 0, 4)),
+        trial.residuals(names),
     )
     return track, CalibrationSettings(markers=dict(limb.markers))
 

@@ -22,6 +22,7 @@ from jointfit_daemon.calibration.anatomy import (
 from jointfit_daemon.calibration.phases._inertial_rotations import inertial_rotations
 from jointfit_daemon.calibration.phases._static_pose import fit_static
 from jointfit_daemon.calibration.registration import sensor_at
+from jointfit_daemon.kinematics import rotation
 from tests.calibration.anatomy.test_segment_frames import truth
 from tests.calibration.synthetic_limb import (
     CHAIN,
@@ -81,6 +82,29 @@ def test_every_estimator_finds_the_knee_and_its_axis(method: CenterMethod) -> No
     assert abs(fit.axis @ right) > np.cos(np.deg2rad(6.0))
     assert fit.axis_sd is not None
     assert np.deg2rad(0.005) < fit.axis_sd < np.deg2rad(1.0)
+
+
+def test_three_frames_of_a_live_track_weight_their_noise_by_the_residuals_of_the_cameras() -> None:
+    tracks, turned = recorded()
+    shank, choice = tracks["shank"], CenterChoice({"knee": "three_frames"}, turned)
+    relative = rotation.multiply(rotation.conjugate(tracks["thigh"].q), shank.q)
+    angle = 2.0 * np.arccos(np.clip(np.abs(relative[:, 0]), 0.0, 1.0))
+    part = (angle - np.nanmin(angle)) / np.ptp(angle[np.isfinite(angle)])
+    used = np.abs(part[:, None] - [0.0, 0.5, 1.0]).min(axis=1) < 0.1  # first, middle and last
+    used = np.tile(used[:, None], shank.points.shape[1])
+
+    def predicted_variance(residuals: Array | None) -> float:
+        moved = tracks | {"shank": replace(shank, residuals=residuals)}
+        found = find_anatomy(CHAIN, moved, choice).joints["knee"]
+        assert found is not None
+        assert found.fit is not None
+        return float(np.trace(found.fit.covariance))
+
+    plain = predicted_variance(None)
+    assert predicted_variance(np.full_like(shank.points[..., 0], 3e-4)) == pytest.approx(plain)
+    assert predicted_variance(np.where(used, 2e-4, 6e-4)) < 0.8 * plain
+    # the disagreement of the four markers limits it in the other direction
+    assert predicted_variance(np.where(used, 6e-4, 2e-4)) > 0.99 * plain
 
 
 def test_an_ankle_with_an_imu_on_the_shank_only_uses_its_angle() -> None:

@@ -82,6 +82,16 @@ def test_a_position_that_is_not_finite_is_absent() -> None:
     assert np.isnan(got.markers).all()
 
 
+def test_residuals_of_the_cameras_are_unknown_for_markers_that_are_not_usable() -> None:
+    seen = marker(65537, (1.0, 2.0, 3.0))._replace(residual=2e-4)
+    hidden = marker(65538, (1.0, 2.0, 3.0), 11)._replace(residual=2e-4)
+    got = ready().frame(frame(1, markers=(seen, hidden)))
+    assert got.residuals is not None
+    usable = np.isfinite(got.markers[:, 0])
+    assert np.isfinite(got.residuals).tolist() == usable.tolist()
+    assert got.residuals[usable].tolist() == pytest.approx([2e-4])
+
+
 def test_the_real_occluded_frame_has_three_markers_of_five(shared_data: Path) -> None:
     folder = shared_data / "mocap" / "natnet_v3_mje-nz" / "test_data"
     feeder = Feeder(up_axis="y")

@@ -54,6 +54,16 @@ def test_what_the_cameras_do_not_see_is_nan() -> None:
     assert np.isnan(got.body_positions).all()
 
 
+def test_residuals_of_the_cameras_are_metres_and_unknown_where_zero_or_missing() -> None:
+    (got,) = ready().frames(
+        frame(1, bodies(MISSING, MISSING), markers((1, 2, 3, 0.5), HIDDEN, (4, 5, 6, 0.0)),
+              camera_time(7))
+    )  # fmt: skip
+    assert got.residuals is not None
+    assert got.residuals[0] == pytest.approx(0.5e-3)
+    assert np.isnan(got.residuals[1:]).all()
+
+
 def test_a_matrix_that_is_no_rotation_is_absent_and_counted() -> None:
     feeder = ready()
     (got,) = feeder.frames(frame(1, bodies(body(1, 2, 3, (0.0,) * 9), MISSING), THREE,

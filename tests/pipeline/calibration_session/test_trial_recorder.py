@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -80,3 +82,17 @@ def test_alternating_layouts_are_merged_by_name() -> None:
         assert a == k
         assert (np.isnan(c), b) == (True, k) if k % 2 else (c, np.isnan(b)) == (k, True)
         assert np.isnan(optical.body_positions[k]).all() == (k % 2 == 0)
+
+
+def test_residuals_of_the_cameras_are_recorded_by_name_and_nan_where_a_frame_has_none() -> None:
+    recorder = TrialRecorder()
+    recorder.add_mocap(1, frame(MocapLayout(("A",), ()), 1.0))
+    optical = recorder.trial().optical
+    assert optical is not None
+    assert optical.residuals is None
+    measured = frame(MocapLayout(("B", "A"), ()), 2.0)
+    recorder.add_mocap(2, replace(measured, residuals=np.array([2e-4, 5e-4])))
+    optical = recorder.trial().optical
+    assert optical is not None
+    assert optical.residuals is not None
+    np.testing.assert_array_equal(optical.residuals, [[np.nan, np.nan], [5e-4, 2e-4]])
