@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from jointfit_protocols.corrupt import CHECKSUM, NO_START, CorruptBytes
 from jointfit_protocols.resynchronizing_codec import ResynchronizingCodec
 from jointfit_protocols.vectornav._layout import (
-    GROUPS,
+    MAX_HEADER,
     MAX_PAYLOAD,
     BinaryLayout,
     header_bytes,
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 SYNC = 0xFA
 _CRC_BYTES = 2
-MAX_MESSAGE = 2 + 2 * GROUPS + MAX_PAYLOAD + _CRC_BYTES
+MAX_MESSAGE = 1 + MAX_HEADER + MAX_PAYLOAD + _CRC_BYTES
 """Size of the largest message, bytes."""
 _START = re.compile(rb"[\xfa$]")
 
@@ -85,23 +85,19 @@ def encode_binary(values: Mapping[int, tuple[Any, ...]]) -> bytes:
     return bytes((SYNC,)) + body + struct.pack(">H", crc_hqx(body, 0))
 
 
-def _read_message(buffer: bytes, at: int, base: int) -> VectorNavMessage | CorruptBytes | None:  # noqa: PLR0911 - one for each fault
+def _read_message(buffer: bytes, at: int, base: int) -> VectorNavMessage | CorruptBytes | None:
     """Return the message that begins at `at`, the reason why none does, or None if it is cut."""
     if buffer[at] != SYNC:
         return _text(buffer, at, base) if buffer[at] == START[0] else _NO_START
 
-    have = len(buffer) - at
-    head = header_bytes(buffer[at + 1]) if have > 1 else None
-    if have > 1 and head is None:
-        return _HEADER
-    if head is None or have < 1 + head:
+    head = header_bytes(buffer, at + 1)
+    if head is None:
         return None
-
-    layout = layout_of(buffer[at + 1 : at + 1 + head])
+    layout = layout_of(buffer[at + 1 : at + 1 + head]) if head else None
     if layout is None:
         return _HEADER
     size = 1 + head + layout.struct.size + _CRC_BYTES
-    if have < size:
+    if len(buffer) - at < size:
         return None
 
     # The CRC of a body with its own CRC behind it is 0.

@@ -4,11 +4,12 @@
 
 Bit k of ``groups`` announces group k + 1, bit k of the fields of a group announces its field k.
 The payload contains the announced fields in ascending order, little-endian, without padding.
-Firmware from 2023 on announces further groups by bit 7 of ``groups`` and further fields by bit 15.
-This module has no layout for a header with either bit, or with a field of unknown size.
+Firmware from 2023 on extends both: after a byte of groups with bit 7, a second byte announces the
+groups from 9 on; after a word of fields with bit 15, a second word announces the fields from 16 on.
+This module has no layout for a header with a field of unknown or variable size.
 
-Source: VN-100 user manual (UM001), section 5, "binary output messages"; field sizes compared with
-the vendor's programming library (MIT).
+Sources: VN-100 user manual (UM001), section 5, "binary output messages"; the vendor's programming
+libraries (MIT), for the sizes of fields and the extensions (SDK 0.99).
 """
 
 from __future__ import annotations
@@ -22,14 +23,16 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 Fields = tuple[int, ...]
-"""Fields of an output, each ``group << 4 | bit``, group from 0, in ascending order."""
-_GROUP_BITS = 4
-_UNKNOWN = 0x80
-"""Bit of ``groups`` that announces a second byte of groups."""
+"""Fields of an output, each ``group << 8 | bit``, group from 0, in ascending order."""
+_GROUP_BITS = 8
+_MORE_GROUPS = 0x80
+"""Bit of a byte of groups after which a second one follows."""
+_MORE_FIELDS = 0x8000
+"""Bit of a word of fields after which a second one follows."""
 
 
 class Field(IntEnum):
-    """Fields that are decoded, each ``group << 4 | bit``."""
+    """Fields that are decoded, each ``group << 8 | bit``."""
 
     TIME_STARTUP = 0x00
     """Time since power-up, ns."""
@@ -43,30 +46,39 @@ class Field(IntEnum):
     """Compensated specific force, m/s^2."""
     MAGNETIC_AND_PRESSURE = 0x0A
     """Compensated field, gauss, three values; temperature, C; pressure, kPa."""
-    TIME_GROUP_STARTUP = 0x10
-    IMU_MAGNETIC_FIELD = 0x28
-    IMU_ACCELERATION = 0x29
-    IMU_ANGULAR_RATE = 0x2A
-    ATTITUDE_STATUS = 0x40
+    TIME_GROUP_STARTUP = 0x100
+    IMU_MAGNETIC_FIELD = 0x208
+    IMU_ACCELERATION = 0x209
+    IMU_ANGULAR_RATE = 0x20A
+    ATTITUDE_STATUS = 0x400
     """Bits 0 and 1: quality of the attitude, 0 excellent to 3 not tracking."""
-    ATTITUDE_QUATERNION = 0x42
+    ATTITUDE_QUATERNION = 0x402
 
 
+_COMMON = ("Q", "Q", "Q", "3f", "4f", "3f", "3d", "3f", "3f", "6f", "5f", "7f", "H", "I", "Q")
+_TIME = ("Q", "Q", "Q", "H", "Q", "Q", "8s", "I", "I", "B")
+_IMU = ("H", "3f", "3f", "3f", "f", "f", "4f", "3f", "3f", "3f", "3f", "2s", "40s")
 _GNSS = ("8s", "Q", "H", "B", "B", "3d", "3d", "3f", "3f", "3f", "f", "I", "2s", "28s")
-_FORMATS: tuple[tuple[str, ...], ...] = (
-    ("Q", "Q", "Q", "3f", "4f", "3f", "3d", "3f", "3f", "6f", "5f", "7f", "H", "I", "Q"),
-    ("Q", "Q", "Q", "H", "Q", "Q", "8s", "I", "I", "B"),
-    ("H", "3f", "3f", "3f", "f", "f", "4f", "3f", "3f", "3f", "3f", "2s",
-     "40s"),
-    _GNSS,
-    ("H", "3f", "4f", "9f", "3f", "3f", "3f", "3f", "3f", "12s", "28s", "24s"),
-    ("H", "3d", "3d", "3f", "3f", "3f", "3f", "3f", "3f", "f", "f", "68s", "64s"),
-    _GNSS,
-)  # fmt: skip
-"""Struct codes of the fields of each group: common, time, IMU, GNSS, attitude, INS, GNSS 2."""
-GROUPS = len(_FORMATS)
-MAX_PAYLOAD = sum(struct.calcsize("<" + code) for group in _FORMATS for code in group)
+_ATTITUDE = ("H", "3f", "4f", "9f", "3f", "3f", "3f", "3f", "3f", "12s", "28s", "24s", "3f", "f")
+_INS = ("H", "3d", "3d", "3f", "3f", "3f", "3f", "3f", "3f", "f", "f", "68s", "64s")
+_MORE_GNSS = {17: "2s", 18: "8s"}
+"""Status and altitude; satellites (14) and raw measurements (16) have variable sizes."""
+_FORMATS: dict[int, dict[int, str]] = {
+    0: dict(enumerate(_COMMON)),
+    1: dict(enumerate(_TIME)),
+    2: dict(enumerate(_IMU)),
+    3: dict(enumerate(_GNSS)) | _MORE_GNSS,
+    4: dict(enumerate(_ATTITUDE)),
+    5: dict(enumerate(_INS)),
+    6: dict(enumerate(_GNSS)) | _MORE_GNSS,
+    12: dict(enumerate(_GNSS)) | _MORE_GNSS,
+}
+"""Struct codes of the fields of each group: common, time, IMU, GNSS, attitude, INS, GNSS 2 and 3.
+"""
+MAX_PAYLOAD = sum(struct.calcsize("<" + x) for group in _FORMATS.values() for x in group.values())
 """Size of a payload with all fields, bytes."""
+MAX_HEADER = 2 + 2 * (len(_FORMATS) + sum(max(group) > 15 for group in _FORMATS.values()))  # noqa: PLR2004 - bits of a word
+"""Size of the header of an output with all fields, bytes."""
 
 
 class BinaryLayout:
@@ -94,9 +106,9 @@ class BinaryLayout:
 
         for field in self.fields:
             group, bit = divmod(field, 1 << _GROUP_BITS)
-            if group >= GROUPS or bit >= len(_FORMATS[group]):
+            code = _FORMATS.get(group, {}).get(bit)
+            if code is None:
                 raise KeyError(f"field {bit} of group {group + 1} has no known size")
-            code = _FORMATS[group][bit]
             count = 1 if code.endswith("s") or len(code) == 1 else int(code[:-1])
             masks[group] = masks.get(group, 0) | 1 << bit
             self.places[field] = slice(at, at + count)
@@ -111,23 +123,56 @@ class BinaryLayout:
 def header_of(masks: Mapping[int, int]) -> bytes:
     """Return the header of an output whose groups, from 0, have these fields."""
     groups = sum(1 << group for group in masks)
-    words = (masks[group].to_bytes(2, "little") for group in sorted(masks))
-    return bytes((groups,)) + b"".join(words)
+    more = groups >> 8
+    header = bytes((groups & 0x7F | _MORE_GROUPS, more) if more else (groups,))
+    for group in sorted(masks):
+        low, high = masks[group] & 0xFFFF, masks[group] >> 16
+        words = (low | _MORE_FIELDS, high) if high else (low,)
+        header += b"".join(word.to_bytes(2, "little") for word in words)
+    return header
 
 
-def header_bytes(groups: int) -> int | None:
-    """Return the size of a header by its first byte; None if no supported header has this byte."""
-    return None if groups == 0 or groups & _UNKNOWN else 1 + 2 * groups.bit_count()
+def header_bytes(buffer: bytes, at: int) -> int | None:
+    """Return the size of the header at `at`; 0 if it has no known layout, None if it is cut."""
+    end = len(buffer)
+    if at >= end:
+        return None
+    groups, size = buffer[at], 1
+    if groups & _MORE_GROUPS:
+        if at + 1 >= end:
+            return None
+        groups, size = groups & 0x7F | buffer[at + 1] << 8, 2
+    if not groups or groups & ~_KNOWN_GROUPS:
+        return 0
+
+    for _ in range(groups.bit_count()):
+        size += 2
+        if at + size > end:
+            return None
+        size += 2 * (buffer[at + size - 1] >> 7)  # the high byte of the word: bit 15
+    return size if at + size <= end else None
+
+
+_KNOWN_GROUPS = sum(1 << group for group in _FORMATS)
 
 
 @lru_cache(maxsize=64)
 def layout_of(header: bytes) -> BinaryLayout | None:
     """Return the layout that a header of the right size describes; None if it is unknown."""
-    groups = [group for group in range(GROUPS) if header[0] >> group & 1]
+    groups, at = header[0] & 0x7F, 1
+    if header[0] & _MORE_GROUPS:
+        groups, at = groups | header[1] << 8, 2
     fields: list[int] = []
-    for number, group in enumerate(groups):
-        mask = int.from_bytes(header[1 + 2 * number : 3 + 2 * number], "little")
-        if mask >> len(_FORMATS[group]):
+    for group in range(groups.bit_length()):
+        if not groups >> group & 1:
+            continue
+        mask = int.from_bytes(header[at : at + 2], "little")
+        at += 2
+        if mask & _MORE_FIELDS:
+            mask = mask & ~_MORE_FIELDS | int.from_bytes(header[at : at + 2], "little") << 16
+            at += 2
+        bits = [bit for bit in range(mask.bit_length()) if mask >> bit & 1]
+        if not _FORMATS[group].keys() >= set(bits):
             return None
-        fields += (group << _GROUP_BITS | bit for bit in range(16) if mask >> bit & 1)
+        fields += (group << _GROUP_BITS | bit for bit in bits)
     return BinaryLayout(fields) if fields else None

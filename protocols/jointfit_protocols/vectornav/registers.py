@@ -19,7 +19,7 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import TYPE_CHECKING, NamedTuple
 
-from jointfit_protocols.vectornav._layout import BinaryLayout, layout_of
+from jointfit_protocols.vectornav._layout import BinaryLayout, header_bytes, layout_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -64,24 +64,33 @@ def encode_output(output: BinaryOutput) -> str:
         A field is unknown.
     """
     header = BinaryLayout(output.fields).header
-    words = (header[at : at + 2] for at in range(1, len(header), 2))
+    at = _group_bytes(header)
+    groups = ",".join(f"{byte:02X}" for byte in header[:at])
+    words = (header[k : k + 2] for k in range(at, len(header), 2))
     fields = ",".join(f"{int.from_bytes(word, 'little'):04X}" for word in words)
-    return f"{output.ports},{output.divisor},{header[0]:02X},{fields}"
+    return f"{output.ports},{output.divisor},{groups},{fields}"
 
 
 def decode_output(values: Sequence[str]) -> BinaryOutput | None:
     """Return the content of the register; None if it is malformed or has unknown fields."""
     try:
-        ports, divisor, groups = int(values[0]), int(values[1]), int(values[2], 16)
-        words = [int(value, 16).to_bytes(2, "little") for value in values[3:]]
+        ports, divisor = int(values[0]), int(values[1])
+        numbers = [int(value, 16) for value in values[2:]]
+        count = _group_bytes(numbers)
+        header = bytes(numbers[:count])
+        header += b"".join(number.to_bytes(2, "little") for number in numbers[count:])
     except (ValueError, IndexError, OverflowError):
         return None
-    if not 0 <= groups < 128 or len(words) < groups.bit_count():  # noqa: PLR2004 - 7 groups
-        return None
-    if not groups:
+    if numbers[0] == 0:
         return BinaryOutput(ports, divisor, ())
-    layout = layout_of(bytes((groups,)) + b"".join(words[: groups.bit_count()]))
+    size = header_bytes(header, 0)
+    layout = layout_of(header[:size]) if size else None
     return None if layout is None else BinaryOutput(ports, divisor, layout.fields)
+
+
+def _group_bytes(header: Sequence[int]) -> int:
+    """Return the number of bytes of groups; bit 7 of the first one announces another."""
+    return 1 + (header[0] >> 7 & 1)
 
 
 def decode_rotation(values: Sequence[str]) -> tuple[float, ...] | None:

@@ -50,7 +50,7 @@ class TestVectorNavThatStreamsFromTheStart(TestVectorNav):
     @override
     def make_device(self, folder: Path, wire_noise: WireNoise) -> VectorNavDevice:
         options = VectorNavDeviceOptions(
-            model="VN-300", imu_rate_hz=400, outputs=((3, 4, (0x00, 0x03, 0x04, 0x05, 0x28)),)
+            model="VN-300", imu_rate_hz=400, outputs=((3, 4, (0x00, 0x03, 0x04, 0x05, 0x208)),)
         )
         return VectorNavDevice(folder / "imu", options=options, wire_noise=wire_noise)
 

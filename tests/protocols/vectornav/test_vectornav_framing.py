@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import struct
+from binascii import crc_hqx
 from typing import Any
 
 import pytest
@@ -104,19 +105,44 @@ def test_an_output_has_the_documented_bytes() -> None:
     assert wire[-2:] == crc.to_bytes(2, "big")
 
 
-@pytest.mark.parametrize("group", range(7))
+@pytest.mark.parametrize("group", [*range(7), 12])
 def test_field_sizes_equal_those_of_the_vendors_library(group: int) -> None:
-    gnss = [8, 8, 2, 1, 1, 24, 24, 12, 12, 12, 4, 4, 2, 28]
+    gnss = [8, 8, 2, 1, 1, 24, 24, 12, 12, 12, 4, 4, 2, 28, 2, 8]  # the last two: 17 and 18
     sizes = [
         [8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8],
         [8, 8, 8, 2, 8, 8, 8, 4, 4, 1],
         [2, 12, 12, 12, 4, 4, 16, 12, 12, 12, 12, 2, 40],
         gnss,
-        [2, 12, 16, 36, 12, 12, 12, 12, 12, 12, 28, 24],
+        [2, 12, 16, 36, 12, 12, 12, 12, 12, 12, 28, 24, 12, 4],
         [2, 24, 24, 12, 12, 12, 12, 12, 12, 4, 4, 68, 64],
         gnss,
     ]
-    assert [struct.calcsize("<" + code) for code in _FORMATS[group]] == sizes[group]
+    known = [struct.calcsize("<" + code) for code in _FORMATS[group].values()]
+    assert known == (gnss if group == 12 else sizes[group])
+
+
+@pytest.mark.parametrize(
+    ("head", "behind"),
+    [
+        (b"\x81\x10\x11\x00\x04\x00", b"\x34\x09"),  # group 13 (GNSS 3): week
+        (b"\x09\x11\x00\x10\x80\x06\x00", bytes(1 + 2 + 8)),  # GNSS: fix, status, altitude
+        (b"\x89\x10\x11\x00\x01\x80\x02\x00\x08\x00", bytes(8 + 2 + 1)),
+        (b"\x11\x11\x00\x00\x30", bytes(12 + 4)),  # attitude: heave, uncertainty
+    ],
+)
+def test_groups_and_fields_of_firmware_from_2023_leave_the_orientation_in_place(
+    head: bytes, behind: bytes
+) -> None:
+    body = head + struct.pack("<Q4f", 7, 0.5, -0.5, 0.25, 0.75) + behind
+    wire = b"\xfa" + body + struct.pack(">H", crc_hqx(body, 0))
+    for cut in (1, len(wire)):
+        found, codec = decode([wire[at : at + cut] for at in range(0, len(wire), cut)] * 2)
+        assert codec.messages == len(found) == 2
+        for packet in found:
+            assert isinstance(packet, BinaryPacket)
+            assert packet.values[packet.layout.places[Field.TIME_STARTUP]] == (7,)
+            assert packet.values[packet.layout.places[Field.QUATERNION]] == (0.5, -0.5, 0.25, 0.75)
+            assert packet.layout.header == head
 
 
 @given(binaries | texts, st.integers(0, 10_000), st.integers(0, 7))
@@ -196,8 +222,10 @@ def test_an_output_register_decodes_to_itself(output: registers.BinaryOutput) ->
     ("text", "expected"),
     [
         ("2,8,01,0011", (2, 8, (0x00, 0x04))),
-        ("3,16,11,0001,0106", (3, 16, (0x00, 0x41, 0x42, 0x48))),
+        ("3,16,11,0001,0106", (3, 16, (0x00, 0x401, 0x402, 0x408))),
         ("0,0,00", (0, 0, ())),
+        ("0,1,00,0000", (0, 1, ())),
+        ("1,8,89,10,0010,8001,0002,0004", (1, 8, (0x04, 0x300, 0x311, 0xC02))),
         ("0,1,01", None),
         ("x", None),
         ("1,8,01,8000", None),
