@@ -96,6 +96,7 @@ class WitMotionDecoder:
         self._rate: bytes | None = None
         self._refused = 0
         self._kinds: set[int] = set()
+        self._kinds_counted = 0  # frames so far; the codec is ahead by the rest of a chunk
         self._norm_checked = self._kinds_checked = self._other_reported = False
 
     @property
@@ -215,7 +216,8 @@ class WitMotionDecoder:
 
     def _missing_kinds(self) -> list[Decoded]:
         """Return the warning about kinds that the settings require and the device does not send."""
-        if self._codec.messages < _CHECKED_FRAMES:
+        self._kinds_counted += 1
+        if self._kinds_counted < _CHECKED_FRAMES:
             return []
         self._kinds_checked = True
         missing = missing_kinds(self._kinds, self._raw)

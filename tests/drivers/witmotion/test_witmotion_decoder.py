@@ -102,6 +102,11 @@ def test_a_stream_without_quaternions_is_reported_once() -> None:
     assert "it sends acceleration, angle, but no quaternion" in warning.text
 
 
+def test_a_file_in_one_piece_is_no_stream_without_quaternions() -> None:
+    wire = (encode(Kind.ACCELERATION, bytes(8)) + quaternion()) * 100
+    assert {type(event) for event in decoder().feed(Chunk(0, wire))} == {ImuSample}
+
+
 def test_the_bluetooth_variant_is_reported() -> None:
     events = run(decoder(), [b"\x55\x61" + bytes(18)] * 30)
     errors = [item for item in events if isinstance(item, DeviceEvent)]
