@@ -38,7 +38,7 @@ class Bno085Imu:
         raw = None
         if settings.orientation == "gateway":
             raw = RawSamples.of(settings)
-        return ShtpDecoder(settings.line_baud, raw)
+        return ShtpDecoder(settings.line_baud, raw, settings.reports[0])
 
     async def run(self, emit: Emit) -> None:
         """Open the port, make the device send, and read until cancelled.

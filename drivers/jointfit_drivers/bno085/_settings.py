@@ -28,6 +28,7 @@ _REPORTS = {
     "game_rotation_vector": HubReportId.GAME_ROTATION_VECTOR,
     "arvr_rotation_vector": HubReportId.ARVR_ROTATION_VECTOR,
     "arvr_game_rotation_vector": HubReportId.ARVR_GAME_ROTATION_VECTOR,
+    "gyro_rotation_vector": HubReportId.GYRO_ROTATION_VECTOR,
 }
 
 
@@ -36,11 +37,12 @@ class Bno085Settings(SerialImuSettings, GatewaySettings):
 
     report: Literal[
         "rotation_vector", "game_rotation_vector", "arvr_rotation_vector",
-        "arvr_game_rotation_vector",
+        "arvr_game_rotation_vector", "gyro_rotation_vector",
     ] = Field(
         "rotation_vector",
         description="orientation that UART-SHTP sends; `game`: without magnetometer, the heading "
-        "drifts; `arvr`: corrections are spread over motion",
+        "drifts; `arvr`: corrections are spread over motion; `gyro`: with rates of turn and the "
+        "least delay",
     )  # fmt: skip
     euler: Literal["zxy", "zyx"] = Field(
         "zxy",

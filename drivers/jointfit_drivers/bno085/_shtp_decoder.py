@@ -32,6 +32,7 @@ from jointfit_protocols.bno085 import (
     ShtpPacket,
     base_time,
     decode_firmware,
+    decode_gyro_rotations,
     decode_interval,
     decode_report,
     split_reports,
@@ -70,13 +71,22 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         Line speed, bit/s, for back-dating of stamps; None for USB.
     raw : RawSamples, optional
         Computes orientations from raw readings; None if the device sends rotation vectors.
+    preferred : int
+        Rotation vector that is used if the device sends several kinds, whose headings differ. Until
+        it arrives, the first kind is used.
     """
 
     tick_clock = None  # reports have an age, but no time
 
-    def __init__(self, baud: int | None, raw: RawSamples | None = None) -> None:
+    def __init__(
+        self,
+        baud: int | None,
+        raw: RawSamples | None = None,
+        preferred: int = HubReportId.ROTATION_VECTOR,
+    ) -> None:
         super().__init__(ShtpCodec(), Refusals(), baud, MOST_PAYLOAD)
         self._gate, self._raw = OrientationGate(), raw
+        self._preferred, self._selected = preferred, 0
         self._arrival_ns = 0
         self._sequences: dict[int, int] = {}
         self._measuring = False
@@ -88,12 +98,16 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         self._reading_ns = self._readings = self._first_ns = 0
 
     @override
-    def _take(self, message: ShtpPacket | ShtpBufferStatus) -> list[Decoded]:
+    def _take(  # noqa: PLR0911 - one for each channel
+        self, message: ShtpPacket | ShtpBufferStatus
+    ) -> list[Decoded]:
         if isinstance(message, ShtpBufferStatus):
             return []
         channel = message.channel
         if channel == ShtpChannel.EXECUTABLE:
             return self._reset() if message.payload == _RESET_COMPLETE else []
+        if channel == ShtpChannel.GYRO_ROTATION:
+            return self._gyro_rotations(message)
         if channel not in {ShtpChannel.CONTROL, ShtpChannel.INPUT, ShtpChannel.WAKE_INPUT}:
             content, known = f"packets on channel {channel}", channel in _CHANNELS
             return [] if known else self._newer.take_unknown(content, self._stamps.chunk_ns)
@@ -138,7 +152,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
             self._arrival_ns = max(self._arrival_ns, sent_ns - max(age, 0) * TICK_NS)
             if self._raw is not None:
                 out += self._reading(report, self._raw)
-            elif report.report_id in ROTATION_REPORTS:
+            elif report.report_id in ROTATION_REPORTS and self._selects(report.report_id):
                 out += self._orientation(packet, report)
         return out
 
@@ -159,6 +173,35 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
             out.append(DeviceEvent("info", text, {"accuracy": name}))
         out.append(ImuSample(self._arrival_ns, q, native, None, counter, status))
         return out
+
+    def _gyro_rotations(self, packet: ShtpPacket) -> list[Decoded]:
+        """Return the samples of gyro rotation vectors, which have neither number nor age."""
+        kind = HubReportId.GYRO_ROTATION_VECTOR
+        found = decode_gyro_rotations(packet.payload)
+        if found is None:
+            return [self._refusals.refuse(packet.size - 2, "reports do not fill the packet")]
+        if self._raw is not None or not self._selects(kind):
+            return []
+
+        self._arrival_ns = max(self._arrival_ns, self._arrival_of(packet))
+        out: list[Decoded] = []
+        for values in found:
+            i, j, k, real, *rate = values
+            native = (real, i, j, k)
+            q = self._gate.admit(native)
+            if q is None:
+                return [*out, self._refusals.refuse(packet.size - 2, "quaternion norm is not 1")]
+            out += self._step(HubReport(kind, packet.sequence, 0, 0, values))[1]
+            self._measuring = True
+            turn = (rate[0], rate[1], rate[2])
+            out.append(ImuSample(self._arrival_ns, q, native, None, packet.sequence, rate=turn))
+        return out
+
+    def _selects(self, kind: int) -> bool:
+        """Return whether rotation vectors of this kind are used."""
+        if kind == self._preferred or not self._selected:
+            self._selected = kind
+        return kind == self._selected
 
     def _step(self, report: HubReport) -> tuple[int, list[Decoded]]:
         """Return the number of steps since the last report of this sensor, and a loss."""

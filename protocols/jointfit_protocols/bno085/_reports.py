@@ -9,10 +9,12 @@
 | 14, 15 raw values             | 16    | x y z                             | counts of the ADC |
 | 05, 28 rotation vector        | 14    | i j k real, accuracy (2^-12 rad)  | 2^-14             |
 | 08, 29 game rotation vector   | 12    | i j k real                        | 2^-14             |
+| 2A gyro rotation vector       | 14    | i j k real, rate x y z            | 2^-14, 2^-10 rad/s|
 
 A sensor report begins with id, sequence, status (bits 0..1 accuracy, bits 2..7 high bits of the
 delay) and delay. A packet begins with FB, the time between its transmission and a base, both in
 units of 100 us: a report was measured at transmission - base + delay. FA shifts the base.
+Gyro rotation vectors have a channel of their own, and consist of their values alone.
 
 Sources: SH-2 reference manual 1000-3625; the vendor's host library (sh2, Apache-2.0), for lengths
 and the sign of times.
@@ -45,6 +47,7 @@ class HubReportId(IntEnum):
     RAW_GYROSCOPE = 0x15
     ARVR_ROTATION_VECTOR = 0x28
     ARVR_GAME_ROTATION_VECTOR = 0x29
+    GYRO_ROTATION_VECTOR = 0x2A
     PRODUCT_RESPONSE = 0xF8
     PRODUCT_REQUEST = 0xF9
     TIME_REBASE = 0xFA
@@ -62,7 +65,7 @@ ROTATION_REPORTS = (
 )
 """Reports that contain an orientation."""
 
-_Q4, _Q8, _Q9, _Q12, _Q14 = (2.0**-bits for bits in (4, 8, 9, 12, 14))
+_Q4, _Q8, _Q9, _Q10, _Q12, _Q14 = (2.0**-bits for bits in (4, 8, 9, 10, 12, 14))
 _SCALES: dict[int, tuple[float, ...]] = {
     HubReportId.ACCELEROMETER: (_Q8,) * 3,
     HubReportId.GYROSCOPE: (_Q9,) * 3,
@@ -86,6 +89,8 @@ _LENGTHS: dict[int, int] = {
 }  # fmt: skip
 """Length of each report, bytes."""
 _FORMATS = {kind: struct.Struct(f"<{len(scales)}h") for kind, scales in _SCALES.items()}
+_GYRO_ROTATION = struct.Struct("<7h")
+_GYRO_ROTATION_SCALES = (*(_Q14,) * 4, *(_Q10,) * 3)
 _BASE = struct.Struct("<Bi")
 _FEATURE = struct.Struct("<BBBHIII")
 _PRODUCT = struct.Struct("<BBBBIIHH")
@@ -138,6 +143,25 @@ def decode_report(report: bytes) -> HubReport | None:
     delay = (report[2] & 0xFC) << 6 | report[3]
     values = tuple(count * scale for count, scale in zip(counts, scales, strict=True))
     return HubReport(kind, report[1], report[2] & 3, delay, values)
+
+
+def decode_gyro_rotations(payload: bytes) -> list[tuple[float, ...]] | None:
+    """Return i j k real, and the rate of turn, rad/s, of each gyro rotation vector of a packet.
+
+    None if they do not fill the packet.
+    """
+    if not payload or len(payload) % _GYRO_ROTATION.size:
+        return None
+    return [
+        tuple(count * scale for count, scale in zip(counts, _GYRO_ROTATION_SCALES, strict=True))
+        for counts in _GYRO_ROTATION.iter_unpack(payload)
+    ]
+
+
+def encode_gyro_rotation(values: tuple[float, ...]) -> bytes:
+    """Return a gyro rotation vector of i j k real and the rate of turn; values are limited."""
+    counts = [round(v / s) for v, s in zip(values, _GYRO_ROTATION_SCALES, strict=True)]
+    return _GYRO_ROTATION.pack(*(max(-32768, min(32767, count)) for count in counts))
 
 
 def encode_report(report: HubReport) -> bytes:

@@ -23,6 +23,7 @@ from jointfit_protocols.bno085 import (
     encode_base_time,
     encode_feature,
     encode_firmware,
+    encode_gyro_rotation,
     encode_report,
     encode_rvc,
     encode_shtp,
@@ -195,9 +196,18 @@ class Bno085Device(SerialDevice):
     def _sample(self, q: Quaternion) -> bytes:
         if self._options.mode == "rvc":
             return self._rvc(q)
-        reports = [self._report(kind, q) for kind in sorted(self.intervals)]
+        wire = b""
+        if HubReportId.GYRO_ROTATION_VECTOR in self.intervals:
+            w, x, y, z = q
+            rate = self._inertial.value(Item.RATE_OF_TURN) or (0.0, 0.0, 0.0)
+            values = encode_gyro_rotation((x, y, z, w, *rate))
+            wire = self._packet(ShtpChannel.GYRO_ROTATION, values)
+        kinds = sorted(self.intervals.keys() - {HubReportId.GYRO_ROTATION_VECTOR})
+        if not kinds and wire:
+            return wire
+        reports = [self._report(kind, q) for kind in kinds]
         payload = encode_base_time(_AGE + len(reports)) + b"".join(reports)
-        return self._packet(ShtpChannel.INPUT, payload)
+        return wire + self._packet(ShtpChannel.INPUT, payload)
 
     def _report(self, kind: int, q: Quaternion) -> bytes:
         w, x, y, z = q

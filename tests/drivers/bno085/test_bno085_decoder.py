@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from math import atan2
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -144,6 +145,38 @@ def test_lost_reports_restarts_and_accuracy_are_events() -> None:
         "accuracy of the orientation: high",
     ]  # fmt: skip
     assert len(samples(events)) == 5
+
+
+def channel_5(number: int, *rows: tuple[int, ...]) -> bytes:
+    """Return a packet as the device sends it: values alone, without base time and report head."""
+    body = b"".join(struct.pack("<7h", *row) for row in rows)
+    return b"\x7e\x01" + struct.pack("<HBB", len(body) + 4, 5, number) + body + b"\x7e"
+
+
+def test_gyro_rotation_vectors_of_channel_5_have_rates_but_no_age() -> None:
+    row = (0, 0, 9830, 13107, 1024, -512, 256)  # 2^-14 and 2^-10 rad/s
+    bno = decoder(3_000_000, transport="usb")
+    wire = channel_5(9, row, row) + channel_5(12, row)
+    events = bno.feed(Chunk(10**9, wire))
+    assert [item.counter for item in samples(events)] == [9, 9, 12]
+    assert texts(events) == ["2 messages lost"]
+    for item in samples(events):
+        assert item.q_world_sensor == pytest.approx((0.8, 0.0, 0.0, 0.6), abs=1e-4)
+        assert (item.rate, item.arrival_ns) == ((1.0, -0.5, 0.25), 10**9)
+    (damaged,) = bno.feed(Chunk(2 * 10**9, channel_5(13, row)[:-3] + b"\x7e"))
+    assert isinstance(damaged, Corrupt)
+    assert bno.discarded_bytes == 17
+
+
+def test_one_kind_of_rotation_vectors_is_used() -> None:
+    game = HubReport(HubReportId.GAME_ROTATION_VECTOR, 1, 3, 0, (0.6, 0.0, 0.0, 0.8))
+    wire = [b"\x7e" + packet(game), packet(game, rotation(1)), packet(game, rotation(2))]
+    found = [item.q_world_sensor for item in samples(run(decoder(3_000_000), wire))]
+    both = [(0.8, 0.6, 0.0, 0.0)] * 2 + [(0.8, 0.0, 0.0, 0.6)] * 2
+    for q, expected in zip(found, both, strict=True):
+        assert q == pytest.approx(expected, abs=1e-4)
+    other = decoder(3_000_000, report="game_rotation_vector")
+    assert {round(item.q_world_sensor[1], 1) for item in samples(run(other, wire))} == {0.6}
 
 
 def test_damage_is_rejected_and_counted() -> None:

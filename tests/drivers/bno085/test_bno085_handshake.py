@@ -61,6 +61,15 @@ async def test_raw_readings_enable_their_reports(tmp_path: Path) -> None:
     assert bno.intervals == {0x01: 5_000, 0x07: 5_000}
 
 
+async def test_gyro_rotation_vectors_are_enabled_and_arrive(tmp_path: Path) -> None:
+    bno = device(tmp_path)
+    async with serving(bno, feeding=True):
+        run = DriverRun(make(tmp_path, 3_000_000, report="gyro_rotation_vector"))
+        await run.wait_for(5)
+        await run.cancel()
+    assert bno.intervals == {0x2A: 10_000}
+
+
 async def test_a_rate_that_the_device_does_not_accept_is_refused(tmp_path: Path) -> None:
     text = await refusal(tmp_path, device(tmp_path, least_interval_us=20_000), 3_000_000)
     assert "report 0x05 is 50 Hz, not 100 Hz: change `rate_hz` or `report`" in text
