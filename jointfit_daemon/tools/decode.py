@@ -99,7 +99,7 @@ def decode(
             autocompletion=complete_driver,
         ),
     ],
-    file: Annotated[Path, typer.Argument(help="Raw bytes, pcapng, or `candump -L` log.")],
+    file: Annotated[Path, typer.Argument(help="Raw bytes, pcapng, pcap, or `candump` log.")],
     *,
     jsonl: Annotated[bool, typer.Option("--jsonl", help="One JSON object per item.")] = False,
     summary: Annotated[bool, typer.Option("--summary", help="Print counts as JSON.")] = False,

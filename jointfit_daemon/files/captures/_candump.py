@@ -1,6 +1,7 @@
-"""Conversion of ``candump -L`` text to CAN chunks; every line is counted.
+"""Conversion of ``candump`` text to CAN chunks; every line is counted.
 
     (1436509052.249713) can0 105#2A366C2B       eight identifier digits: 29 bits; #R: remote
+    (1436509052.249713)  can0  105   [4]  2A 36 6C 2B       without -L; the time may be missing
 
 A chunk is one record of `jointfit_protocols.can_frame` with 24 bytes: i64 time in ns, u32
 identifier, u8 flags, u8 size, two zeros, eight data bytes. This module packs the record itself,
@@ -34,13 +35,20 @@ _LINE = re.compile(
     rb"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#(?:([Rr])\d?|((?:[0-9A-Fa-f]{2}){0,8}))(?:\s+[RT])?"
 )
 
+_PLAIN_LINE = re.compile(
+    rb"(?:\((\d{1,10})(?:\.(\d{1,9}))?\)\s+)?\S+\s+(?:[RT]X\s+\S+\s+\S+\s+)?"
+    rb"([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})\s+\[\d\](?:\s+(remote request)|((?:\s+[0-9A-Fa-f]{2}){0,8}))"
+    rb"(?:\s+'.*'|\s+ERRORFRAME)?"
+)
+
 
 def is_candump(data: bytes) -> bool:
-    """Return whether the first line, blanks and comments excepted, is ``candump -L`` output."""
+    """Return whether the first line, blanks and comments excepted, is ``candump`` output."""
     for line in data[:4096].splitlines():
         text = line.strip()
         if text and not text.startswith(b"#"):
-            return re.match(rb"\(\d+\.?\d*\)\s+\S+\s+[0-9A-Fa-f]+#", text) is not None
+            log = re.match(rb"\(\d+\.?\d*\)\s+\S+\s+[0-9A-Fa-f]+#", text)
+            return (log or _PLAIN_LINE.fullmatch(text)) is not None
     return False
 
 
@@ -52,7 +60,7 @@ def read_candump(data: bytes) -> Iterator[Chunk]:
         if not text or text.startswith(b"#"):
             continue
 
-        found = _record(text)
+        found = _record(text, t_ns)
         if found is None:
             lost = len(line).to_bytes(8, "little")
             yield Chunk(t_ns, _RECORD.pack(t_ns, _LOST_BYTES, _ERROR, 8, lost))
@@ -61,9 +69,18 @@ def read_candump(data: bytes) -> Iterator[Chunk]:
             yield Chunk(t_ns, record)
 
 
-def pack_can_frame(t_ns: int, number: int, data: bytes, *, extended: bool = False) -> bytes:
-    """Return the record of one data frame with identifier `number`, received at `t_ns`."""
-    return _RECORD.pack(t_ns, number, _EXTENDED * extended, len(data), data)
+def pack_can_frame(
+    t_ns: int,
+    number: int,
+    data: bytes,
+    *,
+    extended: bool = False,
+    remote: bool = False,
+    error: bool = False,
+) -> bytes:
+    """Return the record of one frame with identifier `number`, received at `t_ns`."""
+    flags = _EXTENDED * extended | _REMOTE * remote | _ERROR * error
+    return _RECORD.pack(t_ns, number, flags, len(data), data)
 
 
 def frame_sizes(records: bytes) -> dict[tuple[int, bool], int]:
@@ -79,13 +96,18 @@ def frame_sizes(records: bytes) -> dict[tuple[int, bool], int]:
     }
 
 
-def _record(line: bytes) -> tuple[int, bytes] | None:
-    """Return time and record of one line; None if it is not a classic CAN frame."""
-    match = _LINE.fullmatch(line)
+def _record(line: bytes, before_ns: int) -> tuple[int, bytes] | None:
+    """Return time and record of one line; None if it is not a classic CAN frame.
+
+    A line without time has the time before.
+    """
+    match = _LINE.fullmatch(line) or _PLAIN_LINE.fullmatch(line)
     if match is None:
         return None
     seconds, fraction, digits, remote, body = match.groups()
-    t_ns = int(seconds) * 10**9 + int((fraction or b"0").ljust(9, b"0"))
+    t_ns = before_ns
+    if seconds:
+        t_ns = int(seconds) * 10**9 + int((fraction or b"0").ljust(9, b"0"))
     if t_ns >= 2**63:  # the time does not fit into a record
         return None
     number, extended = int(digits, 16), len(digits) > _STANDARD_DIGITS

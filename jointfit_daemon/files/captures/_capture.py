@@ -7,7 +7,8 @@ The file type is determined from the first bytes, not from the name:
 | pcapng, pcap | datagram | one per UDP datagram, both directions, with the time of the packet |
 | pcapng, pcap | datagram, split | the same, and the packets in one direction of a TCP connection |
 | pcapng, pcap | stream | the segments of one direction of a TCP connection |
-| ``candump -L`` text | can | one per line, a record of `jointfit_protocols.can_frame` |
+| pcapng, pcap | can | one per classic CAN frame of a SocketCAN link |
+| ``candump`` text | can | one per line, a record of `jointfit_protocols.can_frame` |
 | raw bytes | stream | pieces of 4096 bytes; the time is that of 921 600 baud |
 | raw bytes | datagram, split | packets |
 | raw bytes | datagram | messages ``u16 id, u16 length, …`` that fit exactly, else one datagram |
@@ -23,12 +24,18 @@ import struct
 from itertools import islice
 from typing import TYPE_CHECKING
 
-from jointfit_daemon.files.captures._candump import RECORD_BYTES, is_candump, read_candump
+from jointfit_daemon.files.captures._candump import (
+    RECORD_BYTES,
+    is_candump,
+    pack_can_frame,
+    read_candump,
+)
 from jointfit_daemon.files.captures._packet_capture import (
     PCAP_MAGICS,
     PCAPNG_MAGIC,
     TcpSegment,
     UdpPacket,
+    read_can,
     read_packets,
 )
 from jointfit_daemon.files.captures._tcp_streams import Piece, directions, split_pieces
@@ -105,6 +112,18 @@ def read_capture(
     reject_device(path)
     data = path.read_bytes()
     if data.startswith(PCAPNG_MAGIC) or data[:4] in PCAP_MAGICS:
+        if wire == "can":
+            frames = [
+                Chunk(
+                    one.t_ns,
+                    pack_can_frame(
+                        *one[:3], extended=one.extended, remote=one.remote, error=one.error
+                    ),
+                )
+                for one in read_can(data)
+            ]
+            if frames:
+                return iter(frames)
         return _network(path, data, wire, port, split=split, rate=rate)
     if is_candump(data):
         _require_wire(path, "candump text", "can", wire)

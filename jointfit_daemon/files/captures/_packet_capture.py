@@ -1,11 +1,12 @@
-"""Reader of UDP datagrams and TCP segments in pcapng and pcap files.
+"""Reader of UDP datagrams, TCP segments and CAN frames in pcapng and pcap files.
 
 A truncated file yields the packets before the cut.
 
 The reader supports little- and big-endian files, several sections and interfaces, and microsecond
-to nanosecond time stamps. It supports Ethernet (with VLAN tags), Linux cooked, loopback and raw IP
-links, and IPv4 and IPv6 with reassembly of fragments. Everything else in the file is skipped. Time
-stamps are returned as in the file, in ns since 1970.
+to nanosecond time stamps. It supports Ethernet (with VLAN tags), Linux cooked, loopback, raw IP and
+SocketCAN links, and IPv4 and IPv6 with reassembly of fragments. Everything else in the file is
+skipped. Time stamps are returned as in the file, in ns since 1970. A packet without time stamp has
+that of the packet before it.
 
 Source: draft-ietf-opsawg-pcapng; draft-ietf-opsawg-pcap; RFC 791; RFC 8200; RFC 9293.
 """
@@ -28,7 +29,7 @@ PCAP_MAGICS = {
 """Byte order (of `struct`), and nanoseconds per unit of the fraction of a second, by the first four
 bytes of a pcap file."""
 
-_SECTION, _INTERFACE, _PACKET = 0x0A0D0D0A, 1, 6
+_SECTION, _INTERFACE, _OLD_PACKET, _SIMPLE_PACKET, _PACKET = 0x0A0D0D0A, 1, 2, 3, 6
 _LITTLE_MAGIC = b"\x4d\x3c\x2b\x1a"
 _RESOLUTION, _OFFSET = 9, 14  # numbers of the options if_tsresol, if_tsoffset
 _LINK_HEADS = {
@@ -52,6 +53,13 @@ _EXTENSIONS = frozenset((_HOP_OPTIONS, _ROUTING, _FRAGMENT, _TARGET_OPTIONS))
 _UDP_HEAD = struct.Struct(">HHHH")
 _TCP_HEAD = struct.Struct(">HHIIBB6x")
 _SYN = 0x02
+_CAN_LINK = 227
+_CAN_COOKED = {113: 16, 276: 20}
+"""Number of bytes before the CAN frame of cooked links, which mark CAN by the protocol 0x000C."""
+_CAN_PROTOCOL = b"\x00\x0c"
+_CAN_HEAD = struct.Struct(">IB3x")
+_CAN_EXTENDED, _CAN_REMOTE, _CAN_ERROR = 1 << 31, 1 << 30, 1 << 29
+_MOST_CAN_BYTES = 8
 _BLOCK_EDGES, _INTERFACE_HEAD, _PACKET_HEAD, _OFFSET_BYTES = 12, 8, 20, 8
 _PCAP_HEAD = 24
 _MAX_PENDING = 64
@@ -81,6 +89,35 @@ class TcpSegment(NamedTuple):
     payload: bytes
 
 
+class CanPacket(NamedTuple):
+    """One classic CAN frame of a capture."""
+
+    t_ns: int
+    number: int
+    data: bytes
+    extended: bool
+    remote: bool
+    error: bool
+
+
+def read_can(data: bytes) -> Iterator[CanPacket]:
+    """Yield the classic CAN frames of a pcapng or pcap file in file order."""
+    for t_ns, link, frame in _read_frames(data):
+        at = 0 if link == _CAN_LINK else _CAN_COOKED.get(link)
+        if at and frame[_LINK_HEADS[link][1] or 0 :][:2] != _CAN_PROTOCOL:
+            at = None
+        if at is None or len(frame) < at + _CAN_HEAD.size:
+            continue
+        word, size = _CAN_HEAD.unpack_from(frame, at)
+        body = frame[at + _CAN_HEAD.size :]
+        if not size <= min(len(body), _MOST_CAN_BYTES):
+            continue  # cut off, or CAN FD
+        error, remote = bool(word & _CAN_ERROR), bool(word & _CAN_REMOTE)
+        extended = bool(word & _CAN_EXTENDED) and not error
+        number = word & (0x1FFF_FFFF if extended or error else 0x7FF)
+        yield CanPacket(t_ns, number, b"" if remote else body[:size], extended, remote, error)
+
+
 def read_udp(data: bytes) -> Iterator[UdpPacket]:
     """Yield the UDP datagrams of a pcapng or pcap file in file order."""
     return (packet for packet in read_packets(data) if isinstance(packet, UdpPacket))
@@ -88,9 +125,8 @@ def read_udp(data: bytes) -> Iterator[UdpPacket]:
 
 def read_packets(data: bytes) -> Iterator[UdpPacket | TcpSegment]:
     """Yield the UDP datagrams and TCP segments of a pcapng or pcap file in file order."""
-    packets = _read_pcapng(data) if data.startswith(PCAPNG_MAGIC) else _read_pcap(data)
     fragments = _Fragments()
-    for t_ns, link, frame in packets:
+    for t_ns, link, frame in _read_frames(data):
         at = _ip_offset(frame, link)
         packet = None if at is None else _ip_packet(frame[at:])
         segment = None if packet is None else fragments.segment(packet)
@@ -126,8 +162,15 @@ def _tcp_segment(t_ns: int, addresses: bytes, segment: bytes) -> TcpSegment | No
 # --- files ------------------------------------------------------------------------------------
 
 
+def _read_frames(data: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Yield time, link type and bytes of each packet of a file."""
+    return _read_pcapng(data) if data.startswith(PCAPNG_MAGIC) else _read_pcap(data)
+
+
 class _Interface(NamedTuple):
     link: int
+    most: int
+    """Largest number of captured bytes of a packet; 0: all."""
     ticks_per_s: int
     offset_s: int
 
@@ -135,7 +178,7 @@ class _Interface(NamedTuple):
 def _read_pcapng(data: bytes) -> Iterator[tuple[int, int, bytes]]:
     order = "<"
     interfaces: list[_Interface] = []
-    at = 0
+    at = t_ns = 0
     while at + _BLOCK_EDGES <= len(data):
         if data[at : at + 4] == PCAPNG_MAGIC:
             order = "<" if data[at + 8 : at + 12] == _LITTLE_MAGIC else ">"
@@ -149,12 +192,17 @@ def _read_pcapng(data: bytes) -> Iterator[tuple[int, int, bytes]]:
             interfaces = []
         elif kind == _INTERFACE and len(body) >= _INTERFACE_HEAD:
             interfaces.append(_interface(body, order))
-        elif kind == _PACKET and len(body) >= _PACKET_HEAD:
-            number, high, low, captured = struct.unpack_from(order + "4I", body)
+        elif kind in {_PACKET, _OLD_PACKET} and len(body) >= _PACKET_HEAD:
+            layout = "4I" if kind == _PACKET else "H2x3I"
+            number, high, low, captured = struct.unpack_from(order + layout, body)
             if number < len(interfaces):
-                link, ticks_per_s, offset_s = interfaces[number]
+                link, _, ticks_per_s, offset_s = interfaces[number]
                 t_ns = (high << 32 | low) * 10**9 // ticks_per_s + offset_s * 10**9
                 yield t_ns, link, body[_PACKET_HEAD : _PACKET_HEAD + captured]
+        elif kind == _SIMPLE_PACKET and interfaces:
+            (size,) = struct.unpack_from(order + "I", body.ljust(4, b"\0"))
+            most = interfaces[0].most or size
+            yield t_ns, interfaces[0].link, body[4 : 4 + min(size, most)]
 
 
 def _interface(body: bytes, order: str) -> _Interface:
@@ -170,7 +218,8 @@ def _interface(body: bytes, order: str) -> _Interface:
             ticks_per_s = 2**power if value[0] & 0x80 else 10**power
         elif code == _OFFSET and size == len(value) == _OFFSET_BYTES:
             (offset_s,) = struct.unpack(order + "q", value)
-    return _Interface(struct.unpack_from(order + "H", body)[0], ticks_per_s, offset_s)
+    link, most = struct.unpack_from(order + "H2xI", body)
+    return _Interface(link, most, ticks_per_s, offset_s)
 
 
 def _read_pcap(data: bytes) -> Iterator[tuple[int, int, bytes]]:

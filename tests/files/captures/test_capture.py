@@ -13,7 +13,7 @@ from jointfit_daemon.files.captures import read_capture
 from jointfit_daemon.files.captures._candump import read_candump
 from jointfit_daemon.files.captures._capture import UnreadableCaptureError
 from jointfit_daemon.files.captures._packet_capture import read_packets, read_udp
-from jointfit_protocols.can import host_count, unpack_frames
+from jointfit_protocols.can import CanFrame, host_count, unpack_frames
 from jointfit_protocols.corrupt import CorruptBytes
 from tests.protocols.can.candump_oracle import parse_candump
 
@@ -169,6 +169,58 @@ def test_candump_text_becomes_the_records_of_the_codec() -> None:
     found = [frame for chunk in chunks for frame in unpack_frames(chunk.data)]
     assert found == parse_candump(LOG)
     assert [chunk.t_ns for chunk in chunks] == [frame.t_ns for frame in found]  # type: ignore[union-attr]
+
+
+def test_candump_text_without_the_option_for_logs_has_the_same_frames(tmp_path: Path) -> None:
+    text = (
+        b" (1.500000)  can0  181   [4]  88 13 78 EC\n"
+        b" (1.600000)  can0  RX - -  19FF0021   [2]  0A FF   '..'\n"
+        b"  vcan0  181   [0]  remote request\n  can0  7FF   [1]  05\n"
+    )
+    (tmp_path / "log").write_bytes(text)
+    found = [unpack_frames(one.data)[0] for one in read_capture(tmp_path / "log", "can")]
+    assert found == [
+        CanFrame(1_500_000_000, 0x181, bytes.fromhex("881378ec")),
+        CanFrame(1_600_000_000, 0x19FF0021, b"\n\xff", extended=True),
+        CanFrame(1_600_000_000, 0x181, b"", remote=True),
+        CanFrame(1_600_000_000, 0x7FF, b"\x05"),
+    ]
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_packets_without_time_and_old_packets_of_pcapng_are_read(order: str) -> None:
+    frame = ethernet(ip(udp(b"hello")))
+    old = struct.pack(order + "HHIIII", 0, 7, 0, 3_000_000, len(frame), len(frame)) + frame
+    simple = struct.pack(order + "I", len(frame)) + frame
+    cut = struct.pack(order + "I", len(frame) + 99) + frame
+    file = pcapng([], order, 6) + block(2, old, order) + block(3, simple, order)
+    found = list(read_udp(file + block(3, cut, order) + block(3, b"", order)))
+    assert [packet.payload for packet in found] == [b"hello"] * 3
+    assert {packet.t_ns for packet in found} == {8 * 10**9}
+
+
+@pytest.mark.parametrize(
+    ("link", "head"), [(227, b""), (113, bytes(14) + b"\0\x0c"), (276, b"\0\x0c" + bytes(18))]
+)
+def test_can_frames_of_a_network_capture_become_records(
+    tmp_path: Path, link: int, head: bytes
+) -> None:
+    words = [
+        (0x181, b"\1\2"),
+        (1 << 31 | 0x19FF0021, bytes(8)),
+        (1 << 30 | 5, b""),
+        (1 << 29 | 4, bytes(8)),
+    ]
+    frames = [head + struct.pack(">IB3x", word, len(data)) + data for word, data in words]
+    frames += [head + b"\0\0\1\x81\x08\0\0\0cut", *([bytes(40)] if head else [])]
+    (tmp_path / "c").write_bytes(pcap([(1_000, frame) for frame in frames], link=link))
+    found = [unpack_frames(one.data)[0] for one in read_capture(tmp_path / "c", "can")]
+    assert found == [
+        CanFrame(1_000_000, 0x181, b"\1\2"),
+        CanFrame(1_000_000, 0x19FF0021, bytes(8), extended=True),
+        CanFrame(1_000_000, 5, b"", remote=True),
+        CanFrame(1_000_000, 4, bytes(8), error=True),
+    ]
 
 
 @pytest.mark.parametrize(
