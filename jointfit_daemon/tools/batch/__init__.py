@@ -1,4 +1,4 @@
-"""`jointfit batch`: many recordings with one command."""
+"""Command `jointfit batch`: processes many recordings with one command."""
 
 from jointfit_daemon.tools.batch._command import batch
 

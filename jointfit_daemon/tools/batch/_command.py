@@ -1,4 +1,4 @@
-"""Command `jointfit batch`: the same steps for every recording of a folder."""
+"""Command `jointfit batch`: runs the same steps on every recording of a folder."""
 
 from __future__ import annotations
 

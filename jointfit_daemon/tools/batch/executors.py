@@ -1,7 +1,7 @@
-"""Execution of tasks: in a pool of processes, or on an existing Dask cluster.
+"""Execution of tasks in a pool of processes, or on an existing Dask cluster.
 
-Invariant: every task yields exactly one result; if a process dies, only the task that ended the
-process fails.
+Invariant: every task yields exactly one result. If a process dies, only the task that caused the
+failure fails.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
 
 _AHEAD = 2
-"""Number of submitted tasks for each process, so that no process waits for a task."""
+"""Number of submitted tasks per process. The second task prevents an idle time between tasks."""
 _DIED = (
     "the process that read this recording was ended, probably by the system for lack of memory:"
     " process it on a computer with more memory"
@@ -39,10 +39,10 @@ class SchedulerUnavailableError(ImportError):
 
 
 def run_in_pool(tasks: Sequence[RecordingTask], jobs: int) -> Iterator[RecordingResult]:
-    """Yield results in the order of their completion; a single job runs in this process.
+    """Yield the results in the order of completion; with one job, run in this process.
 
-    If a process of the pool dies, the pool loses all tasks. The lost tasks run again one at a time,
-    which identifies the task that ends its process.
+    If a process of the pool dies, the pool loses all tasks. The lost tasks then run one at a time,
+    which identifies the task that ended its process.
     """
     if jobs == 1:
         yield from map(process_recording, tasks)
@@ -58,14 +58,15 @@ def run_in_pool(tasks: Sequence[RecordingTask], jobs: int) -> Iterator[Recording
 def _run_pool(
     tasks: Sequence[RecordingTask], jobs: int
 ) -> Generator[RecordingResult, None, list[RecordingTask]]:
-    """Yield results; return the tasks without a result if a process died."""
-    context = multiprocessing.get_context("spawn")  # a forked process would copy numpy's threads
+    """Yield the results; return the tasks that have no result because a process died."""
+    context = multiprocessing.get_context("spawn")  # a fork would copy the state of numpy's threads
     waiting = deque(tasks)
     running: dict[Future[RecordingResult], RecordingTask] = {}
     with ProcessPoolExecutor(jobs, context) as pool:
         try:
             while waiting or running:
-                # A task leaves `waiting` after its submission, which fails if a process died.
+                # Remove a task from `waiting` only after the submission, which fails if a process
+                # died.
                 while waiting and len(running) < _AHEAD * jobs:
                     future = pool.submit(process_recording, waiting[0])
                     running[future] = waiting.popleft()
@@ -84,17 +85,17 @@ def _run_pool(
 
 
 def run_on_cluster(tasks: Sequence[RecordingTask], address: str) -> Iterator[RecordingResult]:
-    """Yield results of the workers of a Dask scheduler, in the order of their completion.
+    """Yield the results from a Dask cluster in the order of completion.
 
-    If a worker dies, another worker runs its tasks. The workers must see the recordings and the
-    output folder under the same paths.
+    If a worker dies, another worker runs its tasks. The workers must have access to the recordings
+    and the output folder under the same paths.
 
     Raises
     ------
     SchedulerUnavailableError
         The extra ``batch`` is not installed.
     OSError
-        There is no scheduler at `address`.
+        No scheduler answers at `address`.
     """
     try:
         dask: Any = import_module("distributed")  # some functions of Dask have no types

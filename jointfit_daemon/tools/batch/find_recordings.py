@@ -1,4 +1,4 @@
-"""Recordings below a folder: parts of one session belong together."""
+"""Search for recordings below a folder; all parts of a session are one recording."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def find_recordings(
 ) -> list[RecordingTask]:
     """Return one task for each recorded session below `folder`, in the order of their names.
 
-    Files in the output folder and in hidden folders are not recordings.
+    Files in the output folder and in hidden folders are ignored.
     """
     sessions: dict[str, list[tuple[int, str]]] = {}
     for path in sorted(folder.rglob("*")):

@@ -1,7 +1,7 @@
-"""Processing of one recording of a batch, in any process.
+"""Processing of one recording of a batch, in this process or another.
 
-Invariant: the files of a recording depend on its bytes, the steps and the software version alone;
-they become visible together, and only when all steps succeeded.
+Invariant: the output files depend only on the bytes of the recording, the steps and the software
+version. All files become visible together, after all steps have succeeded.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ STEPS = ("calibrate", "replay", "export", "report")
 """Steps in the order in which they run."""
 REPORT_FILE, CALIBRATION_FILE = "report.html", "calibration.json"
 _NAMED_GAPS = 5
-"""Number of gaps that a row of the summary names; further gaps are only counted."""
+"""Number of gaps that a summary row lists. Additional gaps are only counted."""
 MARKS = ".done"
-"""Folder, in the output folder, of the files that mark processed recordings."""
+"""Name of a folder in the output folder. Its files mark the processed recordings."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +38,9 @@ class RecordingTask:
     """
 
     name: str
-    """Name of the recording in the summary, and name of the output folder of the recording."""
+    """Name of the recording in the summary, and name of its output folder."""
     parts: tuple[str, ...]
-    """Files of the recording, in the order of their parts."""
+    """Paths of the parts of the recording, in their order."""
     out: str
     """Output folder of the batch."""
     steps: tuple[str, ...]
@@ -50,7 +50,7 @@ class RecordingTask:
 
 @dataclass(frozen=True, slots=True)
 class RecordingResult:
-    """Row of the summary."""
+    """Result of one recording: a row of the summary."""
 
     recording: str
     status: str
@@ -59,9 +59,9 @@ class RecordingResult:
     angle: str = ""
     """Name of the joint angle to which `rms_deg` refers."""
     rms_deg: float | None = None
-    """RMS difference between the angle from the sensors and from the cameras, degrees."""
+    """RMS difference between sensors and cameras in this angle, degrees."""
     range_deg: float | None = None
-    """Largest range of motion of all angles, degrees."""
+    """Largest range of motion among all angles, degrees."""
     gait_cycles: int | None = None
     lost_percent: float | None = None
     """Share of lost samples of the source with the largest loss, percent."""
@@ -75,7 +75,7 @@ class RecordingResult:
 
 
 def task_digest(task: RecordingTask) -> str:
-    """Return the SHA-256 of the bytes of a recording, of the settings and of the version.
+    """Return the SHA-256 of the recording's bytes, the settings and the software version.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def task_digest(task: RecordingTask) -> str:
 
 
 def finished_result(task: RecordingTask, digest: str) -> RecordingResult | None:
-    """Return the stored result of a task; None if it must run."""
+    """Return the stored result of a task; None if the task must run."""
     mark = _mark(task)
     try:
         stored: dict[str, Any] = json.loads(mark.read_bytes())
@@ -99,11 +99,11 @@ def finished_result(task: RecordingTask, digest: str) -> RecordingResult | None:
             return None
         return RecordingResult(**stored)
     except (OSError, ValueError, TypeError, KeyError):
-        return None  # no mark, or the mark of another version
+        return None  # there is no mark, or its format is of another version
 
 
 def process_recording(task: RecordingTask) -> RecordingResult:
-    """Run the steps of a task unless their result exists; errors are in the result."""
+    """Run the steps of a task unless their result exists; the result contains any errors."""
     try:
         digest = task_digest(task)
         known = finished_result(task, digest)
@@ -122,7 +122,7 @@ def _process(task: RecordingTask, digest: str) -> RecordingResult:
     target.parent.mkdir(parents=True, exist_ok=True)
     _mark(task).unlink(missing_ok=True)
 
-    # Outputs of a stopped run stay in a hidden folder, which is never counted.
+    # The outputs of an interrupted run remain in a hidden folder, which no other step reads.
     staging = Path(tempfile.mkdtemp(prefix=f".partial-{target.name}-", dir=target.parent))
     try:
         result = _run_steps(task, staging)
@@ -172,13 +172,13 @@ def _run_steps(task: RecordingTask, folder: Path) -> RecordingResult:
 
 
 def _calibrate(recording: Path, folder: Path, notes: list[str]) -> Calibration | None:
-    """Calibrate from a recording; return None, with a note, if it gives no calibration."""
+    """Calibrate from a recording; return None, and add a note, if no calibration results."""
     from jointfit_daemon.reprocessing import ReprocessingError, calibrate_recording
     from jointfit_daemon.tools.calibrate import store_offline_calibration
 
     try:
         found = calibrate_recording(recording)
-    except ReprocessingError as error:  # most recordings of a day contain no calibration
+    except ReprocessingError as error:  # usual: no calibration
         notes.append(f"calibrate: {error}")
         return None
     if found.calibration is None:
@@ -189,7 +189,7 @@ def _calibrate(recording: Path, folder: Path, notes: list[str]) -> Calibration |
 
 
 def _measured(task: RecordingTask, session: SessionData, notes: str) -> RecordingResult:
-    """Return the row of a session."""
+    """Return the summary row of a session."""
     from jointfit_daemon.tools.report.session_results import analyze_session
 
     results = analyze_session(session)
@@ -198,7 +198,7 @@ def _measured(task: RecordingTask, session: SessionData, notes: str) -> Recordin
     known = [share for share in losses if math.isfinite(share)]
     extents = [found.extent for found in results.ranges]
 
-    # List the first missing parts of the recording with their times, and count the others.
+    # List the first missing parts of the recording with their times, and count the other parts.
     missing = [event for event in session.events if event.kind == "gap"]
     gaps = [f"at {gap.t_s:.3f} s: {gap.text}" for gap in missing[:_NAMED_GAPS]]
     if len(missing) > _NAMED_GAPS:

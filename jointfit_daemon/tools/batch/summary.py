@@ -30,7 +30,7 @@ def write_summary(results: Sequence[RecordingResult], out: Path) -> list[Path]:
     rows = io.StringIO()
     writer = csv.DictWriter(rows, [field.name for field in fields(RecordingResult)])
     writer.writeheader()
-    writer.writerows(asdict(result) for result in ordered)  # None becomes an empty cell
+    writer.writerows(asdict(result) for result in ordered)  # csv writes None as an empty cell
 
     count = Counter(result.status for result in ordered)
     states = [(name.title(), f"{count[name]}") for name in ("done", "differs", "failed")]

@@ -1,4 +1,4 @@
-"""`jointfit center-study`: repeats a published experiment and writes tables and figures."""
+"""Command `jointfit center-study`: repeats a published numerical experiment."""
 
 from jointfit_daemon.tools.center_study._command import center_study
 

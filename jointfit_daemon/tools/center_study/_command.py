@@ -1,4 +1,4 @@
-"""Command `jointfit center-study`: repeats a published experiment and reports its limits."""
+"""Command `jointfit center-study`: repeats a published numerical experiment."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def center_study(
 
     if json is not None:
         check_output("--json", json, (json.suffix.lower(),))
-    if out is not None:  # Check the output before the computation: writing may be impossible.
+    if out is not None:  # Check the folder before the long computation.
         out.mkdir(parents=True, exist_ok=True)
 
     plain = StudySetup()

@@ -1,7 +1,7 @@
 """Maps of the numerical experiment as figures.
 
-All maps of a row share one colour scale, clipped so that outliers do not dominate it. Cells without
-an estimate are hatched.
+All maps of a row share one colour scale, which is clipped to limit the effect of outliers. Cells
+without an estimate are hatched.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _AXES = {"α": ("α, deg", float(np.rad2deg(1.0))), "σ": ("σ, mm", _MM), "r": 
 
 
 def draw_study(study: Sequence[PairMaps], folder: Path) -> list[Path]:
-    """Write figure 2 of the source and the maps of the other estimators, as PNG and SVG."""
+    """Write figure 2 of the publication and the maps of the other estimators, as PNG and SVG."""
     written: list[Path] = []
     for name, methods, title in (
         ("cor-study-figure-2", _SOURCE, "RMS error of the center, three frames"),
@@ -59,7 +59,7 @@ def _figure(study: Sequence[PairMaps], methods: Sequence[tuple[str, str]], title
     figure.suptitle(title)
     grid = figure.subplots(len(study), len(methods), squeeze=False)
     for axes_row, pair in zip(grid, study, strict=True):
-        # One map a method; its rows increase upwards.
+        # Draw one map for each method. The row quantity increases upwards.
         row_name, column_name = pair.name.split("–")
         (y_label, y_scale), (x_label, x_scale) = _AXES[row_name], _AXES[column_name]
         last = None

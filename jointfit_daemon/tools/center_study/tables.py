@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation.study import PairMaps, StudyExtension, StudySetup
 
 NEAREST = {"α–σ": 0.3, "r–σ": None, "r–α": 0.15}
-"""Clipping limit, m, that gives the correlations nearest to the published table, by pair of
-quantities."""
+"""Clipping limit that reproduces the published correlations best, m, by pair of quantities."""
 CAVEATS = (
     "Three noisy points can be collinear, so the error of the analytic solution has no finite"
     " mean square: single outliers determine the raw correlation, which changes with the seed."
@@ -50,7 +49,7 @@ _METHODS = ("predicted", "three frames", "grid", "shifted grid", "bound", "hyper
 
 
 def tables(setup: StudySetup, study: Sequence[PairMaps], more: StudyExtension) -> str:
-    """Return setup, correlations, errors over the arc, other methods and limits."""
+    """Return tables of the setup, correlations, errors by arc, other methods, and limits."""
     degrees = np.rint(np.rad2deg(setup.steps)).astype(int).tolist()
     medians: list[tuple[str, ...]] = [("α", *more.median_errors)]
     for angle in (a for a in _SHOWN_DEG if a in degrees):
@@ -134,7 +133,7 @@ def _correlations(study: Sequence[PairMaps], grid: str) -> list[tuple[str, ...]]
 
 
 def correlations(pair: PairMaps, grid: str, clip: float | None) -> tuple[float, float]:
-    """Return two correlations of a pair of quantities: prediction–analytic and analytic–grid."""
+    """Return the correlations prediction–analytic and analytic–grid of a pair of quantities."""
     analytic = pair.maps["three frames"]
     return (
         correlation(pair.maps["predicted"], analytic, clip),

@@ -1,4 +1,4 @@
-"""`jointfit dashboard`: the web page of a rig, and a tunnel from the page to the broker."""
+"""Command `jointfit dashboard`: serves the web page of a rig, and a tunnel to the broker."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["dashboard"]
 
 
 def __getattr__(name: str) -> Any:
-    """Return the command, imported on demand: the server runs without the command line."""
+    """Return the command; the import on demand lets the server run without it."""
     if name != "dashboard":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from jointfit_daemon.tools.dashboard._command import dashboard

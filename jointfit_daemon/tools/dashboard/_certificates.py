@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from jointfit_daemon.tools.dashboard.addresses import BrokerAddress
 
-# Error numbers of OpenSSL, X509_V_ERR_… in x509_vfy.h.
+# OpenSSL error numbers (X509_V_ERR_… in x509_vfy.h).
 _NOT_YET_VALID, _EXPIRED = 9, 10
 _OTHER_NAMES = (62, 64)
 
@@ -48,14 +48,14 @@ def page_context(certificate: Path | None, key: Path | None) -> ssl.SSLContext |
     Parameters
     ----------
     certificate
-        Certificate of this machine in PEM, with intermediate certificates if there are any.
+        Certificate of this machine in PEM format, with intermediate certificates if necessary.
     key
         Private key of the certificate; None if the certificate file contains the key.
 
     Raises
     ------
     ValueError
-        The files are not a certificate and its own key, or the key has a passphrase.
+        The files are not a certificate and its key, or the key has a passphrase.
     OSError
         A file cannot be read.
     """
@@ -82,7 +82,7 @@ def page_context(certificate: Path | None, key: Path | None) -> ssl.SSLContext |
 
 
 def verification_fault(error: ssl.SSLCertVerificationError) -> str:
-    """Return cause and remedy of a broker certificate that fails verification."""
+    """Return the cause and the remedy if the verification of the broker's certificate fails."""
     if error.verify_code == _EXPIRED:
         return "its certificate has expired: renew it, or set this machine's clock"
     if error.verify_code == _NOT_YET_VALID:

@@ -59,7 +59,7 @@ def dashboard(
     from jointfit_daemon.tools.dashboard._certificates import broker_context, page_context
     from jointfit_daemon.tools.dashboard.server import open_listener
 
-    broker_context(target, ca), page_context(certificate, key)  # report faulty files
+    broker_context(target, ca), page_context(certificate, key)  # this call reports invalid files
     rig = None if set_up is None else _new_rig(set_up, address)
     listener = open_listener(address)
     listener.set_inheritable(True)
@@ -74,13 +74,14 @@ def dashboard(
         "names": [each.lower() for each in name or ()],
         "set_up": None if rig is None else str(rig),
     }
-    # The libraries of the command line take a third of the memory of a server that runs for days.
+    # The server can run for days, so it runs without the command-line libraries, a third of its
+    # memory.
     module = "jointfit_daemon.tools.dashboard"
     os.execv(sys.executable, [sys.executable, "-m", module, json.dumps(settings)])  # noqa: S606 - itself
 
 
 def _new_rig(folder: Path, address: ListenAddress) -> Path:
-    """Return the path of the rig that the page writes; only this machine can use this page."""
+    """Return the path of the rig that the page writes; refuse access from other machines."""
     from jointfit_daemon.tools.init import rig_path
 
     if not address.is_local:

@@ -1,6 +1,7 @@
 """Files of the web page, which are read and compressed once.
 
-Invariant: a request selects a file by an exact name, so no path can leave the folder of the page.
+Invariant: a request selects a file by its exact name, so no request can read a file outside the
+page folder.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class PageFile:
     content_type: str
     etag: str
     compressed: bytes
-    """Content of the file, compressed by gzip."""
+    """Content of the file, compressed with gzip."""
 
     @property
     def content(self) -> bytes:
@@ -45,7 +46,7 @@ def read_page_files(folder: Path = PAGE) -> dict[str, PageFile]:
             continue
         content = path.read_bytes()
         digest = hashlib.sha256(content).hexdigest()[:20]
-        # The tag is weak, because compressed and plain content share the same tag.
+        # The ETag is weak, because compressed and plain content have the same ETag.
         files[f"/{path.relative_to(folder).as_posix()}"] = PageFile(
             _TYPES[path.suffix], f'W/"{digest}"', gzip.compress(content, 9, mtime=0)
         )

@@ -1,7 +1,8 @@
 """Tunnel from a WebSocket of the page to the TCP or TLS port of the broker.
 
-Invariant: the tunnel passes bytes on without decoding them. The page sends its own CONNECT packet,
-so the accounts and access lists of the broker decide, and the tunnel holds no password.
+Invariant: the tunnel forwards bytes without decoding them. The page sends its own CONNECT packet.
+Access therefore depends on the accounts and access lists of the broker, and the tunnel stores no
+password.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.dashboard.addresses import BrokerAddress
 
 BROKER_UNREACHABLE, BROKER_CLOSED = 4502, 4503
-"""Close codes of the WebSocket; the page shows the reason."""
+"""WebSocket close codes. The page shows the reason that accompanies the code."""
 CONNECT_S = 5.0
 """Longest wait for the broker to accept the connection, s."""
 _CHUNK_BYTES = 65536
 _REASON_BYTES = 123
-"""Longest reason of a close frame, bytes (RFC 6455, section 5.5)."""
+"""Maximum length of the reason in a close frame, bytes (RFC 6455, section 5.5)."""
 
 
 async def tunnel(
@@ -66,7 +67,7 @@ async def _first_completed(*coroutines: Coroutine[None, None, None]) -> None:
 
 
 async def _upload(websocket: ServerConnection, writer: asyncio.StreamWriter) -> None:
-    """Pass the packets of the page to the broker."""
+    """Forward the packets of the page to the broker."""
     with contextlib.suppress(OSError, ConnectionClosed):
         async for packet in websocket:
             writer.write(packet if isinstance(packet, bytes) else packet.encode())
@@ -76,9 +77,9 @@ async def _upload(websocket: ServerConnection, writer: asyncio.StreamWriter) -> 
 async def _download(
     reader: asyncio.StreamReader, websocket: ServerConnection, answered: asyncio.Event
 ) -> None:
-    """Pass the bytes of the broker to the page; set `answered` at the first byte.
+    """Forward the bytes of the broker to the page; set `answered` at the first byte.
 
-    A page that reads slowly fills the buffers of reader and WebSocket. The tunnel then stops
+    A page that reads slowly fills the buffers of `reader` and `websocket`. The tunnel then stops
     reading until the page continues, and the broker queues or drops messages.
     """
     with contextlib.suppress(OSError, ConnectionClosed):
@@ -88,11 +89,11 @@ async def _download(
 
 
 def _closure(broker: BrokerAddress, answered: asyncio.Event) -> str:
-    """Return why the broker closed the connection, as far as the tunnel can observe it."""
+    """Return the probable reason why the broker closed the connection."""
     if answered.is_set():
         return "the broker closed the connection"
-    # With TLS 1.3 the broker checks the client certificate after the client has completed the
-    # handshake.
+    # With TLS 1.3, the broker checks the client certificate after the client has completed the
+    # handshake. The connection then ends without an answer.
     cause = (
         "it may require a client certificate" if broker.tls else "a port with TLS needs mqtts://"
     )
@@ -125,7 +126,7 @@ def connection_fault(error: BaseException) -> str:
     if type(error) in words:
         return words[type(error)]
 
-    # If a name has several addresses, asyncio reports one error that contains only the error texts.
+    # If a name has several addresses, asyncio raises one error that contains only the error texts.
     if isinstance(error, ConnectionRefusedError) or "Connect call failed" in str(error):
         return "connection refused: start the broker, or correct --broker"
     if isinstance(error, OSError) and error.errno in (errno.EHOSTUNREACH, errno.ENETUNREACH):
@@ -134,5 +135,5 @@ def connection_fault(error: BaseException) -> str:
 
 
 def close_reason(text: str) -> str:
-    """Return `text`, shortened to the longest reason of a close frame."""
+    """Return `text`, shortened to the maximum length of a close reason."""
     return text.encode()[:_REASON_BYTES].decode(errors="ignore")

@@ -1,4 +1,4 @@
-"""Addresses in the options of the dashboard: of the web server and of the broker."""
+"""Addresses of the web server and of the broker in the options of the dashboard."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 LISTEN = "127.0.0.1:8080"
-"""Default address of the page, which only this machine can open."""
+"""Default address of the page. Only this machine can open it."""
 PLAIN_PORT, TLS_PORT = 1883, 8883
 """Registered TCP ports of MQTT without and with TLS."""
 _SCHEMES = ("mqtt", "mqtts", "ws", "wss")
@@ -44,7 +44,7 @@ class BrokerAddress:
 
     @property
     def text(self) -> str:
-        """Return the address for messages."""
+        """Return the address as text for messages."""
         if self.websocket is not None:
             return self.websocket
         return f"{bracketed(self.host)}:{self.port}{' (TLS)' if self.tls else ''}"
@@ -77,7 +77,8 @@ def parse_listen(text: str) -> ListenAddress:
 def parse_broker(text: str, account: str = "the page asks for them") -> BrokerAddress:
     """Return the address of ``mqtt://HOST:PORT``, ``mqtts://…``, ``wss://…`` or ``HOST:PORT``.
 
-    `account` ends the message about a user name in the address: the place for the user name.
+    A user name in the address raises an error. `account` is the last part of its message, which
+    describes where the user enters the name.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Web server of the dashboard: static files, the configuration of the page, and the tunnel.
+"""Web server of the dashboard: page files, page configuration, and the tunnel to the broker.
 
-Invariant: every response forbids scripts, styles and connections from other origins, and only pages
-of this server may use the tunnel.
+Invariant: every response forbids scripts, styles and connections from other origins. Only pages of
+this server can use the tunnel.
 """
 
 from __future__ import annotations
@@ -34,14 +34,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.dashboard.addresses import BrokerAddress, ListenAddress
 
 TUNNEL = "/mqtt"
-"""Path of the tunnel."""
+"""URL path of the tunnel."""
 _METHODS = ("GET", "HEAD")
 MOST_VIEWERS = 64
-"""Largest number of open tunnels."""
+"""Maximum number of open tunnels."""
 _PACKET_BYTES = 64 * 1024
-"""Longest WebSocket message of a page; requests have at most 32 KiB."""
+"""Maximum size of a WebSocket message from a page, bytes. A request has at most 32 KiB."""
 _PING_S = 20.0
-"""Interval of WebSocket pings, s. The connection of a lost page is closed within two intervals."""
+"""Time between two WebSocket pings, s. The connection of a lost page is closed after at most two
+intervals."""
 
 
 @dataclass(slots=True)
@@ -51,11 +52,11 @@ class DashboardServer:
     broker: BrokerAddress
     context: ssl.SSLContext | None = None
     base: str | None = None
-    """Base topic that the page shows; with None, the page searches for rigs."""
+    """Base topic of the rig that the page shows; None if the page searches for rigs."""
     names: tuple[str, ...] = ()
-    """Further host names under which browsers may open the page."""
+    """Additional host names that browsers may use to open the page."""
     page_context: ssl.SSLContext | None = None
-    """Certificate and key of this machine, for HTTPS; None: HTTP."""
+    """TLS context with certificate and key of this machine for HTTPS; None for HTTP."""
     files: dict[str, PageFile] = field(default_factory=read_page_files)
     _viewers: int = 0
 
@@ -63,19 +64,19 @@ class DashboardServer:
     async def listening(
         self, listen: ListenAddress, listener: socket.socket | None = None
     ) -> AsyncIterator[str]:
-        """Serve for the duration of the block; yield the URL of the page.
+        """Serve the page during the ``with`` block; yield the URL of the page.
 
         Parameters
         ----------
         listen
             Address of the page.
         listener
-            Listening socket of the address; None opens a socket.
+            Socket that listens on the address; the default is a new socket.
 
         Raises
         ------
         ValueError
-            As `open_listener`.
+            The errors of `open_listener`.
         """
         logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # malformed requests
         async with serve(
@@ -85,7 +86,7 @@ class DashboardServer:
             process_request=self.respond,
             subprotocols=[Subprotocol("mqtt"), Subprotocol("jointfit-set-up")],
             server_header=None,
-            compression=None,  # compression costs more than it saves on a local network
+            compression=None,  # compression does not pay on a local network
             max_size=_PACKET_BYTES,
             ping_interval=_PING_S,
             ping_timeout=_PING_S,
@@ -103,14 +104,14 @@ class DashboardServer:
     def respond(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the response to a request; None to open the tunnel."""
         del connection
-        method = getattr(request, "method", "GET")  # old versions of websockets parse GET only
+        method = getattr(request, "method", "GET")  # old websockets versions have no other method
         response = self._refusal(request, method) or self._answer(request, method)
         if method == "HEAD" and response is not None:
-            response.body = b""  # HEAD: the headers remain, with the length
+            response.body = b""  # the response to HEAD keeps its headers
         return response
 
     def _refusal(self, request: Request, method: str) -> Response | None:
-        """Return the error response to a request that is invalid on every path; None if valid."""
+        """Return the error response to a request that no path accepts; None for other requests."""
         host = request.headers.get_all("Host")
         if _path(request.path) is None or len(host) != 1:
             return self._text(HTTPStatus.BAD_REQUEST, "Expected a path and one Host header.")
@@ -138,10 +139,10 @@ class DashboardServer:
         return self._file(found, request.headers)
 
     def _check_tunnel(self, request: Request, method: str) -> Response | None:
-        """Refuse the tunnel to pages of other origins and to ordinary requests."""
+        """Return an error response if the tunnel is refused; None if it may open."""
         if method != "GET" or "websocket" not in _tokens(request.headers, "Upgrade"):
             return self._text(HTTPStatus.UPGRADE_REQUIRED, "This path is for WebSockets only.")
-        # Programs send no origin; browsers always do, and a page cannot change it.
+        # Programs send no Origin header. Browsers always send it, and a page cannot change it.
         origins, host = request.headers.get_all("Origin"), request.headers["Host"].lower()
         if any(_authority(origin) != host for origin in origins):
             return self._text(HTTPStatus.FORBIDDEN, "Pages of other origins cannot use the tunnel.")
@@ -154,8 +155,8 @@ class DashboardServer:
     def _is_own_name(self, host: str) -> bool:
         """Return whether a Host header names this server.
 
-        A name of another site that resolves to this machine (DNS rebinding) would give the pages of
-        that site the origin of this server.
+        If the name of another site resolves to this machine (DNS rebinding), a browser would treat
+        pages of that site as pages of this server.
         """
         try:
             name = urlsplit(f"//{host}").hostname or ""
@@ -183,7 +184,7 @@ class DashboardServer:
 
     def _file(self, found: PageFile, headers: Headers) -> Response:
         more = {"ETag": found.etag, "Vary": "Accept-Encoding"}
-        # The page sends whole files only: a Range header is ignored, as RFC 9110 permits.
+        # The server sends whole files only. It ignores a Range header, as RFC 9110 permits.
         known = _tokens(headers, "If-None-Match")
         if "*" in known or found.etag.lower().removeprefix("w/") in {
             tag.removeprefix("w/") for tag in known
@@ -205,7 +206,7 @@ class DashboardServer:
                 "Content-Type": kind,
                 "Content-Length": str(len(body)),
                 "Connection": "close",
-                "Cache-Control": "no-cache",  # browsers revalidate stored files by the tag
+                "Cache-Control": "no-cache",  # browsers check stored files by their ETag
                 "Content-Security-Policy": self.security_policy,
                 "X-Content-Type-Options": "nosniff",
                 "Referrer-Policy": "no-referrer",
@@ -239,7 +240,7 @@ def _path(target: str) -> str | None:
 
 
 def _authority(origin: str) -> str | None:
-    """Return host and port of an origin; None if it has none."""
+    """Return host and port of an Origin header; None if the header contains none."""
     try:
         return urlsplit(origin).netloc.lower()
     except ValueError:
@@ -247,7 +248,7 @@ def _authority(origin: str) -> str | None:
 
 
 def _tokens(headers: Headers, name: str) -> set[str]:
-    """Return the elements of all headers `name` in lower case, without elements of weight 0."""
+    """Return the elements of all headers `name`, in lower case, whose weight is not 0."""
     elements = ",".join(headers.get_all(name)).lower().split(",")
     parts = [element.replace(" ", "").split(";") for element in elements]
     return {token for token, *weight in parts if weight not in (["q=0"], ["q=0.0"], ["q=0.000"])}
@@ -283,9 +284,10 @@ def _url(listen: ListenAddress, server: Server, scheme: str) -> str:
 
 
 def own_address() -> str:
-    """Return the address of this machine on its network; the loopback address without a network.
+    """Return the network address of this machine, or the loopback address without a network.
 
-    No packet is sent: connecting a UDP socket only selects the interface of the default route.
+    No packet is sent, because connecting a UDP socket only selects the interface of the default
+    route.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:

@@ -1,6 +1,6 @@
 """The set-up page of the dashboard: the dialogue of `jointfit init` in a browser.
 
-Invariant: the page is served on the loopback interface only, and writes only into the folder that
+Invariant: the page is served on the loopback interface only. It writes only into the folder that
 the command names.
 """
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from websockets.http11 import Request, Response
 
 SET_UP = "/set-up"
-"""Path of the WebSocket of the dialogue."""
+"""URL path of the WebSocket for the dialogue."""
 PAGE = "set-up.html"
 
 
@@ -36,7 +36,7 @@ class SetUpServer(DashboardServer):
 
     @override
     def _answer(self, request: Request, method: str) -> Response | None:
-        if request.path == SET_UP:  # super() without arguments fails in a class with slots
+        if request.path == SET_UP:  # super() without arguments fails in a slots class
             return self._check_tunnel(request, method)
         return super(SetUpServer, self)._answer(request, method)
 
@@ -49,9 +49,9 @@ class SetUpServer(DashboardServer):
             await websocket.send(json.dumps(await self._reply(websocket, text)))
 
     async def _reply(self, websocket: ServerConnection, text: str | bytes) -> dict[str, Any]:
-        """Return the dialogue state after a message.
+        """Process a message, and return the new state of the dialogue.
 
-        The message is processed in a thread, because a search takes seconds.
+        The processing runs in a thread, because a search takes seconds.
         """
         try:
             message = json.loads(text)

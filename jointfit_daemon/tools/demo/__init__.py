@@ -1,4 +1,4 @@
-"""`jointfit demo`: the daemon on simulated hardware, compared with the simulated bones."""
+"""Command `jointfit demo`: runs the daemon on simulated hardware and checks its angles."""
 
 from jointfit_daemon.tools.demo._command import demo
 

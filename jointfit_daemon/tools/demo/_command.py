@@ -21,12 +21,13 @@ if TYPE_CHECKING:
 
 
 FLEXION_RMSE_DEG = {"knee": 3.0, "right_knee": 3.0, "elbow": 3.0, "lumbar": 3.0}
-"""Largest accepted flexion error of the compared joint, RMS, degrees."""
+"""Largest accepted flexion error (RMS) of the compared joint, degrees."""
 TARGETS = {"unaccounted": 0, "latency_p99_ms": 60.0}
-"""Largest other accepted values; docs/simulator.md lists the simulated imperfections."""
+"""Largest accepted values of the other results. The page docs/simulator.md lists the simulated
+imperfections."""
 _LIMBS = "Simulated limb: leg, legs (with pelvis), arm (thorax to hand) or trunk."
 _ERROR_KEY = "_flexion_rmse_deg"
-"""End of the result's key for the flexion error; the key begins with the name of the joint."""
+"""Suffix of the result key that contains the flexion error; the name of the joint precedes it."""
 BASE = "jointfit/demo"
 """Topic prefix of the demo."""
 
@@ -124,7 +125,7 @@ def result_line(outcome: str, figures: Mapping[str, Any]) -> str:
 
 
 def _compared_joint(figures: Mapping[str, Any]) -> str:
-    """Return the joint whose flexion error a result contains; by default the knee."""
+    """Return the joint whose flexion error the result contains; the default is the knee."""
     return next((name for name in FLEXION_RMSE_DEG if f"{name}{_ERROR_KEY}" in figures), "knee")
 
 
@@ -132,7 +133,7 @@ HINTS = {"latency_p99_ms": ": check the load of this machine"}
 
 
 def missed_targets(figures: dict[str, Any]) -> list[str]:
-    """Return one line for each target that the result does not meet."""
+    """Return one line for each missed target."""
     values = {**figures, "latency_p99_ms": figures.get("latency_ms", {}).get("p99")}
     joint = _compared_joint(figures)
     targets = {f"{joint}{_ERROR_KEY}": FLEXION_RMSE_DEG[joint]} | TARGETS
@@ -152,7 +153,7 @@ async def _run(
     headless: bool,
     picture: Path | None,
 ) -> tuple[dict[str, Any], StopRequest | None]:
-    """Return the result, and the stop signal if one was received."""
+    """Run the demo; return the result, and the stop signal if one was received."""
     from jointfit_daemon.config import load_rig
     from jointfit_daemon.tools.child_processes import daemon, simulator
     from jointfit_daemon.tools.demo._display import DemoDisplay

@@ -1,7 +1,7 @@
-"""Terminal display of the demo: calibration progress, then joint angles with ground truth.
+"""Terminal display of the demo: calibration progress, then joint angles with the ground truth.
 
-Invariant: the display fits into 80 columns and 24 lines. A terminal is redrawn; other outputs
-receive one line per step.
+Invariant: the display fits into 80 columns and 24 lines. On a terminal the display is redrawn;
+other outputs receive one line per step.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.demo._score import TrueLimbState
 
 LONGEST_CURVE = 200
-"""Number of stored points of each curve; a terminal shows as many of the newest points as fit."""
+"""Number of stored points of each curve. A terminal shows the newest points that fit."""
 SPARSE = 10
 """Number of frames per column of the curves: 7 s at 100 Hz fill 70 columns."""
 _WIDE = 76
-"""Smallest inner width, columns, at which the steps have a progress bar."""
+"""Smallest width inside the border, columns, at which the steps have a progress bar."""
 _STEP_COLUMNS = 12
 """Width of the step names, columns."""
 _BARS = "▁▂▃▄▅▆▇█"
@@ -76,10 +76,10 @@ class DemoDisplay:
             self._live.update(self.render())
             self._live.stop()
             if not self._console.is_terminal:
-                self._console.print()  # rich leaves the cursor at the end of the last line
+                self._console.print()  # rich leaves the cursor in the last line
 
     def step(self, name: str, done: float, text: str) -> None:
-        """Show the progress of a step, `done` from 0 to 1."""
+        """Show the progress of a step; `done` is its completed share, 0 to 1."""
         self._step, self._done, self._text = name, done, text
         if self._headless and name != self._printed_step:
             self._printed_step = name
@@ -90,7 +90,7 @@ class DemoDisplay:
         self._draw()
 
     def figures(self, data: Mapping[str, Any]) -> None:
-        """Show the joint-centre progress of the functional phase; other phases have none."""
+        """Show the predicted errors of joint centres, which exist in the functional phase only."""
         if self._step == "functional":
             self._joints = movement_lines(data)
             self._draw()
@@ -135,7 +135,7 @@ class DemoDisplay:
         return Panel(shown, title="jointfit demo", title_align="left", border_style="cyan")
 
     def _step_table(self, now: int, *, bars: bool) -> Table:
-        """Return the steps, one per line at any width."""
+        """Return a table with one line per step."""
         table = Table.grid(padding=(0, 2))
         table.add_column(no_wrap=True, min_width=_STEP_COLUMNS)
         if bars:
@@ -188,7 +188,7 @@ class _FittedSteps:
 
 @dataclass(frozen=True, slots=True)
 class _Curve:
-    """Labelled line of block characters that shows as many of the newest values as fit."""
+    """Labelled line of block characters, which shows the newest values that fit."""
 
     name: str
     values: Iterable[float]
@@ -206,7 +206,7 @@ class _Curve:
 
 
 def _main_joint(pose: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Return name and payload of the first joint with a flexion: knee, elbow or lumbar joint."""
+    """Return name and payload of the first joint that has a flexion."""
     joints: dict[str, dict[str, Any]] = pose.get("joints") or {}
     found = ((name, joint) for name, joint in joints.items() if "flexion_deg" in joint)
     return next(found, ("joint", {}))

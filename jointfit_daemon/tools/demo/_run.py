@@ -1,6 +1,6 @@
-"""One demo run: connect, calibrate, evaluate live joint angles, count samples.
+"""One run of the demo, which connects, calibrates, and evaluates live joint angles.
 
-The daemon is observed over MQTT only, and ground truth comes from the simulator's log.
+The run observes the daemon over MQTT only. The ground truth is in the simulator's log.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 TOPICS = ("pose", "calibration", "calibration/progress", "bridge/health", "device/+/availability")
 CONNECT_S, FINISH_S = 30.0, 15.0
-"""Time limits for connecting all sources and for counting the last samples, s."""
+"""Time limits, s: to connect all sources, and to count the last samples."""
 SETTLE_S = 3.0
 """Time for the device clocks to converge and for a new motion to begin, s."""
 
@@ -40,7 +40,7 @@ class DemoLimb(NamedTuple):
     functional: tuple[tuple[str, float], ...]
     """Motions of the functional phase and their durations, s."""
     live: tuple[str, ...]
-    """Motions of the live phase, `MOTION_S` each."""
+    """Motions of the live phase; each motion lasts `MOTION_S`."""
 
 
 LIMBS = {
@@ -69,9 +69,9 @@ LIMBS = {
 MOTION_S = 8.0
 """Duration of each motion in the live phase, s."""
 TRUTH_S = 0.1
-"""Interval between readings of the ground truth, s."""
+"""Time between two readings of the ground-truth file, s."""
 MATURE_NS = 300_000_000
-"""Age of a pose, ns, at which the pose is evaluated, because the ground truth is then written."""
+"""Age at which a pose is evaluated, ns. At this age, its ground truth is in the file."""
 CALIBRATIONS = "state/calibrations"
 """Calibration store of the demo, relative to its folder."""
 OUTCOMES = ("used", "decimated", "idle", "late", "duplicate", "dropped")
@@ -100,12 +100,13 @@ class DemoRun:
     _tracker: PhaseTracker | None = None
 
     async def run(self, seconds: float) -> None:
-        """Run all steps; `figures` returns the results, also after an interruption."""
+        """Run all steps; `figures` then returns the results, even after an interruption."""
         async with MqttClient(self.rig.mqtt) as client:
             await client.subscribe(*TOPICS)
 
-            # A pause of this process counts as latency of the daemon: imported objects are excluded
-            # from garbage collection, and the ground truth is read continuously.
+            # A pause of this process would count as latency of the daemon. Garbage collection
+            # therefore excludes the imported objects, and the ground truth is read in short
+            # intervals.
             gc.freeze()
             tasks = [
                 asyncio.create_task(self._listen(client), name="demo listener"),
@@ -243,7 +244,7 @@ class DemoRun:
     # --- results -----------------------------------------------------------------------------
 
     def figures(self) -> dict[str, Any]:
-        """Return errors, latency and sample counts; None where not yet known."""
+        """Return errors, latency and sample counts; None for values not yet known."""
         devices = self._health.get("devices", {})
         counts = {
             key: sum(int(device.get(key) or 0) for device in devices.values())
@@ -251,7 +252,7 @@ class DemoRun:
         }
         counts["dropped"] += counts.pop("pending")
 
-        # Samples without an outcome, and the difference between sent and received samples.
+        # An unaccounted sample has no outcome, or was sent but not received.
         sent, unaccounted = self._sent or {}, dict[str, int]()
         for name, device in devices.items():
             received = int(device.get("received") or 0)

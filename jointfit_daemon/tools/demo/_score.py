@@ -1,4 +1,4 @@
-"""Errors of the published limb against ground truth from the log of the simulator."""
+"""Errors of the published limb state relative to the ground truth in the simulator's log."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class TruthTrack:
         self._times: list[int] = []
 
     def add(self, row: TrueLimbState) -> None:
-        """Append a sample; times increase."""
+        """Append a sample, which must be later than all others."""
         self._rows.append(row)
         self._times.append(row.t_ns)
 
@@ -90,7 +90,7 @@ class RmsAccumulator:
 
 @dataclass(slots=True)
 class DemoScore:
-    """Statistics of the errors of published poses against ground truth."""
+    """Statistics of the errors of published poses relative to the ground truth."""
 
     flexion: RmsAccumulator = field(default_factory=RmsAccumulator)
     segments: dict[str, RmsAccumulator] = field(default_factory=dict)

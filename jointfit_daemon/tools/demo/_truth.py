@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class TruthReader:
-    """Reads new complete lines of ``truth.jsonl``; a partial line is read when it is complete."""
+    """Reads new lines of ``truth.jsonl``; an incomplete line is read later."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -1,6 +1,6 @@
-"""The demo in a browser: simulated hardware, the daemon and the dashboard, until Ctrl-C.
+"""The demo in a browser, which runs simulated hardware, daemon and dashboard until Ctrl-C.
 
-The simulated subject follows the calibration phases, so that a user can calibrate in the page.
+The simulated subject follows the calibration phases, so a user can calibrate in the page.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ PHASES = (("align", 20.0), ("static", 5.0), ("functional", 47.0))
 """Phases of the calibration and their durations, s."""
 TOPICS = ("calibration", "calibration/progress", "device/+/availability")
 ATTEMPTS = 3
-"""Number of attempts at each phase. A busy computer pauses the simulated sensors, which aborts the
+"""Number of attempts at each phase. A busy computer delays the simulated sensors, which aborts the
 phase."""
 STOPPED_BY_USER = "abort requested"
-"""End of the reason of a phase that a user stopped in the page."""
+"""Last words of the reason if a user stopped the phase in the page."""
 LIVE = "The limb is live. Calibrate again in the page; Ctrl-C stops."
 UNCALIBRATED = "The limb is not calibrated. Calibrate it in the page; Ctrl-C stops."
 
@@ -50,12 +50,12 @@ UNCALIBRATED = "The limb is not calibrated. Calibrate it in the page; Ctrl-C sto
 async def run_web_demo(
     folder: Path, base: str, options: Sequence[str], listen: ListenAddress
 ) -> None:
-    """Run until a stop signal; print the URL of the page first.
+    """Print the URL of the page, and run until a stop signal.
 
     Parameters
     ----------
     folder
-        Folder of rig, logs and calibration.
+        Folder for rig, logs and calibration.
     base
         Base topic.
     options
@@ -73,7 +73,7 @@ async def run_web_demo(
                     async with simulator(folder, port, base, [*options, *more]) as simulated:
                         rig_file = Path((await simulated.ready())["rig"])
                         async with daemon(folder, rig_file) as process:
-                            from jointfit_daemon.config import load_rig  # slow; the URL comes first
+                            from jointfit_daemon.config import load_rig  # slow import
 
                             typer.echo(await _calibrate(load_rig(rig_file), process))
                             while True:
@@ -88,7 +88,7 @@ async def run_web_demo(
 def print_address(url: str, listen: ListenAddress) -> None:
     """Print the URL.
 
-    A QR code follows if other devices can open the page and segno is installed.
+    If other devices can open the page and segno is installed, a QR code follows.
     """
     typer.echo(f"dashboard: {url}  (Ctrl-C stops)")
     if listen.is_local:
@@ -103,7 +103,7 @@ def print_address(url: str, listen: ListenAddress) -> None:
 
 
 async def _calibrate(rig: Rig, process: ChildProcess) -> str:
-    """Run all phases unless the user takes over in the page; return the result as text."""
+    """Run all phases unless the user controls them in the page; return the result as text."""
     from jointfit_daemon.outputs.mqtt import MqttClient
 
     online: set[str] = set()
@@ -128,7 +128,7 @@ async def _calibrate(rig: Rig, process: ChildProcess) -> str:
 
 
 async def run_phase(client: MqttClient, tracker: PhaseTracker, phase: str, seconds: float) -> None:
-    """Run a phase, again after an abort that the user did not request, at most `ATTEMPTS` times."""
+    """Run a phase; after an abort by the daemon, repeat it, with at most `ATTEMPTS` attempts."""
     for attempt in range(1, ATTEMPTS + 1):
         typer.echo(f"calibration: {phase}, {seconds:g} s")
         tracker.begin()

@@ -1,7 +1,7 @@
 """Devices of this host: serial ports, CAN interfaces and motion-capture servers.
 
-Functions named ``find_…`` only read files of the kernel and open no device. The other functions
-open the named device only, and write nothing to it.
+Functions named ``find_…`` only read kernel files and open no device. The other functions open only
+the named device, and write nothing to it.
 """
 
 from jointfit_daemon.tools.discovery._can_interfaces import (

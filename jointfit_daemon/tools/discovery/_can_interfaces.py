@@ -21,7 +21,7 @@ from jointfit_daemon.tools.discovery._sysfs import read_attribute, read_number
 RunCommand = Callable[[Sequence[str]], str | None]
 """Function that returns the output of a command; None if the command is absent or fails."""
 _ARPHRD_CAN = 280
-"""Hardware type of CAN interfaces in the kernel."""
+"""Number of the hardware type CAN in the kernel."""
 _IFF_UP = 1
 _IP_TIMEOUT_S = 5.0
 _PYTHON_CAN_FILES = ("/etc/can.conf", "~/.can", "~/.canrc", "can.ini")
@@ -38,14 +38,15 @@ class CanInterface:
     up: bool
     state: str | None = None
     """State of the controller: ``ERROR-ACTIVE``, ``ERROR-WARNING``, ``ERROR-PASSIVE``, ``BUS-OFF``
-    or ``STOPPED``; None if unknown, and for virtual interfaces."""
+    or ``STOPPED``. None for a virtual interface, or if unknown."""
     bitrate: int | None = None
-    """Bit rate, bit/s; None if unknown or not set, and for virtual interfaces."""
+    """Bit rate, bit/s; None for a virtual interface, or if unknown or not set."""
     restart_ms: int | None = None
-    """Time after which the kernel restarts the controller from bus-off, ms; 0: never."""
+    """Time after which the kernel restarts the controller from bus-off, ms; 0 disables the restart.
+    """
     listen_only: bool = False
     driver: str | None = None
-    """Driver of the kernel, such as ``gs_usb`` or ``mcp251xfd``."""
+    """Kernel driver, such as ``gs_usb`` or ``mcp251xfd``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,7 @@ class CanChannel:
     """A bus in a configuration file of python-can."""
 
     interface: str
-    """Kind of interface, such as ``pcan``."""
+    """Type of the interface in python-can, such as ``pcan``."""
     channel: str
     bitrate: int | None
     file: str
@@ -77,15 +78,15 @@ def find_can_interfaces(
 ) -> list[CanInterface]:
     """Return the CAN interfaces of this host, ordered by name.
 
-    Only netlink gives state and bit rate, so both come from the command ``ip``. They are None
-    without this command.
+    The kernel provides state and bit rate over netlink only. The function therefore runs the
+    command ``ip``. Without this command, both values are None.
 
     Parameters
     ----------
     root
         Folder that contains ``sys``.
     run
-        Returns the output of a command, or None.
+        Function that returns the output of a command, or None.
     """
     found = []
     for folder in sorted((root / "sys/class/net").glob("*")):
@@ -114,11 +115,11 @@ def find_can_interfaces(
 
 
 def _link_details(run: RunCommand, name: str) -> dict[str, Any]:
-    """Return the description of an interface by the command ``ip``; empty without ``ip``."""
+    """Return the output of ``ip`` for an interface; empty if ``ip`` is not installed."""
     text = run(["ip", "-details", "-json", "link", "show", "dev", name])
     try:
         links = orjson.loads(text or "[]")
-    except orjson.JSONDecodeError:  # the ip of busybox has no JSON
+    except orjson.JSONDecodeError:  # BusyBox's ip prints no JSON
         return {}
     first = links[0] if isinstance(links, list) and links else {}
     return first if isinstance(first, dict) else {}

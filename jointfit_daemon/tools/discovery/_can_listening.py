@@ -1,7 +1,7 @@
 """Reception on one CAN network interface, and the sensors that the drivers recognize.
 
-Invariant: nothing is sent and no setting is changed. A controller in normal mode acknowledges
-received frames, with this program as with any other.
+Invariant: nothing is sent and no setting is changed. As with any program, a controller in normal
+mode acknowledges the received frames.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class CanIdentifier:
     """Number of data bytes of the last received frame."""
     frames: int
     rate_hz: float | None
-    """Frames per second; None if fewer than two frames arrived."""
+    """Frame rate, Hz; None if fewer than two frames arrived."""
     driver: str | None = None
     """Driver of the sensor that uses this identifier; None if unknown."""
 
@@ -65,7 +65,7 @@ class CanTraffic:
 
     interface: str
     fault: str | None
-    """Reason why the interface cannot be opened, with a remedy; None if it was opened."""
+    """Reason why the interface cannot be opened, with a remedy; None if it could be opened."""
     identifiers: tuple[CanIdentifier, ...] = ()
     devices: tuple[DecodedDevice, ...] = ()
     error_frames: int = 0
@@ -88,9 +88,9 @@ def listen_can(
     listen_s
         Time to listen, s.
     progress
-        Called with the share of the work that is done, 0 to 1.
+        Callback that receives the completed share, 0 to 1.
     layouts
-        Tables to try in addition to those that the drivers propose, by driver.
+        Tables to try in addition to the tables that the drivers propose, by driver.
     """
     try:
         received = _receive(interface, listen_s, progress)
@@ -125,7 +125,7 @@ def listen_can(
 def _receive(
     interface: str, listen_s: float, progress: Callable[[float], None] | None
 ) -> list[tuple[int, int, bytes]]:
-    """Return arrival, identifier with flags, and data of every frame within `listen_s`."""
+    """Return arrival time, identifier with flags, and data of every received frame."""
     found = []
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as receiver:
         try:

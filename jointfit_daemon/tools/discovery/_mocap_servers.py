@@ -22,7 +22,7 @@ __all__ = ["FoundServer", "find_mocap_servers", "installed_drivers"]
 
 
 def installed_drivers() -> Iterator[tuple[str, type[Driver]]]:
-    """Yield name and class of every driver that can be imported; log a warning for the others."""
+    """Yield name and class of every driver; log a warning if a driver cannot be imported."""
     for name in driver_names():
         try:
             yield name, find_driver(name)
@@ -38,23 +38,23 @@ async def find_mocap_servers(
     port: int | None = None,
     wait_s: float = 1.0,
 ) -> list[FoundServer]:
-    """Return the motion-capture servers that answer one of the installed drivers.
+    """Return the motion-capture servers that answer a request of an installed driver.
 
     Parameters
     ----------
     hosts
-        Names or addresses to ask.
+        Names or addresses of the hosts to ask.
     broadcast
-        Whether to ask all hosts in the networks of this host, by one datagram for each network.
+        Whether to ask all hosts in the networks of this host, with one datagram per network.
     port
-        Command port; by default the usual port of each system.
+        Command port; the default is the usual port of each system.
     wait_s
         Time to wait for answers, s.
 
     Raises
     ------
     OSError
-        A host is unknown, or the network cannot be used.
+        The name of a host is unknown, or the network cannot be used.
     """
 
     async def ask(search: ServerSearch) -> list[FoundServer] | OSError:
@@ -63,7 +63,7 @@ async def find_mocap_servers(
         except OSError as error:  # the other searches continue
             return error
 
-    # Search with all drivers at the same time, so that the waiting times do not add up.
+    # Search with all drivers at the same time to shorten the wait.
     async with asyncio.TaskGroup() as group:
         asked = [
             group.create_task(ask(cast("ServerSearch", cast("Any", driver))))

@@ -1,7 +1,7 @@
 """Reception on one serial port, at the usual speeds of the installed drivers.
 
-Invariant: nothing is sent, and the settings of the port are restored. A port is opened for reading
-only; the kernel raises DTR and RTS, which resets some boards.
+Invariant: nothing is sent, and the settings of the port are restored. The port is opened for
+reading only, but the kernel raises DTR and RTS, which resets some boards.
 """
 
 from __future__ import annotations
@@ -44,19 +44,20 @@ class SerialTraffic:
 
     port: str
     fault: str | None
-    """Reason why the port cannot be opened, with a remedy; None if it was opened."""
+    """Reason why the port cannot be opened, with a remedy; None if it could be opened."""
     received_bytes: dict[int, int]
-    """Number of received bytes by speed."""
+    """Number of received bytes, by speed (baud)."""
     baud: int | None = None
     """Speed at which a driver decodes the data, baud."""
     devices: tuple[DecodedDevice, ...] = ()
-    """Driver that decodes the data. There are several drivers only if their formats are alike."""
+    """Devices that the drivers decoded; usually one. Several drivers decode the data only if their
+    formats are similar."""
 
 
 def usual_bauds() -> tuple[int, ...]:
-    """Return the speeds of all installed drivers of byte streams, the most frequent first.
+    """Return the speeds of all installed drivers of byte streams, most frequent speed first.
 
-    Speeds that this system cannot set, such as 128 000 baud, are left out.
+    Speeds that this system cannot set, such as 128 000 baud, are omitted.
     """
     speeds: list[tuple[int, ...]] = [
         getattr(driver, "usual_bauds", _DEFAULT_BAUDS)
@@ -64,7 +65,7 @@ def usual_bauds() -> tuple[int, ...]:
         if driver.wire == "stream"
     ]
     longest = max(map(len, speeds), default=0)
-    # One speed of every driver in turn, so that each default comes before any rare speed.
+    # Take one speed of each driver in turn, so the default speeds precede the rare speeds.
     turns = [bauds[k] for k in range(longest) for bauds in speeds if k < len(bauds)]
     return tuple(baud for baud in dict.fromkeys(turns) if hasattr(termios, f"B{baud}"))
 
@@ -77,10 +78,9 @@ def listen_serial(
     progress: Callable[[float], None] | None = None,
     layouts: Layouts | None = None,
 ) -> SerialTraffic:
-    """Receive on a port at one speed after the other until a driver decodes the data.
+    """Receive on a port at one speed after another until a driver decodes the data.
 
-    A port that is silent at one speed is not tried at other speeds, because bytes arrive even at a
-    wrong speed.
+    If no byte arrives at one speed, the search ends, because bytes arrive even at a wrong speed.
 
     Parameters
     ----------
@@ -89,11 +89,11 @@ def listen_serial(
     listen_s
         Time at each speed, s.
     bauds
-        Speeds to try; default: those of the installed drivers.
+        Speeds to try, baud; the default is `usual_bauds`.
     progress
-        Called with the share of the work that is done, 0 to 1.
+        Callback that receives the completed share, 0 to 1.
     layouts
-        Tables to try in addition to the drivers, by driver.
+        Tables to try in addition to the default tables, by driver.
     """
     tried = tuple(usual_bauds() if bauds is None else bauds)
     received: dict[int, int] = {}
@@ -143,7 +143,7 @@ def _attributes(descriptor: int) -> list[Any]:
 
 
 def _set_speed(descriptor: int, baud: int) -> None:
-    """Set a raw line, 8N1, without flow control, and discard bytes received at another speed."""
+    """Set raw mode, 8N1 without flow control; discard bytes received at another speed."""
     speed = getattr(termios, f"B{baud}", None)
     if speed is None:
         raise OSError(errno.EINVAL, f"{baud} baud is not a speed of this system")
@@ -158,7 +158,7 @@ def _set_speed(descriptor: int, baud: int) -> None:
 
 
 def _receive(descriptor: int, listen_s: float) -> Iterator[Chunk]:
-    """Yield the bytes received within `listen_s`, stamped after the read."""
+    """Yield the bytes received within `listen_s`; their time stamps follow the read call."""
     until = time.monotonic() + listen_s
     while (left := until - time.monotonic()) > 0:
         ready, _, _ = select.select([descriptor], [], [], min(left, _POLL_S))

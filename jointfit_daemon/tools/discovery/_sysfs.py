@@ -1,4 +1,4 @@
-"""Attributes in sysfs and procfs, which are small text files."""
+"""Reading of attributes in sysfs and procfs, which are small text files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def read_attribute(path: Path) -> str | None:
     """Return the text of an attribute without its line end; None if it cannot be read."""
     try:
         return path.read_text(encoding="utf-8", errors="replace").strip()
-    except OSError:  # absent, or not supported by the driver in this state
+    except OSError:  # missing, or not readable in this state of the device
         return None
 
 

@@ -1,6 +1,6 @@
-"""Recognition of received bytes or frames by the decoders of all installed drivers.
+"""Recognition of a device by decoding received data with all installed drivers.
 
-Invariant: all functions are pure, apart from the import of drivers.
+Invariant: all functions are pure, except that they import drivers.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk
 
 LEAST_SAMPLES = 3
-"""Number of samples that identify a driver; noise may pass the checksum of one sample."""
+"""Minimum number of samples that identify a driver. Noise can pass the checksum of one sample."""
 LEAST_MESSAGES = 5
-"""Number of messages that identify a driver if the device sends no orientation."""
+"""Minimum number of messages that identify a driver if the device sends no orientation."""
 MOST_FOREIGN = 0.1
-"""Largest share of bytes outside of messages at which a device without orientations is
-recognized."""
+"""Largest share of bytes that belong to no message, for a device without orientations. With a
+larger share, the driver does not recognize the device."""
 _USUAL_RATES = (
     1,
     5,
@@ -47,14 +47,14 @@ _USUAL_RATES = (
     500,
     1000,
 )
-"""Usual rates of devices, Hz. A short reception measures the rate with an error of a few
-percent."""
+"""Usual output rates of devices, Hz. A rate measured in a short time has an error of a few percent.
+"""
 _NEAR = 0.06
-"""Largest relative difference between a measured and a usual rate."""
+"""Largest relative difference at which a measured rate is replaced by a usual rate."""
 
 
 Layouts: TypeAlias = "Mapping[str, Sequence[Mapping[str, Any]]]"
-"""Tables of rig.toml that describe the data of a device, by driver."""
+"""Tables of rig.toml that describe the data format of a device, by driver."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class DecodedDevice:
 
     driver: str
     settings: dict[str, Any]
-    """Keys of the device's table in rig.toml, without the keys of the connection."""
+    """Keys of the device's table in rig.toml, without the connection keys."""
     messages: int
     """Number of well-formed messages."""
     samples: int
@@ -71,14 +71,15 @@ class DecodedDevice:
     rate_hz: float | None
     """Measured rate of the orientations, Hz; None if fewer than two orientations arrived."""
     discarded_bytes: int
-    """Number of bytes that belong to no message. A rest of a message at the start is usual."""
+    """Number of bytes that belong to no message. Reception often starts within a message, so a few
+    such bytes are usual."""
     properties: dict[str, Any] = field(default_factory=dict)
-    """Properties that the device sent, such as its model."""
+    """Properties of the device from its messages, such as its model."""
     warnings: tuple[str, ...] = ()
 
     @property
     def usual_rate_hz(self) -> int | None:
-        """The rate for rig.toml: the usual one near the measured one, or whole Hz."""
+        """The rate for rig.toml: a usual rate near the measured rate, or the rounded rate, Hz."""
         if self.rate_hz is None:
             return None
         nearest = min(_USUAL_RATES, key=lambda rate: abs(rate - (self.rate_hz or 0)))
@@ -94,7 +95,7 @@ def decode_stream(
     other_than: str = "",
     layouts: Layouts | None = None,
 ) -> tuple[DecodedDevice, ...]:
-    """Return one device for each driver that decodes a byte stream; most samples first.
+    """Return one device for each driver that decodes a byte stream, most samples first.
 
     Parameters
     ----------
@@ -103,9 +104,9 @@ def decode_stream(
     baud
         Speed of the line, baud; None if unknown.
     other_than
-        Driver that is left out.
+        Driver that is not tried.
     layouts
-        Tables to try in addition to the table of each driver.
+        Tables to try in addition to the default table of each driver.
     """
     found = []
     for name, driver in installed_drivers():
@@ -126,17 +127,16 @@ def decode_frames(
     *,
     layouts: Layouts | None = None,
 ) -> Iterator[DecodedDevice]:
-    """Yield the sensors that the installed drivers decode; each identifier has one owner.
+    """Yield the sensors that the installed drivers decode; sensors share no identifier.
 
     Parameters
     ----------
     sizes
-        Number of data bytes of each identifier, by identifier and whether the identifier has 29
-        bits.
+        Number of data bytes of each frame, by identifier and a flag for 29-bit identifiers.
     chunks
-        Records of the frames.
+        Received CAN frames.
     layouts
-        Tables to try in addition to those that the drivers propose.
+        Tables to try in addition to the tables that the drivers propose.
     """
     used: set[tuple[int, bool]] = set()
     for name, driver in installed_drivers():
@@ -152,7 +152,7 @@ def decode_frames(
 def _candidate_tables(
     driver: type[Driver], sizes: Mapping[tuple[int, bool], int]
 ) -> Iterable[Mapping[str, Any]]:
-    """Return the tables that a driver proposes; the default table if it proposes none."""
+    """Return the tables that a driver proposes, or the default table without a proposal."""
     if driver.wire != "can" or not sizes:
         return ()
     if hasattr(driver, "candidate_tables"):
@@ -161,7 +161,7 @@ def _candidate_tables(
 
 
 def used_identifiers(table: Mapping[str, Any]) -> set[tuple[int, bool]]:
-    """Return the identifiers in the key ``ids`` of a table, each with a flag for 29 bits."""
+    """Return the identifiers in the key ``ids`` of a table, each with its 29-bit flag."""
     extended = bool(table.get("extended_ids"))
     return {(number, extended) for number in (table.get("ids") or {}).values()}
 
@@ -169,16 +169,16 @@ def used_identifiers(table: Mapping[str, Any]) -> set[tuple[int, bool]]:
 def decode_traffic(
     driver: type[Driver], name: str, table: Mapping[str, Any], chunks: Sequence[Chunk]
 ) -> DecodedDevice | None:
-    """Return the device whose data are in `chunks`; None if `driver` does not decode them.
+    """Return the device that sent `chunks`; None if `driver` does not decode the data.
 
     Parameters
     ----------
     driver, name
         Class and name of the driver.
     table
-        Keys of its table that matter for decoding.
+        Keys of the driver's table that determine the decoding.
     chunks
-        Received bytes or records of frames, with their arrival.
+        Received bytes or CAN frames, with their arrival times.
     """
     from jointfit_daemon.tools.decoder_settings import decoder_settings
 
@@ -200,7 +200,8 @@ def decode_traffic(
         rate_hz = (len(samples) - 1) * 1e9 / span_ns
     properties = {k: v for event in events if event.kind == "info" for k, v in event.data.items()}
 
-    # A warning names the setting that removes its cause, except the rate, which is measured here.
+    # A warning names the setting that removes its cause. The rate is excluded because it is
+    # measured.
     proposed = {
         key: value
         for event in events

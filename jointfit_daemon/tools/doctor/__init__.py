@@ -1,4 +1,4 @@
-"""`jointfit doctor`: faults of host, network and devices that keep data from the daemon."""
+"""Command `jointfit doctor`: finds the faults that keep data from the daemon."""
 
 from jointfit_daemon.tools.doctor._command import doctor
 

@@ -1,4 +1,4 @@
-"""Checks of the broker: address, TLS, credentials, rights, and other clients with the same id."""
+"""Checks of the broker: address, TLS, credentials, permissions, and clients with equal ids."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 CHECK = "broker"
 _STORED_S = 1.0
-"""Time to wait for the stored state of a daemon, s."""
+"""Time to wait for the retained state of a daemon, s."""
 
 
 async def check_broker(settings: MqttSettings) -> list[Finding]:
-    """Return the findings about the broker; connects with a client id of its own."""
+    """Return the findings about the broker; the connection uses its own client id."""
     address = f"{settings.host}:{settings.tcp_port}"
     missing = missing_files(settings)
     findings = [
@@ -46,7 +46,7 @@ async def check_broker(settings: MqttSettings) -> list[Finding]:
 
 
 async def _state(client: MqttClient) -> str | None:
-    """Return the stored state of the daemon with this base topic; None if there is none."""
+    """Return the retained state of the daemon with this base topic; None if there is none."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(_STORED_S):
             async for topic, payload in client.messages():

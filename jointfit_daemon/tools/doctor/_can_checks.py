@@ -24,9 +24,9 @@ def check_can(host: Host, bitrates: Mapping[str, int | None] | None) -> Iterator
     Parameters
     ----------
     host
-        The host.
+        The host to check.
     bitrates
-        SocketCAN interfaces of rig.toml with the bit rates it states, bit/s; None for all
+        SocketCAN interfaces of rig.toml with their configured bit rates, bit/s. The default is all
         interfaces of the host.
     """
     found = {interface.name: interface for interface in find_can_interfaces(host.root, host.run)}

@@ -74,13 +74,14 @@ def examine(
     Parameters
     ----------
     host
-        The host.
+        The host to check.
     rig
-        Contents of rig.toml; None checks all devices of the host, no broker and no cameras.
+        Contents of rig.toml. Without a rig, all devices of the host are checked, but no broker and
+        no cameras.
     wait_s
         Longest wait for frames of the cameras, s.
     progress
-        Called with the share of the work that is done, 0 to 1.
+        Callback that receives the completed share, 0 to 1.
     """
     from jointfit_daemon.device_search import Finding
     from jointfit_daemon.tools.doctor import _host_checks as of_host
@@ -121,7 +122,7 @@ def examine(
 
 
 async def _diagnose(cameras: Source, wait_s: float) -> list[Finding]:
-    """Return the findings of the driver of the cameras."""
+    """Return the findings of the motion-capture driver."""
     from jointfit_daemon.device_search import Finding
 
     if not hasattr(cameras.driver_class, "diagnose"):
@@ -132,7 +133,7 @@ async def _diagnose(cameras: Source, wait_s: float) -> list[Finding]:
 
 
 def _serial_paths(rig: Rig) -> list[str]:
-    """Return the serial ports of a rig: of sensors, and of CAN adapters on a serial port."""
+    """Return the serial ports of a rig, for sensors and for CAN adapters."""
     from jointfit_daemon.driver import SERIAL_ADAPTERS
 
     paths = []
@@ -146,7 +147,7 @@ def _serial_paths(rig: Rig) -> list[str]:
 
 
 def _can_bitrates(rig: Rig) -> dict[str, int | None]:
-    """Return the SocketCAN interfaces of a rig with the bit rates it states, bit/s, or None."""
+    """Return the SocketCAN interfaces of a rig with their configured bit rates, bit/s."""
     buses = (getattr(source.settings, "can", None) for source in rig.sources)
     return {
         bus.channel: bus.bitrate if "bitrate" in bus.model_fields_set else None

@@ -1,4 +1,4 @@
-"""Checks of the sensors behind serial ports: family, speed and outputs, found by listening only.
+"""Checks of the sensors on serial ports: family, speed and outputs, determined by listening.
 
 Invariant: nothing is sent to a device.
 """
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 CHECK = "sensor"
 _LISTEN_S = 1.0
-"""Time at each speed, s: three samples of a device at 5 Hz."""
+"""Time at each speed, s. It suffices for three samples at 5 Hz."""
 _CONNECTION = {"id", "segment", "driver", "port", "baud", "transport", "silence_s"}
-"""Keys of ``[[imu]]`` that do not change decoding."""
+"""Keys of ``[[imu]]`` that do not affect decoding."""
 _SILENT = (
     "silent, as a device that waits for a command: its family can be named only after the daemon "
     "opened it"
@@ -31,16 +31,16 @@ _SILENT = (
 
 
 def check_devices(host: Host, sources: Iterable[Source]) -> Iterator[Finding]:
-    """Yield findings from the data on serial ports, compared with the configured drivers.
+    """Compare the data on serial ports with the configured drivers; yield the findings.
 
-    Absent, forbidden and used ports are reported by the checks of serial ports.
+    Another module reports missing ports, ports without permission, and ports in use.
 
     Parameters
     ----------
     host
-        The host.
+        The host to check.
     sources
-        Devices of rig.toml; those without a serial port are skipped.
+        Devices of rig.toml. Devices without a serial port are skipped.
     """
     checked = [
         source
@@ -57,8 +57,8 @@ def _is_free(host: Host, source: Source) -> bool:
     node = host.at(source.settings.port)
     if not node.is_char_device() or not host.may_open(node):
         return False
-    # The simulator is one process that has the pseudo-terminal open; a daemon would be a second
-    # one.
+    # The simulator is one process that has the pseudo-terminal open. A running daemon is a second
+    # process.
     is_pseudo = node.resolve().is_relative_to(host.at("/dev/pts"))
     return len(host.holders(node)) <= is_pseudo
 
@@ -82,7 +82,7 @@ def _check(host: Host, source: Source) -> Finding:
 def _compare(  # noqa: PLR0911 - one for each finding
     source: Source, table: dict[str, Any], name: str, heard: SerialTraffic
 ) -> Finding:
-    """Return the finding about bytes that were received."""
+    """Return the finding that follows from the received bytes."""
     expected = f'driver "{source.driver}" at {source.settings.baud} baud'
     if not heard.devices:
         text = f"{sum(heard.received_bytes.values())} bytes, but no driver decodes them"
@@ -92,7 +92,7 @@ def _compare(  # noqa: PLR0911 - one for each finding
         )
         return Finding(CHECK, name, "error", f"{text}, expected {expected}", remedy)
 
-    # The driver also decodes the data with its defaults, but the keys of rig.toml decide.
+    # The driver also decodes the data with its default settings, but only rig.toml matters here.
     same = [device for device in heard.devices if device.driver == source.driver]
     own = [device for device in same if table.items() <= device.settings.items()] or same
     others = [device for device in heard.devices if device.driver != source.driver]

@@ -1,4 +1,4 @@
-"""Result of `jointfit doctor`, and the conversion to text."""
+"""Result of `jointfit doctor`, and its conversion to text."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ _WORST_FIRST: tuple[Level, ...] = ("error", "warning")
 
 @dataclass(frozen=True, slots=True)
 class DoctorReport:
-    """All findings, and the worst level among them."""
+    """All findings, and the most severe level among them."""
 
     level: Level
-    """``error``, ``warning``, or ``ok`` if there is neither."""
+    """``error``, ``warning``, or ``ok`` without errors and warnings."""
     findings: list[Finding]
 
 
 def report_of(findings: list[Finding]) -> DoctorReport:
-    """Return the report with the worst level of `findings`."""
+    """Return the report with `findings` and their most severe level."""
     levels = {finding.level for finding in findings}
     return DoctorReport(next((each for each in _WORST_FIRST if each in levels), "ok"), findings)
 

@@ -1,4 +1,4 @@
-"""Facts about this host, below a root folder and from a few calls of the system.
+"""Facts about this host, from files below a root folder and from a few system calls.
 
 Invariant: everything is read without root access, and nothing is changed.
 """
@@ -20,28 +20,29 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 _TIMEX_BYTES = 256
-"""Buffer size, at least the size of ``struct timex``; modes = 0 only reads."""
+"""Size of the buffer for ``struct timex``, bytes; it may be too large. The value 0 in ``modes``
+only reads the clock state."""
 _STATUS_OFFSET = 40
-"""Position of the field ``status`` on 64-bit systems: after ``modes`` and four more fields."""
+"""Offset of the field ``status`` on 64-bit systems, bytes. Five fields precede it."""
 _STA_UNSYNC = 0x40
 
 
 def clock_is_synchronized() -> bool | None:
-    """Return whether a service disciplines the system clock (adjtimex); None if unknown."""
+    """Return whether the system clock is synchronized (adjtimex); None if unknown."""
     if ctypes.sizeof(ctypes.c_long) != ctypes.sizeof(ctypes.c_int64):
-        return None  # this system has another layout
+        return None  # 32-bit systems have another layout
     buffer = ctypes.create_string_buffer(_TIMEX_BYTES)
     try:
         if ctypes.CDLL(None, use_errno=True).adjtimex(buffer) < 0:
             return None
-    except AttributeError:  # no adjtimex in this C library
+    except AttributeError:  # the C library has no adjtimex
         return None
     status = ctypes.c_int.from_buffer(buffer, _STATUS_OFFSET).value
     return not status & _STA_UNSYNC
 
 
 def can_read_and_write(path: Path) -> bool:
-    """Return whether this user may open `path`."""
+    """Return whether this user may read and write `path`."""
     return os.access(path, os.R_OK | os.W_OK)
 
 
@@ -57,7 +58,7 @@ def own_groups() -> frozenset[str]:
 
 
 def members_of(group: str) -> frozenset[str]:
-    """Return the users that the system's database lists in `group`."""
+    """Return the members of `group` in the system's group database."""
     try:
         return frozenset(grp.getgrnam(group).gr_mem)
     except KeyError:
@@ -80,7 +81,7 @@ def free_bytes(folder: Path) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Host:
-    """The host to check; tests replace single methods.
+    """The host to check. Tests replace some of the methods.
 
     Parameters
     ----------
@@ -110,11 +111,11 @@ class Host:
                 yield int(folder.name), name, folder
 
     def is_running(self, name: str) -> bool:
-        """Return whether a process has this name; the kernel keeps 15 characters."""
+        """Return whether a process has this name, of which the kernel stores 15 characters."""
         return any(found == name[:15] for _, found, _ in self.processes())
 
     def holders(self, device: Path) -> list[tuple[int, str]]:
-        """Return the processes that have `device` open, if this user may inspect them."""
+        """Return the processes that have `device` open, as far as this user may inspect them."""
         wanted = device.resolve()
         found = []
         for number, name, folder in self.processes():
@@ -122,6 +123,6 @@ class Host:
                 links = list((folder / "fd").iterdir())
                 if any(self.at(str(link.readlink())) == wanted for link in links):
                     found.append((number, name))
-            except OSError:  # process of another user, or ended
+            except OSError:  # the process has ended, or belongs to another user
                 continue
         return found

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.doctor._host import Host
 
 LOW_DISK_BYTES, LEAST_DISK_BYTES = 1_000_000_000, 50_000_000
-"""Free space below which a warning and an error are reported, bytes. An hour of recording takes
-about 0.3 GB."""
+"""Free space below which a warning is reported, and below which an error is reported, bytes. An
+hour of recording needs about 0.3 GB."""
 LOW_MEMORY_KB = 200_000
 """Available memory below which a fit may fail, kB."""
 _HARDWARE_GOVERNORS = ("intel_pstate", "amd-pstate-epp")
@@ -25,7 +25,7 @@ _SERVICE_STATE = "/var/lib/jointfitd"
 
 
 def check_clock(host: Host, *, needed: bool) -> Iterator[Finding]:
-    """Yield the finding about clock synchronization; `needed` if cameras use PTP stamps."""
+    """Yield the finding on clock synchronization; the cameras' PTP stamps make it `needed`."""
     synchronized = host.clock_is_synchronized()
     if synchronized is None:
         text = "the state of the clock cannot be read here"

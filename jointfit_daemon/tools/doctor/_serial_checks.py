@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 CHECK = "serial"
 MOST_LATENCY_MS = 2
-"""Largest delay of an FTDI adapter that does not delay samples noticeably, ms."""
+"""Largest acceptable latency timer of an FTDI adapter, ms. A longer delay affects the samples."""
 _MODEM_PORTS = ("ttyACM", "ttyUSB")
 _DAEMON_NAMES = ("jointfitd", "python")
 _RULES = (
@@ -31,9 +31,9 @@ def check_serial(host: Host, paths: Sequence[str] | None) -> Iterator[Finding]:
     Parameters
     ----------
     host
-        The host.
+        The host to check.
     paths
-        Ports of rig.toml; None for all USB adapters of the host.
+        Ports of rig.toml; the default is all USB adapters of the host.
     """
     ports = find_serial_ports(host.root)
     checked = [port.path for port in ports if port.vendor_id is not None]
@@ -59,7 +59,7 @@ def _check_port(host: Host, path: str, ports: Sequence[SerialPortInfo]) -> Itera
     if not host.may_open(node):
         yield _permission(host, path, node)
 
-    # The simulator, or a terminal program, holds both ends of a pseudo-terminal.
+    # One process, such as the simulator, holds both ends of a pseudo-terminal.
     is_pseudo = node.resolve().is_relative_to(host.at("/dev/pts"))
     holders = [] if is_pseudo else host.holders(node)
     for number, program in holders:
@@ -104,7 +104,7 @@ def _permission(host: Host, path: str, node: Path) -> Finding:
 
 
 def _is_probed(host: Host, name: str) -> bool:
-    """Return whether ModemManager runs, and no udev rule excludes the port."""
+    """Return whether ModemManager runs and no udev rule excludes the port."""
     if not host.is_running("ModemManager"):
         return False
     number = read_attribute(host.root / "sys/class/tty" / name / "dev")

@@ -1,4 +1,4 @@
-"""`jointfit ik`: joint coordinates of a marker trial by inverse kinematics."""
+"""Command `jointfit ik`: computes joint coordinates of a marker trial by inverse kinematics."""
 
 from jointfit_daemon.tools.ik._command import ik
 

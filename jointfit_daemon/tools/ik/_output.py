@@ -1,6 +1,6 @@
-"""Writes joint coordinates and marker errors: OpenSim's MOT and STO tables, and CSV.
+"""Writes joint coordinates and marker errors as OpenSim tables (MOT, STO) and CSV files.
 
-OpenSim reads no empty cells: a MOT or STO file contains the known part of the table, see
+OpenSim cannot read empty cells, so a MOT or STO file contains the known part of the table, see
 `files.orientations`. A CSV file contains all columns and frames.
 """
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 ENDINGS = (".mot", ".sto", ".csv")
 ERROR_COLUMNS = ("total_squared_error", "marker_error_RMS", "marker_error_max")
-"""Column names of OpenSim's file of marker errors; m^2 and m."""
+"""Column names in OpenSim's file of marker errors; the values are in m^2 and m."""
 
 
 def write_tables(
@@ -32,7 +32,7 @@ def write_tables(
     with_sd: bool,
     in_degrees: bool,
 ) -> list[WrittenTable]:
-    """Write coordinates and marker errors to the requested files; return an outcome per file."""
+    """Write coordinates and marker errors to the requested files; return one result per file."""
     tables = [
         write_coordinates(path, found, with_sd=with_sd, in_degrees=in_degrees)
         for path in coordinates
@@ -56,7 +56,7 @@ def write_coordinates(
 
 
 def write_errors(path: Path, found: TrialSolution) -> WrittenTable:
-    """Write sum of squares, RMS and maximum of the marker errors of each frame, m^2 and m."""
+    """Write sum of squares (m^2), RMS (m) and maximum (m) of the marker errors in each frame."""
     square, seen = found.distances**2, np.isfinite(found.distances)
     total = np.where(seen, square, 0.0).sum(axis=1)
     count = seen.sum(axis=1)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _MM = 1000.0
 _WORST = 3
-"""Number of markers in the line ``worst``."""
+"""Number of markers that the output line ``worst`` lists."""
 _MARKER_HEAD = ("marker", "segment", "frames", "RMS, mm", "max, mm", "at, s")
 _COORDINATE_HEAD = ("coordinate", "unit", "min", "max", "sd")
 
@@ -75,19 +75,19 @@ def _coordinates(found: TrialSolution) -> list[tuple[str, ...]]:
 
 
 def _errors(found: TrialSolution) -> tuple[Array, NDArray[np.bool_]]:
-    """Return squared errors, m^2, zero where unknown, and a mask of the known errors."""
+    """Return the squared errors, m^2 (0 where unknown), and whether each error is known."""
     seen: NDArray[np.bool_] = np.isfinite(found.distances) & found.solved[:, None]
     return np.where(seen, found.distances, 0.0) ** 2, seen
 
 
 def _overall(found: TrialSolution) -> tuple[float, float]:
-    """Return RMS and largest marker error of all frames with a solution, m."""
+    """Return the RMS and the largest marker error over all frames with a solution, m."""
     square, seen = _errors(found)
     return float(np.sqrt(square.sum() / max(seen.sum(), 1))), float(np.sqrt(square.max()))
 
 
 def _by_marker(found: TrialSolution) -> tuple[Array, Array, Array]:
-    """Return RMS and largest error, m, and the time of the largest error, s, of each marker."""
+    """Return RMS error (m), largest error (m) and time of the largest error (s) by marker."""
     square, seen = _errors(found)
     rms = np.sqrt(square.sum(axis=0) / np.maximum(seen.sum(axis=0), 1))
     return rms, np.sqrt(square.max(axis=0)), found.t_s[square.argmax(axis=0)]

@@ -1,6 +1,7 @@
-"""Inverse kinematics of one trial: input checks, solution, and coordinates with uncertainty.
+"""Inverse kinematics of one trial: input checks, solution, and coordinates with their uncertainty.
 
-A coordinate is NaN if its frame has no solution, or if the visible markers do not determine it.
+A coordinate is NaN if its frame has no solution, or if the visible markers do not determine the
+coordinate.
 """
 
 from __future__ import annotations
@@ -45,19 +46,20 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.inverse_kinematics import IkResult
 
 _LIMIT_M2 = 1.0
-"""Weight of the excess over joint limits, m^2/rad^2, as in `jointfit markers`."""
+"""Weight of angles beyond the joint limits, m^2/rad^2; `jointfit markers` uses the same weight."""
 _MOST_HINTS = 5
-"""Maximum number of missing markers for which one note proposes names."""
+"""Maximum number of missing markers in a note that proposes similar names."""
 _FEWEST_MARKERS = 3
-"""Smallest number of markers of a frame with a solution. Fewer markers do not determine the
+"""Minimum number of visible markers in a frame with a solution. Fewer markers do not determine the
 position of the first segment."""
 _MISFIT_RAD = 0.0017
-"""Rotation outside of the model's coordinates above which a note is given, rad: 0.1 degrees."""
+"""Threshold of a note, rad (0.1 degrees): the rotation that the coordinates of the model cannot
+represent."""
 
 
 @dataclass(frozen=True, slots=True)
 class IkRequest:
-    """Options of the command line."""
+    """Command-line options."""
 
     trial: Path
     model: Path
@@ -71,7 +73,7 @@ class IkRequest:
 
 @dataclass(frozen=True, slots=True)
 class TrialSolution:
-    """Coordinates and marker errors at T instants; K coordinates, M tracked markers."""
+    """Coordinates and marker errors at T times, with K coordinates and M tracked markers."""
 
     trial: str
     model: ChainModel
@@ -82,19 +84,19 @@ class TrialSolution:
     values: Array
     """Value of each coordinate, rad and m, shape (T, K); NaN where unknown."""
     sd: Array
-    """Standard deviations, rad and m, shape (T, K); NaN where unknown."""
+    """Standard deviation of each coordinate, rad and m, shape (T, K); NaN where unknown."""
     marker_names: tuple[str, ...]
     distances: Array
-    """Marker errors, m, shape (T, M); NaN where missing."""
+    """Distance of each marker from its model position, m, shape (T, M); NaN where missing."""
     solved: NDArray[np.bool_]
-    """Frames with a solution, shape (T,)."""
+    """Whether the frame has a solution, shape (T,)."""
     restarted: int
-    """Number of frames with a smaller error after a restart from another pose."""
+    """Number of frames whose error decreased after a restart from another pose."""
     notes: tuple[str, ...]
 
     @property
     def complete(self) -> NDArray[np.bool_]:
-        """Frames in which all coordinates are known, shape (T,)."""
+        """Whether all coordinates of the frame are known, shape (T,)."""
         return np.asarray(np.isfinite(self.values).all(axis=1))
 
 
@@ -104,9 +106,10 @@ def solve_trial(asked: IkRequest) -> TrialSolution:
     Raises
     ------
     RefinementError
-        The trial does not fit the model: other markers, unit, size or labels.
+        The trial does not fit the model because of other markers, another unit, size or labels.
     ValueError
-        Unknown names in options, an empty time range; `MalformedFileError` for broken files.
+        A name in an option is unknown, or the time range is empty. A damaged file raises
+        `MalformedFileError`.
     """
     loaded = load_model(asked.model)
     setup = IkSetup({}, None, ()) if asked.setup is None else read_ik_setup(asked.setup)
@@ -137,7 +140,7 @@ def solve_trial(asked: IkRequest) -> TrialSolution:
     found = solve_frames(model, targets, weights, options=options)
     found, improved = restart_local_minima(model, targets, weights, found, options)
 
-    # Add remarks on exchanged labels; raise `RefinementError` if the model does not fit.
+    # Note exchanged labels; raise `RefinementError` if the trial does not fit the model.
     remarks = []
     for group, frames in exchanged_markers(found.residuals, motion.targets).items():
         text = exchange_text(model, group)
@@ -160,7 +163,7 @@ def _weights(asked: IkRequest, setup: IkSetup, model: ChainModel) -> tuple[Array
     weights, notes = model.weights.copy(), []
     index = {name: k for k, name in enumerate(model.marker_names)}
     if setup.weights:
-        # as in OpenSim, markers without a task are not tracked
+        # As in OpenSim, markers without a task are not tracked.
         weights = np.array([setup.weights.get(name, 0.0) for name in index])
         unknown = [name for name in setup.weights if name not in index]
         if unknown:
@@ -222,7 +225,7 @@ def _described(
     solved = found.converged & (seen.sum(axis=1) >= _FEWEST_MARKERS)
     covariance, determined = pose_covariance(model, found)
 
-    # Coordinates of joints whose markers determine all degrees of freedom, shape (T, K).
+    # Whether the markers determine all degrees of freedom of the coordinate's joint, shape (T, K).
     whole = [
         determined[:, columns].all(axis=1)
         for columns, joint in zip(loaded.chain.columns, loaded.coordinates, strict=True)

@@ -1,4 +1,4 @@
-"""`jointfit markers`: marker positions on their segments, refined from motion trials."""
+"""Command `jointfit markers`: refines marker positions on segments from motion trials."""
 
 from jointfit_daemon.tools.markers._command import markers
 

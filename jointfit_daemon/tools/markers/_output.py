@@ -1,7 +1,7 @@
 """Writes refined markers as a chain model, an OpenSim marker set, or offsets in a TRC file.
 
-OpenSim files use OpenSim axes (y up). Markers of a body that the import welded to its parent are
-written on the parent, at the same position in space.
+OpenSim files have the axes of OpenSim (y up). If the import welded a body to its parent, the
+markers of the body are written on the parent. Their positions in space are unchanged.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _OPENSIM_VERSION = "40000"
 
 
 def write_markers(path: Path, before: ChainModel, after: ChainModel) -> None:
-    """Write the markers; the file extension selects the format."""
+    """Write the markers; the file extension determines the format."""
     kind = path.suffix.lower()
     if kind == ".xml":
         root = ET.Element("OpenSimDocument", Version=_OPENSIM_VERSION)
@@ -42,7 +42,7 @@ def write_markers(path: Path, before: ChainModel, after: ChainModel) -> None:
         ET.indent(root)
         ET.ElementTree(root).write(path, encoding="utf-8", xml_declaration=True)
     elif kind == ".trc":
-        # One frame with the displacement of each marker, m, in segment axes.
+        # The file has one frame with the displacement of each marker, m, in segment axes.
         moved = (after.positions - before.positions)[None]
         one = np.ones(1, dtype=np.int64)
         write_trc(path, MarkerTrajectories(after.marker_names, np.zeros(1), one, moved, 1.0))

@@ -1,4 +1,4 @@
-"""Plot of a refinement: residual and displacement of each marker, error of each trial."""
+"""Plot of a refinement: residual and displacement of each marker, and error of each trial."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ _BEFORE, _AFTER, _MOVED = "tab:gray", "tab:blue", "tab:orange"
 
 
 def draw_refinement(path: Path, found: Refinement) -> None:
-    """Write one figure; the file extension selects the format."""
+    """Write one figure; the file extension determines the format."""
     figure = new_figure(11.0, max(4.0, 0.22 * len(found.markers) + 1.5))
     left, right = figure.subplots(1, 2, width_ratios=(2, 1))
     figure.suptitle(f"{found.model.name}: {found.method}")
 
-    # Residual before and after, and displacement, by marker
+    # Residual before and after refinement, and displacement, by marker
     places = np.arange(len(found.markers))
     before = [_MM * m.rms_before for m in found.markers]
     after = [_MM * m.rms_after for m in found.markers]
@@ -38,7 +38,7 @@ def draw_refinement(path: Path, found: Refinement) -> None:
     left.grid(alpha=0.3)
     left.legend(fontsize=8)
 
-    # Tracking error before and after, by trial
+    # Tracking error before and after refinement, by trial
     places = np.arange(len(found.trials))
     right.barh(places - 0.2, [_MM * t.before.rms for t in found.trials], 0.4, color=_BEFORE)
     right.barh(places + 0.2, [_MM * t.after.rms for t in found.trials], 0.4, color=_AFTER)

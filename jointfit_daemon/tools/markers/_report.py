@@ -83,7 +83,7 @@ def _summary(found: Refinement) -> list[str]:
             )
 
     for trained, word in ((True, "training"), (False, "validation")):
-        # The RMS of the trial with the largest RMS, and the largest marker error, m.
+        # Largest RMS error of a trial, and largest error of a marker, m.
         errors = [t.after for t in found.trials if t.trained is trained]
         unknown = float("nan")
         rms_after, largest = (

@@ -1,4 +1,4 @@
-"""Input of `jointfit markers`: a chain model, and trials with columns in its marker order.
+"""Input of `jointfit markers`: a chain model, and trials in the marker order of the model.
 
 Positions of markers that are missing in a trial are NaN. Unknown names in options raise
 `ValueError`.
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ModelRequest:
-    """Options of the command line that change the model."""
+    """Command-line options that change the model."""
 
     model: Path
     lock: tuple[str, ...] = ()
@@ -42,12 +42,12 @@ class ModelRequest:
 def load(
     asked: ModelRequest, trials: Sequence[Path], validation: Sequence[Path]
 ) -> tuple[ChainModel, tuple[str, ...], list[MotionTrial], list[MotionTrial]]:
-    """Return the chain, remarks of its import, training trials and validation trials.
+    """Return the chain model, notes from its import, training trials and validation trials.
 
     Raises
     ------
     ValueError
-        Unknown names in locks; `MalformedFileError` for broken files.
+        A name in a lock option is unknown. A damaged file raises `MalformedFileError`.
     """
     read = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in trials]
     judges = [read_marker_trial(path, cast("Axis | None", asked.up)) for path in validation]

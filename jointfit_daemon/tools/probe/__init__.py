@@ -1,4 +1,4 @@
-"""`jointfit probe`: devices of this host, and the drivers that decode their data."""
+"""Command `jointfit probe`: lists devices of this host, and drivers that decode their data."""
 
 from jointfit_daemon.tools.probe._command import probe
 

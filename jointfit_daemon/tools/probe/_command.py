@@ -204,11 +204,11 @@ def _report(
 async def _servers(
     hosts: Sequence[tuple[str, int | None]], *, network: bool, wait_s: float
 ) -> tuple[list[FoundServer], list[str]]:
-    """Return the servers that answered, and the fault of each host without an answer."""
+    """Return the servers that answered, and an error text for each host without an answer."""
     from jointfit_daemon.tools.discovery import find_mocap_servers
 
     async def ask(name: str, port: int | None) -> list[FoundServer] | str:
-        """Return the servers that answered, or the fault if none answered."""
+        """Return the servers that answered, or the error text if no server answered."""
         named = name != _NETWORK
         try:
             answered = await find_mocap_servers(
@@ -241,13 +241,13 @@ _REMEDIES = {
     "rig.toml` names the cause)",
     False: "routers and firewalls stop broadcasts; name the server with --mocap HOST",
 }
-"""Remedy if no server answered, by whether the user named a host."""
+"""Remedy if no server answered; the key states whether the user named a host."""
 
 
 def _faults(
     serial: Sequence[SerialTraffic], can: Sequence[CanTraffic], listen_s: float
 ) -> list[str]:
-    """Return why a port or interface was not recognized, with the remedy."""
+    """Return the reason and the remedy for each port or interface without recognized data."""
     faults = []
     for port in serial:
         if port.fault is not None:

@@ -1,4 +1,4 @@
-"""Layouts in an existing rig.toml that describe devices without their own driver."""
+"""Frame layouts in an existing rig.toml, for devices without their own driver."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _CONNECTION = ("id", "segment", "driver", "port", "can", "baud", "transport", "s
 
 
 def described_layouts(rig: Path) -> Layouts:
-    """Return the described layouts of a rig by driver; none without a readable rig.
+    """Return the layouts in a rig, by driver; none if the rig cannot be read.
 
-    Faults of the rig are reported by `jointfit check`.
+    The command `jointfit check` reports the faults of the rig.
     """
     try:
         imus = parse_toml(rig.read_text(encoding="utf-8")).get("imu", [])

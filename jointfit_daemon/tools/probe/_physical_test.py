@@ -1,6 +1,6 @@
-"""Guided test of one sensor: three rotations by hand check the configured frames.
+"""Guided test of one sensor, in which three rotations by hand check the configured frames.
 
-The driver runs as in the daemon; `jointfit_daemon.physical_test` evaluates the chunks of the
+The driver runs as in the daemon. `jointfit_daemon.physical_test` evaluates the chunks from the
 driver.
 """
 
@@ -19,26 +19,27 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk
 
 OPEN_S = 20.0
-"""Longest time from opening to the first orientation, s; including a search at other speeds."""
+"""Time limit from opening the device to the first orientation, s. It includes a search at other
+speeds."""
 
 
 class PhysicalTestError(Exception):
-    """The sensor sent no orientation, or did not rest in time."""
+    """The sensor sent no orientation, or did not rest within the time limit."""
 
 
 async def run_physical_test(
     source: Source, tell: Callable[[str], None], *, step_s: float
 ) -> PhysicalTestResult:
-    """Guide through the rotations, and evaluate them.
+    """Guide the user through the rotations, and evaluate them.
 
     Parameters
     ----------
     source
         Sensor of a rig.
     tell
-        Called with each instruction.
+        Function that shows an instruction.
     step_s
-        Longest time for a step, s.
+        Time limit of a step, s.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Result of `jointfit probe`, and the conversion to text."""
+"""Result of `jointfit probe`, and its conversion to text."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ProbeReport:
-    """Devices of this host, and results of the reception where it was requested."""
+    """Devices of this host, and the results of the requested receptions."""
 
     serial_ports: list[SerialPortInfo]
     can_interfaces: list[CanInterface]
@@ -35,9 +35,9 @@ class ProbeReport:
     can: list[CanTraffic]
     """Results of the reception on the interfaces of ``--can``."""
     mocap_servers: list[FoundServer]
-    """Servers that answered to ``--mocap`` or ``--network``."""
+    """Servers that answered the requests of ``--mocap`` or ``--network``."""
     faults: list[str]
-    """Requests without a result, each with a remedy."""
+    """Error texts about requests without a result, each with a remedy."""
     rig_toml: str
     """Lines for rig.toml; empty if nothing was recognized."""
 

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     )
 
 _USB_SERIAL = "cdc_acm"
-"""Kernel driver of devices that are on USB themselves and therefore have no line of their own."""
+"""Kernel driver of sensors with their own USB interface. They have no serial line and no line
+speed."""
 
 
 def rig_lines(
@@ -28,7 +29,7 @@ def rig_lines(
     can: Sequence[CanTraffic],
     servers: Sequence[FoundServer],
 ) -> str:
-    """Return tables of rig.toml; the user replaces names of sensors and segments."""
+    """Return tables for rig.toml, in which the user replaces the sensor and segment names."""
     names = [traffic.interface for traffic in can if traffic.devices]
     buses = [
         _table(f"[can.{toml_key(name)}]", {"interface": "socketcan", "channel": name})
@@ -75,7 +76,7 @@ def _imu(number: int, device: DecodedDevice, connection: dict[str, Any]) -> str:
     if device.usual_rate_hz is not None:
         keys["rate_hz"] = device.usual_rate_hz
 
-    # required keys that the data do not contain
+    # Required keys of the driver that the received data do not contain.
     fields = find_driver(device.driver).Settings.model_fields
     missing = [key for key, field in fields.items() if field.is_required() and key not in keys]
     return _table("[[imu]]", keys) + "".join(
@@ -89,7 +90,7 @@ def _cameras(servers: Sequence[FoundServer]) -> Iterator[str]:
     for server in servers[:1]:  # a rig has one camera system
         keys: dict[str, Any] = {"driver": server.driver, "server": server.server}
 
-        # Write the command port if it is not the default of the driver.
+        # Write the command port if it differs from the driver's default.
         field = find_driver(server.driver).Settings.model_fields.get("command_port")
         if field is not None and field.default != server.port:
             keys["command_port"] = server.port

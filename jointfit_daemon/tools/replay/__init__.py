@@ -1,4 +1,4 @@
-"""`jointfit replay`: runs a recording through the core again, verifies it, or publishes it."""
+"""Command `jointfit replay`: processes a recording again, verifies it, or publishes it."""
 
 from jointfit_daemon.tools.replay._command import replay
 

@@ -1,4 +1,4 @@
-"""Command `jointfit replay`: processes a recording in a new core, to verify, show or publish it.
+"""Command `jointfit replay`: processes a recording again, to verify, show or publish it.
 
 Invariant: a replay changes no file.
 """
@@ -91,7 +91,7 @@ def replay(
 
 
 def _speed(text: str | None, default: float) -> float:
-    """Return the speed as a factor; infinity for ``max``."""
+    """Return the factor of the recorded speed; ``max`` is infinity."""
     if text is None:
         return default
     if text == _FASTEST:
@@ -122,7 +122,7 @@ def _calibration(given: str, rig: Rig) -> Calibration:
     Raises
     ------
     ValueError
-        There is no such version or file, or it is damaged.
+        The version or the file does not exist, or it is damaged.
     """
     from jointfit_daemon.calibration.record import CalibrationFileError, CalibrationStore
     from jointfit_daemon.reprocessing import load_calibration

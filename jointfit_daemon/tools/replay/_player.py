@@ -1,4 +1,4 @@
-"""Plays a recording at a speed: time line on the terminal, and payloads to a broker."""
+"""Plays a recording at a given speed; prints a time line, and publishes payloads to a broker."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _NS_PER_S = 1e9
 _YIELD_EVENTS = 200
-"""Number of events between two pauses for other tasks at the highest speed."""
+"""Number of events after which other tasks can run, at the highest speed."""
 
 
 @dataclass(slots=True)
@@ -40,10 +40,10 @@ class PlaySummary:
     dropped: int = 0
     """Number of messages that the broker did not accept."""
     settings: str = "as recorded"
-    """Whether the replay uses the recorded rig and the recorded calibration."""
+    """Text about the rig and the calibration of the replay."""
 
     def add(self, seconds: float, outputs: list[Output]) -> None:
-        """Add an event at the recorded time `seconds`, with its outputs."""
+        """Count the outputs of an event at the recorded time `seconds`."""
         self.events += 1
         self.states += sum(isinstance(output, LimbState) for output in outputs)
         self.seconds = max(self.seconds, seconds)
@@ -74,21 +74,21 @@ async def play_recording(
     *,
     quiet: bool = False,
 ) -> PlaySummary:
-    """Run a recording through a new core at a speed, and return a summary.
+    """Process a recording with a new core at a given speed, and return a summary.
 
     Parameters
     ----------
     file
-        The recording.
+        Path of the recording.
     changes
         Differences from the recorded run.
     speed
-        Multiple of the recorded speed; infinity: as fast as possible.
+        Factor of the recorded speed; infinity selects the highest possible speed.
     destination
-        Base topic and broker for the publication, each None for the default. None publishes
-        nothing.
+        Base topic and broker for the publication; None in the tuple selects the default. Without a
+        destination, nothing is published.
     quiet
-        Whether to print no time line.
+        Whether to omit the time line.
 
     Raises
     ------
@@ -132,7 +132,7 @@ async def play_recording(
 
 
 class _Pace:
-    """Waits until an instant of the recording is due."""
+    """Timer that waits until the time of a recorded event is due."""
 
     def __init__(self, speed: float) -> None:
         self._speed, self._began_s = speed, time.monotonic()
@@ -140,7 +140,7 @@ class _Pace:
         self._events = 0
 
     async def wait(self, t_ns: int) -> None:
-        """Return when `t_ns` is due; let other tasks run at intervals."""
+        """Wait until `t_ns` is due; let other tasks run at intervals."""
         if self._first_ns is None:
             self._first_ns, self._began_s = t_ns, time.monotonic()
         self._events += 1

@@ -1,8 +1,8 @@
-"""Publication of a replay: topics and payloads of the daemon, below a base topic of their own.
+"""Publication of a replay with the topics and payloads of the daemon, below its own base topic.
 
-The payloads contain the time stamps of the recording. The topic ``bridge/health`` is not published:
-it describes a running daemon. Invariant: requests to a replay are ignored, and no message leaves
-the base topic.
+The payloads contain the time stamps of the recording. The topic ``bridge/health`` describes a
+running daemon, so it is not published. Invariant: requests to a replay are ignored, and all
+messages are below the base topic of the replay.
 """
 
 from __future__ import annotations
@@ -28,23 +28,23 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output
 
 PREFIX = "replay/"
-"""Prefix of the base topic; it prevents subscribers from mistaking a replay for the daemon."""
+"""Prefix of the base topic. It prevents subscribers from confusing a replay with the daemon."""
 CONNECT_S = 5.0
 """Longest wait for the broker, s."""
 _DRAIN_S = 5.0
 """Longest wait for the broker to accept the last messages, s."""
 _FULL, _POLL_S = 100, 0.002
-"""Number of queued messages at which the replay waits for the broker, and the interval of the
+"""Number of queued messages at which the replay waits for the broker, and the interval between
 checks, s."""
 
 
 class RecordedClock(UnixClock):
-    """Clock that returns UNIX time and host time of the instant that is played."""
+    """Clock that returns the UNIX time and the host time of the current recorded event."""
 
     def __init__(self) -> None:
         super().__init__()
         self.played_ns = 0
-        """Instant that is played, CLOCK_MONOTONIC of the recorded host, ns."""
+        """Time of the current event, CLOCK_MONOTONIC of the recorded host, ns."""
         self.recorded_offset_ns = 0
         """UNIX time minus CLOCK_MONOTONIC of the recorded host, ns."""
 
@@ -63,11 +63,11 @@ class Publication:
     Parameters
     ----------
     rig
-        The first rig: names, rates and broker.
+        First recorded rig, with names, rates and broker.
     base
-        Base topic; None: `PREFIX` and the base topic of the rig.
+        Base topic; the default is `PREFIX` followed by the base topic of the rig.
     broker
-        ``HOST`` or ``HOST:PORT``; None: the broker of the rig.
+        ``HOST`` or ``HOST:PORT``; the default is the broker of the rig.
 
     Raises
     ------
@@ -80,7 +80,7 @@ class Publication:
         self._clock = RecordedClock()
         rig = self._moved(rig)
         self._settings = rig.mqtt
-        # The client has no clock, so no message expires. A replay waits for the broker instead.
+        # The clock is constant, so no message expires. Instead, the replay waits for the broker.
         self._outbox = Outbox(topics.BRIDGE_STATE.name(rig.mqtt.base), clock=lambda: 0.0)
         self._link = MqttPublisher(rig.mqtt, self._outbox, lambda _: None)
         self._topics = TopicWriter(rig, self._outbox, self._clock)
@@ -99,7 +99,7 @@ class Publication:
     def _moved(self, rig: Rig) -> Rig:
         """Return `rig` with the broker and the base topic of the replay."""
         changed: dict[str, object] = {"base": self._base or PREFIX + rig.mqtt.base}
-        changed["home_assistant"] = None  # discovery would announce a second device
+        changed["home_assistant"] = None  # a discovery message would announce another device
         if self._broker is not None:
             host, _, port = self._broker.partition(":")
             changed |= {"host": host, "port": port or 0}
@@ -142,7 +142,7 @@ class Publication:
             await asyncio.sleep(_POLL_S)
 
     async def stop(self) -> None:
-        """Send the last messages, remove the retained ones, and disconnect."""
+        """Send the last messages, remove the retained messages, and disconnect."""
         await self._link.emptied(_DRAIN_S, streams=True)
         for topic in self._outbox.retained:
             if topic != self._outbox.state_topic:

@@ -1,4 +1,4 @@
-"""`jointfit schema`: JSON Schemas of rig.toml, payloads and requests, and the AsyncAPI document."""
+"""Command `jointfit schema`: prints JSON Schemas, and the AsyncAPI document."""
 
 from jointfit_daemon.tools.schema._command import schema
 

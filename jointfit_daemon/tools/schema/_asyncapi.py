@@ -19,11 +19,11 @@ _SIGNATURE = {
     "nonce": {"type": "string", "pattern": "^[A-Za-z0-9-]{16,64}$"},
     "signature": {"type": "string", "description": "HMAC-SHA256 in hexadecimal"},
 }
-"""Keys of a signed request."""
+"""Schema of the keys that a signed request contains in addition."""
 
 
 def request_schema(name: str) -> dict[str, Any]:
-    """Return the JSON Schema (2020-12) of a request, with the keys of a signature."""
+    """Return the JSON Schema (2020-12) of a request, including the signature keys."""
     schema = REQUESTS[name].model.model_json_schema()
     schema["properties"] = schema["properties"] | _SIGNATURE
     return schema
@@ -32,7 +32,7 @@ def request_schema(name: str) -> dict[str, Any]:
 def asyncapi_document() -> dict[str, Any]:
     """Return the document: one channel for each topic, request and answer.
 
-    The document takes the view of the daemon, which sends states and streams and receives requests.
+    The document describes the daemon's view: it sends states and streams, and receives requests.
     """
     channels: dict[str, Any] = {}
     operations: dict[str, Any] = {}
@@ -84,7 +84,7 @@ def asyncapi_document() -> dict[str, Any]:
 
 
 def _channel(topic: Topic, pattern: str, title: str) -> dict[str, Any]:
-    """Return the channel of a topic below the base whose payload has the schema `title`."""
+    """Return the channel of a topic; its payload has the schema `title`."""
     names = {level for level in pattern.split("/") if level.isupper()}
     address = re.sub(r"\b([A-Z]+)\b", lambda found: f"{{{found[1].lower()}}}", pattern)
     base = "[mqtt] base of rig.toml, by default jointfit/ and the name of the rig"
@@ -113,7 +113,7 @@ def _operation(action: str, key: str, topic: Topic) -> dict[str, Any]:
 
 
 def _moved(schema: Any, place: str) -> Any:
-    """Return a schema with references to its own definitions moved to `place`."""
+    """Return a schema whose references point to its definitions at `place`."""
     if isinstance(schema, list):
         return [_moved(item, place) for item in schema]
     if not isinstance(schema, dict):
