@@ -1,15 +1,16 @@
 """Command-line interface of the hardware simulator, ``jointfit-sim``.
 
-``jointfit-sim play --directory DIR`` reads one command per line from stdin: ``play NAME``, ``unplug
-ID``, ``plug ID``, ``reboot ID``, ``stick ID``, ``free ID``, ``slip ID DEG``, ``drift ID DEG``,
-``occlude on|off``, ``hide MARKER``, ``show MARKER``, ``exchange MARKER MARKER``, ``mocap
-stop|start|restart``, ``pause on|off``, ``status``, ``quit``. ID is a sensor, ``can0`` for the bus
-adapter, or (to reboot) ``mocap``. ``--at SECONDS=COMMAND`` schedules a command. The simulator
-continues after the end of stdin. SIGTERM and SIGINT stop it.
+The command ``jointfit-sim play --directory DIR`` reads one command per line from stdin: ``play
+NAME``, ``unplug ID``, ``plug ID``, ``reboot ID``, ``stick ID``, ``free ID``, ``slip ID DEG``,
+``drift ID DEG``, ``occlude on|off``, ``hide MARKER``, ``show MARKER``, ``exchange MARKER MARKER``,
+``mocap stop|start|restart``, ``pause on|off``, ``status``, ``quit``. ID is a sensor, or ``can0``
+for the bus adapter; ``reboot`` also accepts ``mocap``. The option ``--at SECONDS=COMMAND``
+schedules a command. The simulator continues after the end of stdin. SIGTERM and SIGINT stop it.
 
-Invariant: stdout contains JSON lines only: one when all devices are ready, one for each ``status``,
-``{"error": …}`` for each invalid command, ``{"motion": …}`` for each motion started by
-``--follow``, and finally the numbers of samples sent.
+Invariant: stdout contains JSON lines only. One line reports that all devices are ready. Each
+command ``status`` yields a line, each invalid command yields ``{"error": …}``, and each motion
+started by ``--follow`` yields ``{"motion": …}``. The last line contains the numbers of sent
+samples.
 """
 
 from __future__ import annotations
@@ -58,9 +59,9 @@ if TYPE_CHECKING:
 USAGE = 2
 """Exit code for invalid options, files or ports."""
 ORIGIN_NS = 100_000_000
-"""Interval of possible start times, ns: samples of perfect clocks coincide with ground truth."""
+"""Unit of the start time, ns. The samples of perfect clocks then coincide with the ground truth."""
 _COMMAND_BYTES = 4096
-"""Longest command line, bytes."""
+"""Maximum length of a command line, bytes."""
 COMMANDS = """commands, one per line on standard input:
   play NAME                   change to another motion
   unplug ID, plug ID          disconnect or connect a sensor, or the bus adapter (can0)
@@ -193,7 +194,7 @@ def _subject(options: argparse.Namespace, knobs: Knobs) -> InstrumentedSubject:
 
 
 def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:
-    """Split ``A=B`` words; raise ValueError for a word without ``=``."""
+    """Split arguments of the form ``A=B``; raise ValueError for other forms."""
     parts = [word.partition("=") for word in words]
     if wrong := [a for a, equals, _ in parts if not equals]:
         raise ValueError(f"{option} {wrong[0]}: expected two parts, A=B: see --help")
@@ -201,7 +202,7 @@ def _pairs(option: str, words: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def _clocks(words: Sequence[str]) -> dict[str, ClockFault]:
-    """Return the clock faults of ``ID=PPM[,UP_S]`` words."""
+    """Return the clock faults from arguments of the form ``ID=PPM[,UP_S]``."""
     clocks = {}
     for name, text in _pairs("--clock", words):
         try:
@@ -214,7 +215,7 @@ def _clocks(words: Sequence[str]) -> dict[str, ClockFault]:
 
 
 def _schedule(words: Sequence[str]) -> tuple[tuple[float, str], ...]:
-    """Return the commands of ``SECONDS=COMMAND`` words."""
+    """Return the scheduled commands from arguments of the form ``SECONDS=COMMAND``."""
     script = []
     for at_s, command in _pairs("--at", words):
         try:
@@ -231,7 +232,7 @@ def _print_json(line: dict[str, object]) -> None:
     try:
         sys.stdout.buffer.write(text)
         sys.stdout.buffer.flush()
-    except BrokenPipeError:  # the reader closed the pipe: continue without output
+    except BrokenPipeError:  # continue without output if the pipe is closed
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())
         os.close(nowhere)
@@ -244,7 +245,7 @@ async def _run_commands(scene: Scene) -> None:
         transport, _ = await asyncio.get_running_loop().connect_read_pipe(
             lambda: asyncio.StreamReaderProtocol(reader), sys.stdin
         )
-    except (ValueError, OSError):  # stdin is a plain file or /dev/null: no commands
+    except (ValueError, OSError):  # stdin is a plain file or /dev/null, which is not read
         return
 
     try:
@@ -299,7 +300,7 @@ async def _play(options: argparse.Namespace) -> None:
     if options.planar:
         if options.trial or options.no_mocap or options.limb != "leg" or options.chain_model:
             raise ValueError("--planar is for the simulated leg and its markers: leave it out")
-        # the arc of a single marker is hidden by soft-tissue artefact
+        # Soft-tissue artefact would hide the arc of a single marker.
         knobs = dataclasses.replace(knobs, marker_soft_tissue_mm=0.0)
         options.programme = options.programme or "leg_swings"
     subject = _subject(options, knobs)
@@ -315,7 +316,7 @@ async def _play(options: argparse.Namespace) -> None:
 
 
 async def _run_scene(scene: Scene, followed: RigOptions | None, limb: str) -> None:
-    """Run a scene with commands from stdin and, if given, the phases of the rig's daemon."""
+    """Run a scene with the commands from stdin; follow the phases of a daemon if requested."""
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, scene.stop)
 
@@ -337,7 +338,7 @@ async def _run_scene(scene: Scene, followed: RigOptions | None, limb: str) -> No
 
 
 def _select_loop() -> asyncio.AbstractEventLoop:
-    """Return an event loop based on select: epoll rounds timeouts up to the next millisecond."""
+    """Return an event loop based on select, because epoll rounds timeouts up to milliseconds."""
     return asyncio.SelectorEventLoop(selectors.SelectSelector())
 
 

@@ -1,6 +1,6 @@
-"""Host, device and noisy wire for the conformance suite of drivers.
+"""Receiver, device interface and wire noise for the conformance suite of drivers.
 
-Invariant: no driver and no device is named here.
+Invariant: the module names no driver and no device.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion
 
 _POLL_S = 0.005
-"""Interval between two checks for new measurements, s."""
+"""Time between two checks for new measurements, s."""
 _SETTLE_S = 0.03
-"""Time without a new measurement after which all have arrived, s."""
+"""Time without a new measurement after which all measurements have arrived, s."""
 _CLEAN_SHARE = 0.6
-"""Share of the messages that the noise leaves unchanged."""
+"""Share of the messages that the noise does not change."""
 
 
 class ContractDevice(Protocol):
     """Simulated device of the conformance suite."""
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run the device until cancelled."""
 
     def unplug(self) -> None:
-        """Disconnect the wire; no effect on a disconnected device or before ``run``."""
+        """Disconnect the wire; a disconnected device or a device before ``run`` is unchanged."""
 
     def plug(self) -> None:
         """Connect the wire."""
 
 
 def orientation(number: int) -> Quaternion:
-    """Return the orientation of sample `number`, more than 0.1 rad from adjacent samples."""
+    """Return the orientation of sample `number`; it differs by 0.1 rad from its neighbours."""
     turn, tilt = 0.06 * number, 0.025 * number
     return (
         math.cos(turn) * math.cos(tilt),
@@ -62,7 +62,7 @@ def orientation(number: int) -> Quaternion:
 
 
 class DecodingReceiver:
-    """Receiver in place of the daemon: decodes each chunk at once and stores chunks and events."""
+    """Receiver that replaces the daemon; it decodes each chunk and stores chunks and events."""
 
     def __init__(self, driver: Driver, measurement: type) -> None:
         self.chunks: list[Chunk] = []
@@ -76,7 +76,7 @@ class DecodingReceiver:
         self.events += self.decoder.feed(chunk)
 
     async def wait_for(self, count: int, within_s: float) -> None:
-        """Wait until `count` measurements have arrived, at most `within_s`."""
+        """Wait until `count` measurements have arrived; the time limit is `within_s`."""
         for _ in range(round(within_s / _POLL_S)):
             if len(self.measurements) >= count:
                 return
@@ -91,7 +91,7 @@ class DecodingReceiver:
 
     @property
     def measurements(self) -> list[Any]:
-        """Measurements so far."""
+        """All measurements received so far."""
         return [event for event in self.events if isinstance(event, self._measurement)]
 
 
@@ -103,14 +103,14 @@ class SwitchableNoise:
         self._random = random.Random(7)  # noqa: S311 - the same noise in every run
 
     def __call__(self, data: bytes) -> bytes:
-        """Return `data` as it arrives at the host."""
+        """Return `data` with the damage of the wire."""
         if not self.on or self._random.random() < _CLEAN_SHARE:
             return data
 
         place = self._random.randrange(len(data))
         match self._random.randrange(4):
             case 0:
-                # sign bits are more likely: their errors are the largest
+                # Sign bits are chosen more often, because their errors are the largest.
                 bit = self._random.choice((0x01, 0x10, 0x80, 0x80))
                 return data[:place] + bytes((data[place] ^ bit,)) + data[place + 1 :]
             case 1:
@@ -122,14 +122,14 @@ class SwitchableNoise:
 
 
 def require(condition: object, requirement: str) -> None:
-    """Raise AssertionError with the violated requirement unless `condition` is true."""
+    """Raise AssertionError with the text `requirement` unless `condition` is true."""
     if not condition:
         raise AssertionError(f"contract violated: {requirement}")
 
 
 @contextlib.asynccontextmanager
 async def serve_device(device: ContractDevice) -> AsyncIterator[None]:
-    """Run the device for the duration of the block; unplug it at the end."""
+    """Run the device during the ``async with`` block; disconnect it at the end."""
     task = asyncio.create_task(device.run())
     try:
         yield
@@ -146,12 +146,12 @@ async def cancel_and_wait(task: asyncio.Task[None]) -> None:
     _, pending = await asyncio.wait({task}, timeout=1.0)
     require(not pending, "a cancelled run must end within a second")
     if not task.cancelled():
-        task.result()  # raises the exception that ended it
+        task.result()  # raises the exception of the task, if any
     require(task.cancelled(), "a cancelled run must raise CancelledError")
 
 
 async def require_error(kind: type[Exception], task: asyncio.Task[None], within_s: float) -> None:
-    """Require that `task` ends with `kind` within `within_s`."""
+    """Require that `task` raises `kind` within `within_s`, s."""
     _, pending = await asyncio.wait({task}, timeout=within_s)
     if pending:
         await cancel_and_wait(task)
@@ -179,14 +179,14 @@ def content_of(measurement: Any) -> str:
 
 
 def content_text(measurement: Any) -> str:
-    """Return the orientation of a sample, or all of another measurement, for messages."""
+    """Return the orientation of a sample, or all values of another measurement, as text."""
     if not isinstance(measurement, ImuSample):
         return repr(measurement)
     return f"q_world_sensor = {_rounded(measurement.q_world_sensor)}"
 
 
 def expected_text(measurement: Any, number: int) -> str:
-    """Return the end of the message about `measurement`, which should be sample `number`."""
+    """Return the expected value of sample `number` as text for an error message."""
     if not isinstance(measurement, ImuSample):
         return f", expected number {number}"
     text = _rounded(orientation(number))
@@ -198,7 +198,7 @@ def _rounded(q: Quaternion) -> str:
 
 
 def find_installed(name: str) -> type[Driver]:
-    """Return the driver of an entry point; require that it is installed."""
+    """Return the driver of an entry point; require that the driver is installed."""
     require(
         name in driver_names(),
         f"entry point {name!r} must be installed; there are {', '.join(driver_names())}: run "

@@ -1,12 +1,12 @@
-"""Conformance suite for drivers, run against the simulated device of each driver.
+"""Conformance suite for drivers, which tests each driver with its simulated device.
 
-Invariant: the suite uses only the driver interface. It names no driver and no device, and it does
-not import pytest.
+Invariant: the suite uses only the driver interface. It names no driver and no device, and does not
+import pytest.
 
 Use
 ---
-Derive a class whose name starts with ``Test`` and return driver and device. pytest then collects
-all tests of the suite::
+Derive a class whose name starts with ``Test``. Its methods return the driver and the device. pytest
+then collects all tests of the suite::
 
     from jointfit_simulators.driver_contract import DriverContract
 
@@ -22,12 +22,13 @@ all tests of the suite::
         def make_wrong_device(self, folder):        # optional: a device of another kind
             return WrongDevice(folder / "imu")
 
-`folder` is an empty directory for each test. A device needs ``push`` (or override ``send``),
-``run``, ``unplug`` and ``plug``. Its ``rate_hz``, if there is one, is the rate of its samples. If
-the driver yields a type other than ``ImuSample``, override ``measurement``, ``send`` and
-``matches``. Line speed and time limits are class attributes. If a wire lacks a feature, return
-``None`` from ``make_wrong_device``, or set ``baud`` to None, or ``has_noise`` or ``has_plug`` to
-False; the corresponding tests are skipped with a reason.
+`folder` is an empty directory for each test. A device needs the methods ``push``, ``run``,
+``unplug`` and ``plug``; a class that overrides ``send`` needs no ``push``. The attribute
+``rate_hz`` of a device, if it exists, is the rate of its samples. If the driver yields another type
+than ``ImuSample``, override ``measurement``, ``send`` and ``matches``. Line speed and time limits
+are class attributes. Some features are optional: ``make_wrong_device`` may return ``None``,
+``baud`` may be None, and ``has_noise`` and ``has_plug`` may be False. The corresponding tests are
+then skipped with a reason.
 """
 
 from __future__ import annotations
@@ -67,15 +68,15 @@ if TYPE_CHECKING:
 
 _NS = 10**9
 _BITS = 10
-"""Bits of one byte on a serial line, 8N1."""
+"""Number of bits per byte on a serial line (8N1)."""
 _INCOMPLETE = 3
-"""Bytes that an incomplete message lacks: fewer than any message has."""
+"""Number of missing bytes of an incomplete message; every message is longer."""
 _DELIVERY_S = 0.05
-"""Time in which the kernel delivers what a device wrote, s."""
+"""Time in which the kernel delivers written bytes to the reader, s."""
 _PAUSE_NS = 200_000_000
-"""Pause inside a message that a busy host causes, ns."""
+"""Longest pause within a message on a busy host, ns."""
 _SILENCE_NS = 60 * _NS
-"""Silence after which the rest of a message is lost at any speed, ns."""
+"""Time without bytes after which an incomplete message is lost at any line speed, ns."""
 
 
 class DriverContract(ABC):
@@ -88,15 +89,15 @@ class DriverContract(ABC):
     starts_within_s: ClassVar[float] = 10.0
     """Longest time from the start of ``run`` to the first sample, s."""
     lost_within_s: ClassVar[float] = 1.0
-    """Longest time from unplugging, or from the last byte, to DeviceLostError, s."""
+    """Longest time from the disconnection or the last byte to DeviceLostError, s."""
     refused_within_s: ClassVar[float] = 15.0
-    """Longest time from the start on a wrong device to DeviceMisconfiguredError, s."""
+    """Longest time from the start with a wrong device to DeviceMisconfiguredError, s."""
     rate_hz: ClassVar[float] = 100.0
-    """Samples per second of device time, for a device without ``rate_hz``."""
+    """Sample rate in device time, Hz, for a device without ``rate_hz``."""
     pace_s: ClassVar[float] = 0.002
-    """Host time between two samples, s; shorter than the device time, to shorten the suite."""
+    """Host time between two samples, s. It is shorter than the device time to shorten the suite."""
     baud: ClassVar[int | None] = 115_200
-    """Line speed in the driver's settings, bit/s; None if bytes take no time (USB, TCP)."""
+    """Line speed in the driver's settings, bit/s; None if transmission takes no time (USB, TCP)."""
     has_noise: ClassVar[bool] = True
     has_plug: ClassVar[bool] = True
 
@@ -104,14 +105,14 @@ class DriverContract(ABC):
 
     @abstractmethod
     def make_device(self, folder: Path, wire_noise: WireNoise) -> Any:
-        """Return the simulated device, plugged in, not running."""
+        """Return the simulated device, which is connected but not running."""
 
     @abstractmethod
     def make_driver(self, folder: Path) -> Driver:
         """Return a new driver for this device, with ``silence_s`` at most 0.5."""
 
     def make_wrong_device(self, folder: Path) -> Any:  # noqa: ARG002 - for overriding methods
-        """Return a device of another kind at the same port; None if drivers cannot detect it."""
+        """Return a device of another type at the same port; None if drivers cannot detect it."""
         return None
 
     def send(self, device: Any, number: int) -> None:
@@ -119,7 +120,7 @@ class DriverContract(ABC):
         device.push(self.device_ns(device, number), orientation(number))
 
     def device_ns(self, device: Any, number: int) -> int:
-        """Return the device time of sample `number`, at the rate of the device.
+        """Return the device time of sample `number`, ns, from the rate of the device.
 
         The rate may change during the handshake. Device time never decreases.
         """
@@ -130,7 +131,7 @@ class DriverContract(ABC):
         return t_ns
 
     def matches(self, number: int, measurement: Any) -> bool:
-        """Return whether `measurement` is sample `number`; by default within 0.03 rad."""
+        """Return whether `measurement` is sample `number`; the default tolerance is 0.03 rad."""
         w, x, y, z = orientation(number)
         a, b, c, d = measurement.q_world_sensor
         return bool(abs(a * w + b * x + c * y + d * z) > 1 - 1e-4)
@@ -158,7 +159,7 @@ class DriverContract(ABC):
         )
 
     def test_driver_opens_configures_and_streams_every_sample(self, tmp_path: Path) -> None:
-        """All samples arrive once, in order, with a plausible arrival time."""
+        """All samples arrive once and in order, with plausible arrival times."""
 
         async def scene() -> None:
             began_ns = time.monotonic_ns()
@@ -189,7 +190,7 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_samples_do_not_depend_on_the_split_of_the_stream(self, tmp_path: Path) -> None:
-        """Single bytes and one large chunk give the same samples. Datagrams remain whole."""
+        """Single bytes and one large chunk yield the same samples. Datagrams are not split."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
@@ -220,7 +221,7 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_replay_returns_the_same_events(self, tmp_path: Path) -> None:
-        """Decoder output depends on the chunks only: no clock, random numbers or shared state."""
+        """The output of a decoder depends on the chunks only, not on a clock or shared state."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
@@ -237,13 +238,13 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_arrival_stamps_are_those_of_the_first_byte(self, tmp_path: Path) -> None:
-        """A busy host reads many messages at once: each is back-dated by the bytes behind it."""
+        """On a busy host, the arrival of a message is computed from the bytes behind it."""
 
         async def scene() -> None:
             driver, data, t_ns, _ = await self._recorded(tmp_path)
             byte_ns = _BITS * _NS / (self.baud or _NS)
 
-            # The same bytes arrive one by one at the speed of the line, and in one chunk.
+            # The same bytes arrive twice: one by one at the line speed, and in one chunk.
             single = DecodingReceiver(driver, self.measurement)
             late_ns = []
             for number, byte in enumerate(data, 1):
@@ -271,7 +272,7 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_silence_discards_an_incomplete_message(self, tmp_path: Path) -> None:
-        """The rest of an incomplete message does not arrive after a long silence."""
+        """The decoder discards an incomplete message after a long silence."""
 
         async def scene() -> None:
             driver, data, t_ns, whole = await self._recorded(tmp_path)
@@ -298,7 +299,7 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_input_from_before_the_opening_is_discarded(self, tmp_path: Path) -> None:
-        """The system buffers what a device sends while nobody reads; its time is unknown."""
+        """The driver discards bytes that the system buffered before; their time is unknown."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
@@ -322,7 +323,7 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_random_bytes_never_raise(self, tmp_path: Path) -> None:
-        """Corrupt bytes are events, and the number of pending bytes is bounded."""
+        """Corrupt bytes yield events, and the number of pending bytes is bounded."""
         noise = random.Random(11)  # noqa: S311 - the same bytes in every run
         decoder = self.make_driver(tmp_path).decoder()
         fed = lost = 0
@@ -340,7 +341,7 @@ class DriverContract(ABC):
         )
 
     def test_line_noise_affects_only_damaged_samples(self, tmp_path: Path) -> None:
-        """The driver continues, undamaged samples arrive, and damaged ones are rejected."""
+        """The driver continues; undamaged samples arrive, and damaged samples are rejected."""
         if not self.has_noise:
             raise SkipTest("this wire detects damage itself, or does not allow its detection")
 
@@ -355,7 +356,7 @@ class DriverContract(ABC):
                     await asyncio.sleep(self.pace_s)
                 noise.on = False
 
-                # silence ends a message whose length field is damaged
+                # After a silence, the decoder discards a message with a damaged length field.
                 await asyncio.sleep(0.3)
                 self.send(device, first + 200)
                 await receiver.settle()
@@ -374,7 +375,7 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_silence_raises_device_lost(self, tmp_path: Path) -> None:
-        """The driver does not wait for a silent device."""
+        """The driver reports a silent device as lost."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
@@ -412,7 +413,7 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_absent_device_raises_device_lost(self, tmp_path: Path) -> None:
-        """The supervisor retries a device that is absent at the start."""
+        """A device that is absent at the start is lost, so the supervisor tries again."""
         if not self.has_plug:
             raise SkipTest("this wire cannot be unplugged")
 
@@ -425,7 +426,7 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_wrong_device_raises_device_misconfigured(self, tmp_path: Path) -> None:
-        """An error that a retry cannot resolve has a message for the user."""
+        """If a retry cannot help, the driver raises an error with a message for the user."""
         device = self.make_wrong_device(tmp_path)
         if device is None:
             raise SkipTest("this wire does not allow detection of a wrong device")
@@ -438,7 +439,7 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_exception_of_emit_reaches_the_caller(self, tmp_path: Path) -> None:
-        """A bug in the daemon is not reported as a lost device."""
+        """An exception of the receiver is not reported as a lost device."""
 
         async def scene() -> None:
             device = self.make_device(tmp_path, clean_wire)
@@ -459,12 +460,13 @@ class DriverContract(ABC):
         asyncio.run(scene())
 
     def test_cancelling_closes_all_descriptors_and_tasks(self, tmp_path: Path) -> None:
-        """``run`` is cancelled five times: before, during and after opening."""
+        """``run`` can be cancelled before, during and after the opening of the device."""
 
         async def scene() -> None:
             device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
             async with serve_device(device):
-                # the first run creates objects with the lifetime of the process (executors, caches)
+                # The first run creates objects that live as long as the process (executors,
+                # caches).
                 async with self._reading(device, driver, 0):
                     pass
 
@@ -498,7 +500,7 @@ class DriverContract(ABC):
             yield state
 
     async def _recorded(self, tmp_path: Path) -> tuple[Driver, bytes, int, list[Any]]:
-        """Return driver, bytes, time of the last chunk and measurements of a short recording."""
+        """Record a short time; return driver, bytes, time of the last chunk, and measurements."""
         if self.make_driver(tmp_path).wire != "stream" or self.baud is None:
             raise SkipTest("bytes of this wire take no time")
         device, driver = self.make_device(tmp_path, clean_wire), self.make_driver(tmp_path)
@@ -511,7 +513,7 @@ class DriverContract(ABC):
     async def _reading(
         self, device: Any, driver: Driver, number: int
     ) -> AsyncIterator[tuple[DecodingReceiver, int]]:
-        """Run the driver on a running device; yield like `streaming`."""
+        """Run the driver on a running device; yield the same values as `streaming`."""
         receiver = DecodingReceiver(driver, self.measurement)
         task = asyncio.create_task(driver.run(receiver.emit))
         try:
@@ -522,11 +524,11 @@ class DriverContract(ABC):
     async def _send_first(
         self, device: Any, receiver: DecodingReceiver, task: asyncio.Task[None], number: int = 0
     ) -> int:
-        """Send until a sample arrives, then wait for the others; return the next number."""
+        """Send until a sample arrives, then wait for the rest; return the next sample number."""
         async with asyncio.timeout(self.starts_within_s):
             while not receiver.measurements:
                 if task.done():
-                    task.result()  # raises the exception that ended it
+                    task.result()  # raises the exception of the task, if any
                     require(False, "run must read until it is cancelled")
                 self.send(device, number)
                 number += 1

@@ -1,8 +1,8 @@
 """A right arm on the thorax: bones, markers and movements.
 
-Angles of the shoulder are tilt and torsion: the first two columns are the rotation vector of the
-long axis (forward and towards the midline positive), the third is the internal rotation. They are
-regular in every posture with less than 180 degrees of elevation. Elbow and wrist have the angles of
+The angles of the shoulder are tilt and torsion. The first two columns are the rotation vector of
+the long axis (positive forward and towards the midline). The third column is the internal rotation.
+These angles are regular for less than 180 degrees of elevation. Elbow and wrist have the angles of
 the leg: flexion forward, adduction, pronation.
 
 Invariant: a motion has two continuous derivatives.
@@ -46,10 +46,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 SHOULDER, ELBOW, WRIST = HIP, KNEE, ANKLE
-"""Columns of the joints: the first, second and third joint of the limb."""
+"""Columns of the first, second and third joint of the limb."""
 UPPER_ARM_M, FOREARM_M = 0.30, 0.26
 SHOULDER_IN_THORAX = (0.17, 0.0, -0.05)
-"""Shoulder joint centre in thorax coordinates: right, anterior, up, m."""
+"""Shoulder joint centre in thorax coordinates (right, anterior, up), m."""
 THORAX_AT = (0.0, 0.0, 1.45)
 """Origin of the thorax (suprasternal height) in the base world, m."""
 
@@ -102,7 +102,7 @@ def stand(style: MovementStyle, t: Array) -> Array:
 
 
 def _moving(style: MovementStyle, t: Array) -> Array:
-    """Return the rest position with the sway of the trunk and the variability of the subject."""
+    """Return the rest position plus the sway of the trunk and the subject's variability."""
     coordinates = rest(t, THORAX_AT)
     coordinates[:, LEG_ANGLES] += style.variability.at(t)
     coordinates[:, column(PELVIS_TURN, HEADING)] = np.radians(3) * np.sin(2 * np.pi * 0.23 * t)
@@ -112,7 +112,7 @@ def _moving(style: MovementStyle, t: Array) -> Array:
 
 
 def _wave(t: Array, hz: float, phase: float = 0.0) -> Array:
-    """Return a wave that begins at 0 and rises to 1, shape (n,)."""
+    """Return a wave between 0 and 1, shape (n,), which begins at 0 if `phase` is 0."""
     wave: Array = (1 - np.cos(2 * np.pi * hz * t + phase)) / 2
     return wave
 
@@ -127,7 +127,7 @@ def arm_swings(style: MovementStyle, t: Array) -> Array:
 
 
 def abduction(style: MovementStyle, t: Array) -> Array:
-    """Raise the arm sideways to 120 degrees, with the external rotation that accompanies it."""
+    """Raise the arm sideways to 120 degrees, with the accompanying external rotation."""
     coordinates = _moving(style, t)
     raised = _wave(t, 0.25)
     coordinates[:, column(SHOULDER, ADDUCTION)] += np.radians(-120) * raised
@@ -145,7 +145,7 @@ def elbow_flexion(style: MovementStyle, t: Array) -> Array:
     coordinates[:, column(ELBOW, ADDUCTION)] += np.radians(-8) * np.cos(np.radians(125) * bend / 2)
     coordinates[:, column(ELBOW, ADDUCTION)] += np.radians(
         8
-    )  # no carrying angle in the static pose
+    )  # the carrying angle is 0 in the static pose
     coordinates[:, column(ELBOW, ROTATION)] += np.radians(55) * np.sin(2 * np.pi * 0.19 * t) * bend
     coordinates[:, column(SHOULDER, FLEXION)] += np.radians(20) * _wave(t, 0.21)
     coordinates[:, column(WRIST, FLEXION)] += np.radians(15) * np.sin(2 * np.pi * 0.33 * t)
@@ -165,7 +165,7 @@ def wrist_circles(style: MovementStyle, t: Array) -> Array:
 
 
 def reach(style: MovementStyle, t: Array) -> Array:
-    """Reach forward, sideways and up to the mouth: shoulder and elbow together."""
+    """Reach forward, sideways and up to the mouth with shoulder and elbow together."""
     coordinates = _moving(style, t)
     out = _wave(t, 0.35)
     side = np.sin(2 * np.pi * 0.11 * t)

@@ -1,7 +1,7 @@
-"""Both legs with their pelvis: bones, markers and movements.
+"""Two legs with their pelvis: bones, markers and movements.
 
-The left leg is the mirror image of the right one. Its angles have the same signs: a positive angle
-moves both legs in the same clinical direction.
+The left leg is the mirror image of the right leg. The angles of both legs have the same signs: a
+positive angle moves both legs in the same clinical direction.
 
 Invariant: a motion has two continuous derivatives.
 """
@@ -57,9 +57,9 @@ if TYPE_CHECKING:
 
 _GEOMETRY = LegGeometry()
 _MIRROR = np.array([-1.0, 1.0, 1.0])
-"""Reflection about the sagittal plane."""
+"""Factors of a reflection about the sagittal plane."""
 _LATER_S = 550.0
-"""Delay of the variability of the left leg, s: a multiple of the stride of 1.1 s, and long enough
+"""Delay of the left leg's variability, s. It is a multiple of the stride (1.1 s), and long enough
 for independent values."""
 _HALF_STRIDE_S = 0.55
 _PARTS = ("thigh", "shank", "foot")
@@ -78,7 +78,7 @@ def legs_pose(coordinates: Array) -> LegPose:
     right = leg_pose(_GEOMETRY, coordinates)
     pelvis, origin = right.orientations["pelvis"], right.origins["pelvis"]
 
-    mirrored = np.array([1.0, -1.0, -1.0])  # adduction and rotation change their direction
+    mirrored = np.array([1.0, -1.0, -1.0])  # adduction and rotation change sign
     thigh = pelvis * joint_rotation(1, mirrored * coordinates[:, LEFT_HIP])
     shank = thigh * joint_rotation(-1, mirrored * coordinates[:, LEFT_KNEE])
     foot = shank * joint_rotation(1, mirrored * coordinates[:, LEFT_ANKLE])
@@ -96,7 +96,7 @@ def legs_pose(coordinates: Array) -> LegPose:
 
 
 def _together(motion: StyledMotion) -> StyledMotion:
-    """Return a motion in which both legs move alike, each with a variability of its own."""
+    """Return a motion in which both legs move equally, each with its own variability."""
 
     def moved(style: MovementStyle, t: Array) -> Array:
         coordinates = motion(style, t)
@@ -112,7 +112,7 @@ def _together(motion: StyledMotion) -> StyledMotion:
 
 
 def _in_alternation(style: MovementStyle, t: Array) -> Array:
-    """Walk: the left leg follows by half a stride."""
+    """Walk; the left leg follows with a delay of half a stride."""
     coordinates = walk(style, t)
     later = walk(style, t + _LATER_S + _HALF_STRIDE_S)
     coordinates[:, LEFT_LEG_ANGLES] = later[:, LEG_ANGLES]
@@ -120,7 +120,7 @@ def _in_alternation(style: MovementStyle, t: Array) -> Array:
 
 
 def _one_leg(motion: StyledMotion, side: str) -> StyledMotion:
-    """Return a motion of one leg, while the subject stands on the other one."""
+    """Return a motion of one leg while the subject stands on the other leg."""
 
     def moved(style: MovementStyle, t: Array) -> Array:
         coordinates = motion(style, t)
@@ -162,13 +162,13 @@ MOTIONS: Mapping[str, StyledMotion] = {
     ),
     "plate": plate,
 }  # fmt: skip
-"""Motions of both legs; those with a side move one leg."""
+"""Motions of both legs. A motion with a side in its name moves one leg."""
 
 
 def _templates(random: np.random.Generator) -> dict[str, Array]:
-    """Return marker positions in the frame of each part, the left ones mirrored, m."""
+    """Return marker positions in the frame of each part, m; the left side is mirrored."""
     right = marker_templates(random, _GEOMETRY)
-    left = marker_templates(random, _GEOMETRY)  # with placement errors of their own
+    left = marker_templates(random, _GEOMETRY)  # has its own placement errors
     found = {"pelvis": right["pelvis"]} | {f"right_{part}": right[part] for part in _PARTS}
     return found | {f"left_{part}": left[part] * _MIRROR for part in _PARTS}
 

@@ -1,7 +1,7 @@
-"""Built-in motions: functions from time to the leg coordinates.
+"""Built-in motions, which are functions from time to leg coordinates.
 
-Zero joint angles are upright stance, the zero of every calibration. Walking is on a treadmill, so
-the subject stays in the capture volume.
+All joint angles are zero in upright stance, as in every calibration. Walking is on a treadmill, so
+the subject remains in the capture volume.
 
 Invariant: a motion has two continuous derivatives.
 """
@@ -51,24 +51,24 @@ StyledMotion = Callable[[MovementStyle, "Array"], "Array"]
 
 
 def _cycle(*keys: tuple[float, float]) -> CubicSpline:
-    """Return a periodic spline through (share of the cycle, degrees), in radians."""
+    """Return a periodic spline through points (share of the cycle, degrees), in radians."""
     share, degrees = np.array([*keys, (1.0, keys[0][1])]).T
     return CubicSpline(share, np.radians(degrees), bc_type="periodic")
 
 
-# Sagittal angles of level walking over one stride from heel strike, read from textbook curves.
+# Sagittal angles of level walking over one stride from heel strike, from textbook curves.
 _GAIT_HIP = _cycle((0, 30), (0.15, 24), (0.35, 0), (0.52, -10), (0.65, 5), (0.85, 33))
 _GAIT_KNEE = _cycle((0, 4), (0.14, 17), (0.4, 4), (0.58, 30), (0.72, 62), (0.86, 28), (0.96, 4))
 _GAIT_ANKLE = _cycle((0, 0), (0.07, -5), (0.3, 6), (0.46, 11), (0.62, -17), (0.78, 1), (0.9, 2))
 _STRIDE_S = 1.1
 """Duration of a stride, s."""
 
-# Sitting down and standing up: seated, leaning, upright, leaning, seated.
+# Knee angles of sitting down and standing up: seated, leaning, upright, leaning, seated.
 _CHAIR_KNEE = _cycle((0, 92), (0.15, 92), (0.28, 75), (0.45, 4), (0.55, 4), (0.75, 70), (0.9, 92))
 _CHAIR_THIGH = _cycle((0, 86), (0.15, 86), (0.28, 66), (0.45, 2), (0.55, 2), (0.75, 60), (0.9, 86))
 _CHAIR_LEAN = _cycle((0, 6), (0.12, 12), (0.24, 38), (0.45, 2), (0.55, 2), (0.72, 35), (0.9, 10))
 _CHAIR_S = 5.0
-"""Duration of one cycle, s."""
+"""Duration of one sit-to-stand cycle, s."""
 
 
 def stand(style: MovementStyle, t: Array) -> Array:
@@ -87,17 +87,17 @@ def walk(style: MovementStyle, t: Array) -> Array:
     share = t / _STRIDE_S
     phase = 2 * np.pi * share
 
-    # sagittal angles
+    # Sagittal angles
     coordinates[:, column(HIP, FLEXION)] = _GAIT_HIP(share % 1.0)
     coordinates[:, column(KNEE, FLEXION)] = _GAIT_KNEE(share % 1.0)
     coordinates[:, column(ANKLE, FLEXION)] = _GAIT_ANKLE(share % 1.0)
 
-    # frontal and transverse angles
+    # Frontal and transverse angles
     coordinates[:, column(HIP, ADDUCTION)] = np.radians(5) * np.sin(phase - 0.4)
     coordinates[:, column(HIP, ROTATION)] = np.radians(4) * np.cos(phase)
     coordinates[:, column(ANKLE, ADDUCTION)] = np.radians(3) * np.sin(phase + 1.0)
 
-    # pelvis
+    # Pelvis
     coordinates[:, column(PELVIS_TURN, HEADING)] = np.radians(5) * np.sin(phase)
     coordinates[:, column(PELVIS_TURN, TILT)] = np.radians(1.5) * np.sin(2 * phase)
     coordinates[:, column(PELVIS_TURN, LIST)] = np.radians(3) * np.sin(phase + 0.5)
@@ -117,7 +117,7 @@ def _sagittal(style: MovementStyle, t: Array, *, knee: Array, thigh: Array, lean
     coordinates[:, column(KNEE, FLEXION)] = knee
     coordinates[:, column(ANKLE, FLEXION)] = knee - thigh
 
-    # knees over the toes
+    # Keep the knees over the toes.
     coordinates[:, column(HIP, ADDUCTION)] = -0.08 * thigh
     coordinates[:, column(ANKLE, ADDUCTION)] = 0.06 * thigh
 
@@ -140,8 +140,8 @@ def squat(style: MovementStyle, t: Array) -> Array:
 
 
 def sit_to_stand(style: MovementStyle, t: Array) -> Array:
-    """Sit on a chair and stand up again, every 5 s."""
-    share = (t / _CHAIR_S + 0.5) % 1.0  # start in upright stance
+    """Sit down on a chair and stand up, every 5 s."""
+    share = (t / _CHAIR_S + 0.5) % 1.0  # starts in upright stance
     return _sagittal(
         style, t, knee=_CHAIR_KNEE(share), thigh=_CHAIR_THIGH(share), lean=_CHAIR_LEAN(share)
     )
@@ -167,7 +167,7 @@ def hip_circles(style: MovementStyle, t: Array) -> Array:
 
 
 def knee_swings(style: MovementStyle, t: Array) -> Array:
-    """Swing the shank with a raised thigh; internal rotation varies with knee flexion."""
+    """Swing the shank with the thigh raised; internal rotation depends on knee flexion."""
     coordinates = upright(style, t)
     bend = np.radians(55 + 43 * np.sin(2 * np.pi * 0.55 * t))
     coordinates[:, column(HIP, FLEXION)] = np.radians(42 + 8 * np.sin(2 * np.pi * 0.21 * t))
@@ -176,7 +176,7 @@ def knee_swings(style: MovementStyle, t: Array) -> Array:
     coordinates[:, column(ANKLE, FLEXION)] = np.radians(8) * np.sin(2 * np.pi * 0.33 * t)
     coordinates[:, 2] += 0.04
 
-    # only a flexed knee allows voluntary rotation
+    # Voluntary rotation requires a flexed knee.
     twist = np.radians(15) * np.sin(2 * np.pi * 0.29 * t)
     couple_knee(coordinates)
     coordinates[:, column(KNEE, ROTATION)] += twist * np.sin(bend / 2)
@@ -244,5 +244,5 @@ MOTIONS: Mapping[str, StyledMotion] = {
 def motions_of(
     style: MovementStyle, motions: Mapping[str, StyledMotion] = MOTIONS
 ) -> dict[str, Motion]:
-    """Return the motions of a limb, by default of the leg, in the style of a subject."""
+    """Return the motions in the style of a subject; the default is the motions of the leg."""
     return {name: partial(motion, style) for name, motion in motions.items()}

@@ -1,8 +1,8 @@
 """Subject that replays a `RecordedTrial`.
 
-Invariant: the recording is not altered. During synthetic intervals (the blend between standing and
-trial, the final pose) the cameras return no bones and the ground truth has no positions, so these
-intervals enter neither training nor evaluation.
+Invariant: the recording is not changed. The blend between standing and trial, and the final pose,
+are synthetic. During synthetic intervals, the cameras return no bones and the ground truth has no
+positions. These intervals therefore enter neither training nor evaluation.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 _STAND = "stand"
 _MOTION = re.compile(r"stand|trial(@(?P<begin>[\d.]*)-(?P<end>[\d.]*))?")
 _ROUNDING_S = 1e-6
-"""Rounding of instants that were converted from nanoseconds, s."""
+"""Rounding error of times that were converted from nanoseconds, s."""
 _FIRST = np.zeros(1)
-"""Instant of the first recorded frame, s."""
+"""Time of the first recorded frame, s, shape (1,)."""
 
 
 class _Switch(NamedTuple):
-    """Start of a motion; `begin_s` to `end_s` is its part of the recording."""
+    """Start of a motion, which plays the recording from `begin_s` to `end_s`."""
 
     start_s: float
     name: str
@@ -58,23 +58,23 @@ class RecordedSubject:
     recording
         Trial to replay.
     sensors
-        Sensor ids and their segments.
+        Segment of each sensor, by sensor id.
     steps
-        ``stand``, ``trial`` and ``trial@A-B`` (its seconds A to B; either may be omitted) in any
-        order; the last one continues.
+        Steps in any order: ``stand``, ``trial`` and ``trial@A-B``. The last form plays the trial
+        from A to B, s; A or B may be omitted. The last step continues until the end.
     start_s
         Start of the first step, s.
     transition_s
         Duration of the blend between steps, s.
     clusters
-        Markers of each body part; default: OpenCap's right leg, as far as recorded.
+        Markers of each body part. The default is the recorded markers of OpenCap's right leg.
     """
 
     templates: Mapping[str, Array] = {}
-    """Marker templates of rigid bodies; empty, because the reference of a recording is its
+    """Marker templates of rigid bodies. They are empty, because the reference of a recording is its
     bones."""
     chain = LEG_CHAIN
-    """Recordings are of legs."""
+    """Kinematic chain of the recorded limb, which is always a leg."""
 
     def __init__(
         self,
@@ -119,8 +119,8 @@ class RecordedSubject:
     def _place_standing_bones(self) -> Mapping[str, Array]:
         """Return the origins of the bones while standing.
 
-        Each bone is attached to the more proximal one as in the first frame, so that the joints
-        remain connected when the bones are upright.
+        Each bone has the same position relative to the proximal bone as in the first frame. The
+        joints therefore remain connected when the bones are upright.
         """
         placed: dict[str, Array] = {}
         above: tuple[Rotation, Array, Array] | None = None
@@ -135,7 +135,7 @@ class RecordedSubject:
     def _recorded_clusters(
         self, clusters: Mapping[str, tuple[str, ...]]
     ) -> Mapping[str, tuple[str, ...]]:
-        """Return the recorded clusters and the other markers; set the columns of all markers."""
+        """Return the recorded marker clusters and the other markers; set all column indices."""
         markers = self._recording.markers
         recorded = markers.names if markers else ()
         known = {part: names for part, names in clusters.items() if set(names) <= set(recorded)}
@@ -152,7 +152,7 @@ class RecordedSubject:
         return {"trial_s": self._recording.seconds, "bones": list(self._bones)}
 
     def play(self, name: str, t_s: float) -> None:
-        """Start ``stand``, ``trial`` or a part of it; raise UnknownMotionError for other names."""
+        """Start ``stand``, ``trial`` or a part of the trial; raise UnknownMotionError otherwise."""
         part = _MOTION.fullmatch(name)
         if part is None:
             raise UnknownMotionError(
@@ -166,22 +166,23 @@ class RecordedSubject:
         self._switches.append(_Switch(t_s, name, begin_s, end_s))
 
     def motion_at(self, t_s: float) -> str:
-        """Return the name of the motion at an instant."""
+        """Return the name of the motion at the time `t_s`."""
         begun = [switch for switch in self._switches if switch.start_s <= t_s]
         return (begun[-1] if begun else self._switches[0]).name
 
     def discard_before(self, t_s: float) -> None:
-        """Discard nothing; the number of switches is small."""
+        """Do nothing, because the number of stored motions is small."""
 
     def _place(self, t_s: Array) -> tuple[Array, Array]:
-        """Return the time within the trial, s, and the share of trial (1) against standing (0).
+        """Return the time within the trial, s, and the weight of the trial relative to standing.
 
-        The recording starts after the blend; during the blend its first posture is held.
+        The weight is 1 for the trial and 0 for standing. The recording starts after the blend.
+        During the blend, its first posture is used.
         """
         place, share = np.zeros_like(t_s), np.zeros_like(t_s)
         before = _STAND
         for start_s, name, begin_s, end_s in self._switches:
-            # a later switch overrides the earlier ones from its start on
+            # From its start on, a motion replaces all earlier motions.
             begun = t_s >= start_s
             fade = smootherstep((t_s[begun] - start_s) / self._transition_s)
             if name == _STAND:
@@ -194,14 +195,14 @@ class RecordedSubject:
         return place, share
 
     def _synthetic(self, t_s: Array) -> NDArray[np.bool_]:
-        """Return whether neither the static pose nor the recording plays, at each instant."""
+        """Return for each time whether neither the static pose nor the recording plays."""
         synthetic = np.zeros(len(t_s), dtype=np.bool_)
         before = _STAND
         for start_s, name, begin_s, end_s in self._switches:
             begun = t_s >= start_s
             since = t_s[begun] - start_s - self._transition_s
 
-            # a blend between two standing phases is not synthetic
+            # A blend between two standing phases is not synthetic.
             blending = since < -_ROUNDING_S
             if name == _STAND:
                 synthetic[begun] = blending & (before != _STAND)
@@ -211,7 +212,7 @@ class RecordedSubject:
         return synthetic
 
     def observe(self, sensors: Sequence[Array], cameras: Array, truth: Array) -> Observation:
-        """Return the observation at the instants (s) of each sensor, the cameras, the log."""
+        """Return the observation at the given times (s) of each sensor, the cameras and the log."""
         orientations = [
             self._sensor(name, t) for name, t in zip(self.sensors, sensors, strict=True)
         ]
@@ -239,7 +240,7 @@ class RecordedSubject:
         return from_wxyz(self._blended(turns, still, t_s)), origin
 
     def _blended(self, track: InterpolatedTrack, still: Array, t_s: Array) -> Array:
-        """Return a track blended with its value while standing, along the shortest arc."""
+        """Blend a track with its value while standing, along the shortest arc."""
         place, share = self._place(t_s)
         moving = track.at(place)
         blending = (share < 1) & np.isfinite(moving[:, 0])

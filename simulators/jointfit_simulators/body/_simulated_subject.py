@@ -1,6 +1,6 @@
-"""Simulated subject: bones, soft-tissue artefacts, sensors and markers, in the base world.
+"""Simulated subject with bones, soft-tissue artefacts, sensors and markers, in the base world.
 
-Invariant: observations depend only on time, the settings and the sequence of motions.
+Invariant: observations depend only on the time, the settings and the sequence of motions.
 """
 
 from __future__ import annotations
@@ -44,19 +44,20 @@ class SimulatedSubject:
     knobs
         Sensor alignment, soft-tissue artefact and random seed.
     steps
-        Motions from `start_s` on.
+        Sequence of motions, which begins at `start_s`.
     geometry
         Bone lengths and joint centres of the leg.
     motion_files
         Additional motions by name (`motion_from_file`).
     sensors
-        Sensor ids and their segments; default: those of the limb.
+        Segment of each sensor, by sensor id. The default is the usual sensors of the limb.
     limb
         ``leg``, ``legs``, ``arm`` or ``trunk``.
     """
 
     visible_bones: tuple[str, ...] = ()
-    """Bones that the cameras stream; empty, because they measure markers only."""
+    """Bones that the cameras stream. The tuple is empty, because the cameras measure markers only.
+    """
 
     def __init__(
         self,
@@ -81,7 +82,8 @@ class SimulatedSubject:
             motions, steps, start_s=start_s, transition_s=knobs.transition_s
         )
 
-        # the RMS values of the settings hold for a minute of these motions (walking and squats)
+        # The RMS values of the settings are valid for one minute of these motions (walking and
+        # squats).
         t_s = np.arange(0.0, 30.0, 0.04)
         reference = np.concatenate([motions[name](t_s) for name in self._limb.reference])
         self._place_sensors(knobs, reference)
@@ -135,7 +137,7 @@ class SimulatedSubject:
         vectors: int = 1,
         common_share: float = 0.0,
     ) -> SoftTissue:
-        """Return the artefact of `vectors` points on `part` with an RMS in m or rad."""
+        """Return the artefact of `vectors` points on `part`; `rms` is in m or rad."""
         return SoftTissue(
             knobs.random(f"{purpose} {part}"),
             part,
@@ -150,7 +152,7 @@ class SimulatedSubject:
 
     @property
     def chain(self) -> RigChain:
-        """The limb as rig.toml describes it."""
+        """Description of the limb in rig.toml."""
         return self._limb.chain
 
     @property
@@ -169,16 +171,16 @@ class SimulatedSubject:
         self._script.play(name, t_s)
 
     def motion_at(self, t_s: float) -> str:
-        """Return the name of the motion at an instant."""
+        """Return the name of the motion at the time `t_s`."""
         return self._script.name_at(t_s)
 
     def discard_before(self, t_s: float) -> None:
-        """Discard the state for instants before `t_s`, which are not requested again."""
+        """Discard the state for times before `t_s`, which will not be requested again."""
         self._script.discard_before(t_s)
 
     def observe(self, sensors: Sequence[Array], cameras: Array, truth: Array) -> Observation:
-        """Return the observation at the instants (s) of each sensor, the cameras, the log."""
-        # compute the postures of all streams at once, then divide them by stream
+        """Return the observation at the given times (s) of each sensor, the cameras and the log."""
+        # Compute the postures of all streams together, then divide them by stream.
         streams = [*sensors, cameras, truth]
         t_s = np.concatenate(streams)
         coordinates = self._script.coordinates(t_s)
@@ -215,7 +217,7 @@ class SimulatedSubject:
         if not np.any(share):
             return to_wxyz(on_leg)
 
-        # transfer from the leg to the plate along the shortest arc
+        # Move the sensor orientation from the leg to the plate along the shortest arc.
         on_plate = Rotation.from_rotvec(coordinates[:, PLATE_TURN]) * self._plate_mounts[sensor]
         arc = (on_leg.inv() * on_plate).as_rotvec() * share
         return to_wxyz(on_leg * Rotation.from_rotvec(arc))
@@ -245,7 +247,7 @@ def _to_world(turn: Rotation, origin: Array, points: Array) -> Array:
 
 
 def _part_of(pose: LegPose, cut: slice) -> LegPose:
-    """Return the pose at some of its instants."""
+    """Return the pose at a part of its times."""
     return LegPose(
         {part: turn[cut] for part, turn in pose.orientations.items()},
         {part: origin[cut] for part, origin in pose.origins.items()},

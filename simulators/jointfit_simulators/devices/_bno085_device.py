@@ -1,7 +1,8 @@
-"""Virtual BNO085 on a pty, in the modes UART-RVC and UART-SHTP.
+"""Virtual BNO085 on a pseudo-terminal (pty), in the modes UART-RVC and UART-SHTP.
 
-Invariant: in UART-RVC it sends from power-up and ignores the host; in UART-SHTP it announces itself
-after a reset, and sends reports only after their interval was set, which a reset forgets.
+Invariants: in mode UART-RVC, the device sends from power-up and ignores the host. In mode
+UART-SHTP, the device sends an advertisement after a reset. It sends a report only after the host
+has set its interval. A reset clears the intervals.
 """
 
 from __future__ import annotations
@@ -44,11 +45,11 @@ if TYPE_CHECKING:
 
 _G = 9.80665
 _AGE = 12
-"""Time between measurement and transmission, 100 us."""
+"""Time between measurement and transmission, in units of 100 us."""
 _MICROTESLA = 50.0
 """Magnitude of the magnetic field, uT."""
 _ADVERTISEMENT = bytes.fromhex("00010400000000800653482d322e3000")
-"""Part of an advertisement: version, and names of applications."""
+"""Part of an advertisement, with version and application names."""
 _FASTEST_US = 2500
 _RVC_BAUD, _SHTP_BAUD = 115_200, 3_000_000
 _ITEMS = {
@@ -65,17 +66,17 @@ class Bno085DeviceOptions:
 
     mode: Literal["rvc", "shtp"] = "shtp"
     euler: Literal["zxy", "zyx"] = "zxy"
-    """Axes of yaw, pitch and roll in UART-RVC."""
+    """Axis order of yaw, pitch and roll in UART-RVC."""
     checks_speed: bool = False
-    """Whether a host at another speed receives garbage."""
+    """Whether a host at another line speed receives invalid bytes."""
     least_interval_us: int = _FASTEST_US
-    """Shortest interval of reports; a shorter one is replaced by it."""
+    """Shortest report interval, us. It replaces a shorter requested interval."""
     accuracy: int = 3
     firmware: tuple[int, int, int] = (3, 12, 4)
 
 
 class Bno085Device(SerialDevice):
-    """`ImuDevice` on a pty.
+    """`ImuDevice` on a pseudo-terminal (pty).
 
     Parameters
     ----------
@@ -101,10 +102,10 @@ class Bno085Device(SerialDevice):
         self._inertial = InertialSignals()
         self._codec = ShtpCodec()
         self.intervals: dict[int, int] = {}
-        """Interval of each enabled report, us."""
+        """Time interval of each enabled report, us."""
         self._packets: dict[int, int] = {}
         self.counter = 0
-        """Number of the next sample; it is sent modulo 256."""
+        """Number of the next sample. The device sends it modulo 256."""
 
     # --- control by the simulation ------------------------------------------------------------
 
@@ -115,7 +116,7 @@ class Bno085Device(SerialDevice):
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second; 0 while no report is enabled."""
+        """Sample rate, Hz; 0 while no report is enabled."""
         if self._options.mode == "rvc":
             return 100.0
         return 1e6 / min(self.intervals.values()) if self.intervals else 0.0
@@ -123,7 +124,7 @@ class Bno085Device(SerialDevice):
     @property
     @override
     def sample_bytes(self) -> int:
-        """Bytes of a sample on the wire."""
+        """Number of bytes of a sample on the wire."""
         return len(self._sample((1.0, 0.0, 0.0, 0.0)))
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
@@ -137,7 +138,7 @@ class Bno085Device(SerialDevice):
             self.sent += 1
 
     def power_cycle(self) -> None:
-        """Interrupt the power supply: settings and numbers restart."""
+        """Interrupt the power supply; settings and sequence numbers are reset."""
         self.intervals.clear()
         self._packets.clear()
         self.counter = 0
@@ -147,7 +148,7 @@ class Bno085Device(SerialDevice):
 
     @override
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run the device until cancelled."""
         if self._options.mode == "shtp" and not self.intervals:
             self.power_cycle()
         await super().run()
@@ -164,7 +165,7 @@ class Bno085Device(SerialDevice):
     def _receive(self, data: bytes) -> None:
         if self._options.mode == "rvc" or not self._same_speed:
             return
-        # the query of the buffer status has no length and is no packet of the codec
+        # The query of the buffer status has no length field, so the codec does not decode it.
         if encode_status(None) in data:
             self._write(encode_status(256))
         for event in self._codec.feed(data):

@@ -29,7 +29,8 @@ class SerialDevice(ABC):
     wire_noise
         Noise applied to each message to the host.
     baud
-        Speed of the device, bit/s; at another speed both sides receive garbage. None: any (USB).
+        Line speed of the device, bit/s. At another speed, both sides receive invalid bytes. None
+        accepts any speed (USB).
     """
 
     garbage_bits: ClassVar[int] = 0x7F
@@ -50,7 +51,7 @@ class SerialDevice(ABC):
     @property
     @abstractmethod
     def sample_bytes(self) -> int:
-        """Bytes of a sample on the wire."""
+        """Number of bytes of a sample on the wire."""
 
     @property
     def line_ns(self) -> int:
@@ -74,7 +75,7 @@ class SerialDevice(ABC):
         self._line.plug()
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run the device until cancelled."""
 
         def receive(data: bytes) -> None:
             self._receive(data if self._same_speed else bytes(byte ^ 0x55 for byte in data))
@@ -138,5 +139,5 @@ class CanDevice:
         self.wire.plug()
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run the device until cancelled."""
         await self.wire.run()

@@ -73,7 +73,7 @@ class LpmsCanDevice(CanDevice):
         super().__init__(wire)
         self._options = options = options or LpmsCanDeviceOptions()
         self.rate_hz = options.rate_hz
-        """Configured samples per second."""
+        """Configured sample rate, Hz."""
         self._ids = options.ids or tpdo_ids(options.node)
         self._used = {(channel - 1) // PER_FRAME[options.precision] for channel in options.mapping}
         self._layout = PacketLayout(TABLES[1], TABLES[1].quaternion)

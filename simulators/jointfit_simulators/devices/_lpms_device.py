@@ -1,9 +1,9 @@
-"""Virtual LP-Research LPMS sensor: LP-BUS on a pty, both generations, with the faults of real ones.
+"""Virtual LP-Research LPMS sensor of both generations, with LP-BUS on a pseudo-terminal (pty).
 
-Invariant: each generation executes its own commands only, and a command of the other generation
-does what its number means here: 04 writes the flash of a generation 3 and 05 erases its settings,
-08 puts a generation 1 to sleep and 16 starts its gyroscope calibration. Settings are lost with
-power unless stored.
+Invariant: each generation executes its own commands only. A command of the other generation has the
+effect of its number in this generation. For example, 04 writes the flash of generation 3, and 05
+erases its settings. 08 puts generation 1 to sleep, and 16 starts its gyroscope calibration.
+Settings are lost at power-off unless they are stored.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 _NS = 1_000_000_000
 _STATUS, _SLEEP, _GYRO_CALIBRATION = 0x05, 0x08, 0x16
-"""Commands of generation 1 that a host takes for others of generation 3."""
+"""Commands of generation 1 whose numbers are other commands in generation 3."""
 _FACTORY = {
     1: LpmsConfiguration(TABLES[1].mask("accelerometer_raw", "euler", "quaternion"), 100, True),
     3: LpmsConfiguration(TABLES[3].mask("accelerometer", "euler", "quaternion"), 100, True),
@@ -50,37 +50,38 @@ class LpmsDeviceOptions:
     generation: Generation = 3
     sensor_id: int = 1
     name: str = "LPMS-CU2"
-    """Device name, which generation 1 answers to 5B."""
+    """Device name, which generation 1 sends in reply to the command 5B."""
     firmware: str = "2.0.6"
     configuration: LpmsConfiguration | None = None
-    """Settings in flash at the start; None: those of the factory."""
+    """Settings that are initially in flash; the default is the factory settings."""
     world: World = "NWU"
     world_to_sensor: bool = True
     unit: int = 10_000
-    """Counts of 1.0 in 16-bit data; old firmware sends thousandths."""
+    """Number of counts for 1.0 in 16-bit data. Old firmware sends thousandths."""
     tick_hz: int | None = None
-    """Ticks of its time in a second; None: usual for the generation."""
+    """Tick rate of the time stamps, Hz; the default is the usual rate of the generation."""
     sends_seconds: bool = False
-    """Whether its time is float32 seconds, as up to firmware 1.3.4 of generation 1."""
+    """Whether time stamps are float32 seconds, as in generation 1 up to firmware 1.3.4."""
     first_tick: int = 0
     acknowledges: bool = True
-    """Whether commands are acknowledged; old firmware is silent."""
+    """Whether commands are acknowledged. Old firmware does not acknowledge them."""
     identifies: bool = True
-    """Whether it answers 5B."""
+    """Whether the sensor answers the command 5B."""
     streams_at_once: bool = True
-    """Whether it streams from the start."""
+    """Whether the sensor streams from the start."""
     text: bool = False
-    """Whether it sends lines of text in place of data packets."""
+    """Whether the sensor sends lines of text instead of data packets."""
     baud: int | None = None
-    """Speed of the sensor, bit/s; at another speed both sides receive garbage. None: any (USB)."""
+    """Line speed of the sensor, bit/s. At another speed, both sides receive invalid bytes. None
+    accepts any speed (USB)."""
     words: bool = False
-    """Whether its sums are those of words; they differ for addresses above 255 only."""
+    """Whether checksums are sums of 16-bit words. They differ for addresses above 255 only."""
     refused_rates: tuple[int, ...] = field(default=())
-    """Rates that its firmware has not, Hz."""
+    """Rates that the firmware does not support, Hz."""
 
 
 class LpmsDevice(SerialDevice):
-    """`ImuDevice` on a pty.
+    """`ImuDevice` on a pseudo-terminal (pty).
 
     Parameters
     ----------
@@ -105,32 +106,32 @@ class LpmsDevice(SerialDevice):
         self._decoder = LpBusCodec()
 
         self.flash = options.configuration or _FACTORY[options.generation]
-        """Settings that survive a loss of power."""
+        """Settings that remain after a loss of power."""
         self.configuration = self.flash
-        """Settings in force."""
+        """Active settings."""
         self.streaming = options.streams_at_once
         """Whether the sensor is in stream mode."""
         self.asleep = False
 
         self.counter = 0
-        """Number of samples since power-up; it is not sent."""
+        """Number of samples since power-up. The sensor does not send this number."""
         self.flash_writes = 0
         self.factory_resets = 0
         self.gyro_calibrations = 0
         self.commands: list[int] = []
-        """Commands received, in order."""
+        """Received commands in the order of arrival."""
 
     # --- control by the simulation ------------------------------------------------------------
 
     @property
     def rate_hz(self) -> float:
-        """Configured samples per second."""
+        """Configured sample rate, Hz."""
         return float(self.configuration.rate_hz or 0)
 
     @property
     @override
     def sample_bytes(self) -> int:
-        """Bytes of a sample on the wire."""
+        """Number of bytes of a sample on the wire."""
         return len(encode(LpmsCommand.DATA, self._packet(0, (1.0, 0.0, 0.0, 0.0))))
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
@@ -150,7 +151,7 @@ class LpmsDevice(SerialDevice):
         self.sent += self._send(LpmsCommand.DATA, data)
 
     def power_cycle(self) -> None:
-        """Interrupt the power supply: time restarts, and the settings are those in flash."""
+        """Interrupt the power supply; the time restarts, and the settings from flash apply."""
         self._epoch_ns, self.counter = self._last_ns, 0
         self.configuration, self.asleep = self.flash, False
         self.streaming = self._options.streams_at_once
@@ -170,7 +171,7 @@ class LpmsDevice(SerialDevice):
             self.streaming = False
             self._acknowledge()
         elif self.streaming:
-            return  # other commands need command mode
+            return  # outside of command mode, other commands are ignored
         elif command == LpmsCommand.STREAM_MODE:
             self._acknowledge()
             self.streaming = True
@@ -182,7 +183,7 @@ class LpmsDevice(SerialDevice):
             self._acknowledge(accepted=False)
 
     def _read(self, command: int) -> bytes | None:
-        """Return the reply to a read; None if the command is none."""
+        """Return the reply to a read command; None for other commands."""
         options, table = self._options, self._table
         if command in table.reads:
             return encode_configuration(table, command, self.configuration)
@@ -196,7 +197,7 @@ class LpmsDevice(SerialDevice):
         return bytes(4) if command == _STATUS and table.generation == 1 else None
 
     def _write_setting(self, command: int, data: bytes) -> bool:
-        """Execute a set command; return whether it was one with a value that exists."""
+        """Execute a set command; return whether the command and its value are valid."""
         part = decode_set(self._table, command, data)
         if part is None or part.rate_hz in self._options.refused_rates:
             return False
@@ -206,7 +207,7 @@ class LpmsDevice(SerialDevice):
         return True
 
     def _harm(self, command: int) -> bool:
-        """Execute a command with lasting effects; return whether it was one."""
+        """Execute a command with lasting effects; return False for other commands."""
         if command == self._table.store:
             self.flash = self.configuration
             self.flash_writes += 1
@@ -214,7 +215,7 @@ class LpmsDevice(SerialDevice):
             self.configuration = self.flash = _FACTORY[self._options.generation]
             self.factory_resets += 1
             self.flash_writes += 1
-        # sleep and gyroscope calibration exist in generation 1 only
+        # Sleep and gyroscope calibration exist in generation 1 only.
         elif command == _SLEEP and self._options.generation == 1:
             self.asleep = True
         elif command == _GYRO_CALIBRATION and self._options.generation == 1:
@@ -239,12 +240,12 @@ class LpmsDevice(SerialDevice):
 
     def _tick(self, device_ns: int) -> int:
         hz = self._options.tick_hz or self._table.tick_hz
-        # a tick is the number of a sample of the filter: the nearest, whatever the clock's jitter
+        # A tick is the number of a filter sample. Rounding removes the jitter of the clock.
         ticks = self._options.first_tick + round((device_ns - self._epoch_ns) * hz / _NS)
         return tick_of(ticks / hz) if self._options.sends_seconds else ticks % TICK_MODULUS
 
     def _packet(self, device_ns: int, q: Quaternion) -> bytes:
-        """Return the data of one packet; outputs that are not simulated are 0."""
+        """Return the data of one packet; outputs that are not simulated have the value 0."""
         options, (mask, _, floats) = self._options, self.configuration
         layout = PacketLayout(self._table, mask or 0)
         values = [0.0] * layout.values

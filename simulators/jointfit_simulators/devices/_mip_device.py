@@ -1,8 +1,9 @@
-"""Virtual MicroStrain device: MIP on a pty, with the behaviour and faults of real devices.
+"""Virtual MicroStrain device, which sends MIP messages on a pseudo-terminal (pty).
 
-Invariant: settings are volatile until saved, a command of the other family is refused, every field
-has its own decimation, so packets without time exist, the filter's output is later than the
-sensor's, and a changed speed takes effect after 250 ms without data.
+Invariants (as in real devices): settings are volatile until they are saved. A command of the other
+device family is refused. Every field has its own decimation, so some packets contain no time. The
+output of the filter is later than the output of the sensor. A changed line speed takes effect after
+250 ms without data.
 """
 
 from __future__ import annotations
@@ -45,11 +46,11 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
 _FRAME_BYTES = 6
-"""Framing of a packet, bytes."""
+"""Number of bytes of a packet in addition to its fields."""
 _SPEED_BYTES = 4
-"""Size of a speed in a command, bytes."""
+"""Number of bytes of a line speed in a command."""
 _SPEED_CHANGE_S = 0.25
-"""Time without data before a changed speed takes effect, s."""
+"""Time without data before a changed line speed takes effect, s."""
 _INVALID, _FAILED = 3, 4
 """Reply codes: invalid parameter, and command failed."""
 _FIELDS: dict[int, tuple[int, ...]] = {
@@ -77,27 +78,29 @@ class MipDeviceOptions:
     info: DeviceInformation = _CV7
     family: Family = "current"
     base_rates_hz: tuple[tuple[int, int], ...] = ((DataSet.SENSOR, 1000), (DataSet.FILTER, 500))
-    """Base rate of each data set that the device has."""
+    """Data sets of the device, each with its base rate, Hz."""
     formats: tuple[tuple[int, tuple[tuple[int, int], ...]], ...] = ()
-    """Saved message format of each data set: fields with their decimations."""
+    """Saved message formats: data set, and its fields with their decimations."""
     streams: tuple[int, ...] = ()
     """Data sets whose stream is on in the saved settings."""
     missing_fields: tuple[tuple[int, int], ...] = ()
-    """Data set and field of measurements that this model does not have."""
+    """Measurements that this model lacks: data set and field."""
     names_descriptors: bool = True
     """Whether the device answers the request for its descriptors."""
     transform: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """Saved sensor-to-vehicle rotation; legacy devices send its angles about x only."""
+    """Saved sensor-to-vehicle rotation. A legacy device sends only its angle about x."""
     roll_rad: float = 0.0
-    """Saved sensor-to-vehicle rotation of a legacy device, about x."""
+    """Saved sensor-to-vehicle rotation angle of a legacy device about x, rad."""
     baud: int | None = None
-    """Speed of the device, bit/s; at another speed both sides receive garbage. None: any (USB)."""
+    """Line speed of the device, bit/s. At another speed, both sides receive invalid bytes. None
+    accepts any speed (USB)."""
     invalid_samples: int = 0
-    """Filter orientations after power-up that are marked as invalid."""
+    """Number of filter orientations after power-up that are marked as invalid."""
     filter_delay: int = 1
-    """Samples by which the filter's output is later than the sensor's, if both are streamed."""
+    """Delay of the filter's output relative to the sensor's output if both are streamed, samples.
+    """
     idle_delay_s: float = 0.0
-    """Delay before idle is acknowledged, s; the device streams meanwhile."""
+    """Time until the device acknowledges the idle command, s. Until then, it streams."""
     first_ns: int = 0
     """Clock at power-up, ns."""
 
@@ -109,13 +112,13 @@ class _StreamState:
     outputs: tuple[FormatEntry, ...] = ()
     is_on: bool = False
     count: int = 0
-    """Samples so far."""
+    """Number of samples since the start of the stream."""
     delayed: list[tuple[int, Quaternion]] = field(default_factory=list)
-    """Samples that are not sent yet: time and orientation."""
+    """Samples that are not yet sent, each with time and orientation."""
 
 
 class MipDevice(SerialDevice):
-    """`ImuDevice` on a pty.
+    """`ImuDevice` on a pseudo-terminal (pty).
 
     Parameters
     ----------
@@ -141,7 +144,7 @@ class MipDevice(SerialDevice):
         self._codec = MipCodec()
         self._inertial = InertialSignals()
 
-        # saved outputs of each data set, and whether its stream is on
+        # Saved outputs of each data set, and whether its stream is on.
         self._base_rates = dict(options.base_rates_hz)
         self._saved = {
             data_set: (
@@ -153,9 +156,9 @@ class MipDevice(SerialDevice):
         self._changing_speed = False
 
         self.writes = 0
-        """Number of settings written."""
+        """Number of write commands for settings."""
         self.saves = 0
-        """Number of times that the settings were saved."""
+        """Number of commands that saved the settings."""
         self._power_up()
 
     def _power_up(self) -> None:
@@ -166,7 +169,7 @@ class MipDevice(SerialDevice):
         self.idle = False
         """Whether the device was set to idle."""
         self.counter = 0
-        """Number of the next sample, which is not sent."""
+        """Number of the next sample. The device does not send this number."""
         self._invalid_left = self._options.invalid_samples
 
     # --- control by the simulation ------------------------------------------------------------
@@ -178,7 +181,7 @@ class MipDevice(SerialDevice):
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second of the first stream that is on; 0 without one."""
+        """Rate of the first active stream, Hz; 0 without an active stream."""
         for data_set, state in self._streams.items():
             if state.is_on and state.outputs:
                 return self._base_rates[data_set] / _fastest(state)
@@ -187,7 +190,7 @@ class MipDevice(SerialDevice):
     @property
     @override
     def sample_bytes(self) -> int:
-        """Bytes of a sample on the wire."""
+        """Number of bytes of a sample on the wire."""
         return sum(
             _FRAME_BYTES + sum(field_bytes(data_set, one.field) for one in state.outputs)
             for data_set, state in self._streams.items()
@@ -255,7 +258,7 @@ class MipDevice(SerialDevice):
     def _reply(
         self, command_set: int, command: int, data: bytes
     ) -> tuple[int, tuple[MipField, ...]]:
-        """Return code and fields of the reply."""
+        """Return the code and the fields of the reply to a command."""
         if command_set == CommandSet.BASE:
             return self._base_reply(command, data)
         if command_set == CommandSet.FILTER and command == FilterSetup.ROTATION:
@@ -373,7 +376,7 @@ class MipDevice(SerialDevice):
         def change() -> None:
             self.baud, self._changing_speed = int.from_bytes(speed, "big"), False
 
-        def stop() -> None:  # after the acknowledgement
+        def stop() -> None:  # runs after the acknowledgement
             self._changing_speed = True
             self._after(_SPEED_CHANGE_S, change)
 
@@ -403,7 +406,7 @@ class MipDevice(SerialDevice):
             self._invalid_left -= not valid
             return (*native_of(q, "NED"), valid)
 
-        # Without a pulse per second, GPS time is the time since start.
+        # Without a pulse-per-second input, the GPS time is the time since the start.
         gps: tuple[float, ...] = (t_ns * 1e-9, 0, 0)
         x, y, z = (value / STANDARD_GRAVITY for value in self._inertial.force)
         known: dict[tuple[int, int], tuple[float, ...]] = {
@@ -427,7 +430,7 @@ _ZEROS: dict[tuple[int, int], tuple[float, ...]] = {
     (DataSet.SENSOR, SharedField.EXTERNAL_TIME): (0, 0),
     (DataSet.FILTER, SharedField.EXTERNAL_TIME): (0, 0),
 }
-"""Values of fields without a simulated measurement."""
+"""Zero values for fields that are not simulated, by data set and field."""
 
 
 def _fastest(state: _StreamState) -> int:

@@ -1,6 +1,6 @@
 """Rigid bodies of a simulated NatNet server, and conversion of poses to its frames.
 
-Input poses are z up; frames have the server's own axes.
+Input poses are in a world with z up. Frames have the axes of the server.
 
 Invariant: an untracked body repeats its last valid pose with bit 0 clear. An occluded labeled
 marker is omitted, or has bit 0 set and a plausible position.
@@ -42,7 +42,7 @@ _FILLED = _VISIBLE | MARKER_OCCLUDED
 _SIZE, _RESIDUAL, _ERROR = 0.02, 2e-4, 2e-4
 """Marker diameter, marker residual and mean marker error of a body, m."""
 _OFFSET_FROM: Version = (4, 2)
-"""Bitstream from which a body description contains an offset quaternion."""
+"""First bitstream version in which a body description contains an offset quaternion."""
 _ORIGIN: Vector = (0.0, 0.0, 0.0)
 _NEVER_TRACKED: Pose = (_ORIGIN, (1.0, 0.0, 0.0, 0.0))
 
@@ -63,19 +63,19 @@ _AXES: dict[Axis, tuple[Callable[..., Vector], Callable[..., Quaternion]]] = {
 
 @dataclass(frozen=True, slots=True)
 class RigidBodyAsset:
-    """Rigid body of a Motive project and the names of its markers."""
+    """Rigid body of a Motive project, with the names of its markers."""
 
     name: str
     markers: tuple[str, ...]
     id: int
-    """Streaming id."""
+    """Streaming id of the body in Motive."""
     positions: tuple[Vector, ...] = ()
-    """Marker positions in the body frame for the description, m; zeros if empty."""
+    """Marker positions in the body frame for the model description, m; zeros if empty."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameStamps:
-    """Frame number and server ticks of one frame."""
+    """Frame number and time stamps of one frame, in server ticks."""
 
     number: int
     timestamp: float
@@ -91,17 +91,17 @@ def axes_from_z_up(up_axis: Axis) -> tuple[Callable[..., Vector], Callable[..., 
 
 
 def model_definition(bodies: tuple[RigidBodyAsset, ...], version: Version) -> ModelDefinition:
-    """Return the descriptions of `bodies` in the order of Motive.
+    """Return the descriptions of `bodies`, in the order of Motive.
 
     Parameters
     ----------
     bodies : tuple of RigidBodyAsset
         Rigid bodies of the project.
     version : (int, int)
-        Bitstream. From 4.0 bodies name their markers; from 4.2 they contain the offset quaternion
-        expected by the only known client for 4.2.
+        Bitstream version. From 4.0, a body contains the names of its markers. From 4.2, it contains
+        the offset quaternion that the only known client for 4.2 expects.
     """
-    # the set of all markers is sent after those of the bodies
+    # The set of all markers follows the marker sets of the bodies.
     every = tuple(f"{body.name}_{i}" for body in bodies for i in range(1, len(body.markers) + 1))
     sets = [MarkerSetDescription(body.name, body.markers) for body in bodies]
     described = [
@@ -136,9 +136,10 @@ class NatNetFrameBuilder:
         stamps : FrameStamps
             Frame number and times.
         markers : mapping of str to (x, y, z) or None
-            World z up, m; None if occluded. Markers without a body are sent as unlabeled.
+            Position in the world (z up), m; None if occluded. Markers without a body are sent as
+            unlabeled.
         bodies : mapping of str to pose or None
-            Position, m, and q_world_body (w, x, y, z); None if untracked.
+            Position in the world (z up), m, and q_world_body (w, x, y, z); None if untracked.
         """
         self._markers |= {name: self._place(*at) for name, at in markers.items() if at is not None}
         self._poses |= {

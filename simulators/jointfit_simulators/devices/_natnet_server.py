@@ -1,7 +1,7 @@
-"""Simulated NatNet server on loopback with the behaviour of Motive.
+"""Simulated NatNet server of Motive on the loopback interface.
 
-Invariant: a unicast client receives frames only after the reply to its REQUEST_MODELDEF or 50 ms
-after CONNECT, because one existing client parses the next datagram as the model description.
+Invariant: a unicast client receives the first frame after the reply to its REQUEST_MODELDEF, or 50
+ms after CONNECT. One existing client treats the next datagram as the model description.
 """
 
 from __future__ import annotations
@@ -49,11 +49,12 @@ if TYPE_CHECKING:
 
 _NS = 10**9
 _PATIENCE_NS = 50_000_000
-"""Time after CONNECT from which frames are sent without REQUEST_MODELDEF, ns."""
+"""Time after CONNECT at which frames begin without REQUEST_MODELDEF, ns."""
 _ANNOUNCED_FRAMES = 10
-"""Number of frames that announce a change, so that the loss of one datagram does not hide it."""
+"""Number of frames that announce a change. With several frames, the loss of one datagram has no
+effect."""
 _SELECTABLE: Version = (4, 0)
-"""Lowest bitstream from which a unicast client may select its version."""
+"""Lowest bitstream version that a unicast client can select."""
 _NAME_FIELD = 256
 """Length of the application name in SERVERINFO, bytes."""
 _I32_MAX = struct.pack("<i", 2**31 - 1)
@@ -61,7 +62,7 @@ _I32_MAX = struct.pack("<i", 2**31 - 1)
 
 @dataclass(slots=True)
 class Client:
-    """State of one unicast client, or of the multicast group."""
+    """State of one unicast client or of the multicast group."""
 
     address: Address
     version: Version
@@ -69,23 +70,23 @@ class Client:
     connected_ns: int
     described: bool = False
     changed: int = 0
-    """Number of frames that still announce the new bitstream."""
+    """Number of further frames that announce the new bitstream version."""
     sent: int = 0
     held: bytes | None = None
-    """Frame to be sent after its successor (reordering)."""
+    """Frame that is sent after its successor (reordering)."""
 
 
 class NatNetServer:
-    """Simulated server; its port is open from the start, and `run` answers requests.
+    """Simulated server. Its port is open from the start, and `run` answers requests.
 
     Attributes
     ----------
     ready : asyncio.Event
-        Set while `run` answers.
+        Event that is set while `run` answers.
     edit_mode : bool
         Whether frames are flagged as playback of a recording.
     number : int
-        Number of the next frame; writable, to simulate a jump.
+        Number of the next frame; tests can set it to simulate a jump.
     """
 
     def __init__(self, options: NatNetServerOptions | None = None) -> None:
@@ -116,16 +117,16 @@ class NatNetServer:
 
     @property
     def sent(self) -> int:
-        """Number of frames sent, summed over clients (the multicast group counts as one)."""
+        """Number of sent frames, summed over the clients; the multicast group is one client."""
         return self._sent_before + self._group.sent + sum(c.sent for c in self.clients)
 
     @property
     def bitstream(self) -> Version:
-        """Version for clients that select none."""
+        """Bitstream version for clients that select no version."""
         return self._group.version
 
     async def run(self) -> None:
-        """Answer until cancelled."""
+        """Answer requests until cancelled."""
         self.ready.set()
         try:
             await self._port.serve(self._handle)
@@ -164,11 +165,12 @@ class NatNetServer:
         Parameters
         ----------
         exposure_host_ns : int
-            Exposure time, host CLOCK_MONOTONIC, ns; independent of the time of sending.
+            Exposure time, host CLOCK_MONOTONIC, ns. It is independent of the time of sending.
         markers : mapping of str to (x, y, z) or None
-            World z up, m; None if occluded. Markers without a body are sent as unlabeled.
+            Position in the world (z up), m; None if occluded. Markers without a body are sent as
+            unlabeled.
         bodies : mapping of str to (position, quaternion) or None
-            World z up, m, q_world_body (w, x, y, z); None if untracked.
+            Position in the world (z up), m, and q_world_body (w, x, y, z); None if untracked.
         """
         frame = self._builder.frame(self._stamps(exposure_host_ns), markers, bodies)
         if self.options.precision_ns is not None:
@@ -213,14 +215,14 @@ class NatNetServer:
             client.changed -= 1
             frame = frame._replace(params=frame.params | FRAME_BITSTREAM_CHANGED)
 
-        # damage on the wire
+        # Damage the frame on the wire.
         options, draw, data = self.options, self._random.random, encode(frame, client.version)
         if draw() < options.hostile:
             at = self._random.choice((2, 8, 12, 16, 20))
             data = data[:at] + _I32_MAX + data[at + 4 :]
         data = options.wire_noise(data)
 
-        # loss, reordering and duplication on the network
+        # Simulate loss, reordering and duplication on the network.
         if draw() < options.loss:
             return
         if client.held is None and draw() < options.reordering:
@@ -286,7 +288,7 @@ class NatNetServer:
         )  # fmt: skip
         data = bytearray(encode(info))
 
-        # like Motive, leave stale memory after the end of the name
+        # Like Motive, leave arbitrary bytes after the end of the name.
         begin = HEADER.size + len(options.application.encode()) + 1
         end = HEADER.size + _NAME_FIELD
         data[begin:end] = bytes(0xA5 ^ i & 0xFF for i in range(end - begin))
@@ -314,7 +316,7 @@ class NatNetServer:
 
 
 def _selectable_version(text: str) -> Version | None:
-    """Return the version of ``MAJOR.MINOR`` if a client may select it."""
+    """Return the version in a text ``MAJOR.MINOR`` if clients can select this version."""
     major, _, minor = text.partition(".")
     if not (major.isdecimal() and minor.isdecimal()):
         return None

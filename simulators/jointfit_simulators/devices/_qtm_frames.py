@@ -1,9 +1,9 @@
 """Settings and data packets of a simulated QTM server.
 
-Input poses are z up, m; packets have the server's own axes, mm.
+Input poses are in a world with z up, in m. Packets have the axes of the server, in mm.
 
-Invariant: markers and bodies are all sent, in the order of the settings; all bits of a missing one
-are set.
+Invariant: all markers and bodies are sent, in the order of the settings. If a marker or body is
+missing, all bits of its values are set.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ _MM = 1000.0
 _RESIDUAL = 0.5
 """Residual of markers and bodies, mm."""
 _ABSENT: float = struct.unpack("<d", b"\xff" * 8)[0]
-"""NaN whose bits are all set, also after its conversion to 32 bits."""
+"""NaN whose bits are all set, even after a conversion to 32 bits."""
 _NESTED_FROM = (1, 21)
-"""Version from which points of bodies are attributes."""
+"""First protocol version in which the points of bodies are XML attributes."""
 _ENABLED_FROM = (1, 24)
 _COMPONENTS = {
     "3d": ComponentType.MARKERS,
@@ -53,11 +53,11 @@ _COMPONENTS = {
     "6deulerres": ComponentType.BODIES_EULER_RESIDUAL,
     "timecode": ComponentType.TIMECODE,
 }
-"""Components by their names in commands."""
+"""Components, by their names in commands."""
 
 
 def requested_components(words: Sequence[str]) -> tuple[ComponentType, ...]:
-    """Return the known components among the words of a command."""
+    """Return the components whose names are among the words of a command."""
     return tuple(_COMPONENTS[word] for word in words if word in _COMPONENTS)
 
 
@@ -71,7 +71,7 @@ def settings_xml(
     camera_time: bool,
     relative: Sequence[str] = (),
 ) -> str:
-    """Return the answer to ``GetParameters`` for some of General, 3D and 6D."""
+    """Return the answer to ``GetParameters`` for the parts General, 3D and 6D."""
     wanted = {part.partition(":")[0].lower() for part in parts}
     everything = "all" in wanted
     text = ""
@@ -154,13 +154,13 @@ def components(
     kinds : sequence of ComponentType
         Components in the order of the request.
     markers, bodies : mapping
-        World z up, m; None if not seen.
+        Poses in the world (z up), m; None if not visible.
     assets : sequence of RigidBodyAsset
-        Bodies and markers of the settings.
+        Bodies and their markers in the settings.
     axes : pair of callable
         Conversion of positions and orientations to the server's axes.
     camera_ticks : int, optional
-        Exposure on the camera clock, 100 ns; None without camera time.
+        Exposure time on the camera clock, in units of 100 ns; None without camera time.
     """
     place, turn = axes
     found: list[Component] = []
@@ -179,7 +179,7 @@ def components(
             )
             found.append(ItemsComponent(kind, 0, 0, items))
 
-        # an unlabeled marker has a number in place of a name
+        # An unlabeled marker has a number instead of a name.
         elif kind in (ComponentType.UNLABELED, ComponentType.UNLABELED_RESIDUAL):
             with_residual = kind == ComponentType.UNLABELED_RESIDUAL
             loose = [
@@ -211,7 +211,7 @@ def _numbers(position: Vector | None, width: int) -> tuple[float, ...]:
 
 
 def _body(kind: ComponentType, pose: tuple[Vector, Quaternion] | None) -> tuple[float, ...]:
-    """Return position, rotation and residual of a body in the layout of its component."""
+    """Return position, rotation and residual of a body in the format of the component."""
     euler = kind in (ComponentType.BODIES_EULER, ComponentType.BODIES_EULER_RESIDUAL)
     residual = kind in (ComponentType.BODIES_RESIDUAL, ComponentType.BODIES_EULER_RESIDUAL)
     last = (_RESIDUAL,) * residual

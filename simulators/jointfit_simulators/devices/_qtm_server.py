@@ -1,7 +1,7 @@
-"""Simulated QTM server on loopback with the behaviour of Qualisys Track Manager.
+"""Simulated server of Qualisys Track Manager (QTM) on the loopback interface.
 
-Invariant: StreamFrames has no text answer, because one existing client takes the next answer for
-that of its next command.
+Invariant: the server sends no text answer to StreamFrames. One existing client would treat such an
+answer as the answer to its next command.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _NEWEST = (1, 28)
 _OLDEST = (1, 19)
 _FIRST: tuple[int, int] = (1, 1)
-"""Version of a client that selects none."""
+"""Protocol version for a client that selects no version."""
 _HUGE = struct.pack("<I", 2**32 - 1)
 _TEXTS = {
     "byteorder": "Byte order is little endian",
@@ -49,17 +49,17 @@ class QtmServerOptions:
 
     bodies: tuple[RigidBodyAsset, ...] = ()
     newest: tuple[int, int] = _NEWEST
-    """Newest version of the protocol."""
+    """Newest supported version of the protocol."""
     oldest: tuple[int, int] = _OLDEST
-    """Oldest version that it accepts; a later QTM may drop old ones."""
+    """Oldest supported version of the protocol. A future QTM may reject old versions."""
     command_port: int = 0
-    """TCP port on loopback; 0: any free port."""
+    """TCP port on the loopback interface; 0 selects a free port."""
     discovery_port: int | None = None
-    """UDP port of discovery; None: it is not answered."""
+    """UDP port for discovery requests; None if they are not answered."""
     up_axis: Axis = "z"
     rate_hz: float = 120.0
     camera_time: bool = True
-    """Whether frames contain camera time."""
+    """Whether frames contain the camera time."""
     device_ns: Callable[[int], int] = same_clock
     """Conversion from host CLOCK_MONOTONIC to the camera clock, both in ns."""
     relative: tuple[str, ...] = ()
@@ -68,15 +68,16 @@ class QtmServerOptions:
     split: bool = False
     """Whether frames over UDP are split into one datagram per component."""
     pieces: int = 1
-    """TCP segments of a frame."""
+    """Number of TCP segments per frame."""
     numbers_stand: bool = False
-    """Whether the frame number stays at 1, as in live preview."""
+    """Whether the frame number is always 1, as in the live preview."""
     loss: float = 0.0
     duplication: float = 0.0
     reordering: float = 0.0
-    """Probabilities per datagram; a reordered one is sent after its successor."""
+    """Probability that a datagram is sent after its successor. `loss` and `duplication` are also
+    probabilities per datagram."""
     hostile: float = 0.0
-    """Probability per frame of a wrong count or length."""
+    """Probability that a frame contains a wrong count or length."""
     wire_noise: WireNoise = clean_wire
     """Noise applied to each frame."""
     seed: int = 1
@@ -90,23 +91,23 @@ class QtmClient:
     stream: qtm.QtmStream = field(default_factory=qtm.QtmStream)
     version: tuple[int, int] = _FIRST
     kinds: tuple[ComponentType, ...] = ()
-    """Components to stream; none before StreamFrames."""
+    """Components to stream; empty before the command StreamFrames."""
     udp: tuple[str, int] | None = None
     held: bytes | None = None
-    """Datagram to be sent after its successor."""
+    """Datagram that is sent after its successor."""
 
 
 class QtmServer:
-    """Simulated server; its port is open from the start, and `run` answers commands.
+    """Simulated server. Its port is open from the start, and `run` answers commands.
 
     Attributes
     ----------
     ready : asyncio.Event
-        Set while `run` answers.
+        Event that is set while `run` answers.
     number : int
-        Number of the next frame; writable, to simulate a jump.
+        Number of the next frame; tests can set it to simulate a jump.
     measuring : bool
-        Whether a measurement is running; without one there is no data.
+        Whether a measurement is running; otherwise, the server sends no data.
     """
 
     def __init__(self, options: QtmServerOptions | None = None) -> None:
@@ -123,7 +124,7 @@ class QtmServer:
         self.number = 1
         self.measuring = True
         self.sent = 0
-        """Number of frames sent, summed over clients."""
+        """Number of sent frames, summed over the clients."""
         self._state = QtmEvent.CAPTURE_STARTED
         self._began_ns: int | None = None
 
@@ -133,7 +134,7 @@ class QtmServer:
         return sum(bool(client.kinds) for client in self._clients.values())
 
     async def run(self) -> None:
-        """Answer until cancelled."""
+        """Answer requests until cancelled."""
         self.ready.set()
         try:
             if self.options.discovery_port is None:
@@ -188,7 +189,7 @@ class QtmServer:
         self.report(QtmEvent.CAMERA_SETTINGS_CHANGED)
 
     def stop_measurement(self) -> None:
-        """End the measurement: clients receive "no more data"."""
+        """End the measurement; clients receive the message "no more data"."""
         self.measuring = False
         self.report(QtmEvent.CAPTURE_STOPPED)
         for client in self._clients.values():
@@ -196,12 +197,12 @@ class QtmServer:
                 client.wire.send(qtm.encode(qtm.NoMoreData()))
 
     def start_measurement(self, event: QtmEvent = QtmEvent.CAPTURE_STARTED) -> None:
-        """Begin a measurement, or with ``RT_FROM_FILE_STARTED`` the playback of a file."""
+        """Begin a measurement; the event ``RT_FROM_FILE_STARTED`` begins the playback of a file."""
         self.measuring, self._began_ns, self.number = True, None, 1
         self.report(event)
 
     def loop_file(self) -> None:
-        """Begin a recording again: stamps and numbers restart without an event."""
+        """Begin the playback again; time stamps and frame numbers restart without an event."""
         self._began_ns, self.number = None, 1
 
     def report(self, event: QtmEvent) -> None:
@@ -216,11 +217,12 @@ class QtmServer:
         Parameters
         ----------
         exposure_host_ns : int
-            Exposure time, host CLOCK_MONOTONIC, ns; independent of the time of sending.
+            Exposure time, host CLOCK_MONOTONIC, ns. It is independent of the time of sending.
         markers : mapping of str to (x, y, z) or None
-            World z up, m; None if occluded. Markers without a body are sent as unlabeled.
+            Position in the world (z up), m; None if occluded. Markers without a body are sent as
+            unlabeled.
         bodies : mapping of str to (position, quaternion) or None
-            World z up, m, q_world_body (w, x, y, z); None if untracked.
+            Position in the world (z up), m, and q_world_body (w, x, y, z); None if untracked.
         """
         if not self.measuring:
             return
@@ -276,7 +278,7 @@ class QtmServer:
         for item in [data] * copies + ([late] if late is not None else []):
             try:
                 self._udp.sendto(item, client.udp)
-            except OSError:  # closed client or full queue: UDP loses the datagram
+            except OSError:  # client closed or queue full; UDP loses the datagram
                 return False
         return True
 
@@ -351,7 +353,7 @@ class QtmServer:
 
 
 def _udp_socket() -> socket.socket:
-    """Return the socket from which frames are sent."""
+    """Return the UDP socket that sends frames."""
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     opened.setblocking(False)
     return opened

@@ -1,10 +1,11 @@
-"""Virtual self-described device: sends what a table describes, on a serial line or a CAN bus.
+"""Virtual device whose messages a table describes, on a serial line or a CAN bus.
 
-The device encodes with the same codecs as the decoder, from orientations and from the inertial
-signals that follow from them. It never answers. Its faults are those of boards of one's own: text
-at power-up, messages of other types, samples marked as invalid, a clock that starts again at 0.
+The device sends orientations, and the inertial signals that follow from the orientations. It
+encodes them with the codecs of the decoder. It never answers. Its faults are typical for custom
+boards: text at power-up, messages of other types, samples marked as invalid, and a clock that
+restarts at 0.
 
-Invariant: clock and counter continue while the host does not listen.
+Invariant: clock and counter continue while the host does not receive.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.wires import CanWire
 
 _BITS = 10
-"""Bits of one byte on the line (8N1)."""
+"""Number of bits per byte on a serial line (8N1)."""
 _SIGNALS = {
     "rate": Item.RATE_OF_TURN,
     "acceleration": Item.ACCELERATION,
@@ -47,21 +48,21 @@ _SIGNALS = {
 
 
 class TablePort(Protocol):
-    """Wire of a device: turns records into bytes or frames."""
+    """Wire of a device, which converts records to bytes or frames."""
 
     @property
     def is_open(self) -> bool:
-        """Whether the host listens, as far as the wire can detect it."""
+        """Whether the host receives, as far as the wire can detect it."""
 
     @property
     def line_ns(self) -> int:
         """Transmission time of a sample, ns."""
 
     def send(self, values: Sequence[float]) -> bool:
-        """Send a record; return whether all of it was sent."""
+        """Send a record; return whether the whole record was sent."""
 
     def send_text(self, text: bytes) -> None:
-        """Send bytes that are no record; no effect on CAN."""
+        """Send bytes that do not form a record; CAN ignores this call."""
 
     def unplug(self) -> None:
         """Disconnect the wire."""
@@ -70,18 +71,18 @@ class TablePort(Protocol):
         """Connect the wire."""
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run the wire until cancelled."""
 
 
 class SerialTablePort:
-    """Serial line on a pty.
+    """Serial line on a pseudo-terminal (pty).
 
     Parameters
     ----------
     link
         Symbolic link to the host's port.
     wire
-        Description of the frames or lines.
+        Description of the binary frames or text lines.
     wire_noise
         Noise applied to each message.
     """
@@ -92,7 +93,7 @@ class SerialTablePort:
         self._line, self._wire, self._noise = PtyLine(link), wire, wire_noise
         self._size = 0
         self.is_open = True
-        """A serial device sends whether the host listens or not."""
+        """Always True, because a serial device sends even if the host does not receive."""
 
     @property
     def line_ns(self) -> int:
@@ -101,7 +102,7 @@ class SerialTablePort:
         return self._size * _BITS * 1_000_000_000 // baud if baud else 0
 
     def send(self, values: Sequence[float]) -> bool:
-        """Send a record; return whether all of it was sent."""
+        """Send a record; return whether the whole record was sent."""
         wire = self._wire
         if isinstance(wire, LineFormat):
             data = encode_line(wire, values)
@@ -111,7 +112,7 @@ class SerialTablePort:
         return self._line.write(self._noise(data))
 
     def send_text(self, text: bytes) -> None:
-        """Send bytes that are no record."""
+        """Send bytes that do not form a record."""
         if text:
             self._line.write(self._noise(text))
 
@@ -124,7 +125,7 @@ class SerialTablePort:
         self._line.plug()
 
     async def run(self) -> None:
-        """Serve until cancelled; received bytes are ignored."""
+        """Run the line until cancelled; ignore received bytes."""
         await self._line.serve(lambda _: None)
 
 
@@ -134,7 +135,7 @@ class CanTablePort:
     Parameters
     ----------
     wire
-        Bus; several devices may share it.
+        CAN bus, which several devices may share.
     table
         Description of the frames.
     """
@@ -166,7 +167,7 @@ class CanTablePort:
         ]
 
     def send_text(self, text: bytes) -> None:
-        """Ignore text; a CAN bus transfers frames."""
+        """Ignore the text, because a CAN bus transfers frames only."""
 
     def unplug(self) -> None:
         """Disconnect the wire."""
@@ -177,7 +178,7 @@ class CanTablePort:
         self.wire.plug()
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run the wire until cancelled."""
         await self.wire.run()
 
 
@@ -186,14 +187,15 @@ class TableDeviceOptions:
     """Content of the records, and faults."""
 
     fields: Mapping[int, TableField] = field(default_factory=dict)
-    """Form and SI scale of each slot; places matter on CAN and in frames only."""
+    """Format and SI scale of each slot. The position of a field matters in CAN frames and binary
+    frames only."""
     rate_hz: float = 100.0
     world: World = "ENU"
     world_to_sensor: bool = False
     counts: int = 1 << 32
-    """Values of a counter in text."""
+    """Modulus of time and counter in text lines."""
     valid: int = 1
-    """Number of validity in valid samples."""
+    """Value of the validity field in valid samples."""
     invalid: int = 0
     """Number of samples after power-up that are marked as invalid."""
     greeting: bytes = b""
@@ -201,19 +203,19 @@ class TableDeviceOptions:
     other: bytes = b""
     """Message of another type, sent before every tenth sample."""
     first_ns: int = 0
-    """Clock at power-up, ns."""
+    """Clock value at power-up, ns."""
     first_counter: int = 0
     errors: SensorErrors | None = None
-    """Errors of its sensors; None: it measures exactly."""
+    """Errors of the device's sensors; None for exact measurements."""
 
 
 class TableDevice:
-    """`ImuDevice` that sends what a table describes.
+    """`ImuDevice` whose messages a table describes.
 
     Parameters
     ----------
     port
-        Its wire.
+        Wire of the device.
     options
         Content of the records, and faults.
     """
@@ -222,16 +224,16 @@ class TableDevice:
         self._port, self._options = port, options
         self._inertial = InertialSignals(options.errors)
         self.rate_hz = options.rate_hz
-        """Configured samples per second."""
+        """Configured sample rate, Hz."""
         self.counter = options.first_counter
         """Number of the next sample."""
         self._epoch_ns = self._last_ns = self._to_lose = self._since_start = 0
         self.sent = 0
-        """Number of samples written to the wire."""
+        """Number of samples that were written to the wire."""
 
     @property
     def streaming(self) -> bool:
-        """Whether the device sends: always on a serial line, while the bus is open on CAN."""
+        """Whether the device sends: always on a serial line, with an open bus on CAN."""
         return self._port.is_open
 
     @property
@@ -240,7 +242,7 @@ class TableDevice:
         return self._port.line_ns
 
     def edge(self, device_ns: int) -> None:
-        """Ignore an edge on a sync input; tables describe no sync messages."""
+        """Ignore an edge on a sync input, because tables describe no sync messages."""
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Send one sample now, as described in `ImuDevice.push`."""
@@ -259,7 +261,7 @@ class TableDevice:
             self.sent += 1
 
     def record(self, device_ns: int, q_world_sensor: Quaternion) -> list[float]:
-        """Return the numbers of a sample as sent, in the order of their slots."""
+        """Return the transmitted numbers of a sample, in the order of their slots."""
         options = self._options
         w, x, y, z = native_of(q_world_sensor, options.world)
         native = (w, -x, -y, -z) if options.world_to_sensor else (w, x, y, z)
@@ -282,7 +284,7 @@ class TableDevice:
         ]
 
     def _number(self, place: TableField, value: float, name: str) -> float:
-        """Return a value as sent."""
+        """Return the transmitted number for a value."""
         raw = (value - place.zero) / place.scale
         if place.kind == "f":
             return raw
@@ -293,7 +295,7 @@ class TableDevice:
         return max(low, min(low + place.modulus - 1, count))
 
     def lose(self, count: int) -> None:
-        """Lose the next `count` samples: the counter increments, but they are not sent."""
+        """Lose the next `count` samples; the counter increments, but they are not sent."""
         self._to_lose += count
 
     def power_cycle(self) -> None:
@@ -310,5 +312,5 @@ class TableDevice:
         self._port.plug()
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run the device until cancelled."""
         await self._port.run()

@@ -161,7 +161,7 @@ class TextServer:
         self.unplug, self.plug = self._port.unplug, self._port.plug
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run until cancelled."""
         await self._port.serve(self._join, _ignore)
 
     def _join(self, client: TcpClient) -> None:

@@ -1,7 +1,7 @@
-"""Virtual VectorNav device: binary outputs and ASCII registers on a pty.
+"""Virtual VectorNav device with binary outputs and ASCII registers on a pseudo-terminal (pty).
 
-Invariant: registers are volatile until stored, replies repeat the request, an error replaces a
-reply, ASCII messages stand between binary outputs, and asynchronous output can be paused.
+Invariants: registers are volatile until they are stored. A reply repeats the request, and an error
+replaces a reply. ASCII messages are sent between binary outputs. Asynchronous output can be paused.
 """
 
 from __future__ import annotations
@@ -52,21 +52,22 @@ class VectorNavDeviceOptions:
     firmware: str = "3.1.0.0"
     imu_rate_hz: int = 800
     outputs: tuple[tuple[int, int, tuple[int, ...]], ...] = ()
-    """Stored binary outputs 1, 2 and 3: ports, divisor and fields."""
+    """Stored settings of the binary outputs 1, 2 and 3: ports, rate divisor, and fields."""
     text_output: str = "VNYMR"
-    """ASCII output that is on in the stored settings; empty: off."""
+    """Stored ASCII output; empty if it is off."""
     rotation: str = _IDENTITY
-    """Reference frame rotation, register 26."""
+    """Reference frame rotation (register 26)."""
     missing_fields: tuple[int, ...] = ()
-    """Fields of binary outputs that this model refuses."""
+    """Binary output fields that this model refuses."""
     baud: int | None = None
-    """Speed of the device, bit/s; at another speed both sides receive garbage. None: any (USB)."""
+    """Line speed of the device, bit/s. At another speed, both sides receive invalid bytes. None
+    accepts any speed (USB)."""
     first_ns: int = 0
     """Clock at power-up, ns."""
 
 
 class VectorNavDevice(SerialDevice):
-    """`ImuDevice` on a pty.
+    """`ImuDevice` on a pseudo-terminal (pty).
 
     Parameters
     ----------
@@ -92,7 +93,7 @@ class VectorNavDevice(SerialDevice):
         self._codec = VectorNavCodec()
         self._inertial = InertialSignals()
 
-        # registers in flash
+        # Registers in flash.
         self._stored_outputs = dict(
             zip(_OUTPUTS, (BinaryOutput(*one) for one in options.outputs), strict=False)
         )
@@ -100,21 +101,21 @@ class VectorNavDevice(SerialDevice):
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
         self.writes = 0
-        """Number of registers written."""
+        """Number of register writes."""
         self.stores = 0
-        """Number of times that the registers were stored."""
+        """Number of commands that stored the registers."""
         self._power_up()
 
     def _power_up(self) -> None:
         none = BinaryOutput(0, 1, ())
         self.outputs = {number: self._stored_outputs.get(number, none) for number in _OUTPUTS}
-        """Binary outputs in force, by register."""
+        """Active binary outputs, by register."""
         self.text_output = self._stored_text
-        """ASCII output in force; empty: off."""
+        """Active ASCII output; empty if it is off."""
         self.paused = False
         """Whether asynchronous output is paused."""
         self.counter = 0
-        """Number of the next sample, which is not sent."""
+        """Number of the next sample. The device does not send this number."""
 
     # --- control by the simulation ------------------------------------------------------------
 
@@ -125,7 +126,7 @@ class VectorNavDevice(SerialDevice):
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second of the first binary output that is on; 0 without one."""
+        """Rate of the first active binary output, Hz; 0 without an active output."""
         for one in self.outputs.values():
             if one.ports and one.fields:
                 return self._options.imu_rate_hz / one.divisor
@@ -134,7 +135,7 @@ class VectorNavDevice(SerialDevice):
     @property
     @override
     def sample_bytes(self) -> int:
-        """Bytes of a sample on the wire."""
+        """Number of bytes of a sample on the wire."""
         return sum(
             len(self._output(one, 0, self._q))
             for one in self.outputs.values()
@@ -179,8 +180,8 @@ class VectorNavDevice(SerialDevice):
                 self._write(encode_text(self._reply(event)))
 
     def _reply(self, message: TextMessage) -> str:
-        """Return the reply to a request, or an error."""
-        # a valid command is answered by its echo; a read adds the content
+        """Return the reply to a request, or an error message."""
+        # The reply repeats a valid command; the reply to a read adds the content.
         echo = ",".join((message.command, *message.values))
         match message.command:
             case "VNASY" if message.values in {("0",), ("1",)}:
@@ -202,7 +203,7 @@ class VectorNavDevice(SerialDevice):
         return echo
 
     def _read(self, register: int) -> str | None:
-        """Return the content of a register; None if there is none."""
+        """Return the content of a register; None if the register does not exist."""
         if register in self.outputs:
             output = self.outputs[register]
             return encode_output(output) if output.fields else f"{output.ports},{output.divisor},00"
@@ -220,7 +221,7 @@ class VectorNavDevice(SerialDevice):
         }.get(register)
 
     def _store_volatile(self, register: int, values: tuple[str, ...]) -> bool:
-        """Write a register; return whether it and its values are valid."""
+        """Write a register; return whether the register and the values are valid."""
         if register == Register.TEXT_OUTPUT and values[:1] == ("0",):
             self.text_output = ""
             return True
@@ -250,7 +251,7 @@ class VectorNavDevice(SerialDevice):
             Field.MAGNETIC_AND_PRESSURE: (*self._inertial.field, 25.0, 101.3),
         }
 
-        # other fields contain zeros
+        # All other fields contain zeros.
         places = BinaryLayout(output.fields).places
         return encode_binary(
             {

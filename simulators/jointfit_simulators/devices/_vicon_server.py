@@ -1,9 +1,10 @@
-"""Simulated Vicon DataStream server on loopback.
+"""Simulated Vicon DataStream server on the loopback interface.
 
-Every rigid body is a prop: a subject with one segment of the same name. A body that is not seen
-has no object in the frame.
+Every rigid body is a prop: a Vicon subject with one segment of the same name. A frame contains no
+object for a body that is not visible.
 
-Invariant: static objects are sent once after each change and are listed as unchanged afterwards.
+Invariant: static objects are sent once after each change. The following frames list them as
+unchanged.
 """
 
 from __future__ import annotations
@@ -54,20 +55,20 @@ class ViconServerOptions:
 
     bodies: tuple[RigidBodyAsset, ...] = ()
     command_port: int = 0
-    """TCP port on loopback; 0: any free port."""
+    """TCP port on the loopback interface; 0 selects a free port."""
     up_axis: Axis = "z"
-    """``z`` or ``y``, which the server announces."""
+    """Vertical axis that the server announces, ``z`` or ``y``."""
     rate_hz: float = 120.0
     device_ns: Callable[[int], int] = same_clock
     """Conversion from host CLOCK_MONOTONIC to the camera clock, both in ns."""
     stages: tuple[tuple[str, float], ...] = (("Processing", 0.003), ("Streaming", 0.001))
-    """Announced latencies, s."""
+    """Announced latency of each processing stage, s."""
     light: bool = False
-    """Whether only light-weight segments are offered."""
+    """Whether the server offers light-weight segment data only."""
     pieces: int = 1
-    """TCP segments of a frame."""
+    """Number of TCP segments per frame."""
     hostile: float = 0.0
-    """Probability per frame of a wrong count or length."""
+    """Probability that a frame contains a wrong count or length."""
     wire_noise: WireNoise = clean_wire
     """Noise applied to each frame."""
     seed: int = 1
@@ -82,20 +83,20 @@ class ViconClient:
     wanted: frozenset[int] = frozenset()
     streams: bool = False
     frames: int = 0
-    """Frames that it requested one by one."""
+    """Number of single frames that the client requested."""
     informed: frozenset[int] = frozenset()
-    """Static types that it has in their current state."""
+    """Types of static objects whose current state the client has received."""
 
 
 class ViconServer:
-    """Simulated server; its port is open from the start, and `run` answers requests.
+    """Simulated server. Its port is open from the start, and `run` answers requests.
 
     Attributes
     ----------
     ready : asyncio.Event
-        Set while `run` answers.
+        Event that is set while `run` answers.
     number : int
-        Number of the next frame, from 0; writable, to simulate a jump.
+        Number of the next frame, from 0; tests can set it to simulate a jump.
     quality : float
         Tracking quality of all subjects, 0 to 1.
     """
@@ -113,14 +114,14 @@ class ViconServer:
         self.number = 0
         self.quality = 1.0
         self.sent = 0
-        """Number of frames sent, summed over clients."""
+        """Number of sent frames, summed over the clients."""
         self._began_ns: int | None = None
         self.offer = _OFFER
         if self.options.light:
             self.offer = _OFFER - {ObjectId.GLOBAL_SEGMENTS} | {ObjectId.LIGHT_SEGMENTS}
 
     async def run(self) -> None:
-        """Answer until cancelled."""
+        """Answer requests until cancelled."""
         self.ready.set()
         try:
             await self._port.serve(self._join, self._handle)
@@ -143,7 +144,7 @@ class ViconServer:
         self.number, self._began_ns = 0, None
 
     def set_bodies(self, bodies: tuple[RigidBodyAsset, ...]) -> None:
-        """Replace the subjects during the run; clients receive the static objects again."""
+        """Replace the subjects during the run; clients then receive the static objects again."""
         self._bodies = bodies
         self.refresh()
 
@@ -158,16 +159,16 @@ class ViconServer:
         Parameters
         ----------
         exposure_host_ns : int
-            Exposure time, host CLOCK_MONOTONIC, ns; independent of the time of sending.
+            Exposure time, host CLOCK_MONOTONIC, ns. It is independent of the time of sending.
         markers : mapping of str to (x, y, z) or None
-            World z up, m; None if occluded. Markers without a body are not sent.
+            Position in the world (z up), m; None if occluded. Markers without a body are not sent.
         bodies : mapping of str to (position, quaternion) or None
-            World z up, m, q_world_body (w, x, y, z); None if untracked.
+            Position in the world (z up), m, and q_world_body (w, x, y, z); None if untracked.
         """
         device_ns = self.options.device_ns(exposure_host_ns)
         if self._began_ns is None:
             self._began_ns = device_ns
-        # The cameras count exposures by their own clock, from any number.
+        # The cameras count exposures on their own clock, from an arbitrary number.
         hardware = round((device_ns - self._began_ns) * self.options.rate_hz / _NS)
         dynamic = self._dynamic(hardware, markers, bodies)
         self.number += 1
@@ -205,7 +206,7 @@ class ViconServer:
             (ObjectId.APPLICATION_INFO, vicon.ApplicationInfo(int(options.up_axis == "y"))),
         ]
 
-        # subjects, markers and segments count from 1
+        # The numbers of subjects, markers and segments begin at 1.
         for number, body in enumerate(self._bodies, 1):
             markers = tuple(
                 vicon.MarkerInfo(marker, name) for marker, name in enumerate(body.markers, 1)
@@ -226,7 +227,7 @@ class ViconServer:
             (ObjectId.FRAME_RATES, vicon.FrameRates((("Camera", rate_hz),))),
         ]
 
-        # markers and segments that are not seen are left out
+        # Omit markers and segments that are not visible.
         recons = []
         for subject, body in enumerate(self._bodies, 1):
             for marker, name in enumerate(body.markers, 1):
@@ -275,7 +276,7 @@ class ViconServer:
     def _request(self, client: ViconClient, item: Object) -> None:
         match item:
             case vicon.ObjectEnums(ids):
-                # Newly wanted static objects are sent in full.
+                # Send newly requested static objects in full.
                 client.informed &= client.wanted
                 client.wanted = ids & self.offer
             case vicon.RequestFrame(stream):

@@ -1,7 +1,8 @@
-"""Simulated VRPN server: trackers over TCP and UDP, classic and direct connections.
+"""Simulated VRPN server with trackers over TCP and UDP, in classic and direct connections.
 
-Invariant: a body that is not seen has no message. Stamps are the wall clock of the server when a
-message is made, and can step. Numbers of types and senders differ from those of clients.
+Invariant: the server sends no message for a body that is not visible. Time stamps are from the
+server's wall clock when a message is created, and this clock can step. The numbers of types and
+senders differ from the numbers in clients.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.devices._natnet_port import Address
 
 _FIRST_SENDER, _FIRST_TYPE = 3, 11
-"""First numbers of trackers and types; those before belong to the connection of real servers."""
+"""First numbers of trackers and types. In real servers, the connection uses the numbers before."""
 _CONTROL = "VRPN Control"
 _MOST_DATAGRAM = 1472
 _I32_MAX = b"\x7f\xff\xff\xff"
@@ -61,16 +62,16 @@ class _VrpnClient:
 
 
 class VrpnServer:
-    """Simulated server; its port is open from the start, and `run` answers clients.
+    """Simulated server. Its port is open from the start, and `run` answers clients.
 
     Attributes
     ----------
     ready : asyncio.Event
-        Set while `run` answers.
+        Event that is set while `run` answers.
     number : int
-        Number of the next frame, which VRPN does not send.
+        Number of the next frame. VRPN does not send this number.
     stepped_ns : int
-        Time by which the wall clock of the server was stepped; writable.
+        Step of the server's wall clock, ns; tests can set it.
     """
 
     def __init__(self, options: VrpnServerOptions | None = None) -> None:
@@ -101,11 +102,11 @@ class VrpnServer:
 
     @property
     def sent(self) -> int:
-        """Number of frames sent, summed over clients."""
+        """Number of sent frames, summed over the clients."""
         return self._sent_before + sum(client.sent for client in self._clients)
 
     async def run(self) -> None:
-        """Answer until cancelled."""
+        """Answer requests until cancelled."""
         self.ready.set()
         try:
             await self._port.serve(self._connected, self._announced)
@@ -130,7 +131,7 @@ class VrpnServer:
 
     def push(self, exposure_host_ns: int, markers: Markers, bodies: Bodies) -> None:
         """Send one frame now; see `NatNetServer.push`."""
-        # Messages are made one after the other, also those of frames that are sent at once.
+        # Messages are created one after another, even if their frames are sent together.
         made_ns = max(time.monotonic_ns(), exposure_host_ns, self._made_ns)
         server_ns = self.options.device_ns(made_ns) + self._epoch_ns + self.stepped_ns
         poses: dict[str, Pose] = {name: pose for name, pose in bodies.items() if pose is not None}
@@ -185,7 +186,7 @@ class VrpnServer:
         return True
 
     def _send_datagram(self, client: _VrpnClient, address: Address, data: bytes) -> None:
-        """Send a datagram with the losses of a network."""
+        """Send a datagram; simulate the losses of a network."""
         options, draw = self.options, self._random.random
         if draw() < options.loss:
             return
@@ -200,7 +201,7 @@ class VrpnServer:
     # --- connections --------------------------------------------------------------------------
 
     def _announced(self, data: bytes, address: Address) -> None:
-        """Connect back to a client of the classic form, at the address of its datagram."""
+        """Connect to a client that announced a classic connection, at the host of its datagram."""
         announcement = decode_announcement(data)
         if not isinstance(announcement, CorruptBytes) and "classic" in self.options.connections:
             self._port.connect_back((address[0], announcement.port))

@@ -1,7 +1,8 @@
-"""Virtual WitMotion device on a pty, with the behaviour and faults of real devices.
+"""Virtual WitMotion device on a pseudo-terminal (pty), with the faults of real devices.
 
-Invariant: the device sends no quaternion until it is configured, acknowledges nothing, accepts
-writes for 10 s after the unlock command, and loses them at power-off unless they were saved.
+Invariants: the device sends no quaternion until it is configured, and acknowledges no command. It
+accepts write commands for 10 s after the unlock command. Written values are lost at power-off
+unless they are saved.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
 UNLOCKED_S = 10.0
-"""Time after the unlock command in which writes are accepted, s."""
+"""Time after the unlock command in which write commands are accepted, s."""
 FACTORY_CONTENT = content_bits(
     WitMotionFrameKind.ACCELERATION,
     WitMotionFrameKind.RATE,
@@ -59,9 +60,9 @@ _KINDS = 16
 _G = 9.8
 _FULL_RATE = radians(2000.0)
 _EPOCH_MS = 475_372_800_000
-"""Date of the clock at power-up, ms since 2000: an arbitrary one, 24 January 2015."""
+"""Clock value at power-up, ms since 2000. The date is arbitrary (24 January 2015)."""
 _FIELD_COUNTS = 500
-"""Counts of the magnitude of the magnetic field."""
+"""Magnitude of the magnetic field, counts."""
 _GLITCH_MS = 3_600_000
 _OTHER_FRAME = struct.Struct("<BB9h")
 
@@ -74,21 +75,22 @@ class WitMotionDeviceOptions:
     """Value of the register CONTENT."""
     rate_hz: int = 10
     baud: int | None = None
-    """Speed of the device, bit/s; at another speed both sides receive garbage. None: any."""
+    """Line speed of the device, bit/s. At another speed, both sides receive invalid bytes. None
+    accepts any speed."""
     world: World = "ENU"
     world_to_sensor: bool = False
     answers_reads: bool = True
     """Whether the firmware answers read commands."""
     ignores_commands: bool = False
-    """Whether the wire from the host is broken."""
+    """Whether the wire from the host to the device is broken."""
     bluetooth: bool = False
-    """Whether the device sends 55 61 frames, like Bluetooth models."""
+    """Whether the device sends frames that begin with 55 61, like Bluetooth models."""
     time_glitch_every: int = 0
-    """Samples between two glitches of the calendar time; 0: none."""
+    """Number of samples between two errors of the calendar time; 0 disables the errors."""
 
 
 class WitMotionDevice(SerialDevice):
-    """`ImuDevice` on a pty.
+    """`ImuDevice` on a pseudo-terminal (pty).
 
     Parameters
     ----------
@@ -102,7 +104,7 @@ class WitMotionDevice(SerialDevice):
         Clock of the lock, s.
     """
 
-    streaming = True  # from power-on, independent of the host
+    streaming = True  # the device always sends
     garbage_bits = 0x4A
 
     def __init__(
@@ -125,12 +127,12 @@ class WitMotionDevice(SerialDevice):
         if options.baud is not None:
             self.flash[WitMotionRegister.BAUD] = BAUD_CODES[options.baud]
         self.registers = dict(self.flash)
-        """Registers in force; `flash` contains those that survive power-off."""
+        """Active registers; `flash` contains the registers that remain after power-off."""
         self._unlocked_until_s = 0.0
         self._rest = b""
 
         self.counter = 0
-        """Number of the next sample; the device does not send it."""
+        """Number of the next sample. The device does not send this number."""
         self.saved = 0
         """Number of commands that stored the registers in flash."""
 
@@ -138,14 +140,14 @@ class WitMotionDevice(SerialDevice):
 
     @property
     def rate_hz(self) -> float:
-        """Configured samples per second."""
+        """Configured sample rate, Hz."""
         codes = {code: rate for rate, code in RATE_CODES.items()}
         return float(codes.get(self.registers[WitMotionRegister.RATE], 10))
 
     @property
     @override
     def sample_bytes(self) -> int:
-        """Bytes of a sample on the wire."""
+        """Number of bytes of a sample on the wire."""
         return len(self._frames(0, (1.0, 0.0, 0.0, 0.0)))
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
@@ -189,7 +191,7 @@ class WitMotionDevice(SerialDevice):
             if value == _UNLOCK:
                 self._unlocked_until_s = self._now_s() + UNLOCKED_S
         elif self._now_s() >= self._unlocked_until_s:
-            return  # writes need the unlock command
+            return  # a write requires the unlock command
         elif register == WitMotionRegister.SAVE:
             self.flash = dict(self.registers)
             self.saved += 1
@@ -206,7 +208,7 @@ class WitMotionDevice(SerialDevice):
         return code is None or (host is not None and BAUD_CODES.get(host) == code)
 
     def _frames(self, device_ns: int, q: Quaternion) -> bytes:
-        """Return the frames of one sample, in the order of their kinds."""
+        """Return the frames of one sample, in the order of their types."""
         content = self.registers[WitMotionRegister.CONTENT]
         kinds = [_FIRST_KIND + bit for bit in range(_KINDS) if content >> bit & 1]
         return b"".join(encode(kind, self._data(kind, device_ns, q)) for kind in kinds)
@@ -216,13 +218,13 @@ class WitMotionDevice(SerialDevice):
             every = self._options.time_glitch_every
             glitch = every and self.counter % every == every - 1
             return encode_time(_EPOCH_MS + device_ns // TICK_NS + _GLITCH_MS * bool(glitch))
-        # missing values are 0
+        # Missing values are 0.
         values = [*self._values(kind, q), 0.0, 0.0, 0.0, 0.0][:4]
         w, x, y, z = (round(value * FULL_SCALE) for value in values)
         return encode_counts((w, x, y, z))
 
     def _values(self, kind: int, q: Quaternion) -> list[float]:
-        """Return the values of a frame in units of full scale; none for other kinds."""
+        """Return the values of a frame as fractions of full scale; empty for other frame types."""
         match kind:
             case WitMotionFrameKind.ACCELERATION:
                 return self._signal(Item.ACCELERATION, 16.0 * _G)
@@ -243,7 +245,7 @@ class WitMotionDevice(SerialDevice):
         return [value / full for value in self._inertial.value(item) or ()]
 
     def _other_frame(self, q: Quaternion) -> bytes:
-        """Return a frame of the variant 55 61: acceleration, rate and angle, no checksum."""
+        """Return a frame of the variant 55 61: acceleration, rate, angle and no checksum."""
         angles = [round(angle / 180.0 * FULL_SCALE) for angle in roll_pitch_yaw_deg(q)]
         limited = [max(-FULL_SCALE, min(FULL_SCALE - 1, angle)) for angle in angles]
         return _OTHER_FRAME.pack(0x55, 0x61, 0, 0, 2048, 0, 0, 0, *limited)

@@ -1,8 +1,8 @@
-"""Virtual Xsens / Movella device: Xbus on a pty, with the behaviour and faults of real devices.
+"""Virtual Xsens / Movella device, which sends Xbus messages on a pseudo-terminal (pty).
 
-Invariant: the device streams while GoToConfig is pending, rejects an invalid output configuration
-with error 0x21, acknowledges with the rates in use, stores each setting in flash at once, and sends
-WakeUp after power-up. Source: MT0101P rev. 2020.A.
+Invariants (as in real devices): the device streams until it acknowledges GoToConfig. It rejects an
+invalid output configuration with error 0x21, and acknowledges a valid one with the actual rates. It
+stores each setting in flash at once, and sends WakeUp after power-up. Source: MT0101P rev. 2020.A.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ if TYPE_CHECKING:
 WAKE_UP_S = 0.5
 """Time after WakeUp in which the host can select configuration mode, s."""
 FILTER_RATE_HZ = 400
-"""Rate of the orientation filter, Hz; output rates are integer fractions of it."""
+"""Rate of the orientation filter, Hz. The ratio of this rate to an output rate is an integer."""
 _MOST_OUTPUTS = 32
-"""Number of items in an output configuration."""
+"""Maximum number of items in an output configuration."""
 _COUNTS = 1 << 16
 """Modulus of the packet counter."""
 _FOREIGN_EVERY = 12
-"""Number of messages between those of a GNSS receiver: 4 Hz with orientations at 50 Hz."""
+"""Number of messages between two messages of a GNSS receiver: 4 Hz for orientations at 50 Hz."""
 _PARAMETER = b"\x21"
 """Error code for a parameter out of range."""
 _INVALID = b"\x04"
@@ -69,34 +69,36 @@ class XbusDeviceOptions:
         (Item.STATUS_WORD, setup.MAX_RATE),
         (Item.QUATERNION, 100),
     )
-    """Output configuration in flash at the start."""
+    """Output configuration that is initially in flash."""
     sync: tuple[setup.SyncSetting, ...] = ()
-    """Synchronisation settings in flash at the start."""
+    """Synchronisation settings that are initially in flash."""
     baud: int | None = None
-    """Speed of the device, bit/s; at another speed both sides receive garbage. None: any (USB)."""
+    """Line speed of the device, bit/s. At another speed, both sides receive invalid bytes. None
+    accepts any speed (USB)."""
     measures_at_once: bool = False
-    """Whether the device streams from the start; otherwise it starts in configuration mode."""
+    """Whether the device streams from the start. Otherwise, it starts in configuration mode."""
     wakes_up: bool = False
-    """Whether the device starts with WakeUp and `WAKE_UP_S` for the reply."""
+    """Whether the device sends WakeUp at the start and waits `WAKE_UP_S` for the reply."""
     stuck: bool = False
-    """Whether the device streams and ignores all requests except Reset, which ends the fault."""
+    """Whether the device streams and ignores all requests. The request Reset ends this fault."""
     legacy: MTDataLayout | None = None
-    """Fields of MTData of an older device, which knows no output configuration."""
+    """Message layout (MTData) of an older device, which supports no output configuration."""
     legacy_world: World = "NWU"
     legacy_hz: float = 100.0
     legacy_skip: int = 0
-    """Samples left out after each message of MTData."""
+    """Number of samples that are omitted after each MTData message."""
     gnss: bool = False
-    """Whether messages of a GNSS receiver, with its own time and no orientation, are inserted."""
+    """Whether messages of a GNSS receiver are inserted. They have their own time and no
+    orientation."""
     config_delay_s: float = 0.0
-    """Delay before GoToConfig is acknowledged, s; the device streams meanwhile."""
+    """Time until the device acknowledges GoToConfig, s. Until then, it streams."""
     first_tick: int = 0
-    """Clock at power-up, ticks of 100 us."""
+    """Clock value at power-up, in ticks of 100 us."""
     first_counter: int = 0
 
 
 class XbusDevice(SerialDevice):
-    """`ImuDevice` on a pty.
+    """`ImuDevice` on a pseudo-terminal (pty).
 
     Parameters
     ----------
@@ -122,7 +124,7 @@ class XbusDevice(SerialDevice):
         self._decoder = XbusCodec()
 
         self.outputs = tuple(setup.Output(*output) for output in options.outputs)
-        """Output configuration in force."""
+        """Active output configuration."""
         self._alignment = dict.fromkeys((0, 1), options.alignment)
         self._modulus = setup.fine_time_modulus(options.product_code) or setup.WRAP_32_BIT
         self.streaming = options.measures_at_once or options.stuck
@@ -133,13 +135,13 @@ class XbusDevice(SerialDevice):
         self._messages = 0
         self._random = random.Random(3)  # noqa: S311 - the same GNSS times in every run
         self.flash_writes = 0
-        """Number of settings stored in flash."""
+        """Number of write operations to flash."""
 
     # --- control by the simulation ------------------------------------------------------------
 
     @property
     def rate_hz(self) -> float:
-        """Configured samples per second; 0 without an item that defines it."""
+        """Configured sample rate, Hz; 0 without an item that defines the rate."""
         if self._options.legacy is not None:
             return self._options.legacy_hz
         for data_id, rate in self.outputs:
@@ -150,7 +152,7 @@ class XbusDevice(SerialDevice):
     @property
     @override
     def sample_bytes(self) -> int:
-        """Bytes of a sample on the wire."""
+        """Number of bytes of a sample on the wire."""
         return len(encode(XbusMessageId.MT_DATA2, self._content(0, 0, (1.0, 0.0, 0.0, 0.0), {})))
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
@@ -171,7 +173,7 @@ class XbusDevice(SerialDevice):
 
     @property
     def sync(self) -> tuple[setup.SyncSetting, ...]:
-        """Synchronisation settings in force."""
+        """Active synchronisation settings."""
         return self._sync.entries
 
     def power_cycle(self) -> None:
@@ -189,7 +191,7 @@ class XbusDevice(SerialDevice):
 
     @override
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run the device until cancelled."""
         if self._options.wakes_up:
             self.power_cycle()
         await super().run()
@@ -211,7 +213,7 @@ class XbusDevice(SerialDevice):
         elif message.mid == XbusMessageId.WAKE_UP_ACK and self._waking:
             self._stop()
         elif message.mid == XbusMessageId.GOTO_CONFIG:
-            # the device streams until it acknowledges
+            # The device streams until it acknowledges the request.
             if self.streaming and self._options.config_delay_s:
                 self._after(self._options.config_delay_s, lambda: self._configure(message.bid))
             else:
@@ -229,7 +231,7 @@ class XbusDevice(SerialDevice):
             self._timer.cancel()
 
     def _reply_of_age(self, mid: int, data: bytes) -> tuple[int, bytes] | None:
-        """Return the answer of an older or a newer device; neither knows the other's requests."""
+        """Return the answer of an older or a newer device; their sets of requests differ."""
         options = self._options
         if options.legacy is None:
             unknown = mid in {XbusMessageId.OUTPUT_MODE, XbusMessageId.OUTPUT_SETTINGS}
@@ -246,7 +248,7 @@ class XbusDevice(SerialDevice):
         reply: tuple[int, bytes] | None = None
         match mid:
             case XbusMessageId.GOTO_MEASUREMENT:
-                self._send(XbusMessageId.CONFIGURATION, bytes(118))  # sent first by some devices
+                self._send(XbusMessageId.CONFIGURATION, bytes(118))  # some devices send it first
                 self.streaming = True
                 reply = XbusMessageId.GOTO_MEASUREMENT_ACK, b""
             case XbusMessageId.REQ_DEVICE_ID:
@@ -306,7 +308,7 @@ class XbusDevice(SerialDevice):
         return self._options.first_tick + (device_ns - self._epoch_ns) // setup.TICK_NS
 
     def _measure(self, ticks: int, q: Quaternion | None) -> bool:
-        """Send one MTData2; return whether all of it was sent."""
+        """Send one MTData2 message; return whether the whole message was sent."""
         counter = self.counter
         self.counter = (counter + 1) % _COUNTS
         self._messages += 1
@@ -324,7 +326,7 @@ class XbusDevice(SerialDevice):
     def _content(
         self, counter: int, ticks: int, q: Quaternion | None, edges: Mapping[int, Trigger]
     ) -> bytes:
-        """Return the data of one MTData2; an orientation of None is a message of the GNSS."""
+        """Return the data of one MTData2 message; without an orientation it is a GNSS message."""
         values = (
             (data_id, edges.get(data_id, _value(data_id, counter, ticks, q, self._inertial)))
             for data_id, _ in self.outputs

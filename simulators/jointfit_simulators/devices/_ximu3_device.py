@@ -1,9 +1,9 @@
-"""Virtual x-IMU3 on a pty, with the behaviour and faults of real devices.
+"""Virtual x-IMU3 on a pseudo-terminal (pty), with the behaviour and faults of real devices.
 
-Invariant: the serial interface is dead until ``serial_mode`` is 1. The device sends measurements
-all the time, replies to every command with its key, uses new settings after ``apply``, and has
-quaternions of norm 1.000121. Source: x-IMU3-Software of x-io Technologies (MIT), and its example
-log of a device.
+Invariants: the serial interface is inactive until ``serial_mode`` is 1. The device sends
+measurements continuously, and replies to every command with the key of the command. It activates
+new settings after ``apply``. Its quaternions have the norm 1.000121. Source: x-IMU3-Software of
+x-io Technologies (MIT), and its example log of a device.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion, WireNoise
 
 NORM = 1.000121
-"""Norm of the quaternions of the recorded device."""
+"""Norm of the quaternions in the example log."""
 STANDARD_GRAVITY = 9.80665
 _WORLDS: tuple[World, ...] = ("NWU", "ENU", "NED")
 _FACTORY: dict[str, object] = {
@@ -67,12 +67,12 @@ _MOST = {
     "ahrs_message_rate_divisor": 400, "inertial_message_rate_divisor": 400,
     "magnetometer_message_rate_divisor": 20, "serial_baud_rate": 12_000_000,
 }  # fmt: skip
-"""Largest value of each numeric setting."""
+"""Maximum value of each numeric setting."""
 _ACTIONS = ("apply", "save", "strobe", "heading")
 _ACCESSORY = 2
-"""Serial mode in which an accessory occupies the serial interface."""
+"""Value of ``serial_mode`` if an accessory uses the serial interface."""
 _MAGNETIC_NS = 50_000_000
-"""Interval of the magnetometer, ns, at divisor 1."""
+"""Time between two magnetometer messages at divisor 1, ns."""
 _BATTERY_NS = 1_000_000_000
 
 
@@ -81,25 +81,26 @@ class XImu3DeviceOptions:
     """Settings and faults of a device."""
 
     settings: Mapping[str, object] = field(default_factory=dict)
-    """Stored settings that differ from those of a new device."""
+    """Stored settings that differ from the factory settings."""
     interface: Literal["Serial", "USB"] = "Serial"
     baud: int | None = None
-    """Speed of the device, bit/s; at another speed both sides receive garbage. None: any (USB)."""
+    """Line speed of the device, bit/s. At another speed, both sides receive invalid bytes. None
+    accepts any speed (USB)."""
     answers: bool = True
-    """Whether the device answers commands; otherwise it is a board that only sends."""
+    """Whether the device answers commands. Otherwise, it simulates a board that only sends."""
     missing: tuple[str, ...] = ()
-    """Settings that its firmware does not have."""
+    """Settings that the firmware of the device lacks."""
     error: str = ""
-    """Text of an error message with the first measurement."""
+    """Text of an error message that accompanies the first measurement; empty for none."""
     battery_percent: float = 80.0
     first_tick: int = 0
-    """Clock at power-up, us."""
+    """Clock value at power-up, us."""
     errors: SensorErrors | None = None
-    """Errors of its sensors; None: it measures exactly."""
+    """Errors of the device's sensors; None for exact measurements."""
 
 
 class XImu3Device(SerialDevice):
-    """`ImuDevice` on a pty.
+    """`ImuDevice` on a pseudo-terminal (pty).
 
     Parameters
     ----------
@@ -123,13 +124,13 @@ class XImu3Device(SerialDevice):
         self._inertial = InertialSignals(options.errors)
         self._codec = XImu3Codec()
         self.settings = _FACTORY | dict(options.settings)
-        """Settings in force."""
+        """Active settings."""
         self._pending = dict(self.settings)
         self._pushes = 0
         self._next_ns = {DataKind.MAGNETIC: 0, DataKind.BATTERY: 0}
         self._error = options.error
         self.saves = 0
-        """Number of times that the settings were saved."""
+        """Number of commands that saved the settings."""
 
     # --- control by the simulation ------------------------------------------------------------
 
@@ -142,7 +143,7 @@ class XImu3Device(SerialDevice):
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second of the orientation, or of the raw measurements without one."""
+        """Rate of the orientations, Hz, or of the raw measurements without orientations."""
         for key in ("ahrs_message_rate_divisor", "inertial_message_rate_divisor"):
             if divisor := self._number(key):
                 return BASE_RATE_HZ / divisor
@@ -150,13 +151,13 @@ class XImu3Device(SerialDevice):
 
     @property
     def counter(self) -> int:
-        """Number of the next sample; no message contains it."""
+        """Number of the next sample. The device does not send this number."""
         return self._pushes
 
     @property
     @override
     def sample_bytes(self) -> int:
-        """Bytes of a sample on the wire."""
+        """Number of bytes of a sample on the wire."""
         return len(self._ahrs_message(0, (1.0, 0.0, 0.0, 0.0)))
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
@@ -190,7 +191,7 @@ class XImu3Device(SerialDevice):
 
     @override
     def edge(self, device_ns: int, *, rising: bool = True) -> None:
-        """Send the message of an edge at the accessory's sync input, if one is in use."""
+        """Send the message about an edge at the sync input of the accessory, if it is active."""
         if self.streaming and self.settings["serial_mode"] == _ACCESSORY:
             self._write(self._data(DataKind.SYNC, self._ticks(device_ns), (float(rising),)))
 
@@ -223,7 +224,7 @@ class XImu3Device(SerialDevice):
             self.saves += key == "save"
             return None
 
-        # a written value applies with the next command `apply`
+        # A written value becomes active at the next command `apply`.
         if key not in self._pending or key in self._options.missing:
             return {"error": "Unknown command"}
         if value is not None:
@@ -250,7 +251,7 @@ class XImu3Device(SerialDevice):
         return encode_data(kind, ticks, values, binary=self._binary)
 
     def _push_slow_messages(self, device_ns: int, ticks: int) -> None:
-        """Send the messages of the magnetometer and the battery if they are due."""
+        """Send the magnetometer and battery messages if they are due."""
         divisor = self._number("magnetometer_message_rate_divisor")
         x, y, z = self._inertial.value(Item.MAGNETIC_FIELD) or (0.0, 0.0, 0.0)
         due = {
@@ -263,7 +264,7 @@ class XImu3Device(SerialDevice):
                 self._write(self._data(kind, ticks, values))
 
     def _inertial_values(self) -> tuple[float, ...]:
-        """Return angular rate, deg/s, and specific force, g."""
+        """Return the angular rate, deg/s, and the specific force, in units of gravity."""
         rate = self._inertial.value(Item.RATE_OF_TURN) or (0.0, 0.0, 0.0)
         force = self._inertial.value(Item.ACCELERATION) or (0.0, 0.0, 0.0)
         return (*map(degrees, rate), *(value / STANDARD_GRAVITY for value in force))
@@ -283,7 +284,7 @@ class XImu3Device(SerialDevice):
 
 
 def _fault(key: str, value: object, before: object) -> str:
-    """Return why a setting cannot have a value; empty if it can."""
+    """Return the reason why a setting cannot have this value; empty if it can."""
     if key in _READ_ONLY:
         return "Read only"
     if isinstance(value, bool) != isinstance(before, bool) or type(value) is not type(before):

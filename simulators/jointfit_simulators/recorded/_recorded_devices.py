@@ -1,7 +1,7 @@
-"""Virtual devices that send recorded bytes.
+"""Virtual devices that send the bytes of a recording.
 
-Invariant: measurements are sent as the recorded bytes. Answers to the configuration by the host are
-simulated, because the host asks again.
+Invariant: measurements are sent as recorded bytes. The answers to the configuration are simulated,
+because the host sends its requests again.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ class RecordedXbusDevice(XbusDevice):
     link
         Symbolic link to the host's port.
     chunks
-        Recorded chunks of the device with their times, ns.
+        Recorded chunks of the device, each with its time, ns.
     """
 
     def __init__(self, link: Path, chunks: Sequence[tuple[int, bytes]]) -> None:
         codec = XbusCodec()
         self.chunks: list[tuple[int, bytes]] = []
-        """Measurements with their times, ns."""
+        """Bytes of measurements, each with its time, ns."""
         options = XbusDeviceOptions()
         for t_ns, data in chunks:
             messages = [item for item in codec.feed(data) if isinstance(item, XbusMessage)]
@@ -62,7 +62,7 @@ class RecordedXbusDevice(XbusDevice):
             for answer in answers:
                 options = _configured(options, answer)
             measurements = data
-            if answers:  # of a handshake: send its measurements only
+            if answers:  # handshake: keep its measurements only
                 measurements = b"".join(
                     encode_xbus(one.mid, one.data, one.bid)
                     for one in messages
@@ -74,7 +74,7 @@ class RecordedXbusDevice(XbusDevice):
 
     @property
     def ready(self) -> bool:
-        """Whether the host started the measurement."""
+        """Whether the host has started the measurement."""
         return self.streaming
 
     def send(self, data: bytes) -> None:
@@ -84,7 +84,7 @@ class RecordedXbusDevice(XbusDevice):
 
 
 def _configured(options: XbusDeviceOptions, answer: XbusMessage) -> XbusDeviceOptions:
-    """Return the options with what the device answered to the host."""
+    """Return the options with the setting that a recorded answer of the device contains."""
     match answer.mid:
         case XbusMessageId.DEVICE_ID:
             return replace(options, device_id=answer.data)
@@ -100,28 +100,28 @@ def _configured(options: XbusDeviceOptions, answer: XbusMessage) -> XbusDeviceOp
 
 
 class RecordedCanSource:
-    """Frames of one sensor on a bus.
+    """Sender of the recorded frames of one sensor on a CAN bus.
 
     Parameters
     ----------
     wire
-        The bus; several sensors share it.
+        CAN bus, which several sensors share.
     chunks
-        Recorded chunks of the sensor with their times, ns.
+        Recorded chunks of the sensor, each with its time, ns.
     """
 
     def __init__(self, wire: CanWire, chunks: Sequence[tuple[int, bytes]]) -> None:
         self.wire, self.chunks = wire, list(chunks)
         self.sent = 0
-        """Number of chunks sent."""
+        """Number of sent chunks."""
 
     @property
     def ready(self) -> bool:
-        """Whether the host opened the bus."""
+        """Whether the host has opened the bus."""
         return self.wire.is_open
 
     def send(self, data: bytes) -> None:
-        """Send the frames of a chunk, without notes of the recording host."""
+        """Send the frames of a chunk, except the notes of the recording host."""
         frames = [one for one in unpack_frames(data) if isinstance(one, CanFrame) and not one.error]
         self.sent += self.wire.send(frames)
 
@@ -135,29 +135,29 @@ class RecordedCanSource:
 
 
 class RecordedCameras:
-    """NatNet server that sends the recorded datagrams in unicast on loopback.
+    """NatNet server that sends recorded datagrams in unicast on the loopback interface.
 
-    The server answers with its recorded name, version, clock frequency and model; echo requests are
-    answered with the recorded clock, continued.
+    The server answers with the recorded name, version, clock frequency and model. Its clock
+    continues the recorded clock, also in the answers to echo requests.
 
     Parameters
     ----------
     chunks
-        Recorded datagrams with their times, ns.
+        Recorded datagrams, each with its time, ns.
     command_port
-        UDP port for commands of clients; 0: any free port.
+        UDP port for commands of clients; 0 selects a free port.
 
     Raises
     ------
     UnplayableRecordingError
-        The recording does not contain the description of the server.
+        The recording does not contain the server description.
     """
 
     def __init__(self, chunks: Iterable[tuple[int, bytes]], command_port: int = 0) -> None:
         info: ServerInfo | None = None
         model: bytes | None = None
         self.chunks: list[tuple[int, bytes]] = []
-        """Frames with their times, ns."""
+        """Recorded frames, each with its time, ns."""
         self._ticks_at: tuple[int, int] | None = None
         for t_ns, data in chunks:
             message = decode(data, info.bitstream if info is not None else (0, 0))
@@ -179,7 +179,7 @@ class RecordedCameras:
         self._client: Address | None = None
         self._began_ns: int | None = None
         self.sent = 0
-        """Number of frames sent."""
+        """Number of sent frames."""
 
     @property
     def command_port(self) -> int:
@@ -188,11 +188,11 @@ class RecordedCameras:
 
     @property
     def ready(self) -> bool:
-        """Whether a client has the model."""
+        """Whether a client has received the model."""
         return self._client is not None
 
     def begin(self, now_ns: int) -> None:
-        """Set the host time at which the recording begins, ns: it defines the recorded clock."""
+        """Set the host time of the start of the recording, ns, which defines the recorded clock."""
         self._began_ns = now_ns
 
     def send(self, data: bytes) -> None:
@@ -205,11 +205,11 @@ class RecordedCameras:
         self._port.unplug()
 
     async def run(self) -> None:
-        """Answer clients until cancelled."""
+        """Answer requests until cancelled."""
         await self._port.serve(self._handle)
 
     def _ticks(self) -> int:
-        """Return the recorded clock of this instant, in ticks."""
+        """Return the current value of the recorded clock, ticks."""
         first_ns, ticks = self._ticks_at or (0, 0)
         now_ns = time.monotonic_ns()
         since_ns = now_ns - (self._began_ns if self._began_ns is not None else now_ns) - first_ns
@@ -221,7 +221,7 @@ class RecordedCameras:
                 own = self._info._replace(data_port=self._port.data_port, multicast=False)
                 self._port.send(encode(own), address)
             case EchoRequest(stamp):
-                if self._began_ns is not None:  # before, the clock of the recording is undefined
+                if self._began_ns is not None:  # the recorded clock is then defined
                     self._port.send(encode(EchoResponse(stamp, self._ticks())), address)
             case Bare(NatNetMessageId.REQUEST_MODELDEF):
                 self._port.send(self._model, address)

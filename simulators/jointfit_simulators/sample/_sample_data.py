@@ -1,8 +1,8 @@
-"""Sample data for every command that reads files: one leg, recorded in a few short trials.
+"""Sample data for every command that reads files, from short trials of one leg.
 
-Invariant: the same seed gives the same files. Sensors, cameras and reference share one world frame,
-and all streams of a trial share one clock, as in an edited recording. Soft-tissue artefacts, sensor
-alignment, sensor errors, marker noise and occlusion are those of the default settings.
+Invariant: equal seeds produce equal files. Sensors, cameras and reference have one common world
+frame, and all streams of a trial have one common clock, as in an edited recording. Soft-tissue
+artefact, sensor alignment, sensor errors, marker noise and occlusion have the default settings.
 """
 
 from __future__ import annotations
@@ -45,24 +45,26 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion
 
 RATE_HZ = 50.0
-"""Rate of sensors and cameras in the trials, Hz: sufficient for slow movements, small files."""
+"""Rate of sensors and cameras in the trials, Hz. It suffices for slow movements and yields small
+files."""
 CAPTURE_HZ = 100.0
 """Rate of sensors and cameras in the captures, Hz."""
 CAPTURE_S = 2.0
 """Duration of the captures, s."""
 APART_S = 200.0
-"""Time between the starts of two trials, s, so that their noise is independent."""
+"""Time between the starts of two trials, s. Because of this time, the noise of the trials is
+independent."""
 TRIALS = {"standing": 5.0, "squats": 8.0, "walking": 8.0, "knee_swings": 8.0, "sit_to_stand": 8.0}
-"""Names and durations of the trials, s."""
+"""Duration of each trial, s, by name."""
 _MOTIONS = {"standing": "stand", "squats": "squat", "walking": "walk"}
-"""Motions of trials that have another name."""
+"""Name of the motion, for trials with another name than their motion."""
 SWINGS_S = 10.0
 """Duration of the planar movement, s."""
 _IDS = {
     "S2": XcdiIds(0x205, 0x206, 0x221, status_word=None, error=None),
     "S4": XcdiIds(0x405, 0x406, 0x421, status_word=None, error=None),
 }
-"""CAN identifiers of the sensors on the bus."""
+"""CAN identifiers of each sensor on the bus."""
 
 
 class SampleTrial(NamedTuple):
@@ -70,14 +72,15 @@ class SampleTrial(NamedTuple):
 
     t_s: Array
     sensors: Mapping[str, Array]
-    """q_world_sensor, shape (n, 4)."""
+    """Orientations q_world_sensor by sensor, shape (n, 4)."""
     bones: Mapping[str, Array]
-    """q_world_segment, shape (n, 4)."""
+    """Orientations q_world_segment by segment, shape (n, 4)."""
     markers: tuple[str, ...]
     positions: Array
     """Marker positions, m, shape (n, len(markers), 3); NaN if occluded."""
     bodies: Mapping[str, tuple[Array, Array]]
-    """Rigid bodies of the cameras: positions, m, shape (n, 3), and q_world_body, shape (n, 4)."""
+    """Positions, m, shape (n, 3), and orientations q_world_body, shape (n, 4), of each rigid body.
+    """
 
 
 class FolderNotEmptyError(ValueError):
@@ -90,16 +93,17 @@ def write_sample(folder: Path, *, seed: int = 1, force: bool = False) -> dict[st
     Parameters
     ----------
     folder
-        Output folder; created if absent.
+        Output folder, which is created if necessary.
     seed
         Random seed of the simulated subject.
     force
-        Write into a folder that is not empty; files of the same names are replaced.
+        Whether to write into a folder that is not empty. Existing files of the same names are
+        replaced.
 
     Returns
     -------
     dict
-        Content of each file and the commands that read it, by file name.
+        Description of each file and of the commands that read it, by file name.
 
     Raises
     ------
@@ -146,7 +150,7 @@ def _record(
     truth = observation.truth.orientations
     bones = {part: to_wxyz(truth[part]) for part in ("thigh", "shank")}
 
-    # the plate, whose markers are last, is not part of the trials
+    # The markers of the plate are the last ones. The trials do not contain the plate.
     names = tuple(name for part in PARTS for name in subject.clusters[part])
     cameras = Cameras(knobs, subject, rate_hz=rate_hz)
     frames = cameras.capture(observation)
@@ -175,7 +179,7 @@ def _write_marker_trials(folder: Path, trials: Mapping[str, SampleTrial]) -> dic
 
 
 def _write_planar_trial(folder: Path, knobs: Knobs) -> dict[str, str]:
-    # single markers at the ends of a chain determine its joints only without soft-tissue artefact
+    # Single markers at the ends of a chain determine its joints only without soft-tissue artefact.
     rigid = dataclasses.replace(knobs, marker_soft_tissue_mm=0.0)
     start_s = APART_S * (len(TRIALS) + 1)
     trial = _record(rigid, "leg_swings", start_s, SWINGS_S, RATE_HZ)
@@ -230,7 +234,7 @@ def _write_captures(folder: Path, knobs: Knobs, subject: SimulatedSubject) -> di
     samples = zip(times_ns, orientations["S1"], strict=True)
     (folder / "xbus.bin").write_bytes(xbus_bytes(samples))
 
-    # the devices on the bus send their groups 1 ms apart
+    # The devices on the bus send at times that differ by 1 ms.
     devices = {
         name: XcdiDevice(_NoWire(), XcdiDeviceOptions(ids=ids)) for name, ids in _IDS.items()
     }
@@ -269,7 +273,7 @@ def _bodies(trial: SampleTrial, index: int) -> dict[str, Pose | None]:
 
 
 class _NoWire:
-    """Closed bus for a device whose frames are only returned."""
+    """Closed bus, for a device whose frames are returned instead of sent."""
 
     bitrate: int | None = None
     is_open = False

@@ -1,6 +1,6 @@
 """Families of IMUs that a scene can create.
 
-A new family is one function and one entry of `IMU_FAMILIES`.
+A new family needs one function and one entry in `IMU_FAMILIES`.
 """
 
 from __future__ import annotations
@@ -60,27 +60,27 @@ if TYPE_CHECKING:
 BUS = "can0"
 """Name of the CAN bus in rig.toml and in commands."""
 _EVERY_MESSAGE = 0xFFFF
-"""Output rate of items in every message."""
+"""Code of the output rate for items in every message."""
 _SKIPPED_EDGES = 11
-"""Exposures without a reported sync edge in between: ten edges per second at 120 Hz."""
+"""Number of exposures between two reported sync edges: ten edges per second at 120 Hz."""
 _SYNC = (SyncSetting(SyncFunction.TRIGGER_INDICATION, IN1, Polarity.RISING, 0, 0, _SKIPPED_EDGES),)
 _SYNC_TOML = (
     f'sync = [{{ function = "trigger_indication", line = "in1", skip_factor = {_SKIPPED_EDGES} }}]'
 )
 _ID_BLOCK = 0x100
-"""Number of CAN identifiers for each sensor."""
+"""Number of CAN identifiers reserved for each sensor."""
 _WIDE_BLOCKS = 7
-"""Largest number of sensors whose blocks have 11-bit identifiers."""
+"""Maximum number of sensors for which blocks of `_ID_BLOCK` fit into the 11-bit identifiers."""
 _NARROW_BLOCK = 0x40
-"""Number of CAN identifiers for each of more sensors."""
+"""Number of CAN identifiers reserved for each sensor if there are more sensors."""
 
 
 @dataclass(frozen=True, slots=True)
 class SensorPlace:
-    """Where a scene connects one sensor."""
+    """Connection of one sensor in a scene."""
 
     knobs: Knobs
-    """Error magnitudes and sample rate."""
+    """Settings with error magnitudes and sample rate."""
     name: str
     """Id of the sensor."""
     number: int
@@ -88,33 +88,33 @@ class SensorPlace:
     sensors: int
     """Number of sensors in the scene."""
     sync_line: bool
-    """Whether a sync line is connected, whose edges the device reports if it can."""
+    """Whether a sync line is connected. The device reports its edges if it can."""
 
     @property
     def first_can_id(self) -> int:
-        """First of the 11-bit CAN identifiers that belong to this sensor, at least 64."""
+        """First 11-bit CAN identifier of the block that belongs to this sensor, at least 64."""
         return (_ID_BLOCK if self.sensors <= _WIDE_BLOCKS else _NARROW_BLOCK) * self.number
 
 
 @dataclass(frozen=True, slots=True)
 class ConnectedImu:
-    """A device, and how rig.toml describes it."""
+    """A device, with its description in rig.toml."""
 
     device: SceneImuDevice
     keys: list[str]
-    """Lines of its ``[[imu]]`` table, without id, segment, driver and rate_hz."""
+    """Lines of the device's ``[[imu]]`` table, except id, segment, driver and rate_hz."""
     label: str
     """Port of the sensor, or its bus and identifier."""
 
 
 @dataclass(frozen=True, slots=True)
 class UartFamily:
-    """Devices of one driver, each on a pty of its own."""
+    """Devices of one driver, each on its own pseudo-terminal (pty)."""
 
     create: Callable[[SensorPlace, Path], ConnectedImu]
-    """Return the device whose pty is linked at the path."""
+    """Function that returns a device; the path is a symbolic link to its pseudo-terminal."""
     driver: str = ""
-    """Driver in rig.toml, if it is not the name of the family."""
+    """Name of the driver in rig.toml if it differs from the name of the family."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,9 +122,9 @@ class CanFamily:
     """Devices of one driver, all on the CAN bus of the scene."""
 
     create: Callable[[SensorPlace, CanWire], ConnectedImu]
-    """Return a device on the bus."""
+    """Function that returns a device on the bus."""
     driver: str = ""
-    """Driver in rig.toml, if it is not the name of the family."""
+    """Name of the driver in rig.toml if it differs from the name of the family."""
 
 
 def _can_table(place: SensorPlace, bus: CanWire) -> ConnectedImu:
@@ -142,7 +142,7 @@ def _lpms(place: SensorPlace, port: Path) -> ConnectedImu:
 
 
 def _lpms_can(place: SensorPlace, bus: CanWire) -> ConnectedImu:
-    """Return a sensor in CANopen style, or, for the first one, in sequential mode."""
+    """Return a sensor; the first sensor uses sequential mode, and all others use CANopen."""
     is_first = place.number == 1
     numbers = sequential_ids(1, spaced=True) if is_first else tpdo_ids(place.number)
     options = LpmsCanDeviceOptions(
@@ -230,7 +230,7 @@ def _xbus(place: SensorPlace, port: Path) -> ConnectedImu:
 
 
 def _xbus_mtdata(place: SensorPlace, port: Path) -> ConnectedImu:
-    """Return an MTi or MTx of the first generations, which sends MTData."""
+    """Return an MTi or MTx of an early generation, which sends MTData messages."""
     mode = OutputMode.CALIBRATED | OutputMode.ORIENTATION | OutputMode.STATUS
     device = XbusDevice(
         port,
@@ -270,7 +270,7 @@ def _ximu3(place: SensorPlace, port: Path) -> ConnectedImu:
 
 
 def ids_toml(ids: XcdiIds) -> str:
-    """Return the line of rig.toml with the CAN identifiers of a sensor."""
+    """Return the line of rig.toml that contains the CAN identifiers of a sensor."""
     return (
         f"ids = {{ sample_time = {ids.sample_time:#05x}, group_counter = {ids.group_counter:#05x},"
         f" quaternion = {ids.quaternion:#05x} }}"
@@ -291,4 +291,4 @@ IMU_FAMILIES: dict[str, UartFamily | CanFamily] = {
     "xcdi": CanFamily(_xcdi),
     "ximu3": UartFamily(_ximu3),
 }
-"""Families by name, which is that of their driver unless they are a variant of it."""
+"""Families by name. The name is the name of the driver, except for variants."""

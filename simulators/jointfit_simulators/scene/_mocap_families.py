@@ -62,7 +62,7 @@ class MocapServer(Protocol):
         """
 
     async def run(self) -> None:
-        """Answer until cancelled."""
+        """Answer requests until cancelled."""
 
     def unplug(self) -> None:
         """Close the port and disconnect all clients."""

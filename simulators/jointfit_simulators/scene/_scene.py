@@ -1,4 +1,4 @@
-"""Real-time scene: connects subject, devices, streams and ground-truth log, and runs commands."""
+"""Real-time scene, which connects subject, devices, streams and ground-truth log."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ if TYPE_CHECKING:
 
 RIG_FILE = "rig.toml"
 MODEL_FILE = "leg.toml"
-"""Chain model of the subject, with marker position errors of about 1 cm."""
+"""File name of the subject's chain model. Its marker positions have errors of about 1 cm."""
 TRUTH_FILE = "truth.jsonl"
 SAMPLES_FILE = "samples.jsonl"
 PLANAR_MARKERS = {"pelvis": ("P1",), "thigh": ("T1", "T4"), "shank": ("C1", "C4"), "foot": ("F1",)}
-"""Markers of a planar rig: the cameras see others too, which it does not use."""
+"""Markers of a rig for planar movement, by body part. The cameras also stream other markers."""
 OPTICAL = "mocap"
-"""Name of the motion-capture server in commands and in the ground-truth log."""
+"""Name of the motion-capture server in commands and in the log of the ground truth."""
 DOWN_S = 1.0
-"""Downtime of the motion-capture server during a restart."""
+"""Downtime of the motion-capture server during a restart, s."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +62,12 @@ class SceneOptions:
     """Driver of the motion-capture server; None without cameras."""
     can: str = "slcan"
     wires: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    """Driver by sensor; the others have their default."""
+    """Driver of a sensor, by sensor id; other sensors have the default driver."""
     rig: RigOptions = dataclasses.field(default_factory=RigOptions)
     clocks: Mapping[str, ClockFault] = dataclasses.field(default_factory=dict)
-    """Prescribed clock errors by sensor or ``mocap``; others are random."""
+    """Prescribed clock errors, by sensor id or ``mocap``; all other clock errors are random."""
     script: tuple[tuple[float, str], ...] = ()
-    """Scheduled commands: time since the start of the run in s, and command line."""
+    """Scheduled commands: each has a time since the start of the run, s, and a command line."""
     sync_line: bool = False
     """Whether the cameras' sync output is connected to the first sync input of UART sensors."""
     ptp: bool = False
@@ -77,13 +77,13 @@ class SceneOptions:
     chain_model: bool = False
     """Whether a chain model of the simulated subject is written and named in rig.toml."""
     planar: bool = False
-    """Whether there are no sensors, and rig.toml names the markers of a planar movement."""
+    """Whether the scene has cameras only, and rig.toml describes a planar movement."""
     sample_log: bool = False
-    """Whether the true sampling time of each sample sent is logged."""
+    """Whether the true sampling time of each sent sample is logged."""
 
 
 class InvalidCommandError(ValueError):
-    """Invalid command; the message names the valid ones."""
+    """Invalid command; the message lists the valid commands."""
 
 
 class Scene:
@@ -92,13 +92,13 @@ class Scene:
     Parameters
     ----------
     knobs
-        Error magnitudes.
+        Settings with the magnitudes of all errors.
     subject
-        Subject wearing the sensors.
+        Subject with the sensors and markers.
     options
         Hardware configuration.
     now_ns
-        Host time at which the subject's time is 0, ns.
+        Host time that corresponds to the subject's time 0, ns.
     """
 
     def __init__(
@@ -198,7 +198,7 @@ class Scene:
         Parameters
         ----------
         report
-            Called with the ports when all devices are ready, and with the counts at the end.
+            Callback. It receives the ports when all devices are ready, and the counts at the end.
         """
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -224,7 +224,7 @@ class Scene:
                 await wait_until_read(Path(port) for port in self.ports.values())
                 for task in serving:
                     task.cancel()
-        finally:  # also after an error or cancellation
+        finally:  # even after an error or a cancellation
             self.close()
 
     async def _follow_script(self, report: Callable[[dict[str, object]], None]) -> None:
@@ -269,7 +269,7 @@ class Scene:
         return path
 
     def _write_model(self) -> str | None:
-        """Write the chain model, if wanted, and return the name of its file."""
+        """Write the chain model if requested; return the name of its file."""
         subject = self._subject
         if not self._options.chain_model or not isinstance(subject, SimulatedSubject):
             return None
@@ -282,7 +282,7 @@ class Scene:
 
     @property
     def ports(self) -> Mapping[str, str]:
-        """Port of each device or bus."""
+        """Port of each device or bus, by name."""
         return self._hardware.ports
 
     @property
@@ -291,7 +291,7 @@ class Scene:
         return None if self._server is None else self._server.command_port
 
     def command(self, line: str) -> dict[str, object] | None:
-        """Run one command; return the result of ``status``, otherwise None.
+        """Run one command; return the result of ``status``, or None for other commands.
 
         Raises
         ------
@@ -360,7 +360,7 @@ class Scene:
         return streams[name]
 
     def _connection(self, name: str) -> ImuStream | CanWire:
-        """Return the sensor or the bus adapter of a name, for (un)plugging."""
+        """Return the sensor or the bus adapter with this name, to connect or disconnect it."""
         if name == BUS and self._hardware.bus is not None:
             return self._hardware.bus
         return self._stream(name)
@@ -376,7 +376,7 @@ class Scene:
         }
 
     def account(self) -> dict[str, object]:
-        """Return the total numbers of samples sent, dropped, refused and unheard."""
+        """Return the total numbers of samples that were sent, dropped, refused and unheard."""
         streams = self._hardware.streams
         return {
             "sent": {**{n: s.device.sent for n, s in streams.items()}, "mocap": self._optical.sent},

@@ -1,7 +1,8 @@
-"""Streams of IMU samples: one stream per device, planned in blocks, sent one by one.
+"""Streams of IMU samples, one per device. Samples are planned in blocks and sent one by one.
 
-Invariant: a sample contains its sampling time, even if it is sent late. Every sample taken while
-the device measures is counted as sent, dropped (`Knobs.dropout`) or refused by a full line.
+Invariant: a sample contains its sampling time, even if it is sent late. Every sample that a
+measuring device takes is counted as sent, as dropped (`Knobs.dropout`), or as refused by a full
+line.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ if TYPE_CHECKING:
 
 
 SampleCallback = Callable[[str, int, int], None]
-"""Callback for every sample sent: device, number on the wire, true host time in ns."""
+"""Callback for every sent sample: device, transmitted sample number, true host time in ns."""
 
 _MOST_EDGES = 4096
-"""Number of planned sync edges; older ones are dropped."""
+"""Maximum number of planned sync edges. Older edges are dropped."""
 
 
 class SceneImuDevice(ImuDevice, Protocol):
-    """Virtual IMU with the faults that a scene can trigger."""
+    """Virtual IMU with faults that a scene can trigger."""
 
     def edge(self, device_ns: int) -> None:
-        """Add an edge on the sync input at a device time; no effect without a sync input."""
+        """Add an edge on the sync input at a device time; ignored without a sync input."""
 
     @property
     def counter(self) -> int:
@@ -43,13 +44,13 @@ class SceneImuDevice(ImuDevice, Protocol):
 
     @property
     def line_ns(self) -> int:
-        """Transmission time of a sample, first byte to last, ns; 0 for a wire without delay."""
+        """Transmission time of a sample from first to last byte, ns; 0 on a wire without delay."""
 
     def lose(self, count: int) -> None:
-        """Lose the next `count` samples: the counter increments, but they are not sent."""
+        """Lose the next `count` samples; the counter increments, but they are not sent."""
 
     def power_cycle(self) -> None:
-        """Interrupt the power supply: clock and counter restart."""
+        """Interrupt the power supply; clock and counter restart."""
 
     def unplug(self) -> None:
         """Disconnect the wire."""
@@ -59,12 +60,12 @@ class SceneImuDevice(ImuDevice, Protocol):
 
 
 class ImuStream:
-    """Stream of one sensor: orientation errors, clock and device.
+    """Stream of one sensor, with orientation errors, clock and device.
 
     Parameters
     ----------
     knobs
-        Error magnitudes.
+        Settings with the magnitudes of all errors.
     name
         Sensor id.
     device
@@ -72,11 +73,11 @@ class ImuStream:
     latency_ms
         Minimum delay of the transport, ms.
     shared_wire
-        Whether other devices use the wire; unplugging then only stops this sensor.
+        Whether other devices use the wire. If so, unplugging stops this sensor only.
     now_ns
-        Host time of the start of the run, ns.
+        Host time at the start of the run, ns.
     port
-        Serial port of the device; None on a wire that tells whether the host listens.
+        Serial port of the device; None on a wire that can detect whether the host receives.
     """
 
     def __init__(
@@ -92,7 +93,7 @@ class ImuStream:
     ) -> None:
         self.name, self.device = name, device
         self.on_sample: SampleCallback | None = None
-        """Called for every sample sent."""
+        """Callback for every sent sample."""
 
         self.sensor, self.faults = OrientationSensor(knobs, name), SensorFaults()
         self.timing = SampleTiming(knobs, name, latency_ms=latency_ms, now_ns=now_ns)
@@ -102,10 +103,10 @@ class ImuStream:
         self._planned: deque[tuple[int, int, Quaternion | None]] = deque()
         self._edges: deque[int] = deque(maxlen=_MOST_EDGES)
         self.dropped_out = 0
-        """Number of samples dropped by `Knobs.dropout` while measuring."""
+        """Number of samples that `Knobs.dropout` dropped while the device was measuring."""
         self.unheard = 0
-        """Number of samples taken while unplugged, paused or not measuring, or before the first
-        opening of the port."""
+        """Number of samples that were taken while the device was unplugged, paused or not
+        measuring, or before the first opening of the port."""
         self.refused = 0
         """Number of samples rejected by a full line."""
 

@@ -51,7 +51,7 @@ class CanWire(Protocol):
         """Send `frames`; return whether all were sent."""
 
     async def run(self) -> None:
-        """Serve until cancelled."""
+        """Run the bus until cancelled."""
 
     def unplug(self) -> None:
         """Disconnect the wire; no effect if disconnected."""
