@@ -16,7 +16,7 @@ class CalibrationError(Exception):
     Parameters
     ----------
     *reasons : str
-        One sentence for each problem: the object, the finding, the remedy.
+        One sentence for each problem, with the object, the finding and the remedy.
     """
 
     def __init__(self, *reasons: str) -> None:
@@ -27,7 +27,7 @@ class CalibrationError(Exception):
 def unknown_name(kind: str, name: str, known: Iterable[str], taken: Collection[str] = ()) -> str:
     """Return the message for a name that the stream does not have, with the nearest spelling.
 
-    The spelling is none of `taken`, the names that the rig uses already.
+    Names in `taken`, which the rig already uses, are not suggested.
     """
     choices: Sequence[str] = sorted(known)
     listed = f"it has: {', '.join(choices) or 'none'}"

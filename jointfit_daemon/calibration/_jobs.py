@@ -1,7 +1,7 @@
 """Jobs of the worker process and their result.
 
-A job is pickled, and its result is sent back and recorded as JSON. This module imports no fitting
-code, so that the daemon can create jobs without loading scipy.
+A job is sent to the worker process as a pickle. Its result is returned and recorded as JSON. This
+module imports no fitting code, so that the daemon can create jobs without loading SciPy.
 """
 
 from __future__ import annotations
@@ -93,9 +93,10 @@ class JobControl:
     """Time and progress of a running job, supplied by the process that runs it."""
 
     elapsed_s: Callable[[], float] = lambda: 0.0
-    """Returns the time since the start of the job, s."""
+    """Function that returns the time since the start of the job, s."""
     report: Callable[[float, str], None] = lambda _share, _text: None
-    """Publishes progress, 0 to 1, and a sentence about it."""
+    """Function that publishes the progress, 0 to 1, and a sentence that describes the current step.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +112,14 @@ class FitResult:
     kept: str | None = None
     """Reason why a refit does not replace the models in force."""
     notes: tuple[str, ...] | None = None
-    """Sensors that appear re-donned since the calibration in force; None without such a
-    calibration."""
+    """One sentence for each sensor that appears re-donned since the calibration in force. None if
+    no calibration is in force.
+    """
     refused: str | None = None
     """Reason why there is no result; the other fields are then unused."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the JSON form: only `refused` if there is no result, else all non-None fields."""
+        """Return the JSON form, which is `refused` alone, or all fields that are not None."""
         if self.refused is not None:
             return {"refused": self.refused}
         table = {
@@ -132,12 +134,12 @@ class FitResult:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> FitResult:
-        """Return the result of a JSON form.
+        """Return the result from its JSON form.
 
         Raises
         ------
         CalibrationSchemaError
-            The calibration in it is incomplete or has another schema version.
+            The calibration in `data` is incomplete or has another schema version.
         """
         stored, notes = data.get("calibration"), data.get("notes")
         return FitResult(

@@ -41,12 +41,13 @@ class WorldQuality:
     kind: str
     """``full`` | ``heading`` (both verticals assumed correct) | ``stored``."""
     kappa: float
-    """Measure of observability from 0 to 1: at 1, the rotation of the world and the
-    sensor-to-segment alignment cannot be distinguished."""
+    """Measure of observability from 0 to 1. At 1, the rotation of the world and the
+    sensor-to-segment alignment cannot be distinguished.
+    """
     error_rad: float
-    """Standard error of the weakest direction."""
+    """Standard error in the least observable direction."""
     rms_rad: float
-    """RMS angle between plate and model."""
+    """RMS angle between the measured and the modeled orientation of the plate."""
     lag_ns: int | None
     """Sensor minus optical time stamp of the same event; None if not observable."""
     lag_sigma_ns: float | None
@@ -55,7 +56,7 @@ class WorldQuality:
 
 @dataclass(frozen=True, slots=True)
 class MeasuredLag:
-    """Lag of one sensor from the functional movement alone."""
+    """Lag of one sensor, estimated from the functional movement alone."""
 
     lag_ns: int
     sigma_ns: int
@@ -64,14 +65,14 @@ class MeasuredLag:
 
 @dataclass(frozen=True, slots=True)
 class LagQuality:
-    """The lag in use of one sensor, and the lag of the functional movement alone."""
+    """The lag that is used for one sensor, and the lag from the functional movement alone."""
 
     source: str
-    """Source of the lag in use, as in `SensorLag`."""
+    """Source of the lag that is used; `SensorLag` lists the values."""
     lag_ns: int | None = None
     sigma_ns: int | None = None
     refused: str | None = None
-    """Reason why the movement gave no lag."""
+    """Reason why no lag could be estimated from the movement."""
     movement: MeasuredLag | None = None
 
 
@@ -102,17 +103,17 @@ class MarkerErrors:
     maximum_m: float
     """Largest error of one marker in one frame."""
     accepted: bool
-    """Whether both are below the limits of `kinematics.accepted_errors`."""
+    """Whether both errors are below the limits of `kinematics.accepted_errors`."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChainQuality:
-    """Quality of the refinement of a chain model; errors are those of held-out frames."""
+    """Quality of the refinement of a chain model. Errors are measured on held-out frames."""
 
     model: str
     method: str
     refused: str | None = None
-    """Reason why nothing was refined; the figures are then absent."""
+    """Reason why no marker was refined; the other fields are then None."""
     frames: int | None = None
     """Number of frames of the refinement."""
     judged: int | None = None
@@ -123,7 +124,7 @@ class ChainQuality:
     parts: Mapping[str, PartQuality] | None = None
     """Result for each segment of the model with refined markers."""
     moved_m: Mapping[str, float] | None = None
-    """Displacement of each refined marker in its segment."""
+    """Displacement of each refined marker relative to its segment."""
     stopped: str | None = None
     """Reason for the end of the iteration."""
 
@@ -150,7 +151,7 @@ class CenterCoordinates:
 
     center_m: Vector
     covariance_m2: tuple[Vector, Vector, Vector]
-    """Random error and soft-tissue artefact; 0 along the directions in `unseen`."""
+    """Covariance of random error and soft-tissue artefact; 0 along the directions in `unseen`."""
     unseen: tuple[Vector, ...]
     """Unit directions along which the movement did not determine the center."""
     axis: Vector | None = None
@@ -166,7 +167,7 @@ class CenterQuality:
     effective_frames: float
     """Number of independent frames."""
     predicted_error_m: float
-    """Root mean variance of the observed directions, with soft-tissue artefact."""
+    """Root mean variance over the observed directions, including soft-tissue artefact."""
     noise_error_m: float
     """Part of the predicted error that decreases with more movement."""
     bound_m: float | None
@@ -178,7 +179,7 @@ class CenterQuality:
     segments: Mapping[str, CenterCoordinates]
     """Coordinates in each of the two body parts of the joint."""
     axis_sd_rad: float | None = None
-    """Standard deviation of the axis in each direction across it."""
+    """Standard deviation of the axis in each direction perpendicular to it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,7 +205,7 @@ class AnatomyQuality:
 
 @dataclass(frozen=True, slots=True)
 class MethodErrors:
-    """RMS error of every method, rad; None without a finite error."""
+    """RMS error of every method, rad; None if the error is not finite."""
 
     anchored: float | None
     patent12: float | None
@@ -242,11 +243,15 @@ class RegressionQuality:
 
     sensors: tuple[str, ...]
     q_sign: Quaternion
-    """Quaternions with a negative product with this one change their sign before the regression."""
+    """Reference quaternion: quaternions whose dot product with it is negative change their sign
+    before the regression.
+    """
     verified: tuple[tuple[float, ...], ...]
-    """Fitted to the first part of the trial; the errors of ``holdout`` are theirs."""
+    """Coefficients that were fitted to the first part of the trial. ``holdout`` contains their
+    errors.
+    """
     stored: tuple[tuple[float, ...], ...]
-    """Fitted to the whole trial; fusion uses them."""
+    """Coefficients that were fitted to the whole trial and are used by the fusion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,7 +297,7 @@ def sensor_rotations(sensors: Mapping[str, SensorCalibration]) -> dict[str, Sens
 
 
 def quality_table(value: Any) -> Any:
-    """Return the JSON form of figures; a field that is optional is omitted while it is None."""
+    """Return the JSON form of figures; an optional field is omitted if it is None."""
     if is_dataclass(value):
         found = ((field, getattr(value, field.name)) for field in fields(value))
         return {

@@ -1,4 +1,4 @@
-"""Names of the methods and costs of a marker refinement, without the code of the refinement."""
+"""Names of the methods and costs of a marker refinement; the refinement itself is not imported."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 HUBER_K = 1.5
-"""Residual in robust scales above which the weight is reduced."""
+"""Ratio of residual to robust scale above which the weight is reduced."""
 
 MAX_PASSES = 30
 """Largest number of reweighting iterations."""
@@ -21,7 +21,7 @@ _MEDIAN_TO_SD = 1.4826
 
 
 def rms(values: NDArray[np.float64], empty: float = np.nan) -> float:
-    """Return the RMS of the finite values of any shape, in their unit; `empty` without them."""
+    """Return the RMS of the finite values of an array, in their unit; `empty` if it has none."""
     good = values[np.isfinite(values)]
     return float(np.sqrt(np.mean(good**2))) if good.size else empty
 
@@ -41,7 +41,8 @@ def effective_count(residuals: NDArray[np.float64]) -> float:
 
     .. math:: n_{eff} = n \frac{1 - \rho_1}{1 + \rho_1}
 
-    with the lag-one autocorrelation of the series about its mean over all columns; at most n.
+    where :math:`\rho_1` is the lag-one autocorrelation of the series about its mean, over all
+    columns. The result is at most n.
 
     Parameters
     ----------

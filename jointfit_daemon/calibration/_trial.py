@@ -1,6 +1,7 @@
 """Inputs of a calibration: recorded trials on one clock, and the settings.
 
-All time stamps are host CLOCK_MONOTONIC nanoseconds, already mapped by the device clocks.
+All time stamps are nanoseconds of the host clock CLOCK_MONOTONIC. The device clocks have already
+converted them.
 """
 
 from __future__ import annotations
@@ -20,10 +21,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Method, Procedure
 
 CenterMethod = Literal["sphere", "score", "sara", "geometric", "oriented", "grid", "three_frames"]
-"""Estimators of the joint centers that rig.toml can name, see ``center_of_rotation.METHODS``.
-
-``sphere`` is the fit for skin markers of `calibration.anatomy`. All other names are estimators of
-`center_of_rotation`."""
+"""Names of the estimators of joint centers in rig.toml. ``sphere`` is the fit for skin markers in
+`calibration.anatomy`. The others are keys of ``center_of_rotation.METHODS``.
+"""
 ONE_AXIS: frozenset[CenterMethod] = frozenset(
     ("sara", "geometric", "oriented", "grid", "three_frames")
 )
@@ -69,10 +69,10 @@ class CalibrationTrial:
 
 @dataclass(frozen=True, slots=True)
 class ChainRefinement:
-    """Refinement of the markers of a chain model in the functional phase."""
+    """Settings for the refinement of the markers of a chain model in the functional phase."""
 
     model: ChainModel
-    """The model of rig.toml, with the locks and weights of the refinement."""
+    """Chain model that rig.toml names, with the locks and weights of the refinement."""
     settings: RefinementSettings
     limit_s: float
     """Longest duration of the iteration, s."""
@@ -87,15 +87,17 @@ class CalibrationSettings:
 
     method: Method = "anchored"
     procedure: Procedure = "corrected"
-    """``patent``: component mean in the static pose, markers without refinement, and the regression
-    that was verified on the held-out part."""
+    """Procedure of the calibration. ``patent`` uses the component mean in the static pose, markers
+    without refinement, and the regression that was verified on the held-out part.
+    """
     static_s: float = 5.0
     align_s: float = 30.0
     functional_s: float = 60.0
     """Longest duration of the functional phase, s."""
     functional_min_s: float = 45.0
-    """Shortest duration of the functional phase, s: the regression needs this much movement even if
-    the joint centers converge earlier."""
+    """Shortest duration of the functional phase, s. The regression needs this much movement, even
+    if the joint centers converge earlier.
+    """
     center_target_m: float = 0.003
     """Random error of the joint centers, m, below which the movement is sufficient.
 
@@ -103,19 +105,19 @@ class CalibrationSettings:
     center_method: CenterMethod = "sphere"
     """Estimator of the joint centers."""
     joint_center_methods: Mapping[str, CenterMethod] = field(default_factory=dict)
-    """Estimator of single joints instead of `center_method`, by joint."""
+    """Estimator by joint, for joints that do not use `center_method`."""
     markers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Marker names, by segment or adjacent body part (pelvis, foot)."""
     rigid_bodies: Mapping[str, str] = field(default_factory=dict)
-    """Rigid body of the mocap software, by segment; for segments without single markers."""
+    """Rigid body of the mocap software by segment, for segments without individual markers."""
     plate: str | None = None
     """Rigid body of the calibration plate that carries the sensors in the align phase."""
     holdout_share: float = 0.4
-    """Last, contiguous share of the functional trial that is held out for evaluation."""
+    """Fraction of the functional trial, at its end, that is held out for evaluation."""
     refine_markers: bool = True
     """Whether marker positions on the body parts are refined from the movement."""
     chain_refinement: ChainRefinement | None = None
-    """Refinement of the chain model; None without one."""
+    """Refinement of the chain model; None if it is not refined."""
     learn_online: bool = True
     """Whether the models are refitted while the cameras see the limb."""
 
@@ -133,8 +135,9 @@ class OnlineFrames:
     """New complete frames of sensors and markers, in order of time."""
 
     sensors: Mapping[str, Array]
-    """q_optical_segment of each sensor, computed with its sensor-to-segment alignment, shape
-    (n, 4)."""
+    """q_optical_segment of each sensor, which includes the sensor-to-segment alignment, shape (n,
+    4).
+    """
     markers: Mapping[str, Array]
     """Marker positions of the cluster of each segment in the optical world, m, shape (n, k, 3).
 

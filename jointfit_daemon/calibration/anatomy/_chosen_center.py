@@ -1,4 +1,4 @@
-"""Joint centers by an estimator that rig.toml names instead of the default sphere fit.
+"""Joint centers from an estimator that rig.toml selects instead of the default sphere fit.
 
 Invariant: all coordinates are in the static world. Unobserved directions and leverage have the same
 meaning as in `joint_center`.
@@ -41,7 +41,7 @@ class CenterChoice:
     """Estimators of the joint centers, and the segment orientations that some estimators need."""
 
     methods: Mapping[str, CenterMethod] = field(default_factory=dict)
-    """Estimator by joint; ``sphere`` where missing."""
+    """Estimator by joint; joints that are absent use ``sphere``."""
     turned: Mapping[str, Array] = field(default_factory=dict)
     """Rotation q_now_static of each segment from its IMUs, at the instants of the tracks, shape
     (m, 4); NaN where unknown."""
@@ -56,15 +56,15 @@ def chosen_center(
 ) -> CenterEstimate:
     r"""Estimate the center between two body parts by any method of `METHODS`.
 
-    Planar methods use the plane normal to the joint axis, which is estimated from the poses of both
-    parts. A movement about several axes is refused. With the orientation of an IMU, the angle θ of
-    a part about the axis a is computed from the rotation q relative to the neighbor,
+    Planar methods use the plane perpendicular to the joint axis, which is estimated from the poses
+    of both parts. They reject a movement about several axes. If a part has an IMU, the angle θ of
+    the part about the axis a is computed from its rotation q relative to the neighbor,
 
     .. math:: q = q_{neighbor}^* \otimes q_{IMU}, \qquad
               \theta = 2\, \mathrm{atan2}(q_{xyz} \cdot a, q_w).
 
-    If only the proximal part has an IMU, the two parts exchange their roles: the center has the
-    same coordinates in both, because they share the static world.
+    If only the proximal part has an IMU, the two parts exchange their roles. The center has the
+    same coordinates in both parts, because both use the static world.
 
     Parameters
     ----------
@@ -73,14 +73,14 @@ def chosen_center(
     parent, child : ClusterTrack
         Proximal and distal body part.
     start : ndarray, shape (3,)
-        Position along unobserved directions, static world, m.
+        Position that is used along unobserved directions, static world, m.
     turned : (ndarray or None, ndarray or None)
         Rotations q_now_static of both parts from their IMUs, shape (m, 4).
 
     Returns
     -------
     CenterEstimate
-        In the static world, m, with `leverage`; `refused` contains cause and remedy.
+        Center in the static world, m, with `leverage`; `refused` contains cause and remedy.
     """
     if method == "oriented" and turned[1] is None:
         parent, child, turned = child, parent, turned[::-1]
@@ -89,8 +89,8 @@ def chosen_center(
         reason = f"{frames} frames show both sides of it, at least {MIN_FRAMES} are needed"
         return refusal(method, 3, frames, reason)
 
-    # The origin of both parts is `start`, which is near the joint: the poses of a distant origin
-    # would multiply the noise of the rotations.
+    # The origin of both parts is `start`, which is near the joint. The positions of a distant
+    # origin would amplify the noise of the rotations.
     step = max(1, -(-len(parent.t_ns) // MAX_FRAMES))
     above, below = (
         BodyPoses(part.q[::step], part.carry(start)[::step]) for part in (parent, child)
@@ -120,7 +120,7 @@ def chosen_center(
 
 
 def _angle_leverage(angles: Array, unseen: Array) -> Array:
-    r"""Return the covariance of a center per m² of artefact where the angles are known, (3, 3).
+    r"""Return the covariance of a center per m² of artefact if the angles are known, (3, 3).
 
     In the plane, positions are linear in center and marker, :math:`x_t = c + R(\theta_t) p`. One
     observation of unit variance gives

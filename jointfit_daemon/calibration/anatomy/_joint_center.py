@@ -1,7 +1,8 @@
 """Joint centers from the markers of one body part relative to its neighbor.
 
-A fit is a `CenterEstimate` with its leverage. Its `unseen` directions are those that the movement
-did not excite: a hinge does not determine the position of the center along its axis.
+A fit is a `CenterEstimate` with its leverage. Its `unseen` directions are the directions that the
+movement did not excite. For example, the movement of a hinge does not determine the position of the
+center along the axis.
 """
 
 from __future__ import annotations
@@ -34,20 +35,20 @@ if TYPE_CHECKING:
 MIN_FRAMES = 50
 """Smallest number of frames with visible markers."""
 MAX_FRAMES = 2000
-"""Most frames that are used; longer recordings are decimated."""
+"""Largest number of frames that are used; longer recordings are decimated."""
 MIN_DIRECTION_RAD = radians(3.0)
 """RMS change of marker directions below which a direction of the center is unobserved, rad."""
 UNSEEN_SD_M = 0.03
 """Standard deviation of the center along an unobserved direction, m."""
 MAX_SD_M = 0.04
-"""Standard deviation, in a direction that was observed, above which a center is refused."""
+"""Largest standard deviation of an accepted center in the observed directions, m."""
 LIMITS = SphereLimits(min_arc=radians(10.0), reach=(0.02, 1.0))
 ON_SKIN = SphereOptions(
     smallest_scale=1e-4, hold=0.003, min_direction=MIN_DIRECTION_RAD, keep_one=True
 )
 """Options of the sphere fit for skin markers."""
 _STEEP = 0.5
-"""Smallest horizontal part of an unobserved direction along which a center is moved."""
+"""Smallest horizontal component of an unobserved direction along which a center is moved."""
 
 
 def fit_center(points: Array, start: Array) -> CenterEstimate:
@@ -56,9 +57,9 @@ def fit_center(points: Array, start: Array) -> CenterEstimate:
     .. math:: \min_m \sum_{tj} \rho\left(|v_{tj} - m| - \bar u_j\right),
               \qquad \bar u_j = \mathrm{mean}_t |v_{tj} - m|
 
-    This is the geometric sphere fit with options for skin markers: directions in which the markers
-    rotated by less than `MIN_DIRECTION_RAD` would be dominated by the soft-tissue artefact. They
-    are left at `start` and listed as unseen.
+    This is the geometric sphere fit with options for skin markers. If the markers rotated by less
+    than `MIN_DIRECTION_RAD` in a direction, soft-tissue artefact would dominate the result. The
+    center is then left at `start` in this direction, and the direction is listed as unseen.
 
     Parameters
     ----------
@@ -70,8 +71,8 @@ def fit_center(points: Array, start: Array) -> CenterEstimate:
     Returns
     -------
     CenterEstimate
-        With `leverage`; `refused` is set if there are too few frames, no arc, or an implausible
-        radius.
+        Center with `leverage`. `refused` is set if there are too few frames, no arc, or an
+        implausible radius.
     """
     points = points[:: max(1, -(-len(points) // MAX_FRAMES))]
     seen = visible(points)
@@ -84,7 +85,7 @@ def fit_center(points: Array, start: Array) -> CenterEstimate:
     fit = solve_sphere(points, options)
     found = judge_sphere(fit, "sphere", frames, LIMITS, options)
 
-    # Covariance of the center per variance of the radial residuals.
+    # The leverage is the covariance of the center per variance of the radial residuals.
     lever = fit.basis @ np.linalg.pinv(fit.information / max(float(fit.weights.sum()), 1e-12))
     return replace(found, leverage=lever @ fit.basis.T, refused=_objection(found))
 
@@ -111,8 +112,9 @@ def artefact_leverage(points: Array, center: Array, unseen: Array) -> Array:
     .. math:: L = \Big[ \mathrm{mean}_{tj}\,(d_{tj} - \bar d_j)(d_{tj} - \bar d_j)^T \Big]^+,
               \qquad d_{tj} = (v_{tj} - m) / |v_{tj} - m|
 
-    within the observed directions. It is the inverse information of a sphere fit with one
-    observation of unit variance, so the artefact of a posture counts once.
+    in the observed directions. L is the inverse information of a sphere fit with one observation of
+    unit variance. Frames of the same posture have the same artefact and therefore do not reduce the
+    result.
 
     Parameters
     ----------
@@ -121,7 +123,7 @@ def artefact_leverage(points: Array, center: Array, unseen: Array) -> Array:
     center : ndarray, shape (3,)
         m.
     unseen : ndarray, shape (u, 3)
-        Unobserved unit directions.
+        Unit vectors of the unobserved directions.
     """
     away = points - center
     direction = away / np.linalg.norm(away, axis=-1, keepdims=True)
@@ -134,20 +136,21 @@ def artefact_leverage(points: Array, center: Array, unseen: Array) -> Array:
 def align_vertically(found: CenterEstimate, above: Array | None) -> CenterEstimate:
     """Move a center along its unobserved directions above or below a point.
 
-    A hinge does not determine the position along its axis. Nearly vertical directions are
-    unchanged: the horizontal position of a neighbor does not determine a height.
+    A hinge does not determine the position of its center along the axis. The center is not moved
+    along nearly vertical directions, because the horizontal position of a neighbor does not
+    determine a height.
 
     Parameters
     ----------
     found : CenterEstimate
-        In coordinates with vertical z.
+        Center in coordinates with vertical z.
     above : ndarray, shape (2,), or None
         Horizontal target position, m; None leaves the center unchanged.
     """
     if len(found.unseen) == 0 or above is None:
         return found
 
-    # Least-squares steps; directions with a small horizontal part get none.
+    # The steps are a least-squares solution without directions of small horizontal component.
     U, s, Vt = np.linalg.svd(found.unseen[:, :2].T, full_matrices=False)
     inverse = np.where(s > _STEEP, 1.0 / np.maximum(s, _STEEP), 0.0)
     steps = (Vt.T @ (inverse[:, None] * U.T)) @ (above - found.center[:2])
@@ -158,9 +161,10 @@ def joint_center(parent: ClusterTrack, child: ClusterTrack, start: Array) -> Cen
     """Fit the center between two body parts, in static-world coordinates, m (shape (3,)).
 
     The markers of the distal part are first transformed to static-world coordinates of the proximal
-    part, in which the center is fixed. Their spheres decide which directions were observed. The
-    center along these directions is the point that coincides in both parts: noise of a part's
-    markers rotates it, which moves distant markers off their spheres and biases their center.
+    part, in which the center is fixed. A sphere fit to these markers determines which directions
+    were observed. Along these directions the center is the point that coincides in both parts. The
+    sphere fit would be biased: noise in the markers of the proximal part rotates its pose, which
+    moves distant markers off their spheres.
     """
     found = fit_center(parent.to_static(child.points), start)
     if found.refused is not None:
@@ -192,14 +196,14 @@ def _markers(track: ClusterTrack) -> Array:
 
 
 def _poses(track: ClusterTrack) -> BodyPoses:
-    """Return the poses that map static-world points to the optical world, at most `MAX_FRAMES`."""
+    """Return at most `MAX_FRAMES` poses that map static-world points to the optical world."""
     step = max(1, -(-len(track.q) // MAX_FRAMES))
     q, p = track.q[::step], track.p[::step]
     return BodyPoses(q, p - rotation.rotate(q, track.origin))
 
 
 def carried_center_gap(parent: ClusterTrack, child: ClusterTrack, center: Array) -> float:
-    """Return the RMS distance, m, between a center fixed in each of two body parts.
+    """Return the RMS distance, m, between the centers that are fixed in two body parts.
 
     `center` is the joint center in the static world, m, shape (3,).
     """

@@ -1,12 +1,13 @@
 """Body parts in the static pose and in trials, from markers or rigid bodies.
 
-A cluster is stored in coordinates of the *static world*: the optical world during the static pose.
-A pose maps static-world points to their current positions,
+A cluster is stored in coordinates of the *static world*, which is the optical world during the
+static pose. A pose maps static-world points to their current positions,
 
     x(t) = R(t) (x_static - origin) + p(t),
 
-so that R is the identity and p the origin in the static pose, and all body parts share one
-coordinate system there. NaN means not visible, and propagates.
+so that R is the identity and p the origin in the static pose. All body parts therefore share one
+coordinate system in the static pose. NaN marks an invisible marker, and propagates through all
+computations.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class ClusterTrack:
     """Residuals of the cameras for the markers, m, shape (m, k); NaN where unknown."""
 
     def to_static(self, x: Array) -> Array:
-        """Transform current points, shape (m, ..., 3), to the static world of this part."""
+        """Return current points, shape (m, ..., 3), in static-world coordinates of this part."""
         extra = (1,) * (x.ndim - 2)
         q = rotation.conjugate(self.q).reshape(len(self.q), *extra, 4)
         p = self.p.reshape(len(self.p), *extra, 3)
@@ -85,8 +86,8 @@ def columns(track: OpticalTrack, name: str, settings: CalibrationSettings) -> li
     Raises
     ------
     CalibrationError
-        Markers are missing in the stream (all are named, each with the nearest spelling), or there
-        are fewer than three.
+        Markers are missing in the stream, or there are fewer than three. The message contains all
+        missing markers, each with the nearest spelling.
     """
     wanted = settings.markers[name]
     found = _marker_columns(track, name, wanted)
@@ -119,7 +120,7 @@ def body_column(track: OpticalTrack, name: str, body: str) -> int:
 
 
 def static_cluster(track: OpticalTrack, name: str, settings: CalibrationSettings) -> MarkerCluster:
-    """Return one body part in the static pose: component-wise medians, insensitive to outliers.
+    """Return one body part in the static pose, from medians, which are insensitive to outliers.
 
     Raises
     ------
@@ -170,7 +171,7 @@ def _static_body(track: OpticalTrack, name: str, body: str) -> MarkerCluster:
 
 
 def track_cluster(track: OpticalTrack, cluster: MarkerCluster) -> ClusterTrack:
-    """Return the poses of one body part in a trial; see `rigid_fit` for NaN.
+    """Return the poses of one body part in a trial; NaN has the meaning of `rigid_fit`.
 
     Raises
     ------
@@ -190,7 +191,7 @@ def track_cluster(track: OpticalTrack, cluster: MarkerCluster) -> ClusterTrack:
     residuals = None if track.residuals is None else track.residuals[:, chosen]
     q, p, rms = steady_fit(cluster.template, points)
 
-    # A larger residual means swapped or mislabeled markers: no pose.
+    # A larger residual indicates swapped or mislabeled markers. The frame then has no pose.
     wrong = rms > MAX_FIT_RMS_M
     q[wrong], p[wrong] = np.nan, np.nan
     points = np.where(wrong[:, None, None], np.nan, points)
@@ -227,13 +228,14 @@ def exchanged_labels(
 def moving_template(positions: Array) -> Array:
     """Return marker positions on a rigid body, m, (k, 3), from a recorded movement (m, k, 3).
 
-    The first frame with all markers is the initial template. All frames are then aligned with the
-    template and averaged, twice (generalized Procrustes analysis). The centroid is zero.
+    The first frame with all markers is the initial template. All frames are aligned with the
+    template, and their average is the next template. Both steps are done twice (generalized
+    Procrustes analysis). The centroid of the result is zero.
 
     Raises
     ------
     CalibrationError
-        No frame shows all markers, or they are on a line.
+        No frame contains all markers, or the markers are on a line.
     """
     full = np.flatnonzero(np.isfinite(positions).all(axis=(1, 2)))
     if full.size == 0:

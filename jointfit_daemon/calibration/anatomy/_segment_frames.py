@@ -1,12 +1,12 @@
 """Joint centers, segment lengths and segment axes from markers in the static pose and in motion.
 
-All coordinates are in the static world: the optical world during the static pose, common to all
-body parts. The z axis of a segment points from its distal to its proximal joint center, x to the
-right of the subject along the flexion axis, and y = z × x. For a segment with two distal joints
-(the pelvis of both legs), the x axis passes through both joints, from left to right, and the origin
-is between the joints. With static axes, all segments have the axes of the world in the static pose.
-The origin of other segments is the proximal joint center. Quantities that could not be determined
-are None and described in `notes`.
+All coordinates are in the static world. It is the optical world during the static pose, common to
+all body parts. The z axis of a segment points from its distal to its proximal joint center. The x
+axis points to the right of the subject along the flexion axis, and y = z × x. The origin is the
+proximal joint center. A segment with two distal joints, such as the pelvis of both legs, is an
+exception. Its x axis passes through both joints, from left to right, and its origin is between
+them. With static axes, all segments have the axes of the world in the static pose. Quantities that
+could not be determined are None, and `notes` contains the reasons.
 """
 
 from __future__ import annotations
@@ -58,10 +58,12 @@ MAX_AXIS_TILT = 0.7
 CONFIGURED_SD_M = 0.01
 """Standard deviation of a configured length, m."""
 SKIN_SD_M = 0.005
-"""Systematic error of any center from skin markers, m; residuals do not contain it."""
+"""Systematic error of every center from skin markers, m. The residuals do not contain this error.
+"""
 RADIAL_ARTEFACT_SD_M = 0.003
-"""Radial, posture-dependent part of the 5 mm soft-tissue artefact of a marker, m. Over a short arc
-it moves the center in proportion to the inverse of that arc."""
+"""Radial, posture-dependent part of the 5 mm soft-tissue artefact of a marker, m. The resulting
+error of the center is inversely proportional to the arc of the movement.
+"""
 
 _UP = np.array([0.0, 0.0, 1.0])
 _STANDING = rotation.IDENTITY
@@ -77,20 +79,23 @@ class JointCenter:
     covariance: Array
     """Covariance of the position, m², shape (3, 3)."""
     source: str
-    """``fit``; ``length``: from the other end of a segment and its configured length; ``midpoint``:
-    between the two distal joints of a branched segment."""
+    """Source of the center. ``fit`` is the movement, ``length`` the other end of a segment and its
+    configured length, and ``midpoint`` the middle between the two distal joints of a branched
+    segment.
+    """
     fit: CenterEstimate | None
-    """Center of rotation from the movement; None for the other sources."""
+    """Center of rotation from the movement; None if `source` is not ``fit``."""
     gap_rms: float | None
     """RMS distance during the movement between the center fixed in the proximal body part and the
     center fixed in the distal body part, m."""
 
     @property
     def source_text(self) -> str:
-        """Origin of the joint center.
+        """Description of the source of the joint center.
 
-        ``markers``; ``markers, static pose`` if the movement left a direction unobserved;
-        ``configured``: a configured length from another joint; or ``midpoint``.
+        ``markers`` is a center from the movement, and ``markers, static pose`` a center with a
+        direction that the movement did not determine. ``configured`` is a center from another joint
+        and a configured length. ``midpoint`` is the middle between two joints.
         """
         if self.fit is None:
             return "midpoint" if self.source == "midpoint" else "configured"
@@ -106,9 +111,11 @@ class FlexionAxis:
     rms: float
     """RMS rotation about the axis, rad."""
     off: float
-    """RMS angle between the long axis and the plane of the rotation, rad."""
+    """RMS angle between the long axis of the distal part and the plane of the rotation, rad."""
     bend: float
-    """Mean of angle times absolute angle, rad^2: small in a movement to both sides alike."""
+    """Mean of angle times absolute angle, rad^2. It is small if the joint moves equally to both
+    sides.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +128,9 @@ class Anatomy:
     lengths: Mapping[str, tuple[float | None, float | None]]
     """Length and its standard deviation for each segment, m."""
     length_sources: Mapping[str, str]
-    """``configured``, ``markers`` (distance of its joint centers) or ``unknown``."""
+    """Source of the length of each segment: ``configured``, ``markers`` (distance of its joint
+    centers) or ``unknown``.
+    """
     axes: Mapping[str, FlexionAxis]
     flags: tuple[str, ...] = ()
     notes: tuple[str, ...] = field(default=())
@@ -144,8 +153,8 @@ def find_anatomy(
     Raises
     ------
     CalibrationError
-        No joint flexed enough for a flexion axis, the axis is along a segment, or a chosen
-        estimator refused the movement of its joint.
+        No joint flexed enough for a flexion axis, the axis is along a segment, or a configured
+        estimator rejected the movement of its joint.
     """
     fits, notes = _fit_centers(chain, tracks, choice or CenterChoice())
 
@@ -207,7 +216,7 @@ def _jointed(
 def _segment_ends(
     chain: Chain, i: int, joints: Mapping[str, JointCenter | None]
 ) -> tuple[JointCenter | None, JointCenter | None]:
-    """Return the proximal and distal joint of a segment; of a branched one, the right and left."""
+    """Return the proximal and distal joint of a segment, or right and left joint if branched."""
     distal = distal_joints(chain, i)
     if len(distal) == 1:
         return joints[chain.joints[i]], joints[chain.joints[distal[0]]]
@@ -235,7 +244,7 @@ def _fit_centers(
             found[joint] = replace(fit, axis_sd=hinge_axis_sd(points, fit.axis))
         elif method == "sphere":
             notes.append(f"{joint}: no center: {fit.refused}")
-        else:  # an explicit choice is not replaced by another estimator
+        else:  # a configured estimator is not replaced by another estimator
             faults.append(f"{joint}: center_method {method}: {fit.refused}")
     if faults:
         raise CalibrationError(*faults)
@@ -264,10 +273,10 @@ def _fit_centers(
 def place_unobserved(
     chain: Chain, found: Mapping[str, CenterEstimate]
 ) -> dict[str, CenterEstimate]:
-    """Move centers along unobserved directions until vertically above or below their neighbors.
+    """Move centers along unobserved directions until they are above or below their neighbors.
 
-    The leg is straight in the static pose, so neighboring joints are above each other. Centers next
-    to fully observed ones are moved first.
+    The leg is straight in the static pose, so neighboring joints are vertically above each other.
+    Centers next to fully observed centers are moved first.
     """
     whole = [joint for joint, fit in found.items() if len(fit.unseen) == 0]
     settled = {joint: found[joint] for joint in whole}
@@ -299,8 +308,8 @@ def on_skin(fit: CenterEstimate) -> Array:
 
     .. math:: C + \sigma_u^2\, U^T U + \sigma_r^2 L
 
-    with the unobserved directions U (rows) and L = ``fit.leverage``, the covariance per m² of
-    radial soft-tissue artefact.
+    where the rows of U are the unobserved directions, and L = ``fit.leverage`` is the covariance
+    per m² of radial soft-tissue artefact.
     """
     return artefact_covariance(fit) + UNSEEN_SD_M**2 * np.asarray(fit.unseen.T @ fit.unseen)
 
@@ -315,7 +324,7 @@ def artefact_covariance(fit: CenterEstimate) -> Array:
 def _with_lengths(
     chain: Chain, fits: dict[str, JointCenter | None]
 ) -> dict[str, JointCenter | None]:
-    """Place missing joint centers vertically above or below known ones by configured lengths.
+    """Place missing joint centers a configured length above or below known centers.
 
     The origin of a branched segment is the midpoint of its distal joints.
     """
@@ -349,13 +358,13 @@ def _hung(known: JointCenter, up: float) -> JointCenter:
 def flexion_axis(
     parent: ClusterTrack, child: ClusterTrack, z_child: Array, sign: float
 ) -> FlexionAxis | None:
-    r"""Return the axis about which a joint rotates the long axis of its distal part.
+    r"""Return the axis about which a joint rotates the long axis of the distal body part.
 
     .. math:: x = \arg\min_{|x|=1} \sum_t (x \cdot R_{rel}(t)\, z)^2
 
-    This is the normal of the great circle closest to the paths of z, the axis of least adduction.
-    Unlike the principal axis of the rotation vectors, it is insensitive to rotation about the long
-    axis, which accompanies knee flexion.
+    The result is the axis of least adduction: the normal of the great circle closest to the path of
+    z. Unlike the principal axis of the rotation vectors, it is insensitive to rotation about the
+    long axis. Such a rotation accompanies knee flexion.
 
     Parameters
     ----------
@@ -364,12 +373,12 @@ def flexion_axis(
     z_child : ndarray, shape (3,)
         Long axis of the distal part in the static world, unit vector.
     sign : float
-        Sign of flexion about the right-pointing axis, see `flexion_sign`.
+        Sign of flexion about the axis to the right, from `flexion_sign`.
 
     Returns
     -------
     FlexionAxis or None
-        None if the RMS rotation is below `MIN_FLEXION_RAD`.
+        Axis; None if the RMS rotation is below `MIN_FLEXION_RAD`.
     """
     q = rotation.multiply(rotation.conjugate(parent.q), child.q)
     swung = rotation.rotate(q[visible(q)], z_child)
@@ -382,7 +391,7 @@ def flexion_axis(
     rms = float(np.sqrt((angle**2).mean()))
     if rms < MIN_FLEXION_RAD:
         return None
-    # Large rotations determine the sign; small rotations about the static pose do not.
+    # Large rotations have a large weight, because small rotations do not determine the sign.
     bend = float((angle * np.abs(angle)).mean())
     flip = sign * (1.0 if bend > 0 else -1.0)
     return FlexionAxis(x * flip, rms, float(s[2] / np.sqrt(len(swung))), abs(bend))
@@ -398,9 +407,9 @@ def _flexion_axes(
         found[joint] = flexion_axis(above, below, distal, flexion_sign(joint))
     axes = {joint: axis for joint, axis in found.items() if axis is not None}
 
-    # In the static pose all axes point to the right. A joint that moved to both sides alike, such
-    # as a wrist or an ankle, does not determine the sign of its axis, and takes the sign of the
-    # most bent joint.
+    # In the static pose all axes point to the right. A joint that moved equally to both sides, such
+    # as a wrist or an ankle, does not determine the sign of its axis. Its axis gets the sign of the
+    # axis of the joint that was bent most.
     hinges = [axis for joint, axis in axes.items() if joint not in _shoulders(chain)]
     if not hinges:
         return axes
@@ -412,7 +421,7 @@ def _flexion_axes(
 
 
 def _shoulders(chain: Chain) -> set[str]:
-    """Return the joints that move in every direction: no plane of movement defines their axis."""
+    """Return the shoulder joints, whose axis is not defined by one plane of movement."""
     return {
         chain.joints[joint.number]
         for joint in inner_joints(chain)
@@ -421,9 +430,9 @@ def _shoulders(chain: Chain) -> set[str]:
 
 
 def _axis_joints(chain: Chain, i: int, axes: Mapping[str, FlexionAxis]) -> list[str]:
-    """Return the joints that determine the flexion axis of a segment: inner joints if possible.
+    """Return the joints that determine the flexion axis of a segment, inner joints if possible.
 
-    Beside a shoulder the axes of elbow and wrist are preferred, also for the thorax.
+    In a chain with a shoulder, the axes of elbow and wrist are preferred, even for the thorax.
     """
     inner, shoulders = {joint.name for joint in inner_joints(chain)}, _shoulders(chain)
     ends = [chain.joints[k] for k in (i, *distal_joints(chain, i))]

@@ -1,8 +1,9 @@
 """Prior that a subject stands upright in the static pose, combined with joint centers.
 
-A center from skin markers over a short arc has an uncertainty of centimeters across the limb, the
-ankle most of all. Subjects stand upright within a few degrees when asked to. Center
-and posture are combined by their covariances; the model is linear and Gaussian.
+If the arc of the movement is short, a center from skin markers has an uncertainty of centimeters
+across the limb. The uncertainty is largest at the ankle. Subjects who are asked to stand upright do
+so within a few degrees. The two sources of information are weighted by their covariances, in a
+linear Gaussian model.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ def apply_standing_prior(
     covariances: Sequence[Array | None],
     sd: float = STANDING_SD_RAD,
 ) -> list[tuple[Array, Array] | None]:
-    r"""Combine joint centers with the prior that neighbors are vertically above each other.
+    r"""Combine joint centers with the prior that neighboring centers are above each other.
 
-    The horizontal part of the difference of two neighbors at distance L is measured as zero with
-    standard deviation L sd,
+    The matrix S selects horizontal components. The horizontal difference of two neighbors at
+    distance L is treated as a measurement of zero with standard deviation L sd,
 
     .. math:: 0 = S (c_i - c_{i+1}) + e, \qquad e \sim N(0, (L\,sd)^2 I_2),
 
@@ -51,7 +52,7 @@ def apply_standing_prior(
     Returns
     -------
     list of (center, covariance) or None
-        In the given order; a center without known neighbors is unchanged.
+        Combined centers in the given order; a center without known neighbors is unchanged.
     """
     known = [i for i, center in enumerate(centers) if center is not None]
     at = {joint: 3 * k for k, joint in enumerate(known)}

@@ -1,7 +1,8 @@
-"""Poses of all body parts, one camera frame at a time, in one small batched rigid fit.
+"""Poses of all body parts in one camera frame at a time, from one batched rigid fit.
 
-Every frame costs the same. A part whose markers do not fit the static pose has no pose in that
-frame: its misfit is counted, for the part and for the marker that deviates most.
+The cost of every frame is the same. If the markers of a part do not fit the static pose, the part
+has no pose in that frame. Such misfits are counted for the part and for the marker that deviates
+most.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]
 
 _PATTERNS = 4096
-"""Largest number of visibility patterns in the cache."""
+"""Largest number of visibility patterns (sets of visible markers) in the cache."""
 
 
 class ClusterVisibility(NamedTuple):
     """Visibility of one body part."""
 
     seen: float
-    """Share of the frames with a pose."""
+    """Fraction of the frames in which the part has a pose."""
     misfits: float
-    """Share of the frames in which visible markers did not fit the static pose."""
+    """Fraction of the frames in which visible markers did not fit the static pose."""
     suspect: str | None
-    """Marker that deviated most often in those frames."""
+    """Marker that was most often the most deviating marker of a misfit."""
     absent: tuple[str, ...]
     """Markers (or the rigid body) that are not in the stream."""
 
@@ -47,7 +48,7 @@ class LiveClusters:
     ----------
     clusters : mapping of str to MarkerCluster
         Body parts in the static pose, by name. A rigid body is represented by four fixed points
-        in place of its markers.
+        instead of markers.
     """
 
     def __init__(self, clusters: Mapping[str, MarkerCluster]) -> None:
@@ -66,7 +67,7 @@ class LiveClusters:
         self.origins = np.array([c.origin for c in self._clusters]).reshape(-1, 3)
         self._bodies = [i for i, c in enumerate(self._clusters) if c.body is not None]
 
-        # For each part, the frames with a pose and the misfits; for each marker, the misfits in
+        # Counts for each part: frames with a pose, and misfits. Count for each marker: misfits in
         # which it deviated most.
         self._frames = 0
         self._good = np.zeros(shape[0], dtype=np.int64)
@@ -88,16 +89,16 @@ class LiveClusters:
         self.R = np.tile(np.eye(3), (shape[0], 1, 1))
         """R_now_static of the last frame, shape (parts, 3, 3); valid only where `placed`."""
         self.p = np.zeros((shape[0], 3))
-        """Position of each origin, m, shape (parts, 3)."""
+        """Position of the origin of each part, m, shape (parts, 3)."""
         self.placed = np.zeros(shape[0], dtype=np.bool_)
-        """Parts with a pose in the last frame, shape (parts,)."""
+        """Whether each part has a pose in the last frame, shape (parts,)."""
 
     def feed(self, frame: MocapFrame) -> None:
         r"""Fit the pose of every body part in one frame.
 
         .. math:: \min_{R,t} \sum_k |R a_k + t - y_k|^2
 
-        over the visible markers (Kabsch 1976), for all parts at once.
+        The sum is over the visible markers (Kabsch 1976). All parts are fitted in one call.
         """
         if frame.layout is not self._layout and frame.layout != self._layout:
             self._read(frame.layout)
@@ -133,7 +134,7 @@ class LiveClusters:
             y[i] = np.nan
 
     def _read(self, layout: MocapLayout) -> None:
-        """Find the columns of a new layout; missing names are not visible."""
+        """Find the columns of a new layout; missing names count as not visible."""
         self._layout = layout
         markers = {name: i for i, name in enumerate(layout.markers)}
         bodies = {name: i for i, name in enumerate(layout.bodies)}
@@ -167,7 +168,7 @@ class LiveClusters:
         key = seen.tobytes()
         known = self._usable.get(key)
         if known is None:
-            # A movement has few patterns; the cache is bounded against flickering markers.
+            # A movement has few patterns. The limit applies if markers flicker.
             if len(self._usable) >= _PATTERNS:
                 self._usable.clear()
             known = np.array(

@@ -1,18 +1,18 @@
 r"""Joint centers during the movement, frame by frame, with their expected errors.
 
-Two errors are reported separately. *Noise* decreases with the number of frames: it is the
-covariance of the fit, increased for residuals that are correlated in time. The *soft-tissue
-artefact* depends on posture, so more frames do not reduce it. It decreases with a larger arc,
-through the leverage
+Two errors are reported separately. *Noise* decreases with the number of frames. It is the
+covariance of the fit, increased because residuals are correlated in time. The error from
+*soft-tissue artefact* depends on posture, so more frames do not reduce it. It decreases with a
+larger arc, as the leverage in brackets shows:
 
 .. math:: \mathrm{Cov}_{skin} = \sigma_r^2 \Big[ \frac{1}{\sum_j n_j} \sum_j n_j
           \frac{\mathrm{Cov}(v_j)}{R_j^2} \Big]^{-1} + \sigma_s^2 I
 
-with :math:`v_j` marker j in coordinates of the proximal part at distance :math:`R_j` from the
-center, and :math:`n_j` the number of frames of the marker. :math:`\sigma_r, \sigma_s` are the
-standard deviations of the soft-tissue artefact in `calibration.anatomy`. The final fit therefore
-predicts the same soft-tissue error. The final fit compares both body parts instead of spheres, and
-has a smaller random error.
+where :math:`v_j` is marker j in coordinates of the proximal part, :math:`R_j` its distance from the
+center, and :math:`n_j` its number of frames. :math:`\sigma_r, \sigma_s` are the standard deviations
+of the soft-tissue artefact in `calibration.anatomy`. The final fit uses the same values and
+therefore predicts the same soft-tissue error. It has a smaller random error, because it compares
+the poses of both body parts instead of fitting spheres.
 """
 
 from __future__ import annotations
@@ -45,38 +45,44 @@ if TYPE_CHECKING:
 
 
 _ROUNDED_M2 = 1e-12
-"""Lower bound of squared radii, m², against division by zero."""
+"""Lower bound of squared radii, m², which prevents a division by zero."""
 _ALONG = 0.7
-"""Cosine of the angle to an unobserved direction of the estimator above which a direction counts as
-unobserved, too."""
+"""Cosine limit. A direction at a smaller angle to an unobserved direction of the estimator also
+counts as unobserved.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveJointCenter:
-    """Current estimate of one joint center; never contains NaN."""
+    """Current estimate of one joint center. No value is NaN."""
 
     joint: str
     center: Array | None
     """Position in the static world, m, shape (3,); None without an estimate."""
     noise: float
-    """Random error, m: root mean variance of the observed directions; inf without any."""
+    """Random error, m: root mean variance of the observed directions; inf if no direction was
+    observed.
+    """
     noise_across: float
-    """Random error without the least certain direction, m; a hinge determines only the other
-    directions."""
+    """Random error without the least certain direction, m. The movement of a hinge determines only
+    the other directions.
+    """
     total: float
-    """Total error: standard deviation per axis, m, with soft-tissue artefact, and with the prior of
-    the static pose in unobserved directions. A calibration stores this value."""
+    """Total error: standard deviation per axis, m, including soft-tissue artefact. Unobserved
+    directions have the prior of the static pose. A calibration stores this value.
+    """
     arc: float
     """Range of the marker directions about the center, rad."""
     conditioning: float
-    """Radius over the standard deviation in the least certain direction; below 6 there is no
-    center."""
+    """Ratio of the radius to the standard deviation in the least certain direction. Below 6 the
+    center is rejected.
+    """
     frames: int
     """Number of frames with both body parts."""
     unseen: int
     """Number of unobserved directions, 0 to 3."""
     refused: str | None
-    """Reason for which the estimator returned no center."""
+    """Reason why the estimator returned no center."""
 
 
 class LiveJointCenters:
@@ -89,7 +95,7 @@ class LiveJointCenters:
     clusters : mapping of str to MarkerCluster
         Body parts in the static pose; parts without markers are absent.
     limits
-        See `RunningSphere`.
+        Acceptance limits of `RunningSphere`.
     """
 
     def __init__(
@@ -134,13 +140,13 @@ class LiveJointCenters:
             sphere.fade(share)
 
     def feed(self, frame: MocapFrame) -> None:
-        """Process one frame: markers of the distal parts relative to the proximal ones."""
+        """Process the markers of the distal parts relative to the proximal parts in one frame."""
         parts = self.parts
         parts.feed(frame)
         if not self.joints:
             return
 
-        # Markers of the distal parts in static-world coordinates of the proximal ones.
+        # Markers of the distal parts in static-world coordinates of the proximal parts.
         above = self._parents
         v = (parts.points[self._children] - parts.p[above][:, None]) @ parts.R[above]
         v[~parts.placed[above]] = np.nan
@@ -153,9 +159,9 @@ class LiveJointCenters:
                 sphere.feed(v[k, : self._sizes[k]])
 
     def estimate_next(self) -> tuple[LiveJointCenter, CenterEstimate | None]:
-        """Estimate the next joint in turn; with None if fewer than two directions were observed."""
+        """Estimate the next joint in turn. The fit is None below two observed directions."""
         k = self._turn = (self._turn + 1) % len(self.joints)
-        with np.errstate(all="ignore"):  # markers at rest leave zeros
+        with np.errstate(all="ignore"):  # markers at rest cause divisions by zero
             estimate = self._spheres[k].estimate()
         found = self._latest[self.joints[k]] = self._observed_estimate(k, estimate)
         return found
@@ -163,7 +169,8 @@ class LiveJointCenters:
     def estimate_centers(self) -> dict[str, LiveJointCenter]:
         """Return the current estimates; call a few times per second, not in every frame.
 
-        An estimate costs a thousand times a frame, so each call updates one joint in turn.
+        An estimate takes a thousand times as long as a frame, so each call updates only one joint
+        in turn.
         """
         if self.joints:
             self.estimate_next()

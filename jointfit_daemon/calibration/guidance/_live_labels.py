@@ -1,4 +1,4 @@
-"""Exchanged marker labels during a movement, frame by frame."""
+"""Detection of exchanged marker labels during a movement, frame by frame."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import MocapFrame, MocapLayout
 
 _INTERVAL = 24
-"""Frames of which one is examined. A search takes milliseconds and is spread over the next ones."""
+"""One of this number of frames is examined. The search takes milliseconds and is divided among the
+frames that follow.
+"""
 _RECENT = 12
-"""Examined frames on which a decision is based: 2 to 3 s at 100 to 120 Hz."""
+"""Number of examined frames on which a decision is based: 2 to 3 s at 100 to 120 Hz."""
 _CONFIRMED = 0.6
-"""Smallest share of the examined frames that a fault must explain."""
+"""Smallest fraction of the examined frames that a fault must explain."""
 
 
 class LiveLabels:
@@ -41,7 +43,7 @@ class LiveLabels:
         self._columns: list[int] = []
 
     def feed(self, frame: MocapFrame) -> None:
-        """Examine one frame of `_INTERVAL`, or continue with an earlier one."""
+        """Start to examine the frame, or continue the examination of an earlier frame."""
         self._frames += 1
         if self._frames % _INTERVAL == 0:
             if frame.layout is not self._layout:
@@ -49,7 +51,7 @@ class LiveLabels:
                 column = {name: k for k, name in enumerate(frame.layout.markers)}
                 self._columns = [column.get(name, -1) for name in self._search.labels]
             padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
-            # stamps without progress: one part per frame
+            # Both timestamps are 0, so that `advance` does one part of the search per frame.
             self._examination = LabelExamination(self._search, 0, padded[self._columns])
 
         finding = None if self._examination is None else self._examination.advance(0)

@@ -7,8 +7,8 @@ The movement is complete if three conditions hold:
    soft-tissue models.
 3. The shortest duration has passed.
 
-For each condition that does not hold, a message names the missing movement. At the longest duration
-the phase ends in any case, with these messages.
+For each condition that does not hold, a message names the missing movement. When the longest
+duration has passed, the phase ends in any case, and the messages are reported.
 """
 
 from __future__ import annotations
@@ -51,14 +51,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, MocapFrame, Quaternion
 
 MIN_BENDS = 12
-"""Smallest number of flexions of a joint whose two segments carry sensors: half a minute of steps
-and squats."""
+"""Smallest number of flexions of a joint whose two segments carry sensors. Half a minute of steps
+and squats contains this number.
+"""
 MIN_SEEN = 0.5
-"""Share of frames with a body part below which the fit is rejected."""
+"""Smallest fraction of frames with a body part. With fewer frames the fit would be rejected."""
 MAX_MISFITS = 0.1
-"""Share of frames with displaced markers above which the operator is informed."""
+"""Fraction of frames with displaced markers above which the operator is informed."""
 PATIENCE_S = 2.0
-"""Time before the first message on markers, s: a short occlusion is not a fault."""
+"""Time before the first message about markers, s, because a short occlusion is not a fault."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,11 +67,11 @@ class MovementStatus:
     """Current state of a functional movement."""
 
     joints: Mapping[str, Mapping[str, object]]
-    """Published figures of every joint: unknown is None, never infinite."""
+    """Published values of every joint. An unknown value is None, never infinite."""
     parts: Mapping[str, Mapping[str, object]]
     """Visibility of every body part."""
     missing: tuple[str, ...]
-    """Open conditions with their remedies, most urgent first."""
+    """Conditions that do not hold, with their remedies, most urgent first."""
 
     @property
     def ready(self) -> bool:
@@ -88,7 +89,8 @@ class MovementGuide:
     settings : CalibrationSettings
         Target accuracy and markers.
     standing : CalibrationTrial or None
-        Trial of the static pose. If the trial has no camera data, only the sensors are evaluated.
+        Trial of the static pose. Without a trial or without camera data, only the sensors are
+        evaluated.
     """
 
     def __init__(
@@ -101,7 +103,7 @@ class MovementGuide:
         self._centers = LiveJointCenters(chain, clusters)
         self._labels = LiveLabels(clusters)
 
-        # The last orientation of each sensor in the static pose is the zero of its flexion.
+        # The last orientation of each sensor in the static pose defines zero flexion.
         tracks = {} if standing is None else standing.sensors
         zeros = {
             sensor: as_quaternion(track.q_world_sensor[-1].tolist())
@@ -131,7 +133,7 @@ class MovementGuide:
         guessed = self._movement.predicted_center_errors(elapsed_s)
         arcs, bends = self._movement.arcs(), self._movement.bends()
 
-        # Conditions on the body parts, after a short delay.
+        # Conditions on the body parts are checked after a short delay.
         missing = list(self._faults)
         if elapsed_s > PATIENCE_S:
             exchanges = self._labels.exchanges()
@@ -140,7 +142,7 @@ class MovementGuide:
             others = {name: part for name, part in figures.items() if name not in explained}
             missing += [text for name, part in others.items() if (text := _fault(name, part))]
 
-        # Conditions on each joint: center from markers, then flexion measured by sensors.
+        # Conditions on each joint: first the center from markers, then flexion measured by sensors.
         joints: dict[str, Mapping[str, object]] = {}
         inner = {joint.name for joint in inner_joints(self._chain)}
         for joint in self._chain.joints:
@@ -169,7 +171,7 @@ class MovementGuide:
     def _figures_without_center(
         self, joint: str, error: float | None, arc: float | None
     ) -> dict[str, object]:
-        """Return the figures of a joint without a center from markers."""
+        """Return the published values of a joint without a center from markers."""
         i = self._chain.joints.index(joint)
         count = len(self._chain.segments)
         beside = [
@@ -239,7 +241,7 @@ def _missing_movement(one: LiveJointCenter, words: JointInstructions, target: fl
     if noise <= target:
         return one.refused
     more = words.bend if words.hinge else f"{words.bend}, and {words.sideways}"
-    shown_mm = ceil(1e4 * noise) / 10.0  # upwards: an unmet target is never shown as met
+    shown_mm = ceil(1e4 * noise) / 10.0  # rounded up, so that an unmet target is never shown as met
     return f"random error {shown_mm:.1f} mm, target {1e3 * target:g} mm: {more}"
 
 
@@ -262,7 +264,7 @@ def _figures(
 
 
 def _too_little(joint: str, arc: float, bends: int) -> str | None:
-    """Return the flexion that the regression of the sensors still needs."""
+    """Return the flexion that the regression of the sensors still needs, or None."""
     words = instructions_for(joint)
     if arc < words.arc:
         return f"{degrees(arc):.0f}° of {degrees(words.arc):.0f}° so far: {words.bend}"

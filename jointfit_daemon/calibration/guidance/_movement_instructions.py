@@ -1,4 +1,4 @@
-"""Instructions for the subject, by kind of joint, with general ones for unknown joint names."""
+"""Instructions for the subject by kind of joint, and general instructions for other joints."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ class JointInstructions(NamedTuple):
     sideways: str
     """Movement about a second axis."""
     hinge: bool = False
-    """The joint has one main axis: the position of its center along that axis comes from the static
-    pose."""
+    """Whether the joint has one main axis. The position of its center along that axis is then taken
+    from the static pose.
+    """
     arc: float = radians(40.0)
     """Smallest arc, rad, that a joint must cover to train the soft-tissue models.
 

@@ -1,6 +1,6 @@
 """Arc and flexion count of each joint from the inertial sensors during a functional movement.
 
-This is guidance for the subject, computed a few times per second; the fit checks its data itself.
+The values guide the subject and are computed a few times per second. The fit does not use them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ SKIN_NOISE_M = 0.005
 center."""
 
 CORRELATION_S = 0.5
-"""Correlation time of the soft-tissue artefact, s: one second has two independent samples."""
+"""Correlation time of the soft-tissue artefact, s. One second therefore contains two independent
+samples.
+"""
 
 MIN_ARC_RAD = math.radians(5.0)
 """Smallest arc from which the error of a joint center is predicted, rad."""
@@ -62,18 +64,21 @@ class _RotationRange:
 class MovementProgress:
     """Arc and flexion count of each inner joint, from the sensors on both segments of the joint.
 
-    For joints without markers, the arc predicts the error of the center by the Cramér-Rao bound of
-    a circle of unknown radius over an arc φ, ``26.8 σ / (√n φ²)``, at least the full-circle value.
-    n is the number of independent samples of the soft-tissue artefact, not of frames.
+    For joints without markers, the error of the center is predicted from the arc φ. The prediction
+    is the Cramér-Rao bound of a circle of unknown radius, ``26.8 σ / (√n φ²)``, and at least the
+    value of a full circle. n is the number of independent samples of the soft-tissue artefact,
+    which is smaller than the number of frames.
     """
 
     chain: Chain
     standing: Mapping[str, Quaternion] = field(default_factory=dict)
-    """Orientation of each sensor in the static pose, which defines zero flexion. For missing
-    sensors the first orientation defines zero."""
+    """Orientation of each sensor in the static pose, which defines zero flexion. For sensors that
+    are missing here, the first orientation defines zero flexion.
+    """
     _seen: dict[tuple[str, str, str], _RotationRange] = field(default_factory=dict)
-    """Range for each joint and pair of sensors. The zero of a pair depends on the sensor-to-segment
-    alignments of both sensors."""
+    """Range for each joint and pair of sensors. Each pair has its own range, because its zero
+    depends on the sensor-to-segment alignments of both sensors.
+    """
 
     def update(self, latest: Mapping[str, Quaternion]) -> None:
         """Process the newest orientation of each available sensor."""

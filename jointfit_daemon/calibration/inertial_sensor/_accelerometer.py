@@ -1,11 +1,12 @@
 r"""Bias, scale factors and non-orthogonality of an accelerometer from static poses.
 
-At rest an accelerometer measures gravity, in every pose with the same magnitude:
+At rest an accelerometer measures gravity, whose magnitude is the same in every pose:
 
 .. math:: |M (f_i - b)| = g
 
-Nine poses determine bias and scale factors with three degrees of freedom to spare, twelve poses the
-non-orthogonality as well. The faces of the housing need not be exact: only magnitudes are used.
+Nine poses determine the six parameters of bias and scale factors, with three degrees of freedom
+left. Twelve poses also determine the non-orthogonality. The faces of the housing need not be
+exactly perpendicular, because only magnitudes are used.
 
 Source: Frosio, Pedersini and Borghese 2009, IEEE Trans. Instrum. Meas. 58, 2034-2041; static
 detection as in Tedaldi, Pretto and Menegatti 2014, ICRA, 3042-3049.
@@ -45,15 +46,17 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.inertial_sensor._rest_blocks import SensorReading
 
 STANDARD_GRAVITY = 9.80665
-"""Magnitude of gravity, m/s^2. An error is common to all axes, and does not change inclinations."""
+"""Magnitude of gravity, m/s^2. An error of this value is common to all axes and does not change
+inclinations.
+"""
 POSES = 12
-"""Poses that complete the step: six faces and six edges or corners."""
+"""Number of poses of a complete step: six faces and six edges or corners."""
 FEWEST_POSES = 9
-"""Fewest poses of a fit: three more than bias and scale factors."""
+"""Fewest poses of a fit, three more than its six parameters."""
 FEWEST_SKEWED = 12
-"""Fewest poses of a fit of the non-orthogonality."""
+"""Fewest poses of a fit that includes the non-orthogonality."""
 LARGEST_SKEW_SD = 0.003
-"""Largest standard deviation of an off-diagonal element, rad, with which it is used."""
+"""Largest standard deviation, rad, with which an off-diagonal element is used."""
 LARGEST_RESIDUAL = 0.1
 """Largest RMS of the corrected magnitudes minus g, m/s^2."""
 LARGEST_BIAS = 3.0
@@ -61,19 +64,19 @@ LARGEST_BIAS = 3.0
 LARGEST_SCALE_ERROR = 0.2
 """Largest plausible error of a scale factor."""
 _POSE_BLOCKS = 4
-"""Blocks of a pose, 1 s."""
+"""Number of blocks in a pose: 1 s."""
 _DISTINCT = cos(radians(20.0))
 """Cosine of the smallest angle between two poses."""
 _PLANES = {"x and y": (0, 1), "x and z": (0, 2), "y and z": (1, 2)}
 _TILTED = 0.4
 """Smallest share of gravity along both axes of a tilted pose."""
 _SATURATED = 0.5 * STANDARD_GRAVITY
-"""Specific force, m/s^2, below which no accelerometer saturates."""
+"""Specific force, m/s^2, that every accelerometer measures without saturation."""
 
 
 @dataclass(frozen=True, slots=True)
 class AccelerometerEstimate:
-    """Parameters of an accelerometer: the corrected specific force is `matrix` (f - `bias`)."""
+    """Parameters of an accelerometer; `matrix` (f - `bias`) is the corrected specific force."""
 
     bias: Array
     """Bias, m/s^2, shape (3,)."""
@@ -84,7 +87,9 @@ class AccelerometerEstimate:
     matrix_sd: Array
     """Standard deviations of the elements of the matrix; NaN where they are not estimated."""
     covariance: Array
-    """Covariance of bias (m/s^2), diagonal, and upper off-diagonal elements if estimated."""
+    """Covariance of the bias (m/s^2), the diagonal of `matrix` and, if estimated, its upper
+    off-diagonal elements.
+    """
     degrees_of_freedom: int
     """Number of poses minus number of parameters."""
     poses: int
@@ -104,7 +109,7 @@ def fit_accelerometer(forces: Array) -> AccelerometerEstimate:
     Parameters
     ----------
     forces
-        One pose a row, m/s^2, shape (n, 3).
+        Specific force of one pose per row, m/s^2, shape (n, 3).
 
     Raises
     ------
@@ -146,7 +151,7 @@ def fit_accelerometer(forces: Array) -> AccelerometerEstimate:
 
 
 def _check(estimate: AccelerometerEstimate) -> None:
-    """Refuse parameters of no real accelerometer."""
+    """Reject parameters that no real accelerometer has."""
     if estimate.residual > LARGEST_RESIDUAL:
         raise SensorCalibrationError(
             f"after the correction |a| differs from gravity by {estimate.residual:.3f} m/s² (RMS), "
@@ -178,7 +183,7 @@ class AccelerometerStep:
 
     @property
     def progress(self) -> StepProgress:
-        """Share of the poses, and the missing ones."""
+        """Fraction of the poses that are collected, and the missing poses."""
         faces, tilts = self._missing_faces(), self._tilts()
         missing = [f"{NAMES[face]} up" for face in faces]
         missing += [f"{count} tilted between {plane}" for plane, count in tilts.items()]
@@ -188,7 +193,7 @@ class AccelerometerStep:
         return StepProgress(max(1.0 - (wanted + others) / POSES, 0.0), tuple(missing))
 
     def add(self, reading: SensorReading) -> None:
-        """Add a reading; a pose is collected if it differs from those before."""
+        """Add a reading; a pose is collected if it differs from the poses before."""
         blocks = self._blocks
         is_block = blocks.add(reading)
         self._turns.add(reading, blocks.rest if is_block else None)
@@ -220,7 +225,7 @@ class AccelerometerStep:
                 "sensor lie still for two seconds in each pose"
             )
 
-        # At the end of the range, noise does not change the reading.
+        # At the end of its range a saturated reading is constant, without noise.
         forces, constant = np.array(self._forces), np.array(self._constant)
         for axis, name in enumerate("xyz"):
             for end in (forces[:, axis].max(), forces[:, axis].min()):
@@ -239,7 +244,7 @@ class AccelerometerStep:
         Raises
         ------
         SensorCalibrationError
-            The turns do not determine them.
+            The turns do not determine the scale factors.
         """
         return fit_gyroscope_scale(self._turns.turns, estimate.correct)
 
@@ -248,7 +253,7 @@ class AccelerometerStep:
         return [face for face in range(FACES) if face not in taken]
 
     def _tilts(self) -> dict[str, int]:
-        """Return how many poses between two axes are missing; they show the non-orthogonality."""
+        """Return the number of missing poses by pair of axes, which show the non-orthogonality."""
         units = np.abs(np.array([force / np.linalg.norm(force) for force in self._forces]))
         found = dict.fromkeys(_PLANES, 0)
         for unit in units:

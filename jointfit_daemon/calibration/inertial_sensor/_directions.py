@@ -1,4 +1,4 @@
-"""Directions of a measured vector in sensor axes: the faces, edges and corners of a cube."""
+"""Directions of a measured vector in sensor axes: normals of faces, edges and corners of a cube."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SIGNS = sorted(
 DIRECTIONS: Array = np.array([np.array(signs) / np.linalg.norm(signs) for signs in _SIGNS])
 """Unit vectors, shape (26, 3): 6 faces, 12 edges, 8 corners."""
 FACES = 6
-"""Number of faces; they are the first directions."""
+"""Number of faces, which are the first directions in `DIRECTIONS`."""
 NAMES = tuple(
     " ".join(
         f"{'+' if sign > 0 else '-'}{axis}" for axis, sign in zip("xyz", s, strict=True) if sign
@@ -37,7 +37,7 @@ def nearest_direction(vectors: Array) -> NDArray[np.intp]:
     Parameters
     ----------
     vectors
-        Vectors in sensor axes, any length but 0, shape (n, 3).
+        Vectors in sensor axes of any length except 0, shape (n, 3).
     """
     return np.asarray(np.argmax(vectors @ DIRECTIONS.T, axis=1))
 

@@ -4,8 +4,8 @@ A sensor with bias b and a symmetric matrix M of scale factors and non-orthogona
 
 .. math:: |M (v - b)| = r
 
-M is symmetric, because a rotation of all three axes does not change magnitudes. The parameters
-minimise the sum of squares of the magnitudes minus r.
+M can be chosen symmetric, because a rotation of all three axes does not change magnitudes. The
+parameters minimise the sum of squares of the magnitudes minus r.
 
 Sources: Frosio, Pedersini and Borghese 2009, IEEE Trans. Instrum. Meas. 58, 2034-2041, equations
 5 to 9 (accelerometers); Gebre-Egziabher et al. 2006, J. Aerospace Eng. 19, 87-102 (magnetometers).
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 DIAGONAL, SYMMETRIC = 6, 9
-"""Numbers of parameters: bias and scale factors, or non-orthogonality in addition."""
+"""Numbers of parameters: six for bias and scale factors, nine with the non-orthogonality."""
 _OFF_DIAGONAL = ((0, 1), (0, 2), (1, 2))
 _BIAS, _SCALE, _SKEW = slice(0, 3), slice(3, 6), slice(6, 9)
 
@@ -39,7 +39,9 @@ class EllipsoidFit:
     matrix: Array
     """Symmetric matrix that maps the ellipsoid to the unit sphere, shape (3, 3)."""
     covariance: Array
-    """Covariance of center, diagonal and upper off-diagonal elements, shape (p, p)."""
+    """Covariance of the center and of the diagonal and upper off-diagonal elements of `matrix`,
+    shape (p, p).
+    """
     residuals: Array
     """Magnitudes minus 1, shape (n,)."""
     degrees_of_freedom: int
@@ -117,7 +119,8 @@ def matrix_sd(deviations: Array) -> Array:
     Parameters
     ----------
     deviations
-        Of the diagonal and, if estimated, the upper off-diagonal elements, shape (3,) or (6,).
+        Standard deviations of the diagonal and, if estimated, of the upper off-diagonal elements,
+        shape (3,) or (6,).
     """
     out = np.full((3, 3), np.nan)
     np.fill_diagonal(out, deviations[:3])

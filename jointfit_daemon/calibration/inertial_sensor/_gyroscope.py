@@ -1,4 +1,4 @@
-r"""Bias of a gyroscope from a rest.
+r"""Bias of a gyroscope from readings at rest.
 
 The readings are divided into blocks. With the block means m of n blocks,
 
@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.inertial_sensor._rest_blocks import SensorReading
 
 REST_BLOCKS = 24
-"""Blocks of the rest, 6 s; more reduce the standard deviation less than the bias drifts."""
+"""Number of blocks at rest, 6 s. With more blocks the drift of the bias exceeds the gain in
+precision.
+"""
 LARGEST_BIAS = radians(15.0)
 """Largest plausible bias of an angular rate, rad/s."""
 
@@ -54,7 +56,7 @@ class GyroscopeEstimate:
 
 
 class GyroscopeStep:
-    """Collects a rest, and estimates the bias."""
+    """Collects readings at rest, and estimates the bias."""
 
     def __init__(self) -> None:
         self._blocks = RestBlocks()
@@ -68,7 +70,7 @@ class GyroscopeStep:
 
     @property
     def progress(self) -> StepProgress:
-        """Share of the rest, and whether a movement interrupted it."""
+        """Fraction of the rest that has passed, and whether a movement interrupted it."""
         count = len(self._blocks.rest)
         note = "moved: the rest begins again" if self._interruptions and count < 2 else ""
         left_s = max(REST_BLOCKS + 1 - count, 0) * BLOCK_NS * 1e-9
@@ -87,7 +89,7 @@ class GyroscopeStep:
         Raises
         ------
         SensorCalibrationError
-            The sensor did not rest, or the rate at rest is not a bias.
+            The sensor was not at rest, or the rate at rest is too large for a bias.
         """
         last = self._blocks.last
         if last is None:

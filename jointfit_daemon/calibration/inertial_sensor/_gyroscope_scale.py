@@ -1,14 +1,15 @@
 r"""Scale factors and axes of a gyroscope from turns between rests.
 
-With the true rate w = G (m - b), the rotation R of a turn maps the directions of gravity at the two
-rests, which the accelerometer measures in sensor axes, to each other:
+A turn is a movement between two rests. The accelerometer measures the directions of gravity u_0 and
+u_1, in sensor axes, at the rests before and after the turn. The gyroscope measures the rate m, and
+the true rate is G (m - b). The rotation R of the turn maps one direction to the other:
 
 .. math:: R u_1 = u_0, \qquad R = \prod_i \exp(G (m_i - b_i) \Delta t_i)
 
-G minimizes the squared differences of all turns. b is the mean rate of the rests, interpolated over
-the turn. A turn determines two of three components, because a rotation about the vertical does not
-change u. The scale factor of an axis is determined by turns about it while it is level; a full turn
-determines it four times as well as a quarter turn.
+The estimate of G minimizes the squared differences of all turns. b is the mean rate of the rests,
+interpolated over the turn. A turn determines two of three components, because a rotation about the
+vertical does not change u. Turns about a level axis determine the scale factor of this axis. The
+error after a full turn is a quarter of the error after a quarter turn.
 
 Source: Tedaldi, Pretto and Menegatti 2014, ICRA, 3042-3049, section IV.
 """
@@ -35,37 +36,38 @@ FEWEST_TURNS = 6
 LARGEST_SCALE_SD = 0.005
 """Largest standard deviation of a scale factor."""
 LARGEST_AXES_SD = 0.003
-"""Largest standard deviation of an element off the diagonal, rad, with which all are used."""
+"""Largest standard deviation, rad, of the off-diagonal elements with which these elements are used.
+"""
 LARGEST_RESIDUAL = radians(1.5)
 """Largest RMS of the differences between the directions of gravity, rad."""
 LARGEST_SCALE_ERROR = 0.2
 """Largest plausible error of a scale factor."""
 _SCALES = (0, 4, 8)
-"""Elements of the diagonal, by rows."""
+"""Indices of the diagonal elements, counted by rows."""
 _ALL = tuple(range(9))
 _ITERATIONS = 12
 _CONVERGED = 1e-9
 _SPARE = 6
 """Fewest degrees of freedom of a fit of all elements."""
 _SATURATED = radians(100.0)
-"""Rate, rad/s, below which no gyroscope saturates."""
+"""Rate, rad/s, that every gyroscope measures without saturation."""
 _EQUAL_READINGS = 3
 """Number of equal readings at the end of the range that indicates saturation."""
 
 
 @dataclass(frozen=True, slots=True)
 class GyroscopeScaleEstimate:
-    """Parameters of a gyroscope: the corrected rate is `matrix` (rate - bias)."""
+    """Parameters of a gyroscope; `matrix` (rate - bias) is the corrected rate."""
 
     matrix: Array
     """Inverse scale factors, and gyroscope axes relative to the accelerometer axes, shape (3,
     3)."""
     matrix_sd: Array
-    """Standard deviations of its elements; NaN where they are not estimated."""
+    """Standard deviations of the elements of `matrix`; NaN where they are not estimated."""
     covariance: Array
-    """Covariance of the diagonal, or of all elements by rows."""
+    """Covariance of the diagonal of `matrix`, or of all elements by rows."""
     degrees_of_freedom: int
-    """Two for each turn, minus the number of parameters."""
+    """Twice the number of turns, minus the number of parameters."""
     turns: int
     angle: float
     """Sum of the angles of the turns, rad."""
@@ -85,7 +87,8 @@ def fit_gyroscope_scale(
     turns
         Turns between rests.
     correct
-        Corrects a specific force, shape (3,), by the calibration of the accelerometer.
+        Function that corrects a specific force, shape (3,), with the calibration of the
+        accelerometer.
 
     Raises
     ------
@@ -127,7 +130,7 @@ def fit_gyroscope_scale(
 
 
 class _Fit:
-    """Least squares over some elements of the matrix, by Gauss and Newton."""
+    """Gauss-Newton least squares over some elements of the matrix."""
 
     def __init__(
         self,
@@ -152,7 +155,7 @@ class _Fit:
         self.degrees_of_freedom = 2 * len(turns) - len(columns)
         variance = float(self.differences @ self.differences) / self.degrees_of_freedom
         variance = max(variance, _LEAST_SD**2)
-        # an element that no turn determines has a large variance instead of an infinite one
+        # an element that no turn determines gets a large variance instead of an infinite variance
         normal = slopes.T @ slopes + _TINY * np.eye(len(columns))
         self.covariance = np.asarray(variance * np.linalg.inv(normal))
         self.deviations = np.sqrt(np.diag(self.covariance))
@@ -173,7 +176,7 @@ def _differences(
         steps = _means(turn) * np.diff(turn.t_s)[:, None]
         q = _products(rotation.exp(steps @ matrix.T))
         turned = rotation.rotate(q[-1], after)
-        # a change dG rotates the end by the sum of R dG m dt, in the axes of the start
+        # a change dG rotates the final direction by the sum of R dG m dt, in initial axes
         change = np.einsum("kai,kj->aij", rotation.to_matrix(q), steps).reshape(3, 9)
         values.append(before - turned)
         slopes.append(-np.cross(turned, change.T).T)
@@ -207,7 +210,7 @@ def _is_saturated(turn: Turn) -> bool:
 
 
 def _check(estimate: GyroscopeScaleEstimate) -> None:
-    """Refuse scale factors that the turns do not determine."""
+    """Reject scale factors that the turns do not determine."""
     if estimate.residual > LARGEST_RESIDUAL:
         raise SensorCalibrationError(
             f"the turns by the gyroscope end {degrees(estimate.residual):.1f} deg (RMS) from "
@@ -237,5 +240,5 @@ def _unit(vector: Array) -> Array:
 
 
 def _rms(differences: Array) -> float:
-    """Return the RMS length of vectors in a row."""
+    """Return the RMS length of the 3-vectors in a flat array."""
     return float(np.sqrt(3.0 * np.mean(differences**2)))

@@ -40,36 +40,38 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Vector
 
 COMPLETE = 25
-"""Directions of the field, of 26, that complete the step."""
+"""Number of field directions, of 26, in a complete step."""
 FEWEST_DIRECTIONS = 21
-"""Fewest directions of a fit."""
+"""Fewest field directions of a fit."""
 FEWEST_READINGS = 100
 """Fewest readings of a fit."""
 MOST_READINGS = 4000
-"""Most readings that are kept."""
+"""Largest number of stored readings."""
 LARGEST_RESIDUAL = 0.05
 """Largest RMS of the corrected magnitudes about r, relative to r."""
 LARGEST_SD = 0.02
 """Largest standard deviation of a parameter, relative to r."""
 NOISE_SHARE = 0.3
 """Standard deviation of the distances from the center, relative to their mean, above which readings
-are noise about a point; soft iron causes less."""
+are considered noise about a point. Soft iron causes smaller values.
+"""
 FEWEST_ON_SPHERE = 20
 """Smallest number of readings from which the center is estimated."""
 _EVERY = 20
-"""Kept readings between two computations of the missing directions."""
+"""Number of stored readings between two computations of the missing directions."""
 _MOST_NAMES = 6
-"""Most directions that an error names."""
+"""Largest number of directions in an error message."""
 _SPACING = 0.05
-"""Smallest difference of successive readings, as a share of their range: readings at rest carry no
-information."""
+"""Smallest difference of successive stored readings, as a fraction of their range. Readings at rest
+contain no additional information.
+"""
 _SATURATED_SHARE = 0.03
-"""Share of readings with exactly the largest or smallest value that shows saturation."""
+"""Fraction of readings with exactly the largest or smallest value that indicates saturation."""
 
 
 @dataclass(frozen=True, slots=True)
 class MagnetometerEstimate:
-    """Parameters of a magnetometer: the corrected field is `matrix` (m - `bias`)."""
+    """Parameters of a magnetometer; `matrix` (m - `bias`) is the corrected field."""
 
     bias: Array
     """Hard-iron offset in the unit of the device, shape (3,)."""
@@ -117,7 +119,8 @@ def fit_magnetometer(fields: Array) -> MagnetometerEstimate:
     _check_coverage(_missing(fields))
     fit = fit_unit_ellipsoid((fields - origin) / unit, SYMMETRIC)
 
-    # S maps to the unit sphere: r = det(S)^(-1/3) in units of `unit`, and M = r S.
+    # The fitted matrix S maps to the unit sphere. Hence r = det(S)^(-1/3), in units of `unit`, and
+    # M = r S.
     ratio = float(np.linalg.det(fit.matrix)) ** (-1.0 / 3.0)
     matrix, bias = ratio * fit.matrix, origin + unit * fit.bias
     missing = _directions_without((fields - bias) @ matrix)
@@ -158,8 +161,8 @@ def _scaled_covariance(covariance: Array, matrix: Array, ratio: float, unit: flo
 def _fit_sphere(fields: Array) -> tuple[Array, float]:
     """Return center, shape (3,), and radius of the sphere through readings, by linear equations.
 
-    |m|^2 = 2 c m + (r^2 - |c|^2). The center is right even if the readings cover a part of the
-    sphere; soft iron is ignored.
+    The equations are |m|^2 = 2 c m + (r^2 - |c|^2). The center is correct even if the readings
+    cover only a part of the sphere. Soft iron is ignored.
     """
     origin = fields.mean(axis=0)
     about = fields - origin
@@ -176,7 +179,8 @@ def _fit_sphere(fields: Array) -> tuple[Array, float]:
 def _missing(fields: Array) -> set[int]:
     """Return the indices of directions of the field that no reading has.
 
-    If the readings are noise about one point, and not on a sphere, all directions are returned.
+    If the readings are noise about one point instead of points on a sphere, all directions are
+    returned.
     """
     every = set(range(len(DIRECTIONS)))
     if len(fields) < FEWEST_ON_SPHERE:
@@ -189,7 +193,7 @@ def _missing(fields: Array) -> set[int]:
 
 
 def _directions_without(fields: Array) -> set[int]:
-    """Return the indices of directions that no field about 0 has."""
+    """Return the indices of directions that no vector in `fields` has."""
     return set(range(len(DIRECTIONS))) - set(nearest_direction(fields).tolist())
 
 
@@ -250,7 +254,7 @@ class MagnetometerStep:
 
     @property
     def progress(self) -> StepProgress:
-        """Share of the directions, and the missing ones."""
+        """Fraction of the directions that are covered, and the missing directions."""
         missing = self._missing
         directions = (len(DIRECTIONS) - len(missing)) / COMPLETE
         share = min(directions, len(self._fields) / FEWEST_READINGS, 1.0)

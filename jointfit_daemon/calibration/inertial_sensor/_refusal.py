@@ -1,4 +1,4 @@
-"""The error of a sensor calibration whose result would be worse than none."""
+"""Error of a sensor calibration whose result would be worse than no calibration."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Detection of rest in readings: blocks of readings without movement.
+"""Detection of rest from blocks of readings without movement.
 
 The standard deviation of the angular rate does not contain the bias, so a sensor with a large bias
-is still detected as being at rest. A slow rotation has a small deviation too: the specific force of
-successive blocks must therefore agree.
+is still detected as being at rest. A slow rotation also has a small standard deviation. The
+specific forces of successive blocks must therefore agree.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ class RestBlock(NamedTuple):
     force_sd: float
     """Largest standard deviation of a specific force, m/s^2."""
     constant: Array
-    """Whether each component of the specific force did not change at all, shape (3,)."""
+    """Whether each component of the specific force was exactly constant, shape (3,)."""
 
     @property
     def is_calm(self) -> bool:
-        """Whether the block alone shows no movement."""
+        """Whether the block contains no movement."""
         return self.rate_sd < RATE_SD and self.force_sd < FORCE_SD
 
     def agrees(self, other: RestBlock) -> bool:
@@ -67,12 +67,12 @@ class RestBlock(NamedTuple):
 
 
 class RestBlocks:
-    """Divides readings into blocks, and collects the blocks of the present rest."""
+    """Divides readings into blocks, and collects the blocks of the current rest."""
 
     def __init__(self) -> None:
         self._readings: list[SensorReading] = []
         self.rest: list[RestBlock] = []
-        """Blocks of the present rest; empty in motion."""
+        """Blocks of the current rest; empty during a movement."""
         self.last: RestBlock | None = None
         """Most recent block, at rest or not."""
 

@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 
 class StepProgress(NamedTuple):
-    """Readings that a step has collected, and readings that the step still needs."""
+    """Progress of a step, with the poses or directions that are still missing."""
 
     share: float
-    """Share of the required readings, 0 to 1."""
+    """Fraction of the required readings that are collected, 0 to 1."""
     missing: tuple[str, ...]
-    """Poses or directions that are missing, in words."""
+    """Names of the missing poses or directions."""
     note: str = ""
-    """Reason why readings were discarded, or empty."""
+    """Reason why readings were discarded; empty if none were discarded."""

@@ -1,4 +1,4 @@
-"""Turns of a sensor between rests: the readings of each, and gravity before and after it."""
+"""Turns of a sensor between rests, with the readings of each turn and gravity at both rests."""
 
 from __future__ import annotations
 
@@ -16,18 +16,21 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration.inertial_sensor._rest_blocks import RestBlock, SensorReading
 
 REST_BLOCKS = 3
-"""Blocks of a rest before and after a turn, 0.75 s."""
+"""Number of blocks in the rest before and after a turn: 0.75 s."""
 MOST_READINGS = 20_000
-"""Most readings of a turn; a longer one is discarded, because the noise of its integral grows."""
+"""Largest number of readings in a turn. A longer turn is discarded, because the noise of its
+integral grows.
+"""
 
 
 LARGEST_JITTER = 0.4
-"""Largest deviation of arrivals from equal intervals, in intervals; a lost reading deviates by a
-half or more."""
+"""Largest deviation of arrivals from equal spacing, in intervals. A lost reading causes a deviation
+of at least half an interval.
+"""
 
 
 class Rest(NamedTuple):
-    """Means of a rest."""
+    """Mean readings of a rest."""
 
     force: Array
     """Specific force, m/s^2, shape (3,)."""
@@ -52,7 +55,7 @@ class TurnCollector:
 
     def __init__(self) -> None:
         self.turns: list[Turn] = []
-        """Turns so far."""
+        """Turns that have been collected."""
         self._before: Rest | None = None
         self._since: list[SensorReading] = []  # readings since the end of `_before`
 
@@ -64,7 +67,7 @@ class TurnCollector:
         reading
             The next reading.
         rest
-            Blocks of the present rest if the reading completed a block, else None.
+            Blocks of the current rest if the reading completed a block, else None.
         """
         since = self._since
         pause_ns = reading.t_ns - since[-1].t_ns if since else 0
@@ -80,11 +83,11 @@ class TurnCollector:
             np.mean([block.force for block in rest[1:]], axis=0),
             np.mean([block.rate for block in rest[1:]], axis=0),
         )
-        if self._before is not None and len(rest) == REST_BLOCKS + 1:  # this rest is new
+        if self._before is not None and len(rest) == REST_BLOCKS + 1:  # a new rest
             t_s = np.array([each.t_ns - since[0].t_ns for each in since]) * 1e-9
             rates = np.array([each.rate for each in since])
 
-            # Equal intervals, if the arrivals deviate from them by jitter alone.
+            # Arrivals are replaced by equally spaced instants if they deviate only by jitter.
             number = np.arange(len(t_s)) - 0.5 * (len(t_s) - 1)
             period_s = float(number @ t_s / (number @ number))
             regular = t_s.mean() + period_s * number

@@ -1,15 +1,16 @@
-r"""Anderson acceleration of a fixed-point iteration, with acceptance by the caller.
+r"""Anderson acceleration of a fixed-point iteration p = g(p); the caller accepts each proposal.
 
-The caller must accept a proposal only if it lowers the objective. Without this safeguard the
-acceleration increased tracking errors.
+The caller must accept a proposal only if the proposal lowers the objective. Without this condition
+the acceleration increased tracking errors.
 
 .. math::
 
     f_k = g(p_k) - p_k, \quad \gamma = \arg\min |f_k - \Delta F \gamma|, \quad
     p = g(p_k) - \Delta G \gamma
 
-with the differences of the last iterations as columns. Source: Anderson, J. ACM 12 (1965), 547;
-Walker and Ni, SIAM J. Numer. Anal. 49 (2011), 1715.
+where the columns of :math:`\Delta F` and :math:`\Delta G` are the differences of f and g between
+the last iterations. Source: Anderson, J. ACM 12 (1965), 547; Walker and Ni, SIAM J. Numer. Anal. 49
+(2011), 1715.
 """
 
 from __future__ import annotations
@@ -27,14 +28,14 @@ _RANK = 1e-8
 
 
 class Anderson:
-    """The last few iterates and their images."""
+    """The last iterates p and their images g(p)."""
 
     def __init__(self) -> None:
         self._images: list[Array] = []
         self._changes: list[Array] = []
 
     def propose(self, at: Array, image: Array) -> Array | None:
-        """Return the next point to try after g(at) = image; None without a history."""
+        """Return the next point to try after g(`at`) = `image`; None without a history."""
         self._images = [*self._images[-DEPTH:], image]
         self._changes = [*self._changes[-DEPTH:], image - at]
         if len(self._images) == 1:

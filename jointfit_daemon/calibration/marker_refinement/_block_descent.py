@@ -1,17 +1,17 @@
-r"""Block-coordinate descent: marker positions and poses are optimized in turns.
+r"""Block-coordinate descent, which optimizes marker positions and poses in turns.
 
-The module `_objective` defines the objective F and the symbols. The poses of a turn are computed by
-any inverse kinematics for given marker positions. With fixed poses, F is minimized by a weighted
-mean of the measured positions in segment axes and the nominal positions,
+The module `_objective` defines the objective F and the symbols. In each turn an inverse kinematics
+solver first computes the poses for given marker positions. With fixed poses, F is then minimized by
+a weighted mean of the measured positions in segment axes and the nominal positions,
 
 .. math::
 
     p_m = \frac{\sum_t w_{tm} R_{tm}^T (y_{tm} - t_{tm}) + \lambda n_m p^0_m}
                {\sum_t w_{tm} + \lambda n_m}
 
-With Huber's loss, :math:`w_{tm}` is multiplied by the robust weight at the errors of the turn
-before. The pose step and the position step each decrease F. Anderson acceleration proposes a
-further step, which is accepted only if this step also decreases F.
+With the Huber loss, :math:`w_{tm}` is multiplied by the robust weight at the errors of the previous
+turn. The pose step and the position step each decrease F. Anderson acceleration proposes a further
+step, which is accepted only if it also decreases F.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Carriers(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class AlternatingStep:
-    """One accepted iterate: marker positions and the poses fitted to them."""
+    """One accepted iterate, with marker positions and the poses fitted to them."""
 
     positions: Array
     carriers: Carriers
@@ -69,17 +69,17 @@ def solve_in_turns(
     problem
         The objective F with its data.
     follow
-        Inverse kinematics: called with marker positions, m, shape (M, 3), and the weights of their
-        squared errors, shape (T, M); returns the poses.
+        Function that solves inverse kinematics. Its arguments are marker positions, m, shape (M,
+        3), and the weights of their squared errors, shape (T, M). It returns the poses.
     on_step
-        Called with every accepted iterate; True ends the iteration.
+        Function that is called with every accepted iterate. If it returns True, the iteration ends.
     tolerance
         Relative decrease of F in one turn below which the iteration ends.
 
     Returns
     -------
     list of AlternatingStep
-        The start and every accepted iterate, in order; F decreases from each to the next.
+        The start and every accepted iterate in order. F decreases from each iterate to the next.
     """
     turns = _AlternatingSolver(problem, follow)
     path, anderson = [turns.first()], Anderson()
@@ -98,7 +98,7 @@ def solve_in_turns(
         if new is None:
             new = turns.follow(plain, last)
 
-        if new.cost >= last.cost:  # both steps are at their minimum, except for rounding
+        if new.cost >= last.cost:  # converged, except for rounding
             break
         path.append(new)
         done = last.cost - new.cost < tolerance * last.cost
@@ -109,7 +109,7 @@ def solve_in_turns(
 
 
 class _AlternatingSolver:
-    """Computes the two steps of one turn: poses and positions."""
+    """Computes the pose step and the position step of one turn."""
 
     def __init__(
         self, problem: RefinementProblem, follow: Callable[[Array, Array], Carriers]
@@ -127,7 +127,7 @@ class _AlternatingSolver:
         return self._at(positions, self._follow(positions, self._problem.robust(distances)))
 
     def means(self, last: AlternatingStep) -> Array:
-        """Return the best positions at fixed poses."""
+        """Return the positions that minimize F at fixed poses."""
         problem = self._problem
         e = self._errors(last.positions, last.carriers)
         w = problem.robust(np.linalg.norm(e, axis=-1))

@@ -1,16 +1,17 @@
-r"""Published coordinate search: one marker coordinate at a time, scored by inverse kinematics.
+r"""Coordinate search of Price et al. (2020): one marker coordinate at a time is changed.
 
-The search needs only the tracking error of a set of marker positions, so it runs on any model,
-including a model in another program. Every unlocked coordinate has a separate step length::
+The search needs only the tracking error of inverse kinematics for a set of marker positions. It can
+therefore be used with any model, including a model in another program. Every unlocked coordinate
+has a separate step length::
 
     while any step is at or above the threshold:
         for every marker, for x, y, z whose step is:
-            go on in + while the error falls; if it never did, go on in - while it falls
-            if neither way helped: halve the step
+            go on in + while the error falls; if it never did, go on in - while it falls if neither
+            way helped: halve the step
 
 Source: Price, LaPrè, Johnson, Umberger and Sup, Int J Numer Method Biomed Eng 36 (2020) e3283, doi
-10.1002/cnm.3283. The paper does not state the first step, the threshold, the order or the least
-decrease; they are settings here.
+10.1002/cnm.3283. The paper does not state the first step, the threshold, the order of the
+coordinates or the least decrease.
 """
 
 from __future__ import annotations
@@ -35,9 +36,9 @@ class SearchSettings:
     first_step_m: float = 0.008
     """Step of every coordinate at the start, m."""
     threshold_m: float = 0.002
-    """A coordinate is done when its step is below this, m."""
+    """A coordinate is complete when its step is below this threshold, m."""
     least_gain_m: float = 1e-7
-    """The error must fall by more than this for a step to count, m."""
+    """Least decrease of the error with which a step is accepted, m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +69,17 @@ def search(
     Parameters
     ----------
     tracking_error
-        RMS distance between measured and model markers after inverse kinematics, m; it may start
-        from the poses of the last call.
+        Function that returns the RMS distance between measured and model markers after inverse
+        kinematics, m. The inverse kinematics may start from the poses of the last call.
     start
         Positions on their segments, m, shape (M, 3).
     free
         False where a coordinate is locked, shape (M, 3).
     progress
-        Called with the largest remaining step and the error, both m, after every pass.
+        Function that is called after every pass with the largest remaining step and the error, both
+        m.
     stop
-        Called before every coordinate; true ends the search.
+        Function that is called before every coordinate. If it returns true, the search ends.
     """
     walk = _Walk(tracking_error, start)
     steps = np.where(free, settings.first_step_m, 0.0)
@@ -108,7 +110,7 @@ class _Walk:
         return self._tracking_error(positions)
 
     def along(self, marker: int, axis: int, step: float, least_gain: float) -> bool:
-        """Step in one direction while the error falls, else back; return whether it fell."""
+        """Step forward, else backward, while the error decreases; return whether it decreased."""
         accepted = len(self.errors)
         for signed in (step, -step):
             while True:

@@ -1,6 +1,6 @@
 """Tracking error of a model on a trial, and the change of joint angles by a refinement.
 
-Errors are plain squares with unit weights, so that different fits can be compared.
+Errors are computed with unit weights, so that different fits can be compared.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def judge_trial(
 ) -> TrialOutcome:
     """Return tracking errors and joint-angle changes of one trial, solved with both models.
 
-    Frames in a local minimum of inverse kinematics are solved again from other poses.
+    Frames in a local minimum of inverse kinematics are solved again from other initial poses.
     """
     ones = np.ones(len(before.markers))
     old = solve_frames(before, trial.targets, ones, options=options)

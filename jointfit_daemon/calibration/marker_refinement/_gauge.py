@@ -1,12 +1,13 @@
 r"""Gauge freedom: directions in which markers may move without changing the tracking error.
 
-All markers of a segment on a ball joint may be rotated about the joint together. Inverse kinematics
-rotates the segment back, so that the error is equal but the joint angle differs. Such directions
-are the null space of the reduced normal matrix without a prior,
+For example, all markers of a segment on a ball joint may be rotated about the joint together.
+Inverse kinematics then rotates the segment back: the error is equal, but the joint angle differs.
+Such directions are the null space of the reduced normal matrix of `_simultaneous` without a prior,
 
 .. math:: S = \sum_t C_t - B_t^T A_t^{-1} B_t
 
-divided by the number of frames. Locks and priors fix them; otherwise `fixed_by` is "nothing".
+divided by the number of frames. Locked coordinates or a prior make these directions determinate;
+otherwise `fixed_by` is "nothing".
 """
 
 from __future__ import annotations
@@ -22,12 +23,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _ZERO = 1e-6
-"""Eigenvalues of S/T are squared metres per squared metre, 1 for a marker that is independent of
-all others. Smaller eigenvalues are attributed to rounding."""
+"""Eigenvalue of S/T below which the eigenvalue is attributed to rounding. The unit is squared
+metres per squared metre. A marker that is independent of all others has the eigenvalue 1.
+"""
 _WEAK = 0.01
 """Eigenvalue below which a displacement of 10 mm increases the error by less than 1 mm."""
 _NAMED = 0.1
-"""Smallest share of the square of a direction for which a marker is listed."""
+"""Smallest share of a marker in the squared free directions with which the marker is listed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,17 +39,17 @@ class Gauge:
     eigenvalues: Array
     """Eigenvalues of S/T over the unlocked coordinates, ascending; 1 is a fully observed marker."""
     free: int
-    """Number of zero eigenvalues: displacements without effect on the tracking error."""
+    """Number of zero eigenvalues, which are displacements without effect on the tracking error."""
     weak: int
     """Number of non-zero eigenvalues below 0.01."""
     involved: tuple[str, ...]
     """Markers that move along the free directions, the most displaced first."""
     fixed_by: str
-    """Constraint of the free directions: "locks", "prior" or "nothing"."""
+    """Constraint that determines the free directions: "locks", "prior" or "nothing"."""
 
 
 def gauge_of(S: Array, frames: int, coordinates: Sequence[str], *, prior: float) -> Gauge:
-    """Return the gauge freedom according to S.
+    """Return the gauge freedom from the reduced normal matrix S.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ def gauge_of(S: Array, frames: int, coordinates: Sequence[str], *, prior: float)
     frames
         Number of frames in the sum.
     coordinates
-        Marker of every row, length n.
+        Name of the marker of every row, length n.
     prior
         Weight of the nominal positions; 0 for no prior.
     """

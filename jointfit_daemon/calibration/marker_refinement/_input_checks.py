@@ -1,7 +1,7 @@
 """Checks of model and trials before a refinement.
 
-A refinement moves markers to wherever the error is smallest. Wrong units, exchanged labels and
-unscaled models would therefore pass as a good fit. These faults are detected and reported.
+A refinement moves markers to the positions with the smallest error. It would therefore hide wrong
+units, exchanged labels and unscaled models. These faults are detected and reported.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _LEAST_FRAMES = 10
 """Smallest number of frames with enough markers."""
 _UNIT_FACTOR = 100.0
-"""Size ratio above which the length unit must be wrong."""
+"""Size ratio of trial and model above which the length unit must be wrong."""
 _MOST_STRETCH = 1.3
 """Size ratio of trial and model above which the refinement is refused."""
 _NOTED_STRETCH = 1.1
@@ -37,11 +37,12 @@ _APART_M = 0.04
 MOST_RMS_M = 0.08
 """Tracking error above which labels, scaling or axes must be wrong, m."""
 _FAR_M = 0.025
-"""Distance from its place above which a marker may have another label, m."""
+"""Distance from the model position above which a marker may have the label of another marker, m."""
 _SWAP_LEAST_M = 0.05
 """Smallest root of the summed squared distances of exchanged markers, m."""
 _SWAPPED_TRIAL = 0.5
-"""Share of the frames above which a whole trial counts as labelled wrongly."""
+"""Fraction of frames with exchanged labels above which the whole trial counts as labelled wrongly.
+"""
 _ROBUST = IkOptions(huber_m=0.02, reweightings=4)
 
 
@@ -63,7 +64,7 @@ def check(
     Raises
     ------
     RefinementError
-        If a fault prevents the refinement; all faults are listed.
+        A fault prevents the refinement; the message lists all faults.
     """
     every = [*trials, *validation]
     faults = [f for trial in every for f in find_trial_faults(model, trial)]
@@ -101,7 +102,7 @@ def check(
 def find_trial_faults(
     model: ChainModel, trial: MotionTrial, fewest_frames: int = _LEAST_FRAMES
 ) -> list[str]:
-    """Return the reasons why a trial does not belong to the model: markers, unit, size."""
+    """Return the reasons why markers, unit or size of a trial do not agree with the model."""
     whole = np.isfinite(trial.targets).all(axis=-1)
     if (whole.sum(axis=1) >= 3).sum() < fewest_frames:
         few = f"fewer than {fewest_frames} frames show"
@@ -142,13 +143,13 @@ def _stretch(model: ChainModel, trial: MotionTrial) -> float:
 def _movable(
     model: ChainModel, trials: Sequence[MotionTrial]
 ) -> tuple[NDArray[np.bool_], list[str]]:
-    """Return the coordinates that the trials determine, and why other coordinates are locked."""
+    """Return the coordinates that the trials determine, and notes on the other coordinates."""
     seen = np.zeros(len(model.markers), dtype=np.bool_)
     for trial in trials:
         seen |= np.isfinite(trial.targets).all(axis=-1).any(axis=0)
     seen &= model.weights > 0.0
 
-    # The position of the only marker of a segment and the segment's pose are indistinguishable.
+    # With only one marker on a segment, its position and the segment's pose are indistinguishable.
     counted = np.bincount(model.marker_segments[seen], minlength=len(model.segments))
     alone = seen & (counted[model.marker_segments] == 1)
     free = ~model.locked & (seen & ~alone)[:, None]
@@ -212,10 +213,10 @@ def _labels(model: ChainModel, trial: MotionTrial) -> tuple[MotionTrial, list[st
 
 
 def exchanged_markers(residuals: Array, targets: Array) -> dict[tuple[int, ...], NDArray[np.bool_]]:
-    """Return groups of markers that fit far better after an exchange of labels, and the frames.
+    """Return groups of markers that fit much better after an exchange of labels, and the frames.
 
-    Each marker of a group is at the position of the next marker, the last marker at the position of
-    the first.
+    In each group every marker is at the position of the next marker, and the last marker is at the
+    position of the first.
     """
     places = targets + residuals  # positions in the model
     own = np.einsum("tmi,tmi->tm", residuals, residuals)
@@ -230,7 +231,7 @@ def exchanged_markers(residuals: Array, targets: Array) -> dict[tuple[int, ...],
 
 
 def exchange_text(model: ChainModel, group: tuple[int, ...]) -> str:
-    """Return the names of exchanged markers, and the place of each if there are more than two."""
+    """Return a text on exchanged markers, with the position of each if there are more than two."""
     names = [model.markers[i].name for i in group]
     if len(names) == 2:
         return f"{names[0]} and {names[1]} look exchanged"

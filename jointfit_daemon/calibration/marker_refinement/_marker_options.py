@@ -1,4 +1,4 @@
-"""Locks and weights of markers by name, as users write them in options and in rig.toml."""
+"""Locks and weights of markers by name, in command-line options and in rig.toml."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ def require_marker(chain: ChainModel, name: str, option: str) -> None:
 
 
 def with_weights(chain: ChainModel, weights: Mapping[str, float], option: str) -> ChainModel:
-    """Return the chain with other weights of some markers; `option` is their name in messages.
+    """Return the chain with new weights of some markers; messages contain the name `option`.
 
     Raises
     ------
     ValueError
-        Unknown marker, or no weight above 0.
+        A marker is unknown, or no weight is above 0.
     """
     for name in weights:
         require_marker(chain, name, option)
@@ -53,8 +53,8 @@ def with_locks(chain: ChainModel, texts: Iterable[str], option: str, *, locked: 
     Parameters
     ----------
     texts
-        ``NAME`` for a marker, ``NAME.x`` for one of its coordinates, ``*`` for all markers. A
-        marker whose name contains a dot takes precedence over a coordinate.
+        ``NAME`` for a marker, ``NAME.x`` for one of its coordinates, ``*`` for all markers. If a
+        marker has the name ``NAME.x``, the text refers to this marker.
     option
         Name of the option in messages.
 

@@ -1,4 +1,4 @@
-"""Input of a refinement: trials with measured markers, and the settings.
+"""Input of a refinement, which consists of trials with measured markers and settings.
 
 Positions are in meters, in the order of the model's markers, NaN where a marker is missing.
 """
@@ -25,16 +25,16 @@ class MotionTrial:
 
     name: str
     targets: Array
-    """Measured markers, world, m, shape (T, M, 3); NaN where missing."""
+    """Measured marker positions in the world, m, shape (T, M, 3); NaN where missing."""
     rate_hz: float
 
     def thinned(self, most: int) -> MotionTrial:
-        """Return at most `most` frames, evenly over the whole trial."""
+        """Return at most `most` frames, evenly spaced over the whole trial."""
         every = max(1, -(-len(self.targets) // most))
         return MotionTrial(self.name, self.targets[::every], self.rate_hz / every)
 
     def split(self, last_share: float) -> tuple[MotionTrial, MotionTrial]:
-        """Return the first and the last part, each with consecutive frames."""
+        """Return the first part and the last part; the last has the fraction `last_share`."""
         cut = len(self.targets) - round(last_share * len(self.targets))
         first = MotionTrial(self.name, self.targets[:cut], self.rate_hz)
         return first, MotionTrial(self.name, self.targets[cut:], self.rate_hz)
@@ -46,22 +46,35 @@ class RefinementSettings:
 
     method: RefinementMethod = "joint"
     prior: float = 0.05
-    """λ: cost of a displacement of 1 m from the nominal position relative to an error of 1 m."""
+    """Weight λ of the prior: cost of a displacement of 1 m from the nominal position relative to
+    the cost of an error of 1 m.
+    """
     huber_m: float | None = 0.02
-    """Error above which the loss is linear instead of quadratic, m; None: quadratic for all
-    errors."""
+    """Error above which the loss is linear instead of quadratic, m. None makes it quadratic for all
+    errors.
+    """
     cost: RefinementCost = "l2"
-    """``l2``: squared errors up to `huber_m`. ``l1``: distances, so that a marker that is often far
-    off has little influence. Not with the method ``search``."""
+    """Loss function. ``l2`` is the squared error up to `huber_m`. ``l1`` is the distance, so that a
+    marker with frequent large errors has little influence; the method ``search`` does not support
+    it.
+    """
     frames: int = 150
-    """Largest number of frames of a trial; longer trials are decimated, so that none dominates."""
+    """Largest number of frames of a trial. Longer trials are decimated, so that no trial dominates.
+    """
     evenness: float = 0.0
-    """Exponent of a trial's error in its weight; a larger one makes the errors of trials more
-    equal."""
+    """Exponent of a trial's error in its weight. A larger exponent makes the errors of trials more
+    equal.
+    """
     limit_m2: float = 1.0
-    """Weight, m^2/rad^2, of a hinge's excess over its limits, where the model has limits."""
+    """Weight of the squared excess of hinge angles over their limits, m^2/rad^2. It has no effect
+    on a model without limits.
+    """
     holdout_share: float = 0.0
-    """Share of every training trial, at its end, that is not fitted but decides when to stop."""
+    """Fraction of every training trial, at its end, that is not fitted. Its error determines when
+    the iteration stops.
+    """
     tolerance: float | None = None
-    """Relative decrease of F that ends the iteration; None: the default of the method."""
+    """Relative decrease of F below which the iteration ends; None selects the default of the
+    method.
+    """
     search: SearchSettings = field(default_factory=SearchSettings)

@@ -1,6 +1,8 @@
-r"""Objective of a refinement: tracking errors and distance from the nominal positions.
+r"""Objective of a refinement, from tracking errors and distances from the nominal positions.
 
-With the markers' errors :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and weights w,
+In frame t, marker m has the error :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and the weight w.
+Here p is the position on the segment, R and t the pose of the segment, and y the measured position.
+The objective is
 
 .. math::
 
@@ -8,11 +10,11 @@ With the markers' errors :math:`e_{tm} = R_{tm} p_m + t_{tm} - y_{tm}` and weigh
               + \tfrac12 \lambda \sum_m n_m\, |p_m - p^0_m|^2
               + \tfrac12 \kappa \sum_{tk} x_{tk}^2, \qquad n_m = \sum_t w_{tm}
 
-where :math:`\rho` is the Huber loss: :math:`r^2/2`, and :math:`c (r - c/2)` beyond c. The prior
-grows with the number of frames in which a marker is visible, so decimating frames does not change
-the relative weight of the prior. Poses q are free in every frame, positions p are the same in all
-frames. x is the excess of hinge angles over their limits, rad. Without this term, a program with
-joint limits could not follow the refined markers.
+where :math:`\rho` is the Huber loss, :math:`r^2/2` up to the distance c and :math:`c (r - c/2)`
+beyond. The weight of the prior grows with the number of frames in which a marker is visible.
+Decimating frames therefore does not change the relative weight of the prior. Poses q are free in
+every frame, and positions p are the same in all frames. x is the excess of hinge angles over their
+limits, rad. Without this term, a program with joint limits could not track the refined markers.
 """
 
 from __future__ import annotations
@@ -36,14 +38,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RefinementProblem:
-    """Data of one refinement; without slots, because derived values are cached.
+    """Data of one refinement. The class has no slots, because derived values are cached.
 
-    The chain gives names, nominal positions and joints; measured positions beyond it are missing.
+    The chain contains names, nominal positions and joints. Measured positions are in `targets`.
     """
 
     model: ChainModel
     targets: Array
-    """Measured markers in the order of the model's, world, m, shape (T, M, 3); NaN: missing."""
+    """Measured positions in the world, in the order of the model's markers, m, shape (T, M, 3); NaN
+    where missing.
+    """
     weights: Array
     """Weights of squared errors, shape (T, M); 0 where missing."""
     free: NDArray[np.bool_]
@@ -51,13 +55,13 @@ class RefinementProblem:
     prior: float
     """Weight lambda of the distances from the nominal positions."""
     huber_m: float | None
-    """Error c above which the loss is linear, m; None: quadratic for all errors."""
+    """Error c above which the loss is linear, m; None if it is quadratic for all errors."""
     limit_m2: float = 0.0
-    """Weight kappa of the excess of hinge angles, m²/rad²; 0: hinge angles are not limited."""
+    """Weight kappa of the squared excess of hinge angles, m²/rad²; 0 if they are not limited."""
 
     @cached_property
     def seen(self) -> Array:
-        """Measured markers with zeros for missing ones, shape (T, M, 3)."""
+        """Measured positions with zeros for missing markers, shape (T, M, 3)."""
         return np.nan_to_num(self.targets)
 
     @cached_property
@@ -72,7 +76,7 @@ class RefinementProblem:
 
     @cached_property
     def limits(self) -> tuple[Band, ...]:
-        """Limits of hinges in the objective."""
+        """Angle limits of the hinges that are part of the objective."""
         return limits_of(self.model, self.limit_m2)
 
     def excess(self, state: ChainState) -> Array | None:
@@ -82,7 +86,7 @@ class RefinementProblem:
         return None
 
     def overturning(self, state: ChainState) -> float:
-        """Return the part of F caused by hinges beyond their limits."""
+        """Return the term of F for hinges beyond their limits."""
         excess = self.excess(state)
         return 0.0 if excess is None else float(0.5 * self.limit_m2 * (excess**2).sum())
 

@@ -1,6 +1,7 @@
-"""Refinement of the marker positions of a chain model, from trials to a report.
+"""Refinement of the marker positions of a chain model, from trials to the complete result.
 
-Training frames, the hold-out that stops the iteration, and validation trials are separate.
+Training frames, hold-out frames that determine the end of the iteration, and validation trials have
+no frames in common.
 """
 
 from __future__ import annotations
@@ -42,16 +43,19 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel
 
     Progress = Callable[[float, float], None]
-    """Called with the share done, 0 to 1, and the training error, m."""
+    """Function that is called with the completed fraction, 0 to 1, and the training error, m."""
     Stop = Callable[[], bool]
-    """Called during the iteration; true ends it with the positions so far."""
+    """Function that is called during the iteration. If it returns true, the iteration ends with the
+    current positions.
+    """
 
 L1_CORNER_M = 0.001
-"""Distance below which the loss of the cost ``l1`` is quadratic, m; it has a corner at zero
-otherwise."""
+"""Distance below which the loss of the cost ``l1`` is quadratic, m. Otherwise its derivative would
+be discontinuous at zero.
+"""
 _FINE = 1e-9
 STOPPED = "stopped before convergence"
-"""`Refinement.stopped` of an iteration that its caller ended."""
+"""Value of `Refinement.stopped` if the caller ended the iteration."""
 _RISES = 2
 """Consecutive steps without a new minimum of the hold-out error that end the iteration."""
 
@@ -74,18 +78,18 @@ def refine_markers(
     trials
         Training trials.
     validation
-        Trials that are evaluated, not fitted.
+        Trials that are evaluated but not fitted.
     progress
-        Called after every step.
+        Function that is called after every step.
     stop
-        Called after every step, and by ``search`` before every coordinate. If the function returns
-        true, the refinement stops and returns the result of the steps so far.
+        Function that is called after every step, and by ``search`` before every coordinate. If it
+        returns true, the refinement stops and returns the result of the completed steps.
 
     Raises
     ------
     RefinementError
-        If the checks of the inputs find a fault, such as a wrong length unit, exchanged labels or
-        too few frames.
+        The checks of the inputs found a fault, such as a wrong length unit, exchanged labels or too
+        few frames.
     """
     settings = settings or RefinementSettings()
     if settings.cost == "l1" and settings.method == "search":
@@ -171,13 +175,14 @@ def _task(
     first = solve_frames(model, targets, weights, options=options)
     first, improved = restart_local_minima(model, targets, weights, first, options)
     if settings.cost == "l1":
-        # the loss of a typical error is smaller by this factor than its square; so is the prior
+        # The l1 loss of a typical error is smaller than its square. The prior is scaled by the same
+        # factor.
         typical = float(np.nanmedian(np.linalg.norm(first.residuals, axis=-1)))
         weaker = min(1.0, L1_CORNER_M / max(typical, L1_CORNER_M))
         problem = replace(problem, huber_m=L1_CORNER_M, prior=weaker * settings.prior)
     if settings.evenness > 0.0:
         # The frames of a trial are weighted by a power of the trial's tracking error. The weights
-        # are scaled to mean 1, so that the prior keeps its meaning.
+        # are scaled to mean 1, so that the relative weight of the prior is unchanged.
         lengths = [len(part.targets) for part, _ in parts]
         each = np.split(first.residuals, np.cumsum(lengths)[:-1])
         errors = np.array([tracking_error(part) for part in each])
@@ -191,7 +196,7 @@ def _task(
 
 
 class _HoldOut:
-    """Hold-out frames that decide when to stop."""
+    """Hold-out frames, whose error determines when the iteration stops."""
 
     def __init__(self, model: ChainModel, targets: Array, options: IkOptions) -> None:
         self._model, self._targets, self._options = model, targets, options
@@ -201,7 +206,7 @@ class _HoldOut:
         self.positions = model.positions
 
     def enough(self, positions: Array) -> bool:
-        """Record the hold-out error at new positions; return whether the iteration shall stop.
+        """Record the hold-out error at new positions; return whether the iteration must stop.
 
         The iteration stops after `_RISES` consecutive steps without a new minimum.
         """
@@ -274,7 +279,7 @@ _METHODS = {"joint": _jointly, "block": _in_turns, "search": _searching}
 
 
 class ChainFollower:
-    """Inverse kinematics of the chain for `solve_in_turns`; each run starts from the last poses."""
+    """Inverse kinematics of the chain for `solve_in_turns`. Each run starts from the last poses."""
 
     def __init__(self, problem: RefinementProblem, first: IkResult) -> None:
         self._problem, self._state = problem, first.state

@@ -1,7 +1,7 @@
 """Result of a refinement: marker displacements, tracking errors and changes of joint angles.
 
-All values are SI. Errors have unit weights, independent of the weights of the fit. Variances over
-frames and over trials have the divisor N.
+All values are in SI units. Errors are computed with unit weights, independent of the weights of the
+fit. Variances over frames and over trials are divided by N, not N - 1.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ class TrialOutcome:
     before: TrackingStatistics
     after: TrackingStatistics
     angles: dict[str, tuple[float, float]]
-    """RMS and greatest change of each joint rotation, rad, by segment, without the root."""
+    """RMS and greatest change of each joint rotation by segment, rad; the root segment is excluded.
+    """
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +59,9 @@ class MarkerOutcome:
     moved: tuple[float, float, float]
     """Displacement by the refinement in segment axes, m."""
     held: tuple[bool, bool, bool]
-    """Coordinates that were locked, or that the trials do not determine."""
+    """Whether each coordinate was locked, or is not determined by the trials."""
     rms_before: float
-    """RMS over all trials, m; NaN if never visible."""
+    """RMS error over all trials before the refinement, m; NaN if the marker is never visible."""
     rms_after: float
 
     @property
@@ -79,16 +80,17 @@ class Refinement:
     markers: tuple[MarkerOutcome, ...]
     trials: tuple[TrialOutcome, ...]
     costs: tuple[float, ...]
-    """Cost at the start and after every step; it never rises."""
+    """Cost at the start and after every step. It never increases."""
     runs: int
-    """Number of runs of inverse kinematics over all frames (`search`, `block`)."""
+    """Number of runs of inverse kinematics over all frames, for the methods `search` and `block`.
+    """
     stopped: str
     gauge: Gauge
     notes: tuple[str, ...] = ()
     """Findings about the input that do not prevent the refinement."""
 
     def variance_of_trials(self, *, trained: bool) -> tuple[float, float]:
-        """Return the variance of the trials' RMS before and after, m²; NaN below two trials."""
+        """Return the variance of the trials' RMS errors before and after, m²; NaN for one trial."""
         some = [t for t in self.trials if t.trained == trained]
         return _variance([t.before.rms for t in some]), _variance([t.after.rms for t in some])
 

@@ -1,7 +1,7 @@
 r"""Bundle adjustment of markers and poses: Gauss-Newton with Schur elimination of the poses.
 
 Frames are coupled only through the markers, so the normal equations have one small block for each
-frame. With :math:`J_{tm} = \partial e/\partial q`, errors taken in segment axes,
+frame. With errors in segment axes and :math:`J_{tm} = \partial e/\partial q`,
 
 .. math::
 
@@ -10,8 +10,9 @@ frame. With :math:`J_{tm} = \partial e/\partial q`, errors taken in segment axes
     \delta p = -S^{-1} (h - \sum_t B_t^T A_t^{-1} g_t), \quad
     \delta q_t = -A_t^{-1} (g_t + B_t\, \delta p)
 
-(weights included). A step is taken only if F falls. Source: the elimination is Golub and Pereyra's
-variable projection, SIAM J. Numer. Anal. 10 (1973), 413, in the form bundle adjustment uses.
+where the weights are included. A step is accepted only if F decreases. Source: the elimination is
+the variable projection of Golub and Pereyra, SIAM J. Numer. Anal. 10 (1973), 413, in the form that
+is used in bundle adjustment.
 """
 
 from __future__ import annotations
@@ -31,8 +32,9 @@ if TYPE_CHECKING:
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-6, 1e-12, 1e9
 _FLOOR = 1e-11
-"""Constant added to the diagonal of A_t, so that degrees of freedom without markers stay
-constant."""
+"""Constant that is added to the diagonal of A_t. It keeps degrees of freedom without markers
+constant.
+"""
 _TOLERANCE = 1e-6
 """Relative decrease of F below which the iteration ends."""
 _MOST_ITERATIONS = 30
@@ -43,7 +45,7 @@ _FRAMES_AT_ONCE = 128
 
 @dataclass(frozen=True, slots=True)
 class RefinementStep:
-    """One accepted iterate."""
+    """One accepted iterate of marker positions and poses."""
 
     positions: Array
     state: ChainState
@@ -52,7 +54,7 @@ class RefinementStep:
 
 @dataclass(frozen=True, slots=True)
 class NormalEquations:
-    """Blocks of one linearization, for f unlocked coordinates and nq degrees of freedom."""
+    """Blocks of the normal equations for f unlocked coordinates and nq degrees of freedom."""
 
     A: Array
     """Pose block A_t of each frame, shape (T, nq, nq)."""
@@ -138,9 +140,9 @@ def solve_jointly(
     Parameters
     ----------
     start
-        Nominal positions and the poses that fit them.
+        Nominal positions and the poses that were fitted to them.
     on_step
-        Called with every accepted iterate; True ends the iteration.
+        Function that is called with every accepted iterate. If it returns True, the iteration ends.
 
     Returns
     -------
@@ -171,7 +173,7 @@ def place(problem: RefinementProblem, positions: Array, state: ChainState) -> Re
 def _improve(
     problem: RefinementProblem, last: RefinementStep, damping: float
 ) -> tuple[RefinementStep | None, float]:
-    """Return the next iterate, None if no step lowers the cost, and its initial damping."""
+    """Return the next iterate, or None if no step lowers the cost, and the next damping."""
     equations = linearize(problem, last.positions, last.state)
     while damping <= _MOST_DAMPING:
         dp, dq = equations.solve(damping)

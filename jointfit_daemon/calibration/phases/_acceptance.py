@@ -1,4 +1,4 @@
-"""Comparison of a new calibration with the one in force; a rejection always has a reason."""
+"""Comparison of a new calibration with the calibration in force. A rejection has a reason."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
 
 SLACK = 1.15
-"""Ratio of the hold-out errors of two equally good trials."""
+"""Largest ratio of the hold-out errors of two trials that count as equally good."""
 SLACK_RAD = np.deg2rad(0.3)
 """Absolute difference of hold-out errors that is accepted, rad."""
 SLACK_M = 0.005
@@ -20,7 +20,7 @@ SLACK_M = 0.005
 
 
 class CalibrationComparison(NamedTuple):
-    """Whether the new calibration is at least as good, with the reason."""
+    """Whether the new calibration is at least as good as the old calibration, with the reason."""
 
     better: bool
     reason: str
@@ -29,10 +29,11 @@ class CalibrationComparison(NamedTuple):
 def compare_calibrations(new: Calibration, old: Calibration | None) -> CalibrationComparison:
     """Compare a new calibration with the calibration in force.
 
-    The criteria are checked in this order, and the first difference decides: the chain, use of
-    cameras, alignment of the worlds, the hold-out error of each segment and of the flexion of each
-    inner joint (factor 1.15 plus 0.3°), and the gap between the centers fixed in the two body parts
-    (5 mm).
+    The first criterion in which the calibrations differ determines the result. The order is: chain,
+    use of cameras, alignment of the worlds, and finally the errors together. The errors are the
+    hold-out errors of each segment and of the flexion of each inner joint (tolerance: factor 1.15
+    plus 0.3°), and the gap between the centers fixed in the two body parts of a joint (tolerance: 5
+    mm).
     """
     if old is None:
         return CalibrationComparison(True, "no calibration was in force")

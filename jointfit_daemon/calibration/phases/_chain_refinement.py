@@ -1,9 +1,9 @@
-"""Refinement of the markers of a chain model, through inverse kinematics of the movement.
+"""Refinement of the markers of a chain model by inverse kinematics of the movement.
 
-The first part of the movement refines the positions; the rest judges them. A segment whose markers
-have no smaller error there keeps the positions of the model, and so does the whole model if its
-error is not smaller. A model that does not fit the movement is reported, and the calibration
-continues without a refinement.
+Positions are refined on the first part of the movement and evaluated on the rest. If the markers of
+a segment do not have a smaller error on the rest, the segment keeps the positions of the model. If
+the error of the whole model is not smaller, all segments keep them. If the model does not fit the
+movement, the fault is reported, and the calibration continues without a refinement.
 """
 
 from __future__ import annotations
@@ -49,8 +49,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
 
 FARTHEST_M = 0.06
-"""Largest plausible error of a marker in a model, m: in operation, a marker at this distance counts
-as misplaced."""
+"""Largest plausible position error of a marker in a model, m. In operation, a marker at this
+distance counts as misplaced.
+"""
 _MM = 1e3
 
 
@@ -59,7 +60,7 @@ class ChainOutcome:
     """Result of the refinement of a chain model."""
 
     chain: RefinedChain | None = None
-    """Refined markers; None if the positions of the model remain in use."""
+    """Refined markers; None if the positions of the model are used."""
     figures: ChainQuality | None = None
     """Figures of the refinement; None without a chain model."""
     notes: tuple[str, ...] = ()
@@ -75,9 +76,9 @@ def refine_chain(
     functional
         The movement.
     settings
-        Chain model, options and share of the movement that is held out.
+        Chain model, options and held-out fraction of the movement.
     control
-        Elapsed time, which bounds the iteration, and progress.
+        Elapsed time, which limits the iteration, and the function that reports progress.
     """
     wanted = settings.chain_refinement
     if wanted is None or not settings.refine_markers or functional.optical is None:
@@ -156,9 +157,10 @@ def _outcome(wanted: ChainRefinement, found: Refinement, unseen: MotionTrial) ->
 def _select(
     wanted: ChainRefinement, found: Refinement, unseen: MotionTrial, refused: set[str]
 ) -> tuple[TrialOutcome, dict[str, PartQuality]]:
-    """Return the trial errors with the selected segments, and the errors of every moved segment.
+    """Return the errors of the trial with the selected segments, and the errors by moved segment.
 
-    The errors of a segment depend on its neighbors, so each selection is judged as a whole.
+    The errors of a segment depend on its neighbors, so each selection of segments is evaluated as a
+    whole.
     """
     model = wanted.model
     shift = found.model.positions - model.positions
@@ -228,7 +230,7 @@ def _errors(root_mean_square: float, maximum: float) -> MarkerErrors:
 
 
 def _notes(wanted: ChainRefinement, found: Refinement, figures: ChainQuality) -> list[str]:
-    """Return what the operator should know or change."""
+    """Return notes for the operator on faults and possible improvements."""
     name = f"chain model {wanted.model.name!r}"
     notes = [f"{name}: {note}" for note in found.notes]
     if found.stopped == STOPPED:

@@ -1,16 +1,16 @@
 r"""Refinement of marker positions on body parts from the functional movement.
 
 The static pose contains markers in one state of the soft tissue. The movement contains thousands of
-states, and reveals a displaced marker. The markers of each part are refined by `marker_refinement`
-without joints between the parts: joint centers from skin markers have errors of a centimeter and
-would distort the shapes. A rotation of a whole part is unobservable, so the refined shape
-:math:`p'` is fitted back to the pose :math:`p`,
+states, and shows whether a marker is displaced. The markers of each part are refined by
+`marker_refinement`, without joints between the parts. Joint centers from skin markers have errors
+of a centimeter and would distort the shapes. A rotation of a whole part is unobservable. The
+refined shape :math:`p'` is therefore fitted to the marker positions :math:`p` of the static pose,
 
 .. math:: \min_{R,t} \sum_k \rho(|R p'_k + t - p_k|)
 
 with the Huber loss :math:`\rho`, so that a single displaced marker does not rotate its part. The
-refinement uses the first part of the trial and is evaluated on the rest. A part without a smaller
-error there is unchanged.
+refinement uses the first section of the trial and is evaluated on the rest. Body parts whose error
+on the rest is not smaller are unchanged.
 """
 
 from __future__ import annotations
@@ -38,10 +38,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import MarkerCluster
 
 FARTHEST_M = 0.03
-"""Largest plausible displacement of a marker, m; above it the label is wrong or the marker fell
-off."""
+"""Largest plausible displacement of a marker, m. A larger displacement indicates a wrong label or a
+marker that fell off.
+"""
 ALONE_M = 0.004
-"""Residual above which a marker was displaced individually, m."""
+"""Residual above which an individual marker counts as displaced, m."""
 _ROBUST = IkOptions(huber_m=ALONE_M, reweightings=12)
 
 
@@ -58,7 +59,7 @@ class RefinedClusters:
 def refine_clusters(
     clusters: Mapping[str, MarkerCluster], tracks: Mapping[str, ClusterTrack], holdout_share: float
 ) -> RefinedClusters:
-    """Refine the markers of body parts with a movement.
+    """Refine the markers of body parts from a movement.
 
     Parameters
     ----------
@@ -67,12 +68,13 @@ def refine_clusters(
     tracks
         The same parts in the movement, with markers in ``points``.
     holdout_share
-        Last, contiguous share of the movement for the evaluation.
+        Fraction of the movement, at its end, that is used for the evaluation.
 
     Returns
     -------
     RefinedClusters
-        The given clusters, with a note on the reason, if nothing could be refined.
+        Refined clusters. If no part could be refined, the clusters are unchanged, and a note
+        contains the reason.
     """
     marked = {name: c for name, c in clusters.items() if c.body is None and name in tracks}
     if not marked:
@@ -90,7 +92,7 @@ def refine_clusters(
     except RefinementError as refusal:
         return RefinedClusters(clusters, None, (f"markers not refined: {refusal}",))
 
-    # Use the parts with a smaller held-out error and plausible marker displacements.
+    # Only parts with a smaller held-out error and plausible marker displacements are used.
     judge = next(trial for trial in found.trials if not trial.trained)
     used, parts = dict(clusters), {}
     moved: dict[str, float] = {}
@@ -117,7 +119,7 @@ def refine_clusters(
 
 
 def _model(marked: Mapping[str, MarkerCluster]) -> ChainModel:
-    """Return the unconnected parts, in axes of the static world about their origins."""
+    """Return a model of the unconnected parts with the axes of the static world."""
     return ChainModel(
         tuple(Segment(name) for name in marked),
         tuple(
@@ -130,7 +132,7 @@ def _model(marked: Mapping[str, MarkerCluster]) -> ChainModel:
 
 
 def fit_shape_to_pose(cluster: MarkerCluster, shape: Array) -> MarkerCluster:
-    """Return a part with another shape, m, shape (k, 3), fitted to its place in the static pose."""
+    """Return a part with the marker positions `shape`, m, (k, 3), fitted to the static pose."""
     model = _model({cluster.name: cluster}).with_markers(shape)
     placed = solve_frames(model, cluster.template[None], options=_ROBUST)
     points = shape @ placed.rotations[0, 0].T + placed.origins[0, 0] + cluster.origin

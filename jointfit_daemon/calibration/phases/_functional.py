@@ -1,4 +1,4 @@
-"""The functional phase: a complete calibration from a static pose and a movement.
+"""Functional phase, which computes a complete calibration from a static pose and a movement.
 
 The optical reference consists of skin markers. All quality figures are distances from this
 reference, not from bones. All reasons for a rejection are reported at once, with remedies.
@@ -87,12 +87,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag import LagEstimate
 
 MIN_SEEN = 0.5
-"""Smallest share of frames in which a body part is visible."""
+"""Smallest fraction of frames in which a body part must be visible."""
 PLATE_SD_NS = 500_000.0
-"""Standard deviation of a lag from the align phase if the phase reports none, ns."""
+"""Assumed standard deviation of a lag from the align phase if the phase did not estimate it, ns."""
 STORED_SD_NS = 3e6
-"""Standard deviation of a lag of the calibration in force, ns; it may contain soft-tissue
-artefact."""
+"""Standard deviation of a lag from the calibration in force, ns. Such a lag may contain an error
+from soft-tissue artefact.
+"""
 
 
 def fit_calibration(
@@ -114,16 +115,17 @@ def fit_calibration(
     static : StaticPose or CalibrationTrial
         The static pose, or its trial.
     functional : CalibrationTrial
-        The movement with the optical system; sensor time stamps without lag correction.
+        The movement, with data of the optical system. Sensor time stamps are not corrected for lag.
     alignment : PlateAlignment or None
-        None takes all sensor worlds as equal to the optical one, with flag
-        ``headings_from_static``.
+        Alignment of the sensor worlds. With None, all sensor worlds are assumed to equal the
+        optical world, and the calibration has the flag ``headings_from_static``.
     previous : Calibration, optional
-        Source of lags that this movement does not determine.
+        Calibration whose lags are used where this movement determines none.
     lag_ns : mapping, optional
-        Configured lags, ns; missing lags are estimated.
+        Configured lags, ns. The lags of other sensors are estimated.
     tracked : mapping, optional
-        Lag and standard deviation, ns, tracked at run time; used if this movement determines none.
+        Lags and standard deviations that were tracked at run time, ns. They are used where this
+        movement determines none.
 
     Raises
     ------
@@ -133,12 +135,12 @@ def fit_calibration(
     """
     pose = static if isinstance(static, StaticPose) else fit_static(static, settings, chain)
 
-    # Reference: body parts, and lags of the sensors behind them.
+    # Optical reference: body parts, and lags of the sensors relative to them.
     refined, tracks = refined_tracks(_tracks(pose, functional, chain), pose, functional, settings)
     moving = _lags(chain, functional, tracks, lag_ns or {})
     lags = _lags_in_use(chain, moving, alignment, _earlier_lags(previous, tracked), lag_ns or {})
 
-    # Joint centers, segment axes, and mounts of the sensors.
+    # Joint centers, segment axes, and sensor-to-segment alignments.
     raw = _sensors_at(next(iter(tracks.values())).t_ns, functional, pose, lags)
     anatomy = find_anatomy(chain, tracks, _center_choice(chain, raw, pose, alignment, settings))
     sensors = _sensors(chain, pose, alignment, anatomy, lags)
@@ -178,7 +180,7 @@ def fit_calibration(
 def _tracks(
     pose: StaticPose, functional: CalibrationTrial, chain: Chain
 ) -> dict[str, ClusterTrack]:
-    """Return the poses of all body parts; reject trials without a usable reference."""
+    """Return the poses of all body parts; raise an error if the reference is not usable."""
     if functional.optical is None or len(functional.optical.t_ns) < MIN_FRAMES:
         raise CalibrationError("functional: no data of the optical system; check that it streams")
 
@@ -229,7 +231,7 @@ def refined_tracks(
 ) -> tuple[RefinedClusters, dict[str, ClusterTrack]]:
     """Refine the markers, if configured, and return the poses of the refined body parts.
 
-    The reference of the patent is the measured markers.
+    In the procedure of the patent the measured markers are the reference, without refinement.
     """
     refine = settings.refine_markers and settings.procedure == "corrected"
     if not refine or functional.optical is None:
@@ -283,7 +285,7 @@ def _center_choice(
 def _earlier_lags(
     previous: Calibration | None, tracked: Mapping[str, tuple[float, float]] | None
 ) -> dict[str, SensorLag]:
-    """Return earlier lags: the stored ones, or the tracked ones if more certain."""
+    """Return the stored lags, or the tracked lags if they have a smaller standard deviation."""
     stored = {} if previous is None else previous.lag_ns
     seen = tracked_lags(tracked or {})
     kept = {
@@ -301,7 +303,7 @@ def _lags_in_use(
     earlier: Mapping[str, SensorLag],
     known: Mapping[str, int],
 ) -> dict[str, SensorLag]:
-    """Return configured lags, else lags from movement and plate combined, else earlier lags."""
+    """Return the configured lags, or else lags from movement and plate, or else earlier lags."""
     plate = {} if alignment is None else alignment.quality
     prior = {
         name: (
@@ -353,7 +355,7 @@ def _training(
     if alignment is not None:
         return training, notes
 
-    # Sensors whose world seems rotated; the angle includes soft-tissue artefact.
+    # Note the sensors whose world seems rotated; the angle includes soft-tissue artefact.
     for segment, group in zip(chain.segments, chain.sensors, strict=True):
         for s in group:
             found = fit_sensor_alignment("heading", raw[s], training.reference[segment])
@@ -369,7 +371,7 @@ def _training(
 def _models(
     chain: Chain, training: LimbTraining, settings: CalibrationSettings
 ) -> tuple[Mapping[str, Mapping[str, SegmentModel]], HoldoutQuality]:
-    """Return the models by the procedure, and the errors of all methods on the held-out part."""
+    """Return the models of the procedure, and the errors of all methods on the held-out part."""
     method, share = settings.method, settings.holdout_share
     holdout = evaluate_methods(chain, training, method, share, settings.procedure)
     if settings.procedure == "patent":

@@ -27,15 +27,16 @@ def inertial_rotations(
 
     .. math:: q_{now,static} = w \otimes q(t) \otimes q_{static}^* \otimes w^*
 
-    with w from the world of the sensor to the optical world. Segment axes are not needed. Several
-    sensors of a segment are averaged.
+    where w is the rotation from the world of the sensor to the optical world. Segment axes are not
+    needed. If a segment has several sensors, their rotations are averaged.
 
     Parameters
     ----------
     raw : mapping of str to ndarray, shape (m, 4)
         q_world_sensor of every sensor at common instants; NaN if missing.
     alignment : PlateAlignment or None
-        None takes all sensor worlds as equal to the optical one.
+        Alignment of the sensor worlds. With None, all sensor worlds are assumed to equal the
+        optical world.
 
     Returns
     -------

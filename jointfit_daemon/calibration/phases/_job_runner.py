@@ -1,6 +1,7 @@
-"""The fits of the worker process: one function for each class of job.
+"""Fits that the worker process runs, with one function for each class of job.
 
-A rejected calibration is a result with ``refused``; any other exception is a bug.
+A rejected calibration (`CalibrationError`) is a result with ``refused``. Any other exception is a
+bug.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
 
 
 def run_job(job: CalibrationJob, control: JobControl | None = None) -> FitResult:
-    """Run one fit and return its result, or the reason for which the fit was refused."""
+    """Run one fit and return its result, or the reason why the fit was rejected."""
     try:
         match job:
             case AlignJob():
@@ -59,7 +60,7 @@ def run_job(job: CalibrationJob, control: JobControl | None = None) -> FitResult
 def _align(job: AlignJob) -> FitResult:
     sensors = [sensor for group in job.chain.sensors for sensor in group]
     missing = [sensor for sensor in sensors if sensor not in job.trial.sensors]
-    if missing:  # otherwise only later phases would refuse it
+    if missing:  # otherwise only later phases would reject the alignment
         raise CalibrationError(
             *(f"{name}: no data while the plate was turned; switch it on" for name in missing)
         )
@@ -73,11 +74,12 @@ def _static(job: StaticJob) -> FitResult:
     if previous is None:
         if settings.markers or settings.rigid_bodies:
             return FitResult(quality_table(pose.quality))
-        # Without cameras the static pose is the whole calibration.
+        # Without cameras the calibration consists of the static pose alone.
         found = fit_static_only(pose, _alignment(job), chain, software=__version__)
         return FitResult(quality_table(pose.quality), calibration=found)
 
-    # An alignment of this session applies if the models of `previous` refer to aligned worlds.
+    # The alignment of this session applies only if the models of `previous` refer to aligned
+    # worlds.
     alignment = None
     if job.alignment is not None and FrameFlag.HEADINGS_FROM_STATIC not in previous.flags:
         alignment = PlateAlignment.from_dict(job.alignment)
@@ -128,13 +130,13 @@ def _previous(job: StaticJob | FunctionalJob | RefitJob) -> Calibration | None:
 
 
 def _alignment(job: StaticJob | FunctionalJob) -> PlateAlignment | None:
-    """Return the alignment of this session or of the calibration in force; None without either."""
+    """Return the alignment of this session, or else of the calibration in force, or else None."""
     if job.alignment is not None:
         return PlateAlignment.from_dict(job.alignment)
     previous = _previous(job)
     if previous is None or FrameFlag.HEADINGS_FROM_STATIC in previous.flags:
         return None
-    # Alignments of sensor worlds do not depend on the sensor mounts, so they remain valid.
+    # Alignments of sensor worlds remain valid, because they do not depend on the sensor mounts.
     return PlateAlignment(
         {
             name: AlignedSensor(

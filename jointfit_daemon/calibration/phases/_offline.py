@@ -1,8 +1,8 @@
-"""Fits and evaluation of recorded trials with a reference, without device clocks and markers.
+"""Fit and evaluation of recorded trials that contain a reference, without clocks and markers.
 
-Sensors and reference are in one world and on one time axis. The evaluation always uses held-out
-data: a whole trial, or the last part of a single trial. The resulting calibration has the form of
-the daemon, with unknown lengths and joint centers.
+Sensors and reference have the same world and the same time axis. The evaluation always uses
+held-out data, either a whole trial or the last part of a single trial. The resulting calibration
+has the same form as a calibration by the daemon; lengths and joint centers are unknown.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 COMPARED: tuple[Method, ...] = tuple(method for method in METHODS if method != "single")
-"""Evaluated methods; ``single`` is omitted, because each sensor is evaluated alone."""
+"""Evaluated methods. ``single`` is omitted, because each sensor is also evaluated alone."""
 MAX_TRAINING_FRAMES = 2000
 """Largest number of training frames of one trial; longer trials are decimated."""
 
@@ -64,7 +64,7 @@ class OfflineTrial:
     sensors: Mapping[str, Array]
     """q_world_sensor of each sensor, shape (n, 4); NaN if missing."""
     reference: Mapping[str, Array]
-    """q_world_segment of each segment, same world, shape (n, 4); NaN if not visible."""
+    """q_world_segment of each segment in the same world, shape (n, 4); NaN if not visible."""
 
     def part(self, chosen: slice) -> OfflineTrial:
         """Return a contiguous part, or every n-th frame."""
@@ -82,11 +82,11 @@ class MethodScore:
 
     trial: str
     method: str
-    """A method of `METHODS`, or ``single S1+S3``: one sensor of each segment alone."""
+    """Method of `METHODS`, or a text such as ``single S1+S3`` for one sensor of each segment."""
     frames: int
     """Number of complete frames."""
     segments: Mapping[str, float]
-    """RMS angle to the reference, rad."""
+    """RMS angle between estimate and reference, rad, by segment."""
     joints: Mapping[str, float]
     """RMS error of flexion about the functional axis of the training movement, rad."""
     flexion: Mapping[str, Array]
@@ -109,9 +109,9 @@ class MethodEvaluation:
 def mounts_of(chain: Chain, trials: Sequence[OfflineTrial]) -> dict[str, RobustMean]:
     """Return ``q_sensor_segment`` of every sensor from the reference of whole trials.
 
-    For a static trial this is the static calibration. For movements it is the mean over the
-    soft-tissue artefact and depends on the reference: suitable for research, not for another
-    session.
+    For a static trial the result is the static calibration. For movements it is the mean over the
+    soft-tissue artefact and depends on the reference. Such a result is suitable for research, but
+    not for another session.
     """
     found = {}
     for i, segment in enumerate(chain.segments):
@@ -146,14 +146,14 @@ def fit_offline(
     Raises
     ------
     CalibrationError
-        Fewer than 30 complete frames of a segment.
+        A segment has fewer than 30 complete frames.
     """
     known_lengths: Mapping[str, tuple[float | None, float | None]] = lengths or {}
     training = _training(chain, trials, mounts)
     _refuse_few(chain, training, "the training data")
     models = fit_models(chain, training, method)
 
-    # Sensors and reference are in one world, so worlds and static poses are the identity.
+    # Sensors and reference have the same world, so worlds and static poses are the identity.
     identity = as_quaternion(rotation.IDENTITY.tolist())
     return Calibration(
         method=method,
@@ -187,19 +187,20 @@ def evaluate(
     methods: Sequence[Method] = COMPARED,
     holdout: float = 0.4,
 ) -> MethodEvaluation:
-    """Evaluate every method on each trial held out, or on the end of a single trial.
+    """Evaluate every method on each trial, which is held out, or on the end of a single trial.
 
     Parameters
     ----------
     mounts : mapping, optional
-        ``q_sensor_segment`` of each sensor; by default from the reference of the training part.
+        ``q_sensor_segment`` of each sensor. By default it is computed from the reference of the
+        training part.
     holdout : float
-        Held-out share of a single trial.
+        Held-out fraction of a single trial.
 
     Raises
     ------
     CalibrationError
-        Fewer than 30 complete frames of a segment in the training or held-out data.
+        A segment has fewer than 30 complete frames in the training or held-out data.
     """
     if len(trials) == 1:
         cut = round(len(trials[0].t_s) * (1.0 - holdout))
@@ -259,8 +260,9 @@ class _Fold:
     aligned: LimbTraining
     """The held-out trial, bone-aligned."""
     axes: Mapping[str, Array]
-    """Axis of positive flexion of each inner joint, from `functional_axis` of the training
-    movement."""
+    """Axis of positive flexion of each inner joint, which `functional_axis` computes from the
+    training movement.
+    """
     truth: Mapping[str, Array]
 
     @staticmethod
@@ -288,7 +290,7 @@ class _Fold:
         return _Fold(chain, known, test, aligned, axes, truth)
 
     def method(self, method: Method) -> MethodScore:
-        """Evaluate one method with all sensors available, like the daemon."""
+        """Evaluate one method as in the daemon, with all sensors available."""
         estimates = {}
         for i, segment in enumerate(self.chain.segments):
             model = fit_all_sensors(self.chain, i, method, self.training)

@@ -1,6 +1,8 @@
-"""Checks of recorded trials before a fit: joints without movement, misaligned or identical sensors.
+"""Checks of recorded trials before a fit.
 
-Only clear cases are reported, each with the object and the remedy; soft-tissue artefact is not.
+The checks report joints without movement, and misaligned or identical sensors. Each message
+contains the object and the remedy. Differences that soft-tissue artefact can cause are not
+reported.
 """
 
 from __future__ import annotations
@@ -24,18 +26,20 @@ if TYPE_CHECKING:
 
 
 HEADING_SEPARABLE = 0.98
-"""Ratio of singular values above which heading and sensor-to-segment alignment cannot be
-distinguished."""
+"""Ratio of singular values above which the data do not distinguish heading and sensor-to-segment
+alignment.
+"""
 FAR = np.deg2rad(45.0)
-"""Median angle between an aligned sensor and its reference that soft tissue does not explain,
-rad."""
+"""Median angle between an aligned sensor and its reference above which soft tissue is not the
+cause, rad.
+"""
 LEAST_TURN = np.deg2rad(5.0)
 """0.95 quantile of the rotation of a joint below which the trials do not constrain its model,
 rad."""
 
 
 def unmoved_joint(chain: Chain, trials: Sequence[OfflineTrial]) -> str | None:
-    """Return a message on a joint (or single segment) that does not move; None if all move."""
+    """Return a message on a joint (or single segment) that does not move; None if there is none."""
     reference = {s: np.concatenate([t.reference[s] for t in trials]) for s in chain.segments}
     movements = {
         joint.name: joint_rotation(
@@ -43,7 +47,7 @@ def unmoved_joint(chain: Chain, trials: Sequence[OfflineTrial]) -> str | None:
         )
         for joint in inner_joints(chain)
     }
-    for name, q in (movements or reference).items():  # single segment without inner joint
+    for name, q in (movements or reference).items():  # a single segment has no inner joint
         known = q[np.isfinite(q).all(axis=1)]
         turned = rotation.angle_between(robust_mean(known).q, known)
         most = float(np.quantile(turned, 0.95))
@@ -88,7 +92,7 @@ def _far_sensors(
 
 
 def _turned_worlds(chain: Chain, trials: Sequence[OfflineTrial]) -> Iterator[str]:
-    """Yield warnings on worlds rotated about the vertical, if the angle is observable."""
+    """Yield warnings on sensor worlds rotated about the vertical, if the angle is observable."""
     for _, sensor, q, reference in _streams(chain, trials):
         alignment = fit_sensor_alignment("heading", q, reference)
         angle = float(rotation.heading_of(alignment.q_world))

@@ -1,10 +1,11 @@
 """Online learning: refits of the segment models to new frames with cameras.
 
-Only models change; sensor-to-segment alignments, joint centers and lags do not. A candidate is
-fitted to the training frames of the calibration and the older part of the new frames. The candidate
-is compared with the models in force on the newest frames, which are held out. The models in force
-are retained, with a reason, if the candidate is not better, is much worse on the earlier training
-frames, differs too much, or if cameras and sensors are inconsistent.
+Online learning changes only the models, not sensor-to-segment alignments, joint centers or lags. A
+candidate is fitted to the training frames of the calibration and the older part of the new frames.
+The newest frames are held out. On them the candidate is compared with the models in force. The
+models in force are retained, with a reason, in three cases: the candidate is not better, is much
+worse on the earlier training frames, or differs too much. Inconsistent cameras and sensors are an
+error.
 """
 
 from __future__ import annotations
@@ -53,27 +54,31 @@ FEWEST = 200
 HELD = 0.3
 """Newest, contiguous share of the new frames that is held out."""
 GAIN = 0.97
-"""Largest ratio of the errors of candidate and models in force on held-out frames."""
+"""Largest ratio of the candidate's error to the error of the models in force, on held-out frames.
+"""
 GAIN_RAD = np.deg2rad(0.05)
-"""Smallest decrease of the error of the candidate, rad."""
+"""Smallest decrease of the error with which the candidate is accepted, rad."""
 WORSE = 1.15
-"""Largest increase of any single error on earlier training frames, as in `compare_calibrations`."""
+"""Largest factor of the increase of a single error on earlier frames, as in `compare_calibrations`.
+"""
 WORSE_RAD = np.deg2rad(0.3)
-"""Constant part of the largest increase, rad."""
+"""Constant part of the largest accepted increase of an error, rad."""
 MOST_CHANGE = np.deg2rad(8.0)
-"""Largest 0.95 quantile of the change in known postures, rad; soft tissue does not change
-faster."""
+"""Largest 0.95 quantile of the change of the predictions in known postures, rad. Soft tissue does
+not change faster.
+"""
 MARKERS_RMS_M = 0.015
 """RMS residual of the markers of a frame above which the frame is ignored, m."""
 MOST_LEFT_OUT = 0.3
 """Largest share of ignored frames."""
 CONTRADICTED = np.deg2rad(8.0)
-"""Median angle between cameras and models in force above which either is wrong, rad."""
+"""Median angle between cameras and models in force above which one of the two is wrong, rad."""
 SHIFTED = np.deg2rad(5.0)
-"""Largest mean rotation between cameras and models in force, rad; a larger one is due to a
-displaced marker cluster."""
+"""Largest mean rotation between cameras and models in force, rad. A displaced marker cluster causes
+a larger rotation.
+"""
 TURN_FRAMES = 150
-"""Number of frames over which heading drift is taken as constant: 15 s."""
+"""Number of frames over which heading drift is assumed to be constant: 15 s."""
 
 
 def refit_models(
@@ -84,15 +89,16 @@ def refit_models(
     Parameters
     ----------
     calibration : Calibration
-        In force; its ``memory`` has the training frames.
+        Calibration in force; its ``memory`` contains the training frames.
     frames : OnlineFrames
         New frames.
 
     Returns
     -------
     FitResult
-        ``quality`` with ``online``: errors before and after, rad; and either ``calibration`` or
-        ``kept``: the reason to retain the models in force.
+        Result whose ``quality["online"]`` contains the errors before and after, rad. If the
+        candidate is accepted, ``calibration`` is set. Otherwise ``kept`` contains the reason to
+        retain the models in force.
 
     Raises
     ------
@@ -109,7 +115,8 @@ def refit_models(
     cut = round(len(new) * (1.0 - HELD))
     older, newest = new.rows(slice(None, cut)), new.rows(slice(cut, None))
 
-    # Candidate without the newest frames, evaluated on them and on the earlier frames.
+    # The candidate is fitted without the newest frames, and evaluated on these and on earlier
+    # frames.
     training = joined(known, evenly(chain, older))
     in_force = _in_force(calibration, chain)
     candidate = {
@@ -129,7 +136,7 @@ def refit_models(
     if kept is not None:
         return FitResult({"online": quality_table(figures)}, kept=kept)
 
-    # Accepted: fit all sets of sensors to all frames.
+    # The candidate is accepted. The final models are fitted to all frames, for all sets of sensors.
     whole = evenly(chain, joined(known, new))
     models = fit_models(chain, whole, calibration.method)
     rounds = int(calibration.quality.get("online", {}).get("rounds", 0)) + 1
@@ -152,7 +159,7 @@ def refit_models(
 
 
 def _reference(calibration: Calibration, frames: OnlineFrames, chain: Chain) -> LimbTraining:
-    """Return the frames with consistent markers, with the reference of each segment."""
+    """Return the frames with consistent markers and the reference of each segment."""
     reference = {}
     for name in chain.segments:
         cluster = restore_cluster(name, calibration.clusters[name])
@@ -180,7 +187,7 @@ def _reference(calibration: Calibration, frames: OnlineFrames, chain: Chain) -> 
 def _without_heading_drift(
     calibration: Calibration, new: LimbTraining, chain: Chain
 ) -> LimbTraining:
-    """Return the frames with heading drift removed; raise an error if cameras and models disagree.
+    """Return the frames without heading drift; raise an error if cameras and models disagree.
 
     Sensor headings drift over minutes, independent of posture. The rotation about the vertical
     between cameras and models, averaged over 15 s, is therefore removed from the reference.
@@ -240,7 +247,7 @@ def _figures(chain: Chain, models: Models, frames: LimbTraining) -> dict[str, fl
 
 
 def _rejection(figures: OnlineQuality) -> str | None:
-    """Return why the errors of the candidate do not justify its use; None if they do."""
+    """Return the reason to reject the candidate because of its errors, or None."""
     before, after = figures.before_rad, figures.after_rad
     was, now = (float(np.mean([x**2 for x in f.values()])) ** 0.5 for f in (before, after))
     if now > min(GAIN * was, was - GAIN_RAD):

@@ -1,6 +1,6 @@
-"""The align phase: all sensors on one plate with markers, rotated by hand.
+"""Align phase, in which a plate with all sensors and with markers is rotated by hand.
 
-The rotation of each sensor world to the optical world comes from this phase only, never from
+The rotation from each sensor world to the optical world is estimated only in this phase, never from
 skin-mounted sensors. Parameters that the movement did not excite are rejected with the reason.
 """
 
@@ -40,7 +40,9 @@ if TYPE_CHECKING:
 MIN_FRAMES = 200
 """Smallest number of frames with plate and sensor."""
 MAX_RMS = np.deg2rad(6.0)
-"""Largest residual, rad; above it a sensor is loose or not on the plate, or markers are swapped."""
+"""Largest residual, rad. A larger residual indicates a loose sensor, a sensor that is not on the
+plate, or swapped markers.
+"""
 MAX_FRAMES = 3000
 """Most frames that are used; longer recordings are decimated."""
 
@@ -94,7 +96,7 @@ class PlateAlignment:
 
     @staticmethod
     def from_dict(data: Mapping[str, Any]) -> PlateAlignment:
-        """Return the alignment of a JSON form."""
+        """Return the alignment from its JSON form."""
         return PlateAlignment(
             {
                 name: AlignedSensor(
@@ -118,18 +120,18 @@ def fit_plate_alignment(
     Parameters
     ----------
     trial : CalibrationTrial
-        Movement of the plate; all sensors of the trial are assumed to be on the plate.
+        Movement of the plate. All sensors of the trial are assumed to be on the plate.
     settings : CalibrationSettings
         `plate` names the rigid body, or ``markers["plate"]`` the markers.
     lag_ns : mapping, optional
-        Known lags (sensor minus optical time stamp), ns. Missing lags are estimated, or 0 if the
-        estimate is rejected.
+        Known lags (sensor minus optical time stamp), ns. Other lags are estimated; if the estimate
+        is rejected, 0 is used.
 
     Raises
     ------
     CalibrationError
-        The plate is missing or hardly visible, or movement or fit of a sensor do not suffice; all
-        reasons at once.
+        The plate is missing or hardly visible, or the movement or the fit of a sensor is
+        insufficient. The error contains all reasons.
     """
     if trial.optical is None or not trial.sensors:
         raise CalibrationError("align: needs data of the optical system and of at least one sensor")
@@ -167,7 +169,7 @@ def plate_track(
     Raises
     ------
     CalibrationError
-        rig.toml names no plate, or it is not in the stream or hardly visible.
+        rig.toml contains no plate, or the plate is missing in the stream or hardly visible.
     """
     if settings.plate is not None:
         column = body_column(optical, "plate", settings.plate)

@@ -1,4 +1,4 @@
-"""Figures and notes on the lags and the anatomy of a functional calibration."""
+"""Quality figures and notes on the lags and the anatomy of a functional calibration."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 def lag_quality(moving: LagEstimate | None, used: SensorLag) -> LagQuality:
-    """Return the lag in use of one sensor and the lag of the movement alone, if estimated."""
+    """Return the lag that one sensor uses and, if estimated, the lag from the movement alone."""
     refused = None if moving is None else moving.refused
     measured = None
     if moving is not None and refused is None:
@@ -54,7 +54,7 @@ def lag_quality(moving: LagEstimate | None, used: SensorLag) -> LagQuality:
 
 
 def lag_notes(moving: Mapping[str, LagEstimate], used: Mapping[str, SensorLag]) -> list[str]:
-    """Return the sensors without a lag from the movement, with the lag in use."""
+    """Return notes on the sensors without a lag from the movement, with the lag that is used."""
     return [
         f"{name}: no lag from this movement ({lag.refused}); "
         f"{used.get(name, NO_LAG).lag_ns / 1e6:.1f} ms used"

@@ -1,7 +1,7 @@
-"""The static calibration: orientations of sensors and markers in the static pose (N-pose).
+"""Static calibration from sensors and markers in the static pose (N-pose).
 
-A pose is accepted or rejected as a whole, with all reasons and remedies at once. Without cameras
-the pose defines its own world, in which all segments are upright and face +y.
+A pose is accepted or rejected as a whole, and a rejection contains all reasons and remedies.
+Without cameras the pose defines its own world, in which all segments are upright and face +y.
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, Quaternion
 
 MAX_TEMPLATE_RMS_M = 0.02
-"""RMS residual of a cluster relative to the earlier pose above which markers were moved, m."""
+"""RMS residual of a cluster relative to the earlier pose above which its markers count as moved, m.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +81,8 @@ def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Ch
     Raises
     ------
     CalibrationError
-        A sensor has no data or scatters too much, the pose is too short, markers are unknown,
-        hidden or on a line; all reasons at once.
+        A sensor has no data or scatters too much, the pose is too short, or markers are unknown,
+        hidden or on a line. The error contains all reasons.
     """
     wanted = [sensor for group in chain.sensors for sensor in group]
     present = [s for s in wanted if s in trial.sensors and len(trial.sensors[s].t_ns) >= 2]
@@ -96,8 +97,8 @@ def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Ch
     stamps = [trial.sensors[s].t_ns for s in present]
     still_s = min((float(t_ns[-1] - t_ns[0]) / 1e9 for t_ns in stamps), default=0.0)
 
-    # rig.toml may configure a pose shorter than three seconds. A tenth less is accepted, because
-    # the samples span less than the pose.
+    # rig.toml may configure a pose shorter than three seconds. 90 % of the duration is accepted,
+    # because the samples do not span the whole pose.
     limits = StaticLimits(still_s=0.9 * min(StaticLimits().still_s, settings.static_s))
 
     if present:
@@ -119,7 +120,7 @@ def fit_static(trial: CalibrationTrial, settings: CalibrationSettings, chain: Ch
 def sensor_calibration(
     mean: RobustMean, q_optical_world: Quaternion, q_static: Quaternion, lag_ns: int = 0
 ) -> SensorCalibration:
-    """Return a sensor with its mount (q_optical_world q_world_sensor)* q_optical_segment."""
+    """Return a sensor with the mount (q_optical_world q_world_sensor)* q_optical_segment."""
     q_optical_sensor = rotation.multiply(q_optical_world, mean.q)
     bias = rotation.multiply(rotation.conjugate(q_optical_sensor), q_static)
     return SensorCalibration(q_optical_world, as_quaternion(bias), lag_ns, mean.spread)
@@ -128,10 +129,10 @@ def sensor_calibration(
 def fit_static_only(
     pose: StaticPose, alignment: PlateAlignment | None, chain: Chain, *, software: str = ""
 ) -> Calibration:
-    """Calibrate without cameras: all segments upright in the pose, plain mean of the sensors.
+    """Calibrate without cameras, with all segments upright and the plain mean of the sensors.
 
-    Without an alignment, every sensor world is taken as the static world (one common world, as in
-    the patent). With arbitrary headings only the inclination is then correct, and the flag is
+    Without an alignment, every sensor world is assumed to equal the static world, as in the patent.
+    If the headings of the sensors are arbitrary, only the inclination is then correct. The flag is
     ``headings_from_static``.
     """
     upright: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -142,7 +143,7 @@ def fit_static_only(
     else:
         worlds = {name: alignment.world(name) for name in pose.sensors}
 
-    # Equal-weight means of all sensors of a segment, and each sensor alone.
+    # Models: the equal-weight mean of all sensors of a segment, and each sensor alone.
     models = [
         {
             model_key(alive, None): MeanModel(equal_weights(len(alive)), UNREFERENCED_SD)
@@ -180,16 +181,17 @@ def fit_static_only(
 def with_new_static(
     calibration: Calibration, pose: StaticPose, alignment: PlateAlignment | None = None
 ) -> Calibration:
-    """Return the calibration after sensors were re-donned: with new alignments.
+    """Return the calibration with new alignments, after sensors were re-donned.
 
-    If cameras see the markers of a segment at their earlier places on the body, they determine its
-    current orientation. Otherwise, and in the procedure of the patent, it is assumed to stand as in
-    the earlier pose, with the same heading (flag ``same_pose_assumed``).
+    If the markers of a segment are visible and at their earlier positions on the body, they
+    determine the current orientation of the segment. Otherwise, and in the procedure of the patent,
+    the segment is assumed to have the orientation and heading of the earlier pose (flag
+    ``same_pose_assumed``).
 
     Parameters
     ----------
     alignment : PlateAlignment, optional
-        Newer than the calibration: source of the worlds and of its estimated lags.
+        Alignment that is newer than the calibration. Its worlds and estimated lags are used.
 
     Raises
     ------
@@ -206,7 +208,7 @@ def with_new_static(
             *(f"{one.text}; correct the labels and repeat the phase" for one in exchanges)
         )
 
-    # Current orientation of every segment, from cameras or as before.
+    # Current orientation of every segment, from cameras or from the earlier pose.
     q_now: dict[str, Quaternion] = {}
     assumed = False
     for name, segment in calibration.segment.items():
@@ -217,7 +219,7 @@ def with_new_static(
         q = segment.q_static if turned is None else rotation.multiply(turned, segment.q_static)
         q_now[name] = as_quaternion(q)
 
-    # Mounts from the new means; worlds and lags from a newer alignment.
+    # The mounts are computed from the new means, worlds and lags from a newer alignment.
     owner = {
         sensor: segment
         for segment, group in zip(calibration.segments, calibration.chain_sensors, strict=True)
@@ -242,7 +244,7 @@ def with_new_static(
 
 
 def _exchanged(calibration: Calibration, pose: StaticPose) -> list[LabelFault]:
-    """Return exchanges of marker labels since the calibration, of parts that do not fit."""
+    """Return exchanges of marker labels since the calibration, for parts that do not fit."""
     stored = calibration.clusters
     same = [
         name

@@ -1,6 +1,6 @@
 """Training frames of a limb: sensors and reference at common instants.
 
-Only complete frames are used. Missing data are reported with the remedy, as a note or as an error.
+Only complete frames are used. A note or an error reports missing data with the remedy.
 """
 
 from __future__ import annotations
@@ -31,18 +31,19 @@ MAX_FRAMES = 2000
 MIN_FRAMES = 300
 """Smallest number of complete frames."""
 MISALIGNED = np.deg2rad(25.0)
-"""Heading difference of a sensor and its reference that soft tissue does not explain, rad."""
+"""Heading difference of a sensor and its reference above which soft tissue is not the cause, rad.
+"""
 SILENT = 0.1
-"""Share of the movement without data of a sensor above which a note is published."""
+"""Fraction of the movement without data of a sensor above which a note is published."""
 TWINS = np.deg2rad(0.01)
-"""Largest rotation between two sensors, rad, that identifies them as one device."""
+"""Largest relative rotation of two sensors, rad, at which they count as one device."""
 
 
 class TrainingSet(NamedTuple):
     """Training frames of a functional trial."""
 
     training: LimbTraining
-    """Frames in segment axes: lags are subtracted, worlds and sensors are aligned."""
+    """Frames in segment axes, after correction of lags and with alignment of worlds and sensors."""
     raw: dict[str, Array]
     """q_world_sensor of every sensor at the same instants, shape (n, 4)."""
     notes: list[str]
@@ -100,13 +101,13 @@ def limb_training(
 
 
 def identical_sensors(chain: Chain, sensors: Mapping[str, Array]) -> list[str]:
-    """Return notes on sensors of a segment without relative motion: they are one device.
+    """Return notes on sensors of a segment without relative motion, which are one device.
 
     Parameters
     ----------
     sensors : mapping of str to ndarray, shape (n, 4)
-        Orientations of each sensor, in any world, with any
-        sensor-to-segment alignment; NaN if missing.
+        Orientations of each sensor; NaN if missing. World and sensor-to-segment alignment are
+        arbitrary.
     """
     found = []
     for group in chain.sensors:

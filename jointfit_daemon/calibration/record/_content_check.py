@@ -1,7 +1,7 @@
 """Check of the content of a stored calibration: types, shapes, ranges and names.
 
-Invariant: no later code raises an error for a calibration that passed. Models are evaluated,
-because the shapes of their arrays depend on each other.
+Invariant: no other code raises an error for a calibration without faults. The check also evaluates
+the models, because the shapes of their arrays depend on each other.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ _POLYNOMIALS = 10
 _COMPONENTS = {"pair": 3, "joint": 1}
 _HALF = sqrt(0.5)
 _PROBES = ((1.0, 0.0, 0.0, 0.0), (_HALF, _HALF, 0.0, 0.0), (0.5, -0.5, 0.5, 0.5))
-"""Orientations for the evaluation of every model."""
+"""Orientations with which every model is evaluated."""
 
 
 def content_faults(calibration: Calibration) -> list[str]:
-    """Return the faults of a calibration, one phrase each; empty if it can be used."""
+    """Return the faults of a calibration, one phrase each; empty if the calibration is usable."""
     try:
         return list(_faults(calibration))
     except Exception as error:  # noqa: BLE001 - a wrong type may raise any error
@@ -68,7 +68,7 @@ def _faults(c: Calibration) -> Iterator[str]:
 
     yield from _branches(c)
 
-    # Content of each record; names are correct here.
+    # The names are correct at this point, so the content of each record can be checked.
     yield from _sensors(c)
     for name, segment in c.segment.items():
         yield from _segment(name, segment)
@@ -134,11 +134,11 @@ def _segment(name: str, segment: SegmentCalibration) -> Iterator[str]:
 def _wrong_types(model: Any) -> Iterator[str]:
     """Yield the fields of a model whose values do not have the annotated type.
 
-    An evaluation does not use all fields: some apply only after the loss of a sensor.
+    An evaluation does not use all fields, because some apply only after the loss of a sensor.
     """
     for field in fields(model):
         value = getattr(model, field.name)
-        if field.name.startswith("_"):  # derived from other fields
+        if field.name.startswith("_"):  # private fields are derived from other fields
             continue
         if is_dataclass(value):
             yield from (f"{field.name}.{name}" for name in _wrong_types(value))
@@ -179,7 +179,7 @@ def _model(model: SegmentModel, count: int, *, has_other: bool) -> str | None:
 
 
 def _quality(quality: Mapping[str, Any]) -> Iterator[str]:
-    """Check the figures that the program evaluates; other figures are published unchanged."""
+    """Check the quality figures that the program uses; others are published unchanged."""
     for key, section in quality.items():
         if not (section is None or isinstance(section, dict)):
             yield f"quality.{key}: expected a table"

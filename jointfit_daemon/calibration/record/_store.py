@@ -1,13 +1,13 @@
 """Versioned store of calibrations: atomic writes, checksums, and quarantine of damaged files.
 
-Invariant: a stored version never changes, and a reader finds a complete file or none. The text is
-written to a temporary file, flushed to the medium and linked under its number; linking fails if the
-number exists. The directory is flushed last. After an interruption at any point the previous
-version is in force.
+Invariant: a stored version never changes, and a reader never finds an incomplete file. The text is
+written to a temporary file, flushed to the storage medium, and linked under the number of the
+version. Linking fails if the number exists. The directory is flushed last. After an interruption at
+any point the previous version is the newest.
 
 A file is ``{"sha256": …, "calibration": {…}}``; the checksum is computed from the calibration as
-JSON with sorted keys and without whitespace. A file with unusable content is renamed to ``….bad``,
-so that its number stays reserved, and is never deleted.
+JSON with sorted keys and without whitespace. A file with unusable content is renamed to ``….bad``
+and never deleted, so that its number is not used again.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MOST_BYTES = 64 * 1024 * 1024
-"""Size of the largest file that is read; a calibration of four sensors has about 1 MB."""
+"""Size of the largest file that is read. A calibration of four sensors has about 1 MB."""
 LAST_VERSION = 999_999_999
-"""Largest version number: file names of more than nine digits are not read."""
+"""Largest version number. File names with more than nine digits are not read."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP)
 _NUMBERED = re.compile(r"(\d{4,9})\.json")
 _TAKEN = re.compile(r"(\d{4,9})\.json(\.bad\d*)?")
@@ -44,7 +44,7 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 class CalibrationFileError(Exception):
-    """A stored file is damaged or of another program; the message names the file and the remedy."""
+    """A stored file is damaged or is not a calibration; the message contains file and remedy."""
 
 
 class _DamagedFileError(CalibrationFileError):
@@ -58,23 +58,24 @@ class StoredCalibration:
     calibration: Calibration
     version: int
     notes: tuple[str, ...] = ()
-    """Newer versions that could not be read, one sentence each."""
+    """One sentence for each newer version that could not be read."""
 
 
 class CalibrationStore:
-    """The versions of one name in one directory: ``DIRECTORY/NAME/0001.json`` and so on.
+    """The versions of one name in one directory, ``DIRECTORY/NAME/0001.json`` and so on.
 
     Parameters
     ----------
     directory : Path
-        Usually ``$STATE_DIRECTORY/calibrations``; created by the first write.
+        Directory of the store, usually ``$STATE_DIRECTORY/calibrations``. The first write creates
+        it.
     name : str
         Name of the subject or session: letters, digits, ``. _ -``, starting with a letter or digit.
 
     Raises
     ------
     ValueError
-        The name has other characters.
+        The name contains other characters.
     """
 
     def __init__(self, directory: Path, name: str) -> None:
@@ -93,7 +94,7 @@ class CalibrationStore:
         return sorted(int(match[1]) for match in found if match)
 
     def path(self, version: int) -> Path:
-        """Return the path of a version, existing or not."""
+        """Return the path of a version, which need not exist."""
         return self._directory / f"{version:04d}.json"
 
     def save(self, calibration: Calibration) -> int:
@@ -102,7 +103,8 @@ class CalibrationStore:
         Raises
         ------
         OSError
-            The medium is full, read-only or missing, or `LAST_VERSION` is used; nothing changed.
+            The medium is full, read-only or missing, or `LAST_VERSION` exists. The store is then
+            unchanged.
         """
         self._directory.mkdir(parents=True, exist_ok=True)
         text = calibration_text(calibration)
@@ -151,14 +153,14 @@ class CalibrationStore:
         Raises
         ------
         CalibrationFileError
-            No such version, or the file is damaged.
+            The version does not exist, or its file is damaged.
         """
         path = self.path(version)
         if not path.exists():
             known = ", ".join(map(str, self.versions())) or "none"
             raise CalibrationFileError(f"{path}: no such version; stored: {known}")
 
-        # A file that cannot be read may be readable later; one with unusable content never is.
+        # A file with a read error may be readable later; a file with unusable content never is.
         try:
             data = read_bounded(path, MOST_BYTES)
         except MalformedFileError as error:
@@ -179,7 +181,7 @@ class CalibrationStore:
         Raises
         ------
         CalibrationFileError
-            There are versions, but none can be read.
+            Versions exist, but none can be read.
         """
         notes: list[str] = []
         for version in reversed(self.versions()):
@@ -195,7 +197,7 @@ class CalibrationStore:
         return None
 
     def _set_aside(self, version: int) -> str:
-        """Rename a damaged version, so that it is reported once; return the outcome."""
+        """Rename a damaged version, so that it is reported once; return a text on the outcome."""
         path = self.path(version)
         for count in range(1, 100):
             aside = path.with_name(f"{path.name}.bad{count if count > 1 else ''}")
@@ -209,32 +211,32 @@ class CalibrationStore:
 
 
 def calibration_text(calibration: Calibration) -> str:
-    """Return the content of the file of a stored calibration; `calibration_of` reads it."""
+    """Return the text of the file of a calibration; `calibration_of` is the inverse."""
     content = calibration.to_dict()
     table = {"sha256": checksum(content), "calibration": content}
     return json.dumps(table, allow_nan=False, indent=1) + "\n"
 
 
 def checksum(content: Mapping[str, object]) -> str:
-    """Return the SHA-256, in hex, of the JSON form of a calibration, independent of its layout."""
+    """Return the SHA-256, in hex, of the canonical JSON form of a calibration."""
     text = json.dumps(content, allow_nan=False, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def calibration_of(table: object) -> Calibration:
-    """Return the calibration in the JSON value of a file: a stored version, or a bare calibration.
+    """Return the calibration in the JSON value of a file, which may lack the checksum.
 
     Raises
     ------
     ValueError, RecursionError
-        The content cannot be used; includes `CalibrationSchemaError`.
+        The content cannot be used. `CalibrationSchemaError` is a ValueError.
     """
     content = None
     if isinstance(table, dict):
         content = table if "schema" in table else table.get("calibration")
     if not isinstance(table, dict) or not isinstance(content, dict):
         raise ValueError("expected a table with sha256 and calibration")  # noqa: TRY004 - file content
-    # A bare calibration has no checksum: `jointfit fuse fit` writes it.
+    # A file by `jointfit fuse fit` contains only the calibration, without a checksum.
     if content is not table and table.get("sha256") != checksum(content):
         raise ValueError("the checksum differs: the file was damaged or edited")
     if fault := find_structure_fault(content):

@@ -1,4 +1,4 @@
-"""Digest of the trials of a calibration: names, time stamps and values."""
+"""Digest of the names, time stamps and values in the trials of a calibration."""
 
 from __future__ import annotations
 

@@ -6,10 +6,11 @@ of one segment are therefore modeled as
 
 .. math:: m_i = \tau_i + c + d_i + n_i ,
 
-with the noise n of the fit, the artefact d of each sensor, and the artefact c of the markers,
-common to all sensors. The lags of the align phase, measured on a plate without soft tissue, are
-combined with them by precision. A sensor with a known lag thus determines c, and through c the lag
-of a neighbor that was not on the plate. Lags that are too uncertain are absent.
+where :math:`\tau_i` is the true lag of sensor i, n the noise of the fit, d the bias from the soft
+tissue of each sensor, and c the bias from the soft tissue of the markers, common to all sensors.
+The lags of the align phase were measured on a plate without soft tissue. The two kinds of lags are
+weighted by their precision. A sensor with a known lag thus determines c, and c improves the lag of
+a neighbor that was not on the plate. Lags that are too uncertain are absent.
 """
 
 from __future__ import annotations
@@ -37,19 +38,22 @@ PLATE = LagSettings(
     min_acceleration=radians(60),
     min_valid=0.5,
 )
-"""Limits of the lag estimate on a rigid plate, where only noise and occlusion disturb it.
-
-The defaults of `LagSettings` are the limits for live tracking."""
+"""Limits of the lag estimate on a rigid plate, where only noise and occlusion cause errors. The
+defaults of `LagSettings` are the limits for live tracking.
+"""
 SKIN = replace(PLATE, max_sigma_ns=5e6, min_r2=0.7, min_weight=0.5)
-"""Limits of the lag estimate on skin: R² is lower; 5 ms at 3 rad/s is still below 1°."""
+"""Limits of the lag estimate on skin, where R² is lower. An error of 5 ms at 3 rad/s is still below
+1°.
+"""
 
 SENSOR_TISSUE_SD_NS = 2e6
 """Standard deviation of the lag due to soft tissue under a sensor, ns."""
 MARKER_TISSUE_SD_NS = 3e6
 """Standard deviation of the lag due to soft tissue under the markers of a segment, ns."""
 MAX_PRIOR_DEVIATION = 4.0
-"""Difference of the lags on plate and in movement, in standard deviations, above which a clock or
-filter changed in between; the later lag is used."""
+"""Difference between the lags on the plate and in the movement, in standard deviations, above which
+a clock or filter must have changed. The later lag is then used.
+"""
 
 
 class SensorLag(NamedTuple):
@@ -59,8 +63,9 @@ class SensorLag(NamedTuple):
     sigma_ns: float | None
     """Standard deviation, ns; None if unknown."""
     source: str
-    """``known``, ``plate``, ``movement``, ``plate and movement``, ``tracked``, ``stored`` or
-    ``none``."""
+    """Source of the lag: ``known`` (configured), ``plate``, ``movement``, ``plate and movement``,
+    ``tracked``, ``stored`` or ``none``.
+    """
 
 
 NO_LAG = SensorLag(0, None, "none")
@@ -77,15 +82,15 @@ def segment_lags(
     Parameters
     ----------
     moving : mapping
-        Lags measured in the movement; rejected ones are ignored.
+        Lags measured in the movement; rejected estimates are ignored.
     prior : mapping
-        Lag and standard deviation, ns, of the align phase, for any of the sensors.
+        Lag and standard deviation from the align phase, ns, by sensor; sensors may be absent.
 
     Returns
     -------
     dict
-        Sensors without either lag are absent. A lag from movement alone that is below its standard
-        deviation is noise and is absent, too.
+        Lag by sensor. Sensors without either lag are absent. A lag from movement alone that is
+        below its standard deviation is considered noise and is also absent.
     """
     names = [name for name, lag in moving.items() if lag.refused is None]
     alone = {n: SensorLag(lag, sd, "plate") for n, (lag, sd) in prior.items() if n not in names}
@@ -94,7 +99,7 @@ def segment_lags(
     found = np.array([moving[name].lag_ns for name in names])
     sigma = np.array([moving[name].sigma_ns for name in names])
 
-    # Prior lags that agree with the movement.
+    # Only prior lags that agree with the movement are used.
     trusted = {
         name: prior[name]
         for name, lag, own in zip(names, found, sigma, strict=True)
@@ -104,7 +109,7 @@ def segment_lags(
         * hypot(own, prior[name][1], SENSOR_TISSUE_SD_NS, MARKER_TISSUE_SD_NS)
     }
 
-    # Precision-weighted combination, equation above.
+    # Precision-weighted combination by the equation in the docstring.
     weight = np.array([trusted[n][1] ** -2.0 if n in trusted else 0.0 for n in names])
     prior_ns = np.array([trusted[n][0] if n in trusted else 0.0 for n in names])
     inverse = np.linalg.inv(np.diag(sigma**2 + SENSOR_TISSUE_SD_NS**2) + MARKER_TISSUE_SD_NS**2)
@@ -121,7 +126,7 @@ def segment_lags(
 
 
 def tracked_lags(tracked: Mapping[str, tuple[float, float]]) -> dict[str, SensorLag]:
-    """Return lags tracked at run time, with the uncertainty of soft tissue added."""
+    """Return lags tracked at run time; their uncertainty is increased by that of soft tissue."""
     return {
         name: SensorLag(
             round(lag), hypot(sigma, SENSOR_TISSUE_SD_NS, MARKER_TISSUE_SD_NS), "tracked"
@@ -141,9 +146,9 @@ def sensor_lags(
     Parameters
     ----------
     t_ns, q : ndarray, shapes (m,), (m, 4)
-        The optical body; NaN if not visible.
+        Time stamps, ns, and orientations of the optical body; NaN if not visible.
     sensors : mapping
-        Sensors fixed to that body.
+        Sensors that are fixed to the optical body.
     """
     if not visible(q).any():
         return {}

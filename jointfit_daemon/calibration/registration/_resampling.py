@@ -1,4 +1,4 @@
-"""Orientations interpolated to other instants. Gaps are not bridged: NaN means unknown."""
+"""Orientations interpolated to other instants. Long gaps are not bridged and result in NaN."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ if TYPE_CHECKING:
 
 
 MAX_GAP_SAMPLES = 3.5
-"""Widest interpolated gap, in median sample periods: two missing samples are bridged, three are
-not."""
+"""Widest interpolated gap, in median sample periods. Two missing samples are bridged, but not
+three.
+"""
 
 
 def orientations_at(t_ns: NDArray[np.int64], q: Array, at_ns: NDArray[np.int64]) -> Array:
@@ -36,7 +37,7 @@ def orientations_at(t_ns: NDArray[np.int64], q: Array, at_ns: NDArray[np.int64])
     Returns
     -------
     ndarray, shape (m, 4)
-        NaN outside the track and inside gaps.
+        Orientations; NaN outside the track and inside gaps.
     """
     good = visible(q)
     t, q = t_ns[good], q[good]

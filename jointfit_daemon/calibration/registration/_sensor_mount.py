@@ -2,10 +2,12 @@ r"""Sensor-to-segment and world-to-world alignment of one sensor.
 
 .. math:: q_{ref,i} = q_W \otimes q_{s,i} \otimes q_B
 
-The problem is solved by linear algebra of 4x4 matrices; parameters that the movement does not
-excite are detected and not estimated. The full and the heading-only problem apply to sensors on a
-rigid plate. Skin-mounted sensors move with soft tissue; the fit takes this motion for a rotation of
-the world and is wrong by tens of degrees at other headings of the subject.
+q_ref is the orientation of the body, q_s the orientation of the sensor, q_W the rotation of the
+sensor's world, and q_B the sensor-to-segment alignment. The problem is solved with linear algebra
+of 4x4 matrices. Parameters that the movement does not excite are detected and not estimated. The
+full and the heading-only problem apply to sensors on a rigid plate. Skin-mounted sensors move with
+soft tissue. The fit would attribute this motion to a rotation of the world, with errors of tens of
+degrees at other headings of the subject.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ MAX_KAPPA_FULL = 0.95
 MAX_KAPPA_HEADING = 0.98
 """Largest kappa of an accepted heading alignment."""
 MAX_WEAK_ERROR = np.deg2rad(1.0)
-"""Largest standard error of the weakest direction of the full problem, rad."""
+"""Largest standard error in the least observable direction of the full problem, rad."""
 _SAME = 1e-9
 """Singular values with a smaller relative difference are equal."""
 
@@ -48,27 +50,28 @@ class SensorAlignment:
 
     kind: AlignmentKind
     q_world: Array
-    """q_optical_sensorworld, shape (4,); the identity for kind ``mount``."""
+    """Rotation q_optical_sensorworld, shape (4,); the identity for kind ``mount``."""
     q_mount: Array
-    """q_sensor_body, shape (4,)."""
+    """Sensor-to-segment alignment q_sensor_body, shape (4,)."""
     kappa: float
-    """Second over first singular value; 0 for kind ``mount``.
-
-    At 1 the rotation of the world and the sensor-to-segment alignment cannot be distinguished."""
+    """Ratio of the second to the first singular value; 0 for kind ``mount``. At 1 the rotation of
+    the world and the sensor-to-segment alignment cannot be distinguished.
+    """
     weak_error: float
-    """Standard error of the weakest direction, rad; inf where it is unobservable."""
+    """Standard error in the least observable direction, rad; inf if the direction is unobservable.
+    """
     residual_rms: float
-    """RMS angle between model and reference, rad, all frames."""
+    """RMS angle between model and reference over all frames, rad."""
     residual_scale: float
-    """Robust scale of the residual angles, rad; insensitive to outliers."""
+    """Robust scale of the residual angles, rad, which is insensitive to outliers."""
     refused: tuple[str, ...] = ()
-    """Reasons for rejecting each richer kind of alignment."""
+    """Reasons why the kinds with more parameters were rejected."""
 
 
 def fit_observable_alignment(
     q_world_sensor: ArrayLike, q_optical_body: ArrayLike
 ) -> SensorAlignment:
-    """Return the richest alignment that the movement supports: full, else heading, else mount only.
+    """Return the alignment with the most parameters that the movement determines.
 
     Parameters
     ----------
@@ -76,7 +79,7 @@ def fit_observable_alignment(
         Sensor orientations in the world of the sensor.
     q_optical_body : array_like, shape (n, 4)
         Orientations of the body to which the sensor is attached, at the same instants. Rows with
-        NaN in either are ignored.
+        NaN in either array are ignored.
 
     Raises
     ------
@@ -105,13 +108,15 @@ def fit_observable_alignment(
 def fit_sensor_alignment(
     kind: AlignmentKind, q_world_sensor: ArrayLike, q_optical_body: ArrayLike
 ) -> SensorAlignment:
-    r"""Fit one kind of alignment by robust least squares, without accepting or rejecting it.
+    r"""Fit one kind of alignment by robust least squares, without a check of its quality.
 
-    With :math:`b = q_B` and :math:`v = q_W^*` the model reads :math:`L(q_s) b = \pm R(q_{ref}) v`.
-    The sum of squared differences over unit b and v is smallest at the first singular vectors of
-    :math:`M = \sum w_i s_i L(q_{s,i})^T R(q_{ref,i})`. Signs s and Huber weights w are iterated.
-    For ``heading`` only the columns w and z of M are used. For ``mount`` q_W = 1 and q_B is a
-    robust mean. Source: the quaternion form of AX = YB, Zhuang, Roth and Sudhakar 1994.
+    With :math:`b = q_B` and :math:`v = q_W^*` the model is :math:`L(q_s) b = \pm R(q_{ref}) v`. L
+    and R are the matrices of a quaternion product with the argument as left and right factor. The
+    sum of squared differences over unit b and v is smallest at the first singular vectors of
+    :math:`M = \sum w_i s_i L(q_{s,i})^T R(q_{ref,i})`. The signs s and the Huber weights w are
+    computed iteratively. For ``heading`` only the columns w and z of M are used. For ``mount`` q_W
+    = 1 and q_B is a robust mean. Source: the quaternion form of AX = YB, Zhuang, Roth and Sudhakar
+    1994.
 
     Raises
     ------
@@ -131,8 +136,8 @@ def fit_sensor_alignment(
 
     T = np.swapaxes(rotation.left_matrix(q_s), -1, -2) @ rotation.right_matrix(q_ref)
 
-    # Two initial guesses of the signs: from continuity in time, which outliers break, and from
-    # the similarity of the T_i.
+    # The fit starts from two guesses of the signs. One uses continuity in time, which outliers
+    # interrupt. The other uses the similarity of the T_i.
     steady = np.where(np.sum(rotation.continuous(q_s) * q_s, axis=1) < 0.0, -1.0, 1.0)
     steady *= np.where(np.sum(rotation.continuous(q_ref) * q_ref, axis=1) < 0.0, -1.0, 1.0)
     flat = T.reshape(len(T), 16)
@@ -170,7 +175,7 @@ def _decompose(kind: AlignmentKind, T: Array, signed_weights: Array) -> tuple[Ar
 
 
 def _columns(kind: AlignmentKind) -> list[int]:
-    """Return the free components of v: a rotation about the vertical has no x and y."""
+    """Return the free components of v; a rotation about the vertical has no x and y."""
     return [0, 3] if kind == "heading" else [0, 1, 2, 3]
 
 
@@ -186,7 +191,7 @@ def _judged(
     residuals = rotation.log(rotation.multiply(rotation.conjugate(model), q_ref))
     angles = np.linalg.norm(residuals, axis=1)
     rms, scale = float(np.sqrt(np.mean(angles**2))), robust_scale(angles)
-    # Outliers have small weights in the fit, so they have small weights in its error, too.
+    # Outliers have small weights in the fit, and therefore also in its standard error.
     weights = huber_weights(angles, scale)
     weighted_rms = float(np.sqrt(np.sum(weights**2 * angles**2) / np.sum(weights)))
     apart = effective_count(residuals * weights[:, None]) * (1.0 - kappa)

@@ -1,6 +1,7 @@
-"""Robust mean orientation in the static pose, and its acceptance.
+"""Robust mean orientation in the static pose, and the check whether it is accepted.
 
-Re-donning changes only this mean: all other calibrated quantities are in bone-aligned coordinates.
+Re-donning a sensor changes only this mean, because all other calibrated quantities are in
+bone-aligned coordinates.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class RobustMean:
     """Mean rotation with its scatter."""
 
     q: NDArray[np.float64]
-    """The mean, shape (4,), unit, w >= 0."""
+    """Mean as a unit quaternion with w >= 0, shape (4,)."""
     spread: float
     """Robust scale of the angles to the mean, rad."""
 
@@ -52,9 +53,9 @@ class StaticLimits:
 def robust_mean(q: ArrayLike, weights: ArrayLike | None = None) -> RobustMean:
     r"""Return the mean rotation of noisy orientations, with Huber weights against outliers.
 
-    Iterates the largest eigenvector of :math:`M = \sum w_i q_i q_i^T` (Markley et al. 2007) with
-    :math:`w_i = w_{0,i} \min(1, 1.5 s / e_i)`, where e_i is the angle to the mean and s its robust
-    scale. Quaternion signs have no influence.
+    The mean is computed iteratively as the largest eigenvector of :math:`M = \sum w_i q_i q_i^T`
+    (Markley et al. 2007) with :math:`w_i = w_{0,i} \min(1, 1.5 s / e_i)`, where e_i is the angle to
+    the mean and s its robust scale. The signs of the quaternions have no effect.
 
     Parameters
     ----------
@@ -87,13 +88,13 @@ def robust_mean(q: ArrayLike, weights: ArrayLike | None = None) -> RobustMean:
 
 
 def component_mean(q: ArrayLike) -> RobustMean:
-    r"""Return the normalized mean of the components of orientations, as the patent averages them.
+    r"""Return the normalized mean of the components of orientations, as in the patent.
 
     .. math:: \bar q = \sum s_i q_i \,/\, \lVert \sum s_i q_i \rVert, \qquad s_i = \pm 1
 
-    with signs that give every quaternion a non-negative product with the first. The mean bias of
-    step S2, :math:`\overline{q_i^* \otimes q_O}`, equals :math:`\bar q^* \otimes q_O`, because the
-    product is linear. Its norm has no effect on the regression that follows.
+    The signs :math:`s_i` make the product of every quaternion with the first non-negative. The mean
+    bias of step S2, :math:`\overline{q_i^* \otimes q_O}`, equals :math:`\bar q^* \otimes q_O`,
+    because the product is linear. Its norm has no effect on the regression that follows.
 
     Parameters
     ----------
@@ -121,15 +122,17 @@ def static_mount(
 
     .. math:: b_i = q_{s,i}^* \otimes q_{O,i}
 
-    and their robust mean; in motion ``q_world_segment = multiply(q_world_sensor, mount)``.
-    Source: the static step of the patent, with a rotation mean instead of its component-wise mean.
+    The result is the robust mean of :math:`b_i`. In motion ``q_world_segment =
+    multiply(q_world_sensor, mount)``. The source is the static step of the patent; a rotation mean
+    replaces the component-wise mean of the patent.
 
     Parameters
     ----------
     q_world_sensor : array_like, shape (n, 4)
         Frames of the static pose only.
     q_world_segment : array_like, shape (n, 4) or (4,)
-        Segment orientation in the same world: the identity in the static world, or the optical one.
+        Segment orientation in the same world. It is the identity in the static world, or the
+        orientation from the optical system.
     """
     return robust_mean(rotation.multiply(rotation.conjugate(q_world_sensor), q_world_segment))
 
@@ -137,7 +140,7 @@ def static_mount(
 def static_problems(
     means: Mapping[str, RobustMean], still_s: float, limits: StaticLimits | None = None
 ) -> tuple[str, ...]:
-    """Return the reasons for rejecting a static pose, one sentence each; empty if it is accepted.
+    """Return the reasons for rejecting a static pose, one sentence each, or none if accepted.
 
     Parameters
     ----------
@@ -169,7 +172,7 @@ def redonning_notes(
     after: Mapping[str, ArrayLike],
     segments: Mapping[str, Sequence[str]],
 ) -> tuple[str, ...]:
-    """Return the sensors of one segment that moved differently between two static poses.
+    """Return notes on the sensors of a segment that moved differently between two static poses.
 
     The change of a mount in segment axes is ``before* after``. For sensors that were not taken off,
     this change equals the change of the pose.
@@ -184,7 +187,7 @@ def redonning_notes(
     found = []
     for segment, sensors in segments.items():
         known = [s for s in sensors if s in before and s in after]
-        # The mount maps segment to sensor, so a change of the segment is on its right-hand side.
+        # The mount is q_sensor_segment, so a change of the segment multiplies it on the right.
         changes = [rotation.multiply(rotation.conjugate(before[s]), after[s]) for s in known]
         for sensor, change in zip(known[1:], changes[1:], strict=True):
             apart = float(rotation.angle_between(changes[0], change))

@@ -1,7 +1,7 @@
 """Detection of rest from live orientations.
 
-Time is the time of the samples. Only relative rotations are used, so an arbitrary heading has no
-influence.
+The detector uses the timestamps of the samples. It uses only relative rotations, so an arbitrary
+heading has no effect.
 """
 
 from __future__ import annotations
@@ -22,17 +22,18 @@ STEP_NS = 50_000_000
 LONGEST_PAUSE_NS = WINDOW_NS // 4
 """Longest pause in the data within a window, ns."""
 MAX_ROTATION = radians(1.0)
-"""Largest rotation from the first step of a window to any later step, rad: three times the noise of
-a sensor on a table."""
+"""Largest rotation from the first step of a window to any later step, rad. The limit is three times
+the noise of a sensor on a table.
+"""
 
 
 class StillnessMonitor:
     """Detects from live samples whether one sensor was at rest for a complete window.
 
-    A window is at rest if the rotation from its first step to every later one is below the limit. A
-    step is the mean of its samples, so that white noise of a third of a degree is not a movement.
+    A window is at rest if the rotation from its first step to every later step is below the limit.
+    A step is the mean of its samples, so that white noise of a third of a degree is not a movement.
     The window ends with the last complete step, so a movement is detected at most one step late. A
-    pause in the data or time running backwards starts a new window.
+    pause in the data or a decreasing timestamp starts a new window.
     """
 
     def __init__(self) -> None:
@@ -53,7 +54,7 @@ class StillnessMonitor:
             self._began_ns, self._sum = t_ns, q
             self._calm = self._is_at_rest(t_ns)
         else:
-            # The sum of a step, with equal signs of all quaternions.
+            # The quaternions of a step are summed with equal signs.
             w, x, y, z = self._sum
             sign = -1.0 if w * q[0] + x * q[1] + y * q[2] + z * q[3] < 0.0 else 1.0
             self._sum = (w + sign * q[0], x + sign * q[1], y + sign * q[2], z + sign * q[3])

@@ -1,4 +1,4 @@
-"""Fit of the aligned mean: world, sensor-to-segment alignment and weight of each sensor."""
+"""Fit of the aligned mean, with world, sensor-to-segment alignment and weight of each sensor."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from jointfit_daemon.limb_model import AlignedModel
 def fit_aligned(training: SegmentTraining) -> AlignedModel:
     """Return the mean of aligned sensors, weighted by their residual errors.
 
-    Robot-world and hand-eye calibration with known verticals (`fit_sensor_alignment`) for each
-    sensor, then the eigenvector mean of Markley et al. 2007.
+    Each sensor is aligned by a robot-world and hand-eye calibration with known verticals
+    (`fit_sensor_alignment`). The mean is the eigenvector mean of Markley et al. 2007.
     """
     sd = held_out_sd(training, lambda part, test: _aligned(part, 0.0).predict(test.sensors))
     return _aligned(training, sd)

@@ -3,9 +3,9 @@ r"""Correlation of the errors of two neighboring segments about the flexion axis
 .. math:: \rho = \frac{\sum_i e_{1i} e_{2i}}{\sqrt{\sum_i e_{1i}^2 \sum_i e_{2i}^2}}, \qquad
           \sigma_{flexion}^2 = \sigma_1^2 + \sigma_2^2 - 2 \rho\, \sigma_1 \sigma_2
 
-with e the residual of each segment about its x axis on held-out frames. Both models use the same
-joint rotation, so their errors are correlated, mostly negatively. Without data, errors are taken as
-independent.
+where e is the residual of each segment about its x axis on held-out frames. Both models use the
+same joint rotation, so their errors are correlated, mostly negatively. Without data the errors are
+assumed to be independent.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain
 
 MOST = 0.9
-"""Limit of the absolute correlation: perfectly correlated errors are implausible."""
+"""Limit of the absolute correlation, because perfectly correlated errors are implausible."""
 
 
 def joint_error_correlations(
@@ -41,7 +41,7 @@ def joint_error_correlations(
         return {}
     found = {}
     for joint in inner_joints(chain):
-        # Sensors of each segment, mean of its neighbor, and its reference.
+        # For each segment: its sensors, the mean of its neighbor, and its reference.
         columns = [
             [
                 *(training.sensors[name] for name in chain.sensors[k]),

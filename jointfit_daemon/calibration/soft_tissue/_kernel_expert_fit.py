@@ -1,4 +1,4 @@
-"""Fit of one kernel expert: width and penalties from held-out groups."""
+"""Fit of one kernel expert, whose width and penalties are determined by held-out groups."""
 
 from __future__ import annotations
 
@@ -27,12 +27,13 @@ if TYPE_CHECKING:
 HULL_QUANTILE = 0.995
 """Quantile of the training leverage that defines the training range."""
 WIDTHS = (0.35, 0.5, 0.8)
-"""Candidate kernel widths, rad: the distance over which joint rotations and tilts are
-correlated."""
+"""Candidate kernel widths, rad. The width is the distance over which joint rotations and tilts are
+correlated.
+"""
 MOST_CENTERS = 24
-"""Largest number of bump centers."""
+"""Largest number of kernel centers (bumps)."""
 NEAREST_CENTERS = 0.01
-"""Squared distance between centers, in kernel widths, below which they are redundant."""
+"""Squared distance between two centers, in squared kernel widths, below which one is redundant."""
 
 
 class Fitted(NamedTuple):
@@ -46,24 +47,25 @@ class Fitted(NamedTuple):
 
 
 def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) -> Fitted:
-    """Fit one expert; its width has the smallest squared error on held-out groups.
+    """Fit one expert with the width that has the smallest squared error on held-out groups.
 
-    Penalties are stacked once for each grouping, and the resulting fits are averaged: whole trials
-    measure generalization to another movement, blocks in time generalization within one.
+    Penalties are combined by stacking once for each grouping, and the resulting fits are averaged.
+    Whole trials as groups measure the generalization to another movement; blocks in time measure
+    the generalization within a movement.
 
     Parameters
     ----------
     u : ndarray, shape (n, 3 m + 3)
-        Relative rotations, then tilts.
+        Regressors: relative rotations, then tilts.
     rho : ndarray, shape (n, 3)
         Target corrections, rad.
     ways : sequence of sequence of ndarray of bool, shape (n,)
-        Groupings of the frames, each a sequence of held-out masks.
+        Groupings of the frames. Each grouping is a sequence of masks, one for each held-out group.
     """
     seen = u if tilted else u[:, : 3 * sensors]
     smooth = smooth_terms(seen)
 
-    # Width with the smallest held-out error.
+    # Select the width with the smallest held-out error.
     best = None
     for width in WIDTHS:
         x = seen / widths_of(width, sensors, tilted=tilted)
@@ -77,7 +79,7 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
         raise ValueError("no width to choose")
     _, width, centers, basis, held = best
 
-    # Final fit to all frames with the stacked shares of every grouping.
+    # Fit to all frames, with the shares from the stacking of every grouping.
     C = np.mean([fit(basis, rho, each.shares) for each in held], axis=0)
     leverage = hull(smooth)
     h = np.einsum("ij,jk,ik->i", smooth, leverage, smooth)
@@ -98,7 +100,8 @@ def fit_expert(u: Array, rho: Array, sensors: int, ways: Ways, *, tilted: bool) 
 def spread_centers(x: Array) -> Array:
     """Return frames far from each other and from zero, shape (m, width).
 
-    Farthest-point selection of at most 24 frames: each has the largest distance to all before it.
+    At most 24 frames are selected. Each selected frame has the largest distance to all frames
+    selected before (farthest-point selection).
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Fit of the kernel model: experts, trend and claimed variance from held-out groups."""
+"""Fit of the kernel model, with experts, trend and claimed variance from held-out groups."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
 
 BLOCKS = 3
-"""Number of held-out blocks of a single trial: few and long, so that each contains movement absent
-elsewhere."""
+"""Number of held-out blocks of a single trial. Few long blocks are used, so that each contains
+movement that the other blocks do not contain.
+"""
 
 
 def fit_kernel(training: SegmentTraining) -> KernelModel:
@@ -42,13 +43,13 @@ def fit_kernel_with_residuals(training: SegmentTraining) -> tuple[KernelModel, A
     -------
     model : KernelModel
     residuals : ndarray, shape (w n, 3)
-        Residual of every frame with its group held out, rad, segment axes; one grouping after the
-        other.
+        Residual of every frame with its group held out, in segment axes, rad. The w groupings
+        follow each other.
 
     Raises
     ------
     ValueError
-        There is no neighboring segment.
+        The segment has no neighboring segment.
     """
     if training.q_other is None:
         raise ValueError("the kernel model needs a sensor of the neighboring segment")
@@ -58,7 +59,7 @@ def fit_kernel_with_residuals(training: SegmentTraining) -> tuple[KernelModel, A
     rho = rotation.log(rotation.multiply(rotation.conjugate(mean), training.q_reference))
     u = model_inputs(training.sensors, mean, training.q_other)
 
-    # Groupings: blocks in time and, with several trials, whole trials.
+    # The groupings are blocks in time and, with several trials, whole trials.
     ways = [list(training.folds(BLOCKS))]
     if training.movements > 1:
         ways.append([training.trials == label for label in np.unique(training.trials)])
@@ -66,7 +67,7 @@ def fit_kernel_with_residuals(training: SegmentTraining) -> tuple[KernelModel, A
     plain = fit_expert(u, rho, count, ways, tilted=False)
     tilted = fit_expert(u, rho, count, ways, tilted=True)
 
-    # Residuals of held-out frames and their distance from the training range.
+    # Compute the residuals of held-out frames and their distance from the training range.
     lines = [unseen_trend(u, rho, groups) for groups in ways]
     unseen = list(zip(lines, plain.unseen, plain.ratios, tilted.unseen, tilted.ratios, strict=True))
     residuals = [rho - mix_corrections(*each) for each in unseen]

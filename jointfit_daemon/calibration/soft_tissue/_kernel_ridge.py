@@ -1,4 +1,4 @@
-r"""Ridge regression on smooth terms and bumps, with penalties stacked by held-out groups.
+r"""Ridge regression on smooth terms and bumps (kernels); stacking combines the penalties.
 
 .. math:: c_{jp} = \arg\min \sum_i w_{ij} (\rho_{ij} - c_{jp}^T g_i)^2
           + \lambda_p n (|c_{smooth}|^2 + r_p |c_{bumps}|^2), \qquad c_j = \sum_p a_{jp} c_{jp}
@@ -6,9 +6,10 @@ r"""Ridge regression on smooth terms and bumps, with penalties stacked by held-o
 .. math:: a_j = \arg\min_{a \ge 0,\ \sum a \le 1} \sum_i
           \bigl(\rho_{ij} - \sum_p a_p\, \hat\rho_{ijp}\bigr)^2
 
-for every axis j, with predictions of held-out frames (stacking: Breiman 1996). Regressors are not
-centered, because the regression must have no intercept. Shares may sum to less than 1: the part
-that does not generalize to held-out frames is not corrected.
+for every axis j, where p numbers the penalties, g are the regressors and :math:`\hat\rho` the
+predictions of held-out frames (stacking: Breiman 1996). Regressors are not centered, because the
+regression must have no intercept. The shares a may sum to less than 1. The part of the correction
+that does not generalize to held-out frames is then omitted.
 """
 
 from __future__ import annotations
@@ -30,22 +31,23 @@ if TYPE_CHECKING:
     Masks = Sequence[NDArray[np.bool_]]
 
 PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Ridge penalties of the fits whose weighted sum is the model."""
+"""Ridge penalties. The model is the weighted sum of one fit for each penalty."""
 RATIOS = (1.0, 0.1, 10.0)
 """Ratios of the penalty of bumps to the penalty of smooth terms."""
 PASSES = 3
 """Number of reweighting iterations."""
 SMALLEST_SCALE = 1e-3
-"""Constant added to the RMS of each regressor, rad, so that a nearly constant regressor is not
-amplified."""
+"""Constant that is added to the RMS of each regressor, rad, so that a nearly constant regressor is
+not amplified.
+"""
 _JITTER = 1e-6
 """Constant added to the diagonal of a kernel matrix for a stable Cholesky decomposition."""
 _HEAVY = 1e3
 """Relative weight of the row that fixes the sum of the shares."""
 _SMALLEST_SHARE = 1e-3
-"""Share of a penalty below which its fit is omitted from the final sum."""
+"""Share below which the fit of a penalty is omitted from the final sum."""
 _BUMPS_COUNT_AS = 5.0
-"""Number of smooth terms to which the bumps together are equal in scale."""
+"""Number of smooth terms whose total scale equals the scale of all bumps together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +70,7 @@ class Basis:
         smooth : ndarray, shape (n, s)
         raw_bumps : ndarray, shape (n, m)
         at_centers : ndarray, shape (m, m)
-            Bumps evaluated at the centers: the kernel matrix.
+            Kernel matrix: bumps evaluated at the centers.
         """
         s, m = smooth.shape[1], raw_bumps.shape[1]
         back = np.zeros((s + m, s + m))
@@ -76,7 +78,7 @@ class Basis:
         back[:s, :s] = np.diag(1.0 / scales)
         g = smooth / scales
 
-        # Whiten the bumps by the Cholesky root of the kernel matrix.
+        # Whiten the bumps with the Cholesky factor of the kernel matrix.
         if m:
             root = np.linalg.cholesky(at_centers + _JITTER * np.eye(m))
             white = np.linalg.solve(root, raw_bumps.T).T
@@ -93,18 +95,20 @@ class Basis:
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Shares of the penalties for one grouping, with the held-out residuals."""
+    """Shares of the penalties for one grouping, and the residuals of held-out frames."""
 
     shares: Array
-    """Share a of each axis, ratio and penalty, shape (3, ratios, penalties)."""
+    """Share a by axis, ratio and penalty, shape (3, ratios, penalties)."""
     residuals: Array
-    """rho minus prediction of held-out frames, in order of time, rad, shape (n, 3)."""
+    """Difference between rho and its prediction on held-out frames, in order of time, rad, shape
+    (n, 3).
+    """
 
 
 def choose(basis: Basis, rho: Array, groups: Masks) -> HeldOut:
-    """Hold out each group in turn and stack the predictions of all penalties for each axis.
+    """Hold out each group in turn, and combine the predictions of all penalties for each axis.
 
-    One eigendecomposition per group and ratio serves all penalties.
+    One eigendecomposition per group and ratio is sufficient for all penalties.
     """
     predicted = np.empty((len(RATIOS), len(PENALTIES), *rho.shape))
     for held in groups:
@@ -119,7 +123,7 @@ def choose(basis: Basis, rho: Array, groups: Masks) -> HeldOut:
             for j, penalty in enumerate(PENALTIES):
                 predicted[i, j, held] = seen @ (turned / (values + penalty * len(kept))[:, None])
 
-    # Shares of the penalties, axis by axis.
+    # The shares of the penalties are computed for each axis.
     shares, residuals = [], np.empty_like(rho)
     for axis in range(rho.shape[1]):
         A = predicted[:, :, :, axis].reshape(-1, len(rho)).T
@@ -142,7 +146,7 @@ def stacked(predictions: Array, y: Array) -> Array:
     gram = predictions.T @ predictions
     count = len(gram)
     size = np.trace(gram) / count + 1e-12
-    # A slack column of zeros takes the rest of the sum; a heavy row fixes the sum at 1.
+    # A column of zeros is the slack variable. A row with a large weight fixes the sum at 1.
     whole = np.pad(gram, (0, 1)) + _HEAVY * size + _JITTER * size * np.eye(count + 1)
     moment = np.append(predictions.T @ y, 0.0) + _HEAVY * size
     root = np.linalg.cholesky(whole)
@@ -158,7 +162,7 @@ def fit(basis: Basis, rho: Array, shares: Array) -> Array:
 
 
 def _robust(basis: Basis, y: Array, shares: Array) -> Array:
-    """Return the coefficients of one axis, with Huber weights of the residuals of the stack."""
+    """Return the coefficients of one axis, with Huber weights of the combined residuals."""
     g, n = basis.g, len(y)
     taken = [
         (shares[i, j], n * PENALTIES[j] * basis.shape(RATIOS[i]))

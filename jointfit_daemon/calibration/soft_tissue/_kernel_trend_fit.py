@@ -1,7 +1,7 @@
 """Fit of the linear trend that replaces the kernel correction outside the training range.
 
-The trend is the mean of two fits, one without and one with tilt. With few movements, joint rotation
-and tilt are correlated, and neither fit alone generalizes.
+The trend is the mean of two fits, one without and one with tilt. If the training contains few
+movements, joint rotation and tilt are correlated, and neither fit alone generalizes.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ amplified."""
 
 
 def fit_trend(u: Array, rho: Array) -> tuple[Row, Row]:
-    """Return the coefficients about x and y, each of ``[1, u]``, rad per unit.
+    """Return the coefficients of ``[1, u]`` for the axes x and y, rad per unit.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def fit_trend(u: Array, rho: Array) -> tuple[Row, Row]:
 
 
 def unseen_trend(u: Array, rho: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
-    """Return T of every frame from a fit without its group, rad, shape (n, 3)."""
+    """Return the trend of every frame from a fit without its group, rad, shape (n, 3)."""
     found = np.empty_like(rho)
     for held in groups:
         found[held] = trend(fit_trend(u[~held], rho[~held]), u[held])
@@ -54,9 +54,10 @@ def unseen_trend(u: Array, rho: Array, groups: Sequence[NDArray[np.bool_]]) -> A
 
 
 def _axis(u: Array, y: Array, axis: int) -> Row:
-    """Return the coefficients of one axis: the mean of both fits."""
+    """Return the coefficients of one axis, which are the mean of both fits."""
     width = u.shape[1]
-    # The same axis of each further sensor, after the three columns of the joint rotation.
+    # Columns of the same axis for each further sensor, after the three columns of the joint
+    # rotation.
     pairs = list(range(3 + axis, width - TILTS, 3))
     # A rotation about x moves the vertical along y of the segment, and vice versa.
     tilt = width - TILTS + (1 - axis)

@@ -1,4 +1,4 @@
-"""Fit of the claimed variance against the distance from the training range."""
+"""Fit of the claimed variance as a function of the distance from the training range."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ if TYPE_CHECKING:
 
 
 FAR = 1.5
-"""Leverage ratio of a prior observation of the variance: training contains few frames far
-outside."""
+"""Leverage ratio of a prior observation of the variance. The observation is needed, because
+training contains few frames far outside the training range.
+"""
 FAR_FACTOR = 3.0
 """Error of the prior observation relative to the RMS error."""
 FAR_SHARE = 0.1
 """Weight of the prior observation relative to all frames."""
 
 LEAST = 0.15
-"""Lower bound of a and b as a share of the mean square error."""
+"""Lower bound of the coefficients a and b as a fraction of the mean square error."""
 
 PASSES = 5
 """Iterations of the gamma regression."""
@@ -37,7 +38,7 @@ HULL_PENALTY = 1e-2
 """Ridge penalty of the leverage matrix."""
 
 SMALLEST_LEVERAGE = 1e-12
-"""Lower bound of the leverage quantile: a static training movement has no leverage."""
+"""Lower bound of the leverage quantile, for a training movement without motion."""
 
 
 def hull(smooth: Array) -> Array:
@@ -53,9 +54,9 @@ def hull(smooth: Array) -> Array:
 def measure_spread(ratios_of: Sequence[Array], residuals: Sequence[Array]) -> LeverageVariance:
     """Fit the variance as a function of the leverage ratio over all held-out frames.
 
-    Every grouping contributes: blocks of a trial are close to the rest of the trial, whole trials
-    are far from other trials. A prior observation (`FAR`, `FAR_FACTOR`) represents movements absent
-    from all trials.
+    Every grouping contributes to the fit. Blocks of a trial are close to the rest of the trial;
+    whole trials are far from other trials. A prior observation (`FAR`, `FAR_FACTOR`) represents
+    movements that no trial contains.
 
     Parameters
     ----------
@@ -91,7 +92,7 @@ def ratios(smooth: Array, groups: Sequence[NDArray[np.bool_]]) -> Array:
 
 
 def _line(distances: Array, squares: Array, shares: Array) -> tuple[float, float]:
-    """Return a, b of E(square) = a + b max(r - 1/2, 0) by gamma regression in five iterations."""
+    """Return a, b of E(square) = a + b max(r - 1/2, 0), fitted by iterated gamma regression."""
     typical = float(np.mean(squares)) + SMALLEST_VARIANCE
     distances = np.append(distances, FAR)
     squares = np.append(squares, FAR_FACTOR**2 * typical)
@@ -101,7 +102,7 @@ def _line(distances: Array, squares: Array, shares: Array) -> tuple[float, float
     design = np.stack([np.ones_like(beyond), beyond], axis=1)
     from scipy.optimize import nnls  # noqa: PLC0415 - only fits need it, not the running daemon
 
-    # Weights are the inverse of the current variance.
+    # The weights are the inverse of the current variance.
     line = np.array([typical, 0.0])
     for _ in range(PASSES):
         scale = np.sqrt(shares) / (design @ line)

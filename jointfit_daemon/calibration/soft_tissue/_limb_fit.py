@@ -43,8 +43,10 @@ if TYPE_CHECKING:
 METHODS: tuple[Method, ...] = get_args(Method)
 """All fusion methods."""
 MAX_SUBSET_SENSORS = 3
-"""Largest number of sensors on a segment for which every subset gets a model. With more sensors,
-only three kinds of subsets get a model: all sensors, all but one sensor, and each single sensor."""
+"""Largest number of sensors on a segment for which every subset has a model. With more sensors,
+only three kinds of subsets have a model: all sensors, all sensors except one, and each single
+sensor.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +73,7 @@ class LimbTraining:
 
 
 def sensor_sets(sensors: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Return the sets of sensors of one segment that get a model, largest first."""
+    """Return the sets of sensors of one segment for which a model is fitted, largest first."""
     n = len(sensors)
     sizes = range(n, 0, -1) if n <= MAX_SUBSET_SENSORS else (n, n - 1, 1)
     return [alive for size in sizes for alive in combinations(sensors, size)]
@@ -80,10 +82,11 @@ def sensor_sets(sensors: tuple[str, ...]) -> list[tuple[str, ...]]:
 def fit_models(
     chain: Chain, training: LimbTraining, method: Method
 ) -> dict[str, dict[str, SegmentModel]]:
-    """Fit a model of each segment for every set of its sensors and of its neighbor.
+    """Fit a model of each segment for every set of its own sensors and of its neighbor's sensors.
 
-    Without a neighbor, ``anchored`` reduces to the weighted mean. The other methods do not use the
-    neighbor, so each set of sensors has the same model under every key.
+    Without a neighbor, ``anchored`` is equal to the weighted mean. The other methods do not use the
+    neighbor. Their model of a set of sensors is therefore the same for every set of neighbor
+    sensors.
     """
     out: dict[str, dict[str, SegmentModel]] = {}
     for i, segment in enumerate(chain.segments):
@@ -108,8 +111,9 @@ def fit_verified_models(
 ) -> dict[str, dict[str, SegmentModel]]:
     """Fit one model of each segment, for all its sensors, to the first part of a trial.
 
-    Source: step S4 of the patent, which substitutes the coefficients that were fitted to one part
-    of the data and verified on the rest. It defines no output for a part of the sensors.
+    The source is step S4 of the patent, which uses the coefficients that were fitted to one part of
+    the data and verified on the rest. The patent defines no output if some of the sensors are
+    missing.
     """
     first, _ = _parts(training, share)
     return {
@@ -138,7 +142,7 @@ def evaluate_methods(
     Parameters
     ----------
     method, procedure
-        Method and procedure of the calibration; the result contains both names.
+        Names of the method and procedure of the calibration, which the result contains.
     """
     first, last = _parts(training, share)
     truth = [last.reference[segment] for segment in chain.segments]
@@ -191,7 +195,7 @@ def regression_quality(
     models: Mapping[str, Mapping[str, SegmentModel]],
     share: float,
 ) -> dict[str, RegressionQuality] | None:
-    """Return the coefficients of every segment for all its sensors; None for other methods.
+    """Return the regression coefficients of every segment; None if the method has none.
 
     The patent fits one part of the data and verifies the coefficients on the rest. The verified
     coefficients equal the coefficients of `evaluate_methods`. The stored coefficients are fitted to
@@ -237,7 +241,7 @@ def fit_all_sensors(chain: Chain, i: int, method: Method, training: LimbTraining
 
 
 def predict_all_sensors(chain: Chain, i: int, model: SegmentModel, frames: LimbTraining) -> Array:
-    """Return the orientation of segment i by such a model, shape (n, 4)."""
+    """Return the orientation of segment i by the model of `fit_all_sensors`, shape (n, 4)."""
     sensors = [frames.sensors[s] for s in chain.sensors[i]]
     return model.predict(sensors, _neighbor_mean(chain, i, frames))
 
@@ -259,8 +263,8 @@ def flexion_error(
 ) -> float:
     """Return the RMS flexion error of a joint, rad, from its proximal and distal segments.
 
-    In the conventions ``elevation`` and ``tilt_torsion``, it is the error of the elevation: the
-    flexion of a shoulder is not defined at 90 degrees of abduction.
+    In the conventions ``elevation`` and ``tilt_torsion``, the result is the error of the elevation,
+    because the flexion of a shoulder is not defined at 90 degrees of abduction.
     """
     raised = convention in {AngleConvention.ELEVATION, AngleConvention.TILT_TORSION}
     angle = _elevation if raised else _flexion

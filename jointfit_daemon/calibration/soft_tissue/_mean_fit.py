@@ -1,4 +1,4 @@
-"""Fits of the weighted mean: equal weights, the best single sensor, weights by error."""
+"""Fits of the weighted mean, with equal weights, one best sensor, or weights from errors."""
 
 from __future__ import annotations
 
@@ -19,11 +19,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _SMALLEST_VARIANCE = 1e-12
-"""Lower bound of an error variance, rad²: a sensor equal to the reference gets a finite weight."""
+"""Lower bound of an error variance, rad², so that a sensor equal to the reference has a finite
+weight.
+"""
 
 
 def fusion_weights(sensors: Sequence[Array], q_reference: Array) -> Array:
-    """Return weights 1 / mean(e²), normalized to sum 1, with e the angle to the reference.
+    """Return weights 1 / mean(e²), normalized to sum 1, where e is the angle to the reference.
 
     Parameters
     ----------
@@ -42,7 +44,7 @@ def fusion_weights(sensors: Sequence[Array], q_reference: Array) -> Array:
 
 
 def plain_mean(training: SegmentTraining) -> MeanModel:
-    """Return the mean with equal weights, with its RMS error in training: a baseline."""
+    """Return the mean with equal weights and its RMS error in training, as a baseline."""
     weights = equal_weights(len(training.sensors))
     mean = fuse(training.sensors, weights)
     angles = rotation.angle_between(mean, training.q_reference)
@@ -50,7 +52,7 @@ def plain_mean(training: SegmentTraining) -> MeanModel:
 
 
 def best_single(training: SegmentTraining) -> MeanModel:
-    """Return the model of the sensor with the smallest training error: weight 1, all others 0."""
+    """Return the model that uses only the sensor with the smallest training error."""
 
     def best(part: SegmentTraining) -> int:
         errors = [rotation.angle_between(q, part.q_reference) for q in part.sensors]

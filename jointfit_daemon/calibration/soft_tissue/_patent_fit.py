@@ -1,4 +1,4 @@
-"""Fits of the patent regression, in two interpretations of its text."""
+"""Fits of the regression of the patent, in two interpretations of the patent text."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 def fit_patent(reading: PatentReading, training: SegmentTraining) -> PatentModel:
-    """Return the regression of one reading, with its error on held-out blocks.
+    """Return the regression of one interpretation, with its error on held-out blocks.
 
-    Least squares by orthogonal decomposition: normal equations would square condition numbers close
-    to a thousand.
+    The least-squares problem is solved by orthogonal decomposition. Normal equations would square
+    the condition numbers, which are close to a thousand.
     """
     sd = held_out_sd(
         training, lambda part, test: _regressed(reading, part, 0.0).predict(test.sensors)
@@ -40,7 +40,7 @@ def _regressed(reading: PatentReading, training: SegmentTraining, sd: float) -> 
 
 
 def _separate(inputs: list[Array], target: Array) -> Array:
-    """Fit each component separately: four systems of len(inputs) + 1 parameters."""
+    """Fit four separate systems, one per component, with len(inputs) + 1 parameters each."""
     rows = []
     for k in range(4):
         A = np.column_stack([*(q[:, k] for q in inputs), np.ones(len(target))])
@@ -49,7 +49,7 @@ def _separate(inputs: list[Array], target: Array) -> Array:
 
 
 def _shared(inputs: list[Array], target: Array) -> Array:
-    """Fit one system of all components: one coefficient per sensor, one intercept per component."""
+    """Fit all components together; each sensor has one coefficient, each component an intercept."""
     n, count = len(target), len(inputs)
     A = np.zeros((4 * n, count + 4))
     for m, q in enumerate(inputs):

@@ -29,9 +29,11 @@ class Ridge:
     coefficients: Array
     """Coefficients of k targets per unit of each regressor, shape (p, k)."""
     leverage: Array
-    """Matrix of the leverage n g^T H^-1 g = ``phi @ leverage @ phi`` of a row, shape (p, p)."""
+    """Matrix whose quadratic form ``phi @ leverage @ phi`` is the leverage n g^T H^-1 g of a row,
+    shape (p, p).
+    """
     scales: Array
-    """RMS of each regressor in training, shape (p,): g = phi / scales."""
+    """RMS of each regressor in training, shape (p,). The scaled regressors are g = phi / scales."""
 
     def leverages(self, phi: Array) -> Array:
         """Return the leverage of each row, shape (n,)."""
@@ -42,10 +44,10 @@ class Ridge:
 def fit_ridge(
     phi: Array, rho: Array, penalty: float, smallest_scale: float = _SMALLEST_SCALE
 ) -> Ridge:
-    """Fit rho (n, k) on phi (n, p) with five iterations of Huber weights on the residual norm.
+    """Fit rho (n, k) on phi (n, p), with five iterations of Huber weights of the residual norm.
 
-    `smallest_scale` is added to the RMS of each regressor, so that a nearly constant one is not
-    amplified.
+    `smallest_scale` is added to the RMS of each regressor, so that a nearly constant regressor is
+    not amplified.
     """
     n, p = phi.shape
     scales = np.sqrt(np.mean(phi**2, axis=0)) + smallest_scale

@@ -31,15 +31,16 @@ def fit_segment(
     Parameters
     ----------
     method : {"anchored", "patent12", "patent6", "markley", "mean", "single"}
-        ``anchored`` is the kernel model; without a neighbor it reduces to the weighted mean.
-        ``markley`` aligns each sensor by a heading and a mount and weights sensors by their errors;
-        ``mean`` weights all sensors equally; ``single`` uses the best sensor.
+        ``anchored`` is the kernel model; without a neighbor it is equal to the weighted mean.
+        ``patent12`` and ``patent6`` are two interpretations of the regression of the patent.
+        ``markley`` aligns each sensor by a heading and a mount, and weights sensors by their
+        errors. ``mean`` weights all sensors equally. ``single`` uses only the best sensor.
     sensors : sequence of array_like, shape (n, 4)
         q_world_segment of each sensor with its static alignment; any number of sensors.
     q_other : array_like, shape (n, 4), or None
-        Orientation of the neighboring segment: of one sensor, or the mean of several.
+        Orientation of the neighboring segment, from one sensor or from the mean of several sensors.
     q_reference : array_like, shape (n, 4)
-        q_world_segment from optical markers, same world. Frames with any NaN are ignored.
+        q_world_segment from optical markers in the same world. Frames with any NaN are ignored.
     trials : array_like of int, shape (n,), optional
         Movement label of each frame; one movement by default. Generalization between movements
         determines the size of the correction and its claimed uncertainty.
@@ -47,7 +48,7 @@ def fit_segment(
     Raises
     ------
     ValueError
-        No sensor, fewer than 30 complete frames, or an unknown method.
+        There is no sensor, fewer than 30 frames are complete, or the method is unknown.
     """
     training = SegmentTraining.of(sensors, q_other, q_reference, trials)
     if method == "patent12" or method == "patent6":  # noqa: PLR1714 - narrows the literal

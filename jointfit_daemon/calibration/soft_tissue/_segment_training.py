@@ -46,7 +46,8 @@ class SegmentTraining:
         Raises
         ------
         ValueError
-            There is no sensor, or fewer than 30 frames are complete: too few to evaluate a fit.
+            There is no sensor, or fewer than 30 frames are complete, which is too few for an
+            evaluation.
         """
         if not sensors:
             raise ValueError("a segment model needs at least one sensor")
@@ -83,8 +84,8 @@ class SegmentTraining:
         """Yield masks of held-out blocks, contiguous in time.
 
         A single trial has `of_one` blocks; each of several trials has three. Random frames are
-        unsuitable: neighboring frames are almost identical, so the evaluation would use frames of
-        the fit.
+        unsuitable: neighboring frames are almost identical, so held-out frames would be almost
+        identical to frames of the fit.
         """
         labels = np.unique(self.trials)
         blocks = of_one if len(labels) == 1 else 3
@@ -103,7 +104,8 @@ def held_out_sd(
     Parameters
     ----------
     predict : callable
-        Fits the first frames and returns the orientation of the second, shape (n, 4).
+        Function that fits a model to its first argument, and returns the predicted orientations of
+        its second argument, shape (n, 4).
     """
     squares = []
     for held in training.folds():

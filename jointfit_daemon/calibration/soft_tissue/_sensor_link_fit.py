@@ -1,16 +1,16 @@
 r"""Fit of the links between the sensors of a limb.
 
-The weights of the polynomials :math:`\phi` are a ridge regression on a movement. Their covariance
-is
+A link predicts the relation of two sensors from posture, by a weighted sum of polynomials
+:math:`\phi`. The weights are fitted to a movement by ridge regression. Their covariance is
 
 .. math::
 
     C = \Bigl(\frac{m}{\sigma_0^2} \overline{\phi\phi^\mathsf{T}} + \tau^{-2} S^2 \Bigr)^{-1}
 
-with the RMS residual :math:`\sigma_0` on held-out blocks, the RMS :math:`\tau` of the quantity as
-the standard deviation of a weight before the movement, and the RMS :math:`S` of the polynomials
-(C. M. Bishop, Pattern Recognition and Machine Learning, 2006, section 3.3). The residuals of
-neighboring frames are alike, so the n frames count as
+where :math:`\sigma_0` is the RMS residual on held-out blocks and :math:`S` the RMS of the
+polynomials. :math:`\tau`, the RMS of the predicted quantity, is the prior standard deviation of a
+weight (C. M. Bishop, Pattern Recognition and Machine Learning, 2006, section 3.3). The residuals of
+neighboring frames are similar, so the n frames count as
 
 .. math:: m = n \Big/ \Bigl(1 + 2 \sum_{k=1}^{K} \rho_k\Bigr)
 
@@ -56,7 +56,7 @@ FEWEST_FRAMES = 100
 """Smallest number of complete frames."""
 
 LEAST_SPREAD = radians(0.3)
-"""Lower bound of the residual standard deviation, rad."""
+"""Lower bound of the standard deviation of the residuals, rad."""
 
 
 def fit_links(
@@ -79,7 +79,7 @@ def fit_links(
     Returns
     -------
     tuple of SensorLink
-        Empty with fewer than 100 complete frames.
+        Links; empty with fewer than 100 complete frames.
     """
     links = []
     for i, group in enumerate(chain.sensors):
@@ -151,7 +151,7 @@ def _uncertainty(
     information = frames / spread**2 * (g.T @ g) / len(g)
     information += np.eye(g.shape[1]) / max(total, LEAST_SPREAD) ** 2
 
-    # information = L L^T, so U = L^-1 for the scaled polynomials.
+    # The information is L L^T, so U = L^-1 for the scaled polynomials.
     factor = np.linalg.inv(np.linalg.cholesky(information)) / scale
     return tuple(tuple(row) for row in factor.tolist())
 
@@ -164,12 +164,12 @@ def independent_frames(residual: Array, regressors: Array) -> float:
     residual : ndarray, shape (n, components)
         Residuals at constant intervals, in order of time.
     regressors : ndarray, shape (n, weights)
-        Values of the regressors, on one scale.
+        Values of the regressors, scaled to similar magnitude.
 
     Returns
     -------
     float
-        From 1 to n.
+        Number from 1 to n.
     """
     n = len(residual)
     correlation = _autocorrelation(residual)
@@ -181,7 +181,7 @@ def independent_frames(residual: Array, regressors: Array) -> float:
 def _autocorrelation(values: Array) -> Array:
     """Return the autocorrelation about zero, summed over the columns, shape (n,)."""
     n = len(values)
-    spectrum = np.fft.rfft(values, 2 * n, axis=0)  # padded: no wrap-around
+    spectrum = np.fft.rfft(values, 2 * n, axis=0)  # padded against wrap-around
     products: Array = np.fft.irfft((spectrum * spectrum.conj()).real.sum(axis=1))[:n]
     if products[0] <= 0.0:
         return np.ones(n)  # a perfect fit is no evidence of independence
@@ -189,7 +189,7 @@ def _autocorrelation(values: Array) -> Array:
 
 
 def _ridge(shown: Array, wanted: Array) -> Array:
-    """Return the weights, shape (10, components); no intercept, as upright gives zero."""
+    """Return the weights, shape (10, components); upright is zero, so there is no intercept."""
     scale = np.sqrt(np.mean(shown**2, axis=0)) + 1e-6
     g = shown / scale
     H = g.T @ g + RIDGE * len(g) * np.eye(g.shape[1])

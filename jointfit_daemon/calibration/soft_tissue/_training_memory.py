@@ -1,8 +1,8 @@
-"""Compact storage of training frames, so that later online learning retains earlier movements.
+"""Compact storage of training frames, with which online learning retains earlier movements.
 
-Frames are limited in number and spread evenly over postures, with the newest frames of each
-posture. They are encoded as text; a quaternion component is rounded to 1/32767, an orientation to
-0.003°.
+The number of frames is limited. They are spread evenly over postures, and are the newest frames of
+each posture. The encoding is text. A quaternion component is rounded to 1/32767, which is 0.003° of
+orientation.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 
 MOST = 800
-"""Largest number of frames: the models have some hundred parameters; a frame has 50 bytes."""
+"""Largest number of frames. The models have some hundred parameters, and a frame has 50 bytes."""
 CELL = 0.25
 """Width of a posture cell, rad."""
 MOVEMENTS = 3
-"""Number of distinct movement labels; older movements are merged."""
+"""Largest number of distinct movement labels; older movements are merged."""
 _ONE = 32767
 """Integer that represents 1."""
 
@@ -43,7 +43,7 @@ def pack(chain: Chain, training: LimbTraining) -> str:
 
 
 def unpack(chain: Chain, text: str) -> LimbTraining | None:
-    """Return the frames of a text; None if it is empty or belongs to another chain."""
+    """Return the frames from a text; None if the text is empty or belongs to another chain."""
     sensors = [s for group in chain.sensors for s in group]
     width = 4 * (len(sensors) + len(chain.segments)) + 1
     table = np.frombuffer(b64decode(text), dtype="<i2")
@@ -61,7 +61,7 @@ def unpack(chain: Chain, text: str) -> LimbTraining | None:
 
 
 def joined(old: LimbTraining, new: LimbTraining) -> LimbTraining:
-    """Return both sets in this order, the new one labeled as another movement."""
+    """Return the frames of `old`, then of `new`, which get the label of another movement."""
     before = _labels(old)
     labels = np.concatenate([before, np.full(len(new), before.max(initial=-1) + 1)])
     labels = np.maximum(labels - max(int(labels.max()) - MOVEMENTS + 1, 0), 0)
@@ -76,7 +76,7 @@ def evenly(chain: Chain, training: LimbTraining, most: int = MOST) -> LimbTraini
     """Return at most `most` frames, evenly over postures.
 
     The newest frame of every posture is selected first, then the second newest, and so on. Rare
-    postures are thus retained, and frequent ones are renewed.
+    postures are thus retained, and the frames of frequent postures are replaced.
     """
     if len(training) <= most:
         return training
@@ -84,7 +84,7 @@ def evenly(chain: Chain, training: LimbTraining, most: int = MOST) -> LimbTraini
     _, which = np.unique(cells, axis=0, return_inverse=True)
     which = np.ravel(which)
 
-    # Rank of every frame within its posture, newest first.
+    # Compute the rank of every frame within its posture, newest first.
     newest = np.arange(len(which))[::-1]
     by_cell = newest[np.argsort(which[newest], kind="stable")]
     edges = np.flatnonzero(np.diff(which[by_cell], prepend=-1))
@@ -97,7 +97,7 @@ def evenly(chain: Chain, training: LimbTraining, most: int = MOST) -> LimbTraini
 
 
 def postures(chain: Chain, training: LimbTraining) -> NDArray[np.int64]:
-    """Return the posture cell of every frame: direction of gravity and joint rotations."""
+    """Return the posture cell of every frame, from direction of gravity and joint rotations."""
     means = [mean_of(training, group) for group in chain.sensors]
     seen = [rotation.rotate(rotation.conjugate(means[0]), np.array([0.0, 0.0, 1.0]))]
     seen += [
