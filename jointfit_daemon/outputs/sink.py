@@ -1,6 +1,6 @@
 """Interface of the components that receive the input events and the outputs of the core.
 
-The supervisor creates and subscribes the sinks that rig.toml requests.
+The supervisor creates the sinks that rig.toml requests, and connects them to the core.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 
 
 class Sink(Protocol):
-    """A subscriber of the core: a recorder, a publisher or an exporter of metrics.
+    """A consumer of the core's events and outputs: a recorder, publisher or metrics exporter.
 
-    Both methods run on the event loop and return at once: slow work belongs to a task or thread.
+    Both methods run on the event loop and return at once. Slow work must run in a task or a thread.
     """
 
     def event(self, event: Event) -> None:

@@ -1,4 +1,4 @@
-"""A token bucket: limits the mean rate of log lines and of requests, and permits short bursts."""
+"""Token bucket that limits the mean rate of log lines and requests, but permits short bursts."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ class TokenBucket:
     rate_hz
         Permitted mean rate, 1/s.
     burst
-        Capacity: tokens available at once after a pause. The bucket is full at the start.
+        Capacity of the bucket, which limits the number of tokens after a pause. It is full at the
+        start.
     now_s
-        Present time of any monotonic clock, s.
+        Current time of any monotonic clock, s.
     """
 
     def __init__(self, rate_hz: float, burst: float, now_s: float) -> None:

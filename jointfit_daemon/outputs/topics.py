@@ -8,7 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 PAYLOAD_VERSION = 1
-"""Version of all payloads; incremented when a key is removed or renamed, or changes its meaning."""
+"""Version of all payloads. It is incremented when a key is removed or renamed, or changes its
+meaning."""
 
 ONLINE, OFFLINE = b'{"v":1,"state":"online"}', b'{"v":1,"state":"offline"}'
 """Payloads of `BRIDGE_STATE` and `DEVICE_AVAILABILITY`."""
@@ -16,12 +17,12 @@ ONLINE, OFFLINE = b'{"v":1,"state":"online"}', b'{"v":1,"state":"offline"}'
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic below the base topic of a rig."""
+    """One topic relative to the base topic of a rig."""
 
     pattern: str
-    """Name below the base; a level in capitals is a placeholder."""
+    """Name relative to the base topic. A level in capitals is a placeholder."""
     qos: int
-    """Quality of service: 1 is acknowledged by the broker, 0 is not."""
+    """Quality of service. The broker acknowledges messages with 1, but not with 0."""
     retained: bool = False
     """Whether the broker stores the last message for later subscribers."""
 
@@ -63,10 +64,10 @@ TOPICS = (
 
 
 def client_identifier(base: str) -> str:
-    """Return the daemon's client id on the broker, also its device id in Home Assistant.
+    """Return the daemon's client id on the broker, which is also its device id in Home Assistant.
 
-    It is fixed, so that a new process takes over the connection of a dead one. The id contains
-    letters, digits and dashes only, because rumqttd fails on a slash.
+    The id is fixed, so that a new process takes over the connection of a terminated process. It
+    contains only letters, digits and dashes, because the broker rumqttd fails on a slash.
     """
     return "jointfitd-" + "".join(
         letter if letter.isascii() and letter.isalnum() else "-" for letter in base

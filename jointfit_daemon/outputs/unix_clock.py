@@ -1,7 +1,7 @@
-"""UNIX time of CLOCK_MONOTONIC stamps.
+"""Conversion of CLOCK_MONOTONIC stamps to UNIX time.
 
-NTP makes the kernel slew both clocks alike, so their offset changes only if UNIX time is set, or if
-the host was suspended, which stops CLOCK_MONOTONIC.
+NTP makes the kernel slew both clocks equally. Their offset therefore changes only if UNIX time is
+set, or if the host was suspended, which stops CLOCK_MONOTONIC.
 """
 
 from __future__ import annotations
@@ -10,25 +10,25 @@ import time
 from typing import NamedTuple
 
 STEP_NS = 50_000
-"""Smallest change of the offset, beyond the reading errors, that counts as a step, ns."""
+"""Smallest change of the offset that counts as a step, in addition to the reading errors, ns."""
 _READINGS = 5
-"""Number of readings per measurement; the reading with the shortest duration is used."""
+"""Number of readings per measurement. The reading with the shortest duration is used."""
 _NS_PER_S = 1_000_000_000
 
 
 class _OffsetReading(NamedTuple):
-    """One comparison of UNIX time with CLOCK_MONOTONIC."""
+    """One simultaneous reading of UNIX time and CLOCK_MONOTONIC."""
 
     width_ns: int
-    """Duration of the comparison, ns: twice its largest error."""
+    """Duration of the reading, ns, which is twice its largest error."""
     offset_ns: int
 
 
 class UnixClock:
     """Offset of UNIX time from CLOCK_MONOTONIC, measured at most once per second.
 
-    Between steps the offset is constant, so the intervals of stamps are preserved. A step of UNIX
-    time is followed within one second.
+    Between steps the offset is constant, so intervals between stamps are preserved. After a step of
+    UNIX time, the offset is corrected within one second.
     """
 
     def __init__(self) -> None:
@@ -36,7 +36,7 @@ class UnixClock:
         self._until_ns = -1
 
     def now_ns(self) -> int:
-        """Return the present instant, CLOCK_MONOTONIC ns."""
+        """Return the current instant, CLOCK_MONOTONIC ns."""
         return time.monotonic_ns()
 
     def offset_ns(self) -> int:

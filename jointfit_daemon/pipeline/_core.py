@@ -1,7 +1,7 @@
 """The core, which converts input events to limb states, notices and calibration jobs.
 
 Invariant: the core is synchronous and deterministic, without clock, I/O, logging or randomness. The
-same events in the same order give the same outputs, byte for byte, so a recording can be replayed.
+same events in the same order yield the same outputs, byte for byte, so a recording can be replayed.
 """
 
 from __future__ import annotations
@@ -78,20 +78,20 @@ _CLOSED_LEVELS = {
 class Core:
     """Processes input events.
 
-    The first event must be ``Configured``. Call ``feed`` with every event, in order of arrival, and
-    with a ``Tick`` at ``next_deadline_ns`` if nothing else arrives before.
+    The first event must be ``Configured``. Call ``feed`` with every event in the order of arrival.
+    If no event arrives before ``next_deadline_ns``, call it with a ``Tick`` at that time.
 
     Parameters
     ----------
     observe
-        Function called with source and measurement once the instant of the measurement is known, in
-        the order of processing. It must not change the measurement.
+        Function that is called with source and measurement when the instant of the measurement is
+        known, in the order of processing. It must not change the measurement.
     """
 
     def __init__(self, observe: Callable[[str, StampedMeasurement], None] | None = None) -> None:
         self._observe = observe
         self.stages: StageObserver | None = None
-        """Observer of the stages of every frame."""
+        """Observer of the processing stages of every frame."""
         self._rig: Rig | None = None
         self._sources: dict[str, SourceState] = {}
         self._lines = SyncLines()
@@ -99,7 +99,7 @@ class Core:
         self._now_ns = 0
         self._seq = 0
         self._empty = 0
-        """Number of frames without any sensor."""
+        """Number of frames to which no sensor contributed."""
         self._marks = 0
         self._mocap = MocapRouter()
         self._limiter = NoticeLimiter()
@@ -113,7 +113,7 @@ class Core:
         self._collector: OnlineFrameCollector
         self._comparison: OpticalComparison
         self._usable: Calibration | None = None
-        """The calibration in force, if it belongs to the chain of the rig."""
+        """The calibration in force; None if it does not fit the rig's chain."""
         self._sensors_rate: RateDivider | None = None
         self._moving_centers: MovingCenters | None = None
         self._chain_tracker: ChainTracker | None = None
@@ -135,8 +135,8 @@ class Core:
     # --- events ------------------------------------------------------------------------------
 
     def feed(self, event: Event) -> list[Output]:
-        """Process one event and return its outputs, in order."""
-        # Chunks are checked first, because thousands of chunks arrive per other event.
+        """Process one event, and return its outputs in order."""
+        # Chunks are tested first, because thousands of chunks arrive for each other event.
         if isinstance(event, ChunkArrived):
             self._now_ns = max(self._now_ns, event.chunk.t_ns)
             return self._add_chunk(event)
@@ -145,12 +145,12 @@ class Core:
 
     @property
     def next_deadline_ns(self) -> int | None:
-        """Latest host time of the next ``Tick``; None before the configuration."""
+        """Latest host time of the next ``Tick``, ns; None before the configuration."""
         return None if self._rig is None else self._aligner.next_deadline_ns
 
     @property
     def lags_ns(self) -> Mapping[str, int]:
-        """Lags behind the optical system that are subtracted from the stamps, by sensor, ns."""
+        """Lags behind the optical system, by sensor, ns. They are subtracted from the stamps."""
         return self._lag_ns
 
     def health(self, now_ns: int) -> CoreHealth:
@@ -223,7 +223,7 @@ class Core:
         return [*outputs, session.status(event.t_ns, text)]
 
     def _reload_sources(self, rig: Rig) -> None:
-        """Create states of new and changed sources; states of unchanged sources continue."""
+        """Create states of new and changed sources. Unchanged sources keep their state."""
         unchanged = {
             source.id: state
             for source in rig.sources
@@ -288,8 +288,7 @@ class Core:
         if state is None:
             return [notice]
 
-        # A repeated failure for the same reason, without a sample in between, is not reported
-        # again.
+        # A failure is reported once, unless its reason changes or a sample arrives in between.
         repeated = not state.online and event.text == state.closed_text
         state.closed_text = event.text
         notices: list[Output] = [] if repeated else [notice]
@@ -310,8 +309,9 @@ class Core:
             self.stages.mark_decoded(event.chunk.t_ns)
         outputs = self._process(event.source, state, items)
 
-        # After a stall of the process, samples of other sources are still in the kernel. Deadlines
-        # therefore apply at a Tick only, which comes after everything readable was read.
+        # After the process was delayed, samples of other sources may still be in the kernel.
+        # Deadlines are therefore applied only at a Tick, which follows after all available data
+        # were read.
         outputs += self._advance(complete_only=True)
         return outputs
 
@@ -355,8 +355,8 @@ class Core:
         t_ns, _, synced, epoch, _ = stamp
         q = sample.q_world_sensor
 
-        # The aligner receives stamps minus the lag in use, which are instants of the optical
-        # system.
+        # The aligner receives stamps minus the lag in use. These are instants on the clock of the
+        # optical system.
         self._aligner.push(
             source,
             t_ns - self._lag_ns.get(source, 0),
@@ -395,7 +395,7 @@ class Core:
     # --- time --------------------------------------------------------------------------------
 
     def _advance(self, *, complete_only: bool = False) -> list[Output]:
-        """Fuse the frames that are due, and do the work that depends on time."""
+        """Fuse the frames that are due, and do all other work that is due at this time."""
         if self._rig is None:
             return []
         now_ns = self._now_ns
@@ -462,7 +462,7 @@ class Core:
         self,
         event: Request | CalibrationSelected | JobFinished | JobProgress | CalibrationStored,
     ) -> list[Output]:
-        """Pass an event to the session, and use its new calibration, if any."""
+        """Pass an event to the session, and use the new calibration if there is one."""
         before = self._session.calibration
         if isinstance(event, JobFinished):
             outputs = self._session.finish_job(event)
@@ -486,5 +486,5 @@ class Core:
 
 
 def _calibration_inputs(rig: Rig) -> tuple[object, ...]:
-    """Return the parts of a rig on which a static pose or an alignment depends."""
+    """Return the parts of a rig that affect a static pose or an alignment."""
     return rig.chain, rig.calibration, rig.sources

@@ -1,8 +1,9 @@
-"""Frame grid of a rig, across reloads of the configuration, and the counts of its samples.
+"""Frame grid of a rig, which continues across reloads, and the counts of its samples.
 
 Invariant: frames are due from the first configuration on, with or without samples, and their
 instants increase across reloads. A reload starts a new grid only if it changes rates, sensors or
-the alignment mode. Pending samples are then counted, and the counts of remaining sensors continue.
+the alignment mode. In this case pending samples are counted, and the counts of remaining sensors
+continue.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _NS = 1_000_000_000
 
 
 class FrameGrid:
-    """Owns the frame aligner of one rig; replaces the aligner if a reload needs a new grid.
+    """Owner of the frame aligner of one rig; it replaces the aligner if a reload needs a new grid.
 
     Parameters
     ----------
@@ -32,7 +33,7 @@ class FrameGrid:
         self._layout = _layout(rig)
         self._names = [source.id for source in rig.sources if source.kind == "imu"]
         self._counts_before: dict[str, dict[str, int]] = {}
-        """Sample counts of the aligners that reloads have replaced."""
+        """Sample counts of aligners that were replaced at a reload."""
         self.aligner = _aligner(rig, begin_ns)
 
     def reload(self, rig: Rig) -> None:
@@ -44,12 +45,11 @@ class FrameGrid:
         self.aligner = _aligner(rig, self.aligner.next_ns)
         self._layout = _layout(rig)
         self._names = [source.id for source in rig.sources if source.kind == "imu"]
-        # The counts of a removed sensor are deleted; if the sensor is added again, they start from
-        # 0.
+        # The counts of a removed sensor are deleted. If it is added again, its counts start from 0.
         self._counts_before = {name: counts[name] for name in self._names if name in counts}
 
     def counts(self) -> dict[str, dict[str, int]]:
-        """Return the counts of every sensor's samples since the daemon started, by outcome."""
+        """Return the counts of every sensor's samples since the start of the daemon, by outcome."""
         found = {}
         for name in self._names:
             before = self._counts_before.get(name, {})

@@ -1,10 +1,9 @@
 """Detection of exchanged, mislabelled and displaced markers from the shapes of marker clusters.
 
-The monitor is for rigs without chain model and uses the clusters of the calibration in force.
-Markers with faulty labels are hidden from fusion until they are at their places again.
-
-Invariant: a fault is reported after it explained the frames of 2 s, and its end is reported after 2
-s without this fault. Hidden markers neither begin nor end a fault.
+The monitor is used for rigs without a chain model. It compares the markers with the clusters of the
+calibration in force. Markers with faulty labels are hidden from fusion until they fit the clusters
+again. Invariant: a fault is reported when it has explained the frames of 2 s. Its end is reported
+after 2 s without this fault. Hidden markers neither begin nor end a fault.
 """
 
 from __future__ import annotations
@@ -40,30 +39,30 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 RATE_HZ = 5.0
-"""Examined frames per second. A search takes milliseconds and is therefore spread over several
+"""Rate of examined frames, Hz. A search takes milliseconds, so it is distributed over several
 frames."""
 FAULT_NS = 2_000_000_000
 """Time after which a fault begins or ends, ns."""
 MISFIT_NS = 4_000_000_000
-"""Time after which a cluster without explanation is reported, ns."""
+"""Time after which a cluster that fits no explanation is reported, ns."""
 _FEWEST = 7
-"""Number of frames with all clusters of a fault that a decision needs. They cover over half of
-`FAULT_NS`."""
+"""Smallest number of frames with all clusters of a fault that permits a decision. They span more
+than half of `FAULT_NS`."""
 _PRESENT = 0.6
-"""Smallest share of the frames that a fault must explain to begin; the other frames may have hidden
-markers."""
+"""Smallest share of frames that a fault must explain to begin. Markers may be hidden in the other
+frames."""
 _ABSENT = 0.1
-"""Share of the frames that a fault explains, or that do not fit, below which the fault ends."""
+"""Share of frames that a fault explains, or that do not fit, below which a fault or misfit ends."""
 _REFUSED = 0.8
 """Share of unexplained frames that do not fit, above which a misfit is reported."""
 
 
 class _Examined(NamedTuple):
-    """Result of one examined frame."""
+    """Result of the examination of one frame."""
 
     t_ns: int
     fitted: frozenset[str]
-    """Body parts whose visible markers determine a pose."""
+    """Body parts with enough visible markers to determine a pose."""
     refused: Mapping[str, float]
     """RMS residuals of the body parts whose markers do not fit, m."""
     faults: frozenset[LabelFault]
@@ -92,19 +91,19 @@ class LabelMonitor:
         self._layout: MocapLayout | None = None
         self._columns: list[int] = []
         self._hidden: NDArray[np.intp] = np.zeros(0, dtype=np.intp)
-        """Columns of the layout whose labels are faulty."""
+        """Columns of the mocap layout whose labels are faulty."""
         self.faults: dict[LabelFault, frozenset[str]] = {}
-        """Faults in force, with the body parts whose markers must be visible to end them."""
+        """Faults in force. The markers of the listed body parts must be visible to end a fault."""
         self.misfits: frozenset[str] = frozenset()
-        """Body parts whose markers do not fit, without explanation."""
+        """Body parts whose markers do not fit, and for which no fault is an explanation."""
 
     def serves(self, chain: Chain, calibration: Calibration) -> bool:
-        """Return whether a new monitor with these arguments would be equal to this one."""
+        """Return whether a new monitor with these arguments would be equivalent to this monitor."""
         given = chain, dict(calibration.clusters), _centers(chain, calibration)
         return self._given == given
 
     def reset(self) -> None:
-        """Discard all frames and faults, because markers are being placed or calibrated again."""
+        """Discard all frames and faults, for example because markers are being placed again."""
         self._examination = None
         self._examined.clear()
         self.faults, self.misfits = {}, frozenset()
@@ -119,7 +118,7 @@ class LabelMonitor:
         return replace(frame, markers=markers)
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
-        """Examine a live frame, if due, or continue with an earlier frame; return notices."""
+        """Examine a live frame if it is due, or continue with an earlier frame; return notices."""
         if not self._search.clusters:
             return []
         if frame.layout is not self._layout:
@@ -130,7 +129,7 @@ class LabelMonitor:
         if self._examination is None:
             if not self._rate.is_due(t_ns):
                 return []
-            # Find the markers of the clusters in a frame, m, shape (M, 3); NaN where missing.
+            # Collect the markers of the clusters in a frame, m, shape (M, 3); NaN where missing.
             padded = np.concatenate((frame.markers, np.full((1, 3), np.nan)))
             points = padded[self._columns]
             self._examination = LabelExamination(self._search, t_ns, points)
@@ -174,11 +173,11 @@ class LabelMonitor:
             frames = self._frames(t_ns, fault.parts, FAULT_NS)
             if len(frames) < _FEWEST or count < _PRESENT * len(frames):
                 continue
-            # The new fault replaces an earlier explanation of the same markers.
+            # The new fault replaces earlier faults that explained the same markers.
             for other in [f for f in self.faults if not set(f.markers).isdisjoint(fault.markers)]:
                 del self.faults[other]
-            # Clusters that fit in spite of the fault are at fault only in relation to adjacent
-            # clusters.
+            # Some clusters fit although they are part of the fault. They differ only relative to
+            # adjacent clusters.
             bad = sum(not one.refused.keys().isdisjoint(fault.parts) for one in frames)
             parts = frozenset(fault.parts)
             fits = bad < _PRESENT * len(frames)
@@ -220,7 +219,7 @@ class LabelMonitor:
         return notices
 
     def _hide(self) -> None:
-        """Find the columns of the faulty markers in the present layout."""
+        """Find the columns of the faulty markers in the current layout."""
         names = {name for fault in self.faults for name in fault.markers}
         columns = zip(self._search.labels, self._columns, strict=False)
         found = [column for name, column in columns if name in names and column >= 0]
@@ -228,7 +227,7 @@ class LabelMonitor:
 
 
 def _centers(chain: Chain, calibration: Calibration) -> dict[tuple[str, str], Vector]:
-    """Return the known joint centers in the static world, m, by pair of adjacent body parts."""
+    """Return the known joint centers in the static world, m, by pairs of adjacent body parts."""
     parts, found = body_parts(chain), {}
     for name, (proximal, distal) in zip(chain.joints, joint_parts(chain), strict=True):
         joint = calibration.joint.get(name)

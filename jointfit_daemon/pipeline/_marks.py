@@ -1,4 +1,4 @@
-"""Marks: labels of instants that a person or a program requests during a session."""
+"""Marks: labels that a person or a program requests for an instant of a session."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ if TYPE_CHECKING:
 def mark_outputs(
     request: Request, number: int, unix_offset_ns: int | None, rig: str
 ) -> list[Output]:
-    """Return the answer to a request for a mark, and the event at the instant of the request.
+    """Return the answer to a request for a mark, and the event that marks the instant.
 
     Parameters
     ----------
     request
-        The request with the ``text`` of the mark.
+        Request that contains the ``text`` of the mark.
     number
-        Number of the mark since the start, from 1.
+        Number of the mark since the start of the daemon, from 1.
     unix_offset_ns
         UNIX time minus CLOCK_MONOTONIC, ns; None if unknown.
     rig

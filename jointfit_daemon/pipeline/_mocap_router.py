@@ -1,7 +1,7 @@
-"""Distribution of mocap frames: calibration, lag monitoring, online learning, first joint center.
+"""Distribution of mocap frames to calibration, lag monitoring, online learning and joint center O1.
 
-Invariant: every frame is counted once, as used or idle. Only live frames are used, and only frames
-whose stamp is synchronized to the host clock are paired with sensors.
+Invariant: every frame is counted once, as used or idle. Only live frames are used. Frames are
+combined with sensor data only if their stamp is synchronized to the host clock.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.sources import LagMonitor, StampedMeasurement
 
 FRESH_NS = 200_000_000
-"""Age up to which the last live frame makes the mode ``imu+mocap``, ns."""
+"""Largest age of the last live frame at which the fusion mode is ``imu+mocap``, ns."""
 
 
 class MocapRouter:
@@ -31,12 +31,12 @@ class MocapRouter:
         self._locator: OpticalOrigin | None = None
         self._origin: Vector | None = None
         self._unlocated: MocapFrame | None = None
-        """Last frame until O1 is requested. O1 is computed on request, because cameras may be
-        faster than the limb states."""
+        """Last frame, until O1 is requested. O1 is computed on request, because the rate of the
+        cameras may exceed the rate of the limb states."""
 
     @property
     def origin(self) -> Vector | None:
-        """O1 in the last frame, optical world, m; None if not visible."""
+        """Position of O1 in the last frame, optical world, m; None if it is not visible."""
         if self._unlocated is not None and self._locator is not None:
             self._origin, self._unlocated = self._locator.locate(self._unlocated), None
         return self._origin
@@ -46,7 +46,7 @@ class MocapRouter:
         self._used = self._idle = 0
 
     def set_calibration(self, chain: Chain, calibration: Calibration | None) -> None:
-        """Locate O1 by the markers of `calibration`; without calibration O1 is not located."""
+        """Locate O1 by the markers of `calibration`. Without a calibration, O1 is not located."""
         self._locator = OpticalOrigin(chain, calibration) if calibration else None
         self._origin = self._unlocated = None
 

@@ -54,13 +54,13 @@ class Outbox:
         Topic of the daemon's own state. On a new connection, this state is sent after all other
         retained messages, so that its subscribers can rely on the other messages.
     clock
-        Monotonic time, s, for the expiry of waiting messages.
+        Function that returns monotonic time, s. It determines the expiry of waiting messages.
     """
 
     def __init__(self, state_topic: str, clock: Callable[[], float] = time.monotonic) -> None:
         self.state_topic = state_topic
         self.dropped = 0
-        """Number of messages dropped without having been sent."""
+        """Number of messages that were dropped before they were sent."""
         self._state: dict[str, bytes] = {}
         self._unsent: dict[str, None] = {}
         self._clock = clock
@@ -69,7 +69,8 @@ class Outbox:
         self._streams: deque[_Waiting] = deque()
         self._late: deque[_Waiting] = deque()
         self._unacknowledged: dict[int, tuple[deque[_Waiting], _Waiting] | None] = {}
-        """Messages that are being sent, in order, each with its original queue; None for state."""
+        """Messages that are being sent, in order, each with the queue it came from; None for
+        state."""
         self._numbers = count()
         self._wake = asyncio.Event()
 
@@ -114,27 +115,27 @@ class Outbox:
             self._wake.set()
 
     def repeat(self, prefix: str) -> None:
-        """Send the retained values of all topics that begin with `prefix` again."""
+        """Send again the retained values of all topics that begin with `prefix`."""
         self._unsent |= dict.fromkeys(topic for topic in self._state if topic.startswith(prefix))
         self._wake.set()
 
     def event(self, topic: str, payload: bytes) -> None:
-        """Queue a message that is sent at least once, at QoS 1."""
+        """Add a message that is sent at least once (QoS 1)."""
         message = Outgoing(topic, payload, 1, False, RESPONSE_EXPIRY_S)
         self._push(self._events, _EVENT_CAPACITY, message)
 
     def respond(self, topic: str, payload: bytes, *, correlation: bytes | None = None) -> None:
-        """Queue the response to a request; it is sent before all other messages, at QoS 1."""
+        """Add the response to a request. It is sent before all other messages, with QoS 1."""
         message = Outgoing(topic, payload, 1, False, RESPONSE_EXPIRY_S, None, correlation)
         self._push(self._responses, _EVENT_CAPACITY, message)
 
     def stream(self, topic: str, payload: bytes, written: Callable[[], None] | None = None) -> None:
-        """Queue a message that is sent at most once, at QoS 0; `written` as in `Outgoing`."""
+        """Add a message that is sent at most once (QoS 0); `written` is described at `Outgoing`."""
         message = Outgoing(topic, payload, 0, False, STREAM_EXPIRY_S, written=written)
         self._push(self._streams, _STREAM_CAPACITY, message)
 
     def late(self, topic: str, payload: bytes) -> None:
-        """Queue a message of an earlier outage, at QoS 1; the caller limits the number of these."""
+        """Add a message of an earlier outage, with QoS 1; the caller limits their number."""
         self._late.append((math.inf, Outgoing(topic, payload, 1, False)))
         self._wake.set()
 
@@ -146,9 +147,9 @@ class Outbox:
         self._wake.set()
 
     def reconnected(self) -> None:
-        """Queue all state again, since the broker may have lost it; drop streams.
+        """Queue all state again, because the broker may have lost it, and drop stream messages.
 
-        Responses and events that were sent without an acknowledgement are queued again, too.
+        Responses and events whose acknowledgement is missing are queued again as well.
         """
         for origin in reversed(self._unacknowledged.values()):
             if origin is not None:
@@ -162,7 +163,7 @@ class Outbox:
         self._wake.set()
 
     async def next(self) -> tuple[Outgoing, Callable[[], None]]:
-        """Wait for the next message; return it with a callback for its acknowledgement."""
+        """Wait for the next message; return it with the function to call at its acknowledgement."""
         while True:
             if (waiting := self._take(self._responses)) is not None:
                 return waiting[1], self._hand_out((self._responses, waiting))
@@ -184,7 +185,7 @@ class Outbox:
         return None
 
     def _hand_out(self, origin: tuple[deque[_Waiting], _Waiting] | None) -> Callable[[], None]:
-        """Store a message until it is acknowledged; return the callback for the acknowledgement."""
+        """Store a message until it is acknowledged; return the function to call then."""
         number = next(self._numbers)
         self._unacknowledged[number] = origin
         return partial(self._acknowledge, number)

@@ -1,9 +1,9 @@
-"""A socket that drops incoming MQTT packets above a size limit, and messages that are not admitted.
+"""A socket that drops incoming MQTT packets above a size limit, and messages on other conditions.
 
 Invariant: a packet above the limit occupies no memory, and a message that is not admitted is
-dropped before it is decoded. paho buffers a whole packet before it decodes it. MQTT 5 lets a client
-announce a maximum packet size; MQTT 3.1.1 does not permit this, and some brokers ignore the
-announcement.
+dropped before it is decoded. The class is necessary because paho buffers a whole packet before it
+decodes it. An MQTT 5 client can announce a maximum packet size, but some brokers ignore it, and
+MQTT 3.1.1 has no such announcement.
 """
 
 from __future__ import annotations
@@ -14,35 +14,36 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 _DISCARDED_BYTES = 64 * 1024
-"""Largest number of bytes read and discarded in one iteration of the event loop. The limit lets
-other tasks run."""
+"""Largest number of bytes that are discarded in one iteration of the event loop, so that other
+tasks can run."""
 _DROPPED_AT_ONCE = 16
-"""Largest number of packets dropped in one iteration of the event loop; each packet takes 10 µs."""
+"""Largest number of packets dropped in one iteration of the event loop. Each packet takes 10 µs."""
 _MORE = 0x80
 """Bit of a length byte that is set if another length byte follows."""
 _SHORTEST_HEADER, _LONGEST_HEADER = 2, 5
-"""Lengths of a fixed header, bytes: packet type and one to four length bytes (MQTT 5.0, 2.1.4)."""
+"""Shortest and longest fixed header, bytes: packet type and one to four length bytes (MQTT 5.0,
+2.1.4)."""
 _TYPE, _PUBLISH, _RETAIN = 0xF0, 0x30, 0x01
-"""Bits of the first byte: mask of the packet type, type PUBLISH, and the retain flag."""
+"""Bits of the first byte: mask of the packet type, type PUBLISH, and retain flag."""
 _TOPIC_LENGTH_BYTES = 2
 
 
 class PacketLimitSocket:
-    """Wraps a connected, non-blocking socket.
+    """Wrapper of a connected, non-blocking socket.
 
-    Only ``recv`` differs from the wrapped socket. No bytes beyond the current packet are buffered,
-    so the readiness of the wrapped socket is the readiness of this object.
+    Only ``recv`` differs from the wrapped socket. The wrapper reads no bytes beyond the current
+    packet, so both sockets are readable at the same time.
 
     Parameters
     ----------
     wrapped
         A ``socket.socket`` or ``ssl.SSLSocket``.
     longest_bytes
-        Largest remaining length of a packet that is passed on, bytes.
+        Largest packet that is passed on, bytes without the fixed header.
     admit
-        Called with topic and retain flag of each message within the limit; the message is dropped
-        if the function returns False. A dropped message is not acknowledged, so the function is
-        only for subscriptions at QoS 0.
+        Function that is called with topic and retain flag of each message within the limit. If it
+        returns False, the message is dropped. A dropped message is not acknowledged, so the
+        function is only for subscriptions with QoS 0.
     """
 
     def __init__(
@@ -52,14 +53,14 @@ class PacketLimitSocket:
         admit: Callable[[str, bool], bool] | None = None,
     ) -> None:
         self.oversized = 0
-        """Number of packets above the limit."""
+        """Number of packets larger than the limit."""
         self._wrapped, self._longest_bytes, self._admit = wrapped, longest_bytes, admit
         self._header = b""
-        """Header of the packet being read; it is complete before its first byte is passed on."""
+        """Header of the current packet. It is complete before its first byte is passed on."""
         self._start = b""
-        """Bytes read after the header to find the topic."""
+        """Bytes that were read after the header in order to find the topic."""
         self._ready = b""
-        """Header, and bytes read with it, that are still to be passed on."""
+        """Header, and bytes read with it, that were not passed on yet."""
         self._body_bytes = self._excess_bytes = 0
 
     def __getattr__(self, name: str) -> Any:
@@ -83,7 +84,7 @@ class PacketLimitSocket:
         return data
 
     def _find_packet(self) -> bool:
-        """Read up to the next admitted packet; return False if the peer closed."""
+        """Read until the start of the next admitted packet; return False if the peer closed."""
         for _ in range(_DROPPED_AT_ONCE):
             if self._excess_bytes and not self._discard():
                 return False
@@ -95,7 +96,7 @@ class PacketLimitSocket:
                 self._header, self._excess_bytes = b"", length
                 continue
 
-            # A message is admitted by its topic, at the start of the packet.
+            # A message is admitted by its topic, which is at the start of the packet.
             asks = self._admit is not None and self._header[0] & _TYPE == _PUBLISH
             if asks and not self._read_topic(length):
                 return False
@@ -112,7 +113,7 @@ class PacketLimitSocket:
         raise BlockingIOError
 
     def _read_header(self) -> bool:
-        """Read up to the end of the header; return False if the peer closed."""
+        """Read until the end of the header; return False if the peer closed the connection."""
         while (missing := _SHORTEST_HEADER - len(self._header)) > 0 or self._header[-1] & _MORE:
             if len(self._header) == _LONGEST_HEADER:
                 break  # malformed: paho reports it
@@ -123,12 +124,13 @@ class PacketLimitSocket:
         return True
 
     def _read_topic(self, length: int) -> bool:
-        """Read at least up to the end of the topic; return False if the peer closed.
+        """Read at least until the end of the topic; return False if the peer closed the connection.
 
         Parameters
         ----------
         length
-            Remaining length of the packet; a longer topic is malformed, and truncated.
+            Remaining length of the packet. A topic longer than the packet is malformed, and is
+            truncated.
         """
         while len(self._start) < min(length, _topic_end(self._start)):
             data: bytes = self._wrapped.recv(length - len(self._start))
@@ -138,12 +140,12 @@ class PacketLimitSocket:
         return True
 
     def _discard(self) -> bool:
-        """Read the rest of a dropped packet; return False if the peer closed.
+        """Read the rest of a dropped packet; return False if the peer closed the connection.
 
         Raises
         ------
         BlockingIOError
-            More than `_DISCARDED_BYTES` of the packet are left.
+            More than `_DISCARDED_BYTES` of the packet remain to be read.
         """
         data = self._wrapped.recv(min(self._excess_bytes, _DISCARDED_BYTES))
         self._excess_bytes -= len(data)

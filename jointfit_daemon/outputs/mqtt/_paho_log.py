@@ -1,4 +1,4 @@
-"""Log of paho, which contains the error with which a broker ended a connection."""
+"""Logger for paho that stores the error with which a broker ended a connection."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import logging
 
 
 class PahoLog(logging.Logger):
-    """Logger of paho that stores the last exception of a socket instead of logging it.
+    """Logger of paho that stores the last socket exception instead of logging it.
 
-    With TLS 1.3 a broker rejects the client's certificate after the handshake. paho only logs this
-    alert, and aiomqtt reports a timeout.
+    With TLS 1.3, a broker rejects the client's certificate after the handshake. paho only logs the
+    alert, and aiomqtt reports a timeout, so the stored exception is the only source of the cause.
     """
 
     def __init__(self) -> None:

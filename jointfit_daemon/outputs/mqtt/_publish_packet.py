@@ -1,6 +1,6 @@
-"""PUBLISH packets at QoS 0 (MQTT 5.0 and 3.1.1, section 3.3), encoded without the library.
+"""Encoder of PUBLISH packets with QoS 0 (MQTT 5.0 and 3.1.1, section 3.3), without paho.
 
-Invariant: the packets equal the packets of paho, byte for byte.
+Invariant: the packets are identical to the packets of paho, byte for byte.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _MORE = 0x80
 
 
 class PublishEncoder:
-    """Encodes messages at QoS 0; topic and properties of a stream are encoded only once."""
+    """Encodes messages with QoS 0. Topic and properties of a stream are encoded only once."""
 
     def __init__(self) -> None:
         self._headers: dict[str, tuple[Any, bytes]] = {}
@@ -27,10 +27,10 @@ class PublishEncoder:
         Parameters
         ----------
         topic, payload, retain
-            The message.
+            Content of the message.
         properties
-            Properties object of paho, which is not changed later; None with MQTT 3.1.1, which has
-            no properties.
+            Properties object of paho, which is not changed later. It is None with MQTT 3.1.1, which
+            has no properties.
         """
         known, header = self._headers.get(topic, (None, b""))
         if not header or known is not properties:

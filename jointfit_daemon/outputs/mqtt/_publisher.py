@@ -1,7 +1,7 @@
-"""The daemon's own connection to the broker: publishes the outbox and passes on requests.
+"""The daemon's own connection to the broker: it publishes the outbox and passes on requests.
 
-Invariant: `MqttPublisher.run` ends by cancellation only, for any behaviour of the broker. Requests
-are passed on synchronously, at a limited rate, and never from a retained message.
+Invariant: `MqttPublisher.run` ends only by cancellation, whatever the broker does. Requests are
+passed on synchronously and at a limited rate. Retained requests are never passed on.
 """
 
 from __future__ import annotations
@@ -49,36 +49,35 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ECHO_S = 5.0
-"""Time within which the daemon's own message must come back, s. After this time, the access list of
-the broker may forbid the message."""
+"""Time within which the broker must return the daemon's own message, s. Otherwise the broker's
+access list may forbid the message."""
 REQUEST_RATE_HZ = 10.0
-"""Permitted mean rate of requests, 1/s; a person sends a request in several seconds."""
+"""Permitted mean rate of requests, 1/s. A person needs several seconds per request."""
 REQUEST_BURST = 20.0
-"""Permitted requests at once after a pause."""
+"""Permitted number of requests without waiting after a pause."""
 CHECK_S = 10.0
-"""Interval at which a stream's topic is published at QoS 1, s: acknowledgements contain
-refusals."""
+"""Interval at which one message of each stream is sent with QoS 1, s. The acknowledgement shows
+whether the broker refuses the topic."""
 _NOTICE_S = 10.0
 """Shortest interval between log lines on ignored requests, s."""
 _CORRECTION_S = 0.1
-"""Delay before a foreign ``bridge/state`` is overwritten, s. The delay limits a flood of messages
-to ten per second."""
+"""Delay before ``bridge/state`` of another process is overwritten, s. The delay limits such
+messages to ten per second."""
 _POLL_S = 0.01
 """Interval between checks whether the outbox is empty, s."""
 _FIRST_RETRY_S = 0.05
-"""Wait before the first retry, s. A broker that reset one connection may accept the next
-connection."""
+"""Wait before the first retry, s. A broker that reset one connection may accept the next one."""
 _LAST_RETRY_S = 0.6
-"""Longest wait before a retry, s: a refused attempt is cheap, and a user waits for the broker."""
+"""Longest wait before a retry, s. A refused attempt costs little, and a user may be waiting."""
 _HEALTHY_S = 5.0
-"""Duration of a connection that resets the wait, s."""
+"""Duration after which a connection counts as successful and resets the wait, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkHealth:
     """State of the connection to the broker; docs/mqtt.md explains the fields.
 
-    The payload of ``bridge/health`` contains these fields, and no others.
+    The payload of ``bridge/health`` contains exactly these fields.
     """
 
     __pydantic_config__: ClassVar = {"extra": "forbid"}
@@ -94,20 +93,21 @@ class LinkHealth:
     dropped: int
     ignored_requests: int
     noise: int
-    """Harmless errors of the MQTT library about closed connections."""
+    """Number of harmless errors that the MQTT library raised about closed connections."""
 
 
 class MqttPublisher:
-    """Publishes an outbox and passes on requests, with reconnection.
+    """Publishes an outbox and passes on requests; it reconnects after a loss of the connection.
 
     Parameters
     ----------
     settings
-        ``[mqtt]``: address of the broker; every topic begins with ``settings.base``.
+        Table ``[mqtt]``: address of the broker, and ``settings.base``, with which every topic
+        begins.
     outbox
         Messages to publish.
     on_request
-        Called with each request that is not retained; must not block.
+        Function that is called with each request that is not retained; it must not block.
     """
 
     def __init__(
@@ -124,8 +124,7 @@ class MqttPublisher:
         self._notice_due_s = 0.0
         self._modern = settings.version == "5"
 
-        # With MQTT 3.1.1, the broker has provably accepted a message only if the message comes
-        # back.
+        # With MQTT 3.1.1, only a message that comes back proves that the broker accepted it.
         own = [outbox.state_topic]
         if not self._modern:
             own.append(topics.POSE.name(settings.base))
@@ -138,9 +137,9 @@ class MqttPublisher:
         self.connected = False
         self.connects = self.sent = 0
         self.ignored_requests = 0
-        """Number of requests that were retained, above the permitted rate, or too long."""
+        """Number of ignored requests: retained, above the permitted rate, or too long."""
         self.denied: set[str] = set()
-        """Topics on which the broker refuses messages of this daemon."""
+        """Topics on which the broker refuses this daemon's messages."""
         self._correcting = False
         outbox.retain(outbox.state_topic, ONLINE)
 
@@ -151,7 +150,7 @@ class MqttPublisher:
 
     @property
     def base(self) -> str:
-        """First levels of all topics."""
+        """Levels with which all topics begin."""
         return self._base
 
     def health(self, noise: int = 0) -> LinkHealth:
@@ -188,7 +187,7 @@ class MqttPublisher:
             attempt = asyncio.create_task(self._serve(), name="mqtt connection")
             reason = ""
             try:
-                # no TaskGroup, because it drops a cancellation that coincides with a failure
+                # A TaskGroup would drop a cancellation that coincides with a failure.
                 await attempt
             except* BrokerLostError as lost:
                 error: BaseException = lost
@@ -197,13 +196,14 @@ class MqttPublisher:
                 reason = str(error)
             stop_if_cancelled()
 
-            # A daemon that was connected takes its connection back at once; see `TakeoverDetector`.
+            # A daemon that was connected before reconnects at once; see `TakeoverDetector`.
             lasted_s, self._lasted_s = self._lasted_s, 0.0
             if lasted_s >= NEWCOMER_S:
                 delay_s = _FIRST_RETRY_S
 
             try:
-                # A takeover closes the connection, so a silent broker does not indicate a takeover.
+                # A takeover closes the connection. A broker that does not answer is therefore no
+                # takeover.
                 silent = NO_ANSWER in reason
                 if silent or not await self._gave_way(lasted_s):
                     self._report_loss(reason, lasted_s)
@@ -216,9 +216,10 @@ class MqttPublisher:
             delay_s = min(2 * delay_s, _LAST_RETRY_S)
 
     async def emptied(self, within_s: float, *, streams: bool = False) -> None:
-        """Wait until the broker has all state and events; at most `within_s`, if connected.
+        """Wait until the broker has accepted all state and events, for at most `within_s`.
 
-        With `streams`, the method also waits until the streams are sent.
+        The method returns at once without a connection. With `streams`, it also waits until all
+        stream messages are sent.
         """
         until, outbox = self._loop.time() + within_s, self._outbox
         while self.connected and self._loop.time() < until:
@@ -235,7 +236,7 @@ class MqttPublisher:
         )
 
     async def _gave_way(self, lasted_s: float) -> bool:
-        """Leave the client id to the daemon that used it before, and wait for the daemon's end."""
+        """Leave the client id to the daemon that used it first, and wait until that daemon ends."""
         if not self._takeovers.suspects(lasted_s, taken_over=self._taken_over):
             return False
         if not (self._taken_over or await is_publishing(self._settings, GLANCE_S)):
@@ -251,13 +252,13 @@ class MqttPublisher:
         log.warning("mqtt: the other client with this client id is gone: connecting")
 
     def _report_loss(self, reason: str, lasted_s: float) -> None:
-        """Log why the last attempt or connection ended."""
+        """Log the reason why the last attempt or connection ended."""
         if lasted_s >= SHORT_S:
             self._reported = ""  # short connections in a row share one log line
         if lasted_s > 0.0 and self._taken_over:
             reason = self._contested
         elif lasted_s > 0.0 and (CONNECTION_LOST in reason or CONNECTION_CLOSED in reason):
-            # Which operation fails first is accidental, and a takeover causes the same error.
+            # It is accidental which operation fails first, and a takeover causes the same error.
             reason = (
                 f"broker {self._settings.host}:{self._settings.tcp_port}: the connection ended "
                 "without a reason: the broker stopped, the network failed, or another client uses "
@@ -277,8 +278,9 @@ class MqttPublisher:
         TaskGroup appears cancelled from then on.
         """
         if self.connects == 0:
-            # A connection takes over the client id, and the broker then publishes the will of
-            # another daemon. The next attempt to connect reports a fault of the broker.
+            # A connection takes over the client id. The broker then publishes the will of a daemon
+            # that used this id, so the check comes first. The next attempt to connect reports a
+            # fault of the broker.
             with contextlib.suppress(BrokerLostError):
                 if await is_in_use(self._settings, OFFLINE):
                     await self._pause()
@@ -315,7 +317,8 @@ class MqttPublisher:
         while True:
             message, sent = await self._outbox.next()
             if message.qos == 0 and self._modern:
-                # Once per CHECK_S, a message of each stream is sent at QoS 1 and acknowledged.
+                # Once per `CHECK_S`, a message of each stream is sent with QoS 1, so that it is
+                # acknowledged.
                 topic, now_s = message.topic, self._loop.time()
                 if now_s >= self._checked_s.get(topic, now_s):
                     self._checked_s[topic] = now_s + CHECK_S
@@ -326,13 +329,13 @@ class MqttPublisher:
     def _note_acceptance(
         self, message: Outgoing, sent: Callable[[], None], refusal: str | None
     ) -> None:
-        """Process the acceptance or refusal of `message` by the broker (at QoS 0 by the kernel)."""
+        """Process the acceptance or refusal of `message` by the broker (QoS 0: the kernel)."""
         sent()
         self.sent += 1
         if message.written is not None and not message.qos:
             message.written()
         if message.qos and self._modern:
-            # Log a change of whether the broker accepts messages on this topic.
+            # Log if the broker begins or stops to accept messages on this topic.
             topic = message.topic
             if topic.startswith(responses := topics.RESPONSE.name(self._base)):
                 topic = responses + "#"  # clients choose the last levels, so all share one entry
@@ -366,8 +369,8 @@ class MqttPublisher:
                 self._on_request(message)
                 continue
 
-            # With MQTT 3.1.1 a retained message comes from an earlier process. With MQTT 5 new
-            # messages are marked as retained, too, and no stored messages are sent.
+            # With MQTT 3.1.1, a retained message comes from an earlier process. With MQTT 5, new
+            # messages are marked as retained as well, but the broker sends no stored messages.
             if message.retained and not self._modern:
                 continue
             if message.topic == self._outbox.state_topic:
@@ -382,7 +385,7 @@ class MqttPublisher:
             self.denied.discard(message.topic)
 
     def _admit(self, topic: str, retained: bool) -> bool:
-        """Return whether a message is passed on; count and log an ignored request."""
+        """Return whether a message is passed on; otherwise count and log the ignored request."""
         if topic in self._echoes or topic == self._birth:
             return True
         if retained:
@@ -409,7 +412,7 @@ class MqttPublisher:
         self._outbox.retain(self._outbox.state_topic, ONLINE)
 
     async def _await_echo(self, topic: str) -> None:
-        """Check that messages on `topic` come back; forbidden messages are acknowledged, too."""
+        """Check that messages on `topic` come back; brokers acknowledge forbidden messages, too."""
         echo = self._echoes[topic]
         await echo.sent.wait()
         try:
@@ -427,7 +430,7 @@ class MqttPublisher:
 
 
 class _TopicEcho:
-    """State of the check whether a sent message of the daemon came back."""
+    """State of the check whether the broker returned a message that the daemon sent."""
 
     def __init__(self) -> None:
         self.sent, self.arrived = asyncio.Event(), asyncio.Event()

@@ -1,4 +1,4 @@
-"""Search for the rigs on a broker, by their retained `bridge/info`."""
+"""Search for all rigs on a broker by their retained topic `bridge/info`."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 _DEEPEST_BASE = 4
-"""Maximum number of levels of a base topic that the search finds."""
+"""Largest number of levels of a base topic that the search finds."""
 _MOST_RIGS = 100
 _LONGEST_BYTES = 256 * 1024
 """Largest incoming packet, bytes."""
 
 
 async def find_rigs(settings: MqttSettings, patience_s: float) -> dict[str, str]:
-    """Return the names of the rigs on a broker by base topic; `settings.base` is not used.
+    """Return the names of the rigs on a broker, by base topic; `settings.base` is ignored.
 
     Parameters
     ----------
     settings
-        Address and account.
+        Address of the broker and user account.
     patience_s
-        Time for the retained messages to arrive, s.
+        Time to wait for the retained messages, s.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Password and request key, read from files or systemd credentials.
 
-Invariant: secrets appear in no configuration file, log line, error, argument, event or topic. No
-other service can read a systemd credential.
+Invariant: secrets appear in no configuration file, log line, error, argument, event or topic. Other
+services cannot read a systemd credential.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ log = logging.getLogger(__name__)
 CREDENTIAL = "jointfitd.mqtt-password"
 """Name of the systemd credential that contains the password."""
 LEAST_KEY_BYTES = 16
-"""Shortest request key, bytes: a key of 128 bit cannot be guessed."""
+"""Shortest request key, bytes. A key of 128 bits cannot be guessed."""
 _OTHERS = stat.S_IROTH | stat.S_IWOTH
 
 
 class RequestKeyError(Exception):
-    """Requests must be signed, and the key to verify them is missing or too short."""
+    """Requests must be signed, but the key to verify them is missing or too short."""
 
 
 def password_of(settings: MqttSettings) -> str | None:
-    """Return the password from `password_file` or the systemd credential; None without either."""
+    """Return the password from `password_file` or the systemd credential; None without a source."""
     path = _password_path(settings)
     if path is None:
         return None
@@ -42,7 +42,7 @@ def password_of(settings: MqttSettings) -> str | None:
 
 
 def missing_password(settings: MqttSettings) -> str | None:
-    """Return why the configured user has no password; None with a password or without user."""
+    """Return why the configured user has no password; None if there is a password or no user."""
     if settings.username is None or password_of(settings) is not None:
         return None
     path = _password_path(settings)
@@ -65,7 +65,7 @@ def request_key_of(settings: MqttSettings) -> bytes | None:
     Raises
     ------
     RequestKeyError
-        The file is configured, and is missing or too short.
+        A key file is configured, but is missing or too short.
     """
     if settings.request_key_file is None:
         return None
@@ -86,7 +86,7 @@ def request_key_of(settings: MqttSettings) -> bytes | None:
 
 
 def security_warnings(settings: MqttSettings) -> list[str]:
-    """Return one line for each weakness of the configuration: plain MQTT, readable secrets."""
+    """Return one line for each security weakness, such as plain MQTT or readable secrets."""
     found = []
     if settings.insecure and not settings.is_local:
         found.append(

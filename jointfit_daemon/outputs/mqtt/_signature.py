@@ -6,9 +6,9 @@ A signed request has three additional keys::
     nonce       16 to 64 letters, digits and dashes, new for every request
     signature   HMAC-SHA256, in hexadecimal, of topic, newline, and canonical text
 
-The canonical text is the JSON of the request without ``signature``: keys sorted, no blanks, UTF-8
-without escapes, as ``jq -cS`` prints it. The full topic is signed, so a request for one rig or
-command is invalid for another.
+The canonical text is the JSON of the request without ``signature``. Its keys are sorted, it has no
+blanks, and it is UTF-8 without escapes, as ``jq -cS`` prints it. The signature covers the full
+topic, so a request for one rig or command is invalid for another.
 
 Source: RFC 2104 (HMAC), FIPS 180-4 (SHA-256).
 """
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 SIGNATURE_LIFETIME_US = 30_000_000
-"""Largest absolute difference between a signature's time and the present, microseconds."""
+"""Largest absolute difference between the time of a signature and the current time, µs."""
 SIGNING_KEYS = ("nonce", "signature", "t_us")
 """Keys that a signature adds to a request."""
 _NONCE = re.compile(r"[A-Za-z0-9-]{16,64}")
 
 
 class SignatureRejectedError(Exception):
-    """The signature of a request is missing, wrong, expired or used; the message gives details."""
+    """The signature of a request is missing, wrong, expired or already used."""
 
 
 def canonical(topic: str, request: Mapping[str, Any]) -> bytes:
-    """Return the bytes that are signed."""
+    """Return the bytes over which the signature is computed."""
     table = {name: value for name, value in request.items() if name != "signature"}
     return topic.encode() + b"\n" + orjson.dumps(table, option=orjson.OPT_SORT_KEYS)
 
@@ -50,7 +50,7 @@ def signature_of(key: bytes, topic: str, request: Mapping[str, Any]) -> str:
 
 
 def signed(key: bytes, topic: str, request: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `request` with the present time, a nonce and the signature."""
+    """Return `request` with the current time, a nonce and the signature."""
     stamped = {**request, "t_us": time.time_ns() // 1000, "nonce": secrets.token_hex(16)}
     return stamped | {"signature": signature_of(key, topic, stamped)}
 

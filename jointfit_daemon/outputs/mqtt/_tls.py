@@ -1,8 +1,8 @@
-"""TLS to a broker.
+"""TLS connections to a broker.
 
 Invariant: certificates are always verified, and the TLS version is at least 1.2. Verification
-cannot be switched off: a private broker has a private certificate authority, which
-``[mqtt.tls] ca`` names.
+cannot be switched off. A private broker needs the certificate of its private certificate authority
+in ``[mqtt.tls] ca``.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
 _NOT_YET_VALID, _EXPIRED = 9, 10
 _OTHER_NAME, _OTHER_ADDRESS = 62, 64
 _PLAIN_ANSWERS = {"WRONG_VERSION_NUMBER", "RECORD_LAYER_FAILURE", "HTTP_REQUEST"}
-"""Reasons of OpenSSL if the peer does not speak TLS."""
+"""Reasons that OpenSSL reports if the peer does not use TLS."""
 
 
 class _ClosingTlsSocket(ssl.SSLSocket):
-    """A TLS socket that closes if its handshake fails; paho would leave the socket open."""
+    """A TLS socket that closes if its handshake fails, because paho would leave it open."""
 
     def do_handshake(self, block: bool = False) -> None:  # type: ignore[explicit-override]  # 3.12's
-        """Perform the handshake, or close the socket."""
+        """Perform the handshake; close the socket if it fails."""
         try:
             super().do_handshake(block)
         except BaseException:
@@ -61,7 +61,7 @@ def tls_context(tls: TlsSettings) -> ssl.SSLContext:
 
     if tls.cert is not None:
         try:
-            # Without a function for the passphrase, OpenSSL prompts on the terminal.
+            # Without a passphrase function, OpenSSL would prompt on the terminal.
             context.load_cert_chain(tls.cert, tls.key, password=lambda: "")
         except (ssl.SSLError, ValueError) as error:
             files = f"cert = {tls.cert}, key = {tls.key or tls.cert}"
@@ -82,11 +82,11 @@ def tls_remedy(
     error
         Exception that ended the connection.
     settings
-        ``[mqtt]``.
+        Table ``[mqtt]``.
     established
-        Whether the client side of the handshake was completed. A broker that closes the connection
-        later has rejected the client's certificate. TLS 1.3 checks this certificate last, and a
-        reset connection loses the alert.
+        Whether the client completed its part of the handshake. TLS 1.3 checks the client's
+        certificate last. If the broker closes the connection afterwards, it rejected this
+        certificate, and the reset of the connection loses the alert.
     """
     if isinstance(error, ssl.SSLCertVerificationError):
         return f" ({_verification_remedy(error.verify_code, settings)})"
@@ -104,7 +104,7 @@ def tls_remedy(
 
 
 def _verification_remedy(code: int, settings: MqttSettings) -> str:
-    """Return cause and remedy of a broker certificate that fails verification."""
+    """Return cause and remedy if the verification of the broker's certificate failed."""
     trusted = (settings.tls.ca if settings.tls else None) or "the system's certificates"
     if code == _EXPIRED:
         return "the broker's certificate has expired: renew it, or set this machine's clock"
@@ -122,7 +122,7 @@ def _verification_remedy(code: int, settings: MqttSettings) -> str:
 
 
 def _rejection_remedy(settings: MqttSettings) -> str:
-    """Return cause and remedy of a client certificate that the broker rejects."""
+    """Return cause and remedy if the broker rejected the client's certificate."""
     if settings.tls is None or settings.tls.cert is None:
         return "the broker requires a client certificate: set cert and key in [mqtt.tls]"
     return (

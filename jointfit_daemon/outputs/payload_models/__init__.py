@@ -1,4 +1,4 @@
-"""Models of all payloads, the source of their JSON Schemas. The daemon itself does not load them.
+"""Models of all payloads, the source of their JSON Schemas; the daemon does not load them.
 
 Invariant: every topic that the daemon publishes has one model, and every published payload fits its
 model.
@@ -76,13 +76,13 @@ PAYLOADS: dict[Topic, type[Payload]] = {
     topics.LATE_EVENT: _state.EventMessage,
     topics.LATE_POSE: _streams.Pose,
 }
-"""Model of every topic that the daemon publishes."""
+"""Model of each topic that the daemon publishes."""
 
 
 def payload_schema(topic: Topic) -> dict[str, Any]:
     """Return the JSON Schema (2020-12) of the payload of a topic.
 
-    Further keys are permitted: readers ignore keys that they do not know.
+    Further keys are permitted, because readers must ignore unknown keys.
     """
     schema: dict[str, Any] = _open(PAYLOADS[topic].model_json_schema())
     return schema
@@ -112,7 +112,7 @@ def payload_topic(name: str) -> Topic | None:
 
 
 def _open(schema: Any) -> Any:
-    """Return a schema without the refusal of further keys."""
+    """Return a schema that permits further keys."""
     if isinstance(schema, list):
         return [_open(item) for item in schema]
     if not isinstance(schema, dict):

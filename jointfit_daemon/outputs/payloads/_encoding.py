@@ -1,7 +1,7 @@
-"""JSON of the payloads, as documented in docs/mqtt.md.
+"""JSON encoding of the payloads that docs/mqtt.md documents.
 
-Invariant: the key of every quantity ends in its unit, unknown values are null and never 0, and no
-payload contains NaN (orjson writes null). UNIX time is used in outputs only.
+Invariant: the key of every quantity ends in its unit. Unknown values are null and never 0. No
+payload contains NaN, because orjson writes null instead. UNIX time exists in outputs only.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ _NO_PATENT: dict[str, float | bool | None] = dict.fromkeys(
 def encode(payload: Mapping[str, Any]) -> bytes:
     """Return `payload` as JSON.
 
-    An integer that a browser would round becomes null, and a lone surrogate a question mark:
-    devices and file names can contain both.
+    An integer that a browser would round becomes null. A lone surrogate becomes a question mark.
+    Both occur in data of devices and in file names.
     """
     try:
         return orjson.dumps(payload, _to_json, _OPTIONS)
@@ -69,11 +69,11 @@ def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
     Parameters
     ----------
     state
-        One frame.
+        Limb state of one frame.
     offset_ns
         UNIX time minus CLOCK_MONOTONIC, ns.
     now_ns
-        Present CLOCK_MONOTONIC time, ns, for ``age_ms``.
+        Current CLOCK_MONOTONIC time, ns, from which ``age_ms`` is computed.
     """
     return encode(
         {
@@ -93,14 +93,14 @@ def encode_pose(state: LimbState, offset_ns: int, now_ns: int) -> bytes:
 
 
 def encode_joint(state: LimbState, number: int, t_us: int) -> bytes:
-    """Return the payload of ``joint/NAME``: scalars only, for dashboards.
+    """Return the payload of ``joint/NAME``, which contains only scalars, for dashboards.
 
     Parameters
     ----------
     state
-        One frame.
+        Limb state of one frame.
     number
-        Index of the joint; joints between two segments have keys of angles, null if unknown.
+        Index of the joint. Joints between two segments have keys for the angles, null if unknown.
     t_us
         UNIX time of the frame, µs.
     """
@@ -114,7 +114,7 @@ def encode_joint(state: LimbState, number: int, t_us: int) -> bytes:
 
 
 def encode_optical(state: OpticalState, offset_ns: int) -> bytes:
-    """Return the payload of ``optical/pose``; `offset_ns` as for `encode_pose`."""
+    """Return the payload of ``optical/pose``; `offset_ns` is described at `encode_pose`."""
     return encode(
         {
             "v": PAYLOAD_VERSION,
@@ -139,7 +139,7 @@ def encode_optical(state: OpticalState, offset_ns: int) -> bytes:
 
 
 def encode_sensors(states: SensorStates, offset_ns: int) -> bytes:
-    """Return the payload of ``sensors/pose``; `offset_ns` as for `encode_pose`."""
+    """Return the payload of ``sensors/pose``; `offset_ns` is described at `encode_pose`."""
     return encode(
         {
             "v": PAYLOAD_VERSION,
@@ -158,7 +158,7 @@ def encode_sensors(states: SensorStates, offset_ns: int) -> bytes:
 
 
 def encode_chain(state: ChainModelState, offset_ns: int) -> bytes:
-    """Return the payload of ``optical/chain``; `offset_ns` as for `encode_pose`."""
+    """Return the payload of ``optical/chain``; `offset_ns` is described at `encode_pose`."""
     return encode(
         {
             "v": PAYLOAD_VERSION,
@@ -192,7 +192,7 @@ def _fit_errors(errors: MarkerFitErrors | None) -> dict[str, Any] | None:
 
 
 def encode_centers(state: RunningCenters, offset_ns: int) -> bytes:
-    """Return the payload of ``optical/centers``; `offset_ns` as for `encode_pose`."""
+    """Return the payload of ``optical/centers``; `offset_ns` is described at `encode_pose`."""
     return encode(
         {
             "v": PAYLOAD_VERSION,
@@ -204,7 +204,7 @@ def encode_centers(state: RunningCenters, offset_ns: int) -> bytes:
 
 
 def encode_sticks(state: StickFigure, offset_ns: int) -> bytes:
-    """Return the payload of ``optical/sticks``; `offset_ns` as for `encode_pose`."""
+    """Return the payload of ``optical/sticks``; `offset_ns` is described at `encode_pose`."""
     return encode(
         {
             "v": PAYLOAD_VERSION,
@@ -303,7 +303,7 @@ def _joint(state: LimbState, number: int) -> dict[str, Any]:
 
 
 def _patent(state: LimbState, number: int) -> dict[str, float | bool | None] | None:
-    """Return the patent's angles of a joint; None if a segment orientation is unknown."""
+    """Return a joint's angles by the patent's definition; None if an orientation is unknown."""
     if number >= len(state.segments):
         return None
     proximal = state.joints[number].proximal
@@ -324,7 +324,7 @@ def _patent(state: LimbState, number: int) -> dict[str, float | bool | None] | N
 def _degrees(angle: float | None) -> float | None:
     """Return `angle`, rad, in degrees with two decimals; None if it is not finite.
 
-    Rounding to an integer and dividing takes a third of the time of ``round(x, 2)``; a pose has
+    Rounding to an integer and dividing takes a third of the time of ``round(x, 2)``, and a pose has
     forty such numbers.
     """
     if angle is None or not isfinite(whole := angle * _HUNDREDTHS):
@@ -340,7 +340,7 @@ def _rounded(values: Iterable[float] | None, digits: int) -> list[float | None] 
 
 
 def _sanitized(value: object) -> object:
-    """Return `value`; integers and characters that JSON cannot represent are replaced."""
+    """Return `value`, in which integers and characters that JSON cannot represent are replaced."""
     if isinstance(value, int):
         return value if abs(value) <= _EXACT else None
     if isinstance(value, str):

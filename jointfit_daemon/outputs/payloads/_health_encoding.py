@@ -1,4 +1,4 @@
-"""JSON form of ``bridge/health``: units in the keys, and rounding."""
+"""JSON form of ``bridge/health``: rounding, and units in the keys."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ class ProcessHealth:
     """Resource usage of the process since the last health message."""
 
     cpu_pct: float
-    """CPU time over elapsed time, percent of one core."""
+    """CPU time divided by elapsed time, percent of one core."""
     rss_bytes: int | None
     """Resident memory; None if unknown."""
     loop_delay_p99_ms: float | None
-    """0.99 quantile of the event loop's delay in the last minute."""
+    """0.99 quantile of the event loop's delay in the last minute, ms; None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class StateHealth:
-    """Faults of persistent data; each field is a reason, or None without a fault."""
+    """Faults of persistent data. Each field is the reason of a fault, or None without a fault."""
 
     fault: str | None
-    """Reason why the state directory cannot be written."""
+    """Reason why the daemon cannot write to the state directory."""
     not_stored: str | None
     """Reason why the calibration in force is not stored."""
 

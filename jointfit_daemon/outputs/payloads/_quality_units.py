@@ -1,7 +1,8 @@
-"""Units of a calibration's quality on MQTT: degrees, milliseconds, and four digits.
+"""Units of a calibration's quality on MQTT: degrees, milliseconds, and four significant digits.
 
-The core uses radians and nanoseconds, and the tables by method in the core have no unit. Invariant:
-on a topic every quantity has a unit, in its own key or in the key of the table that contains it.
+The core uses radians and nanoseconds, and the core's tables by method have no unit in their keys.
+Invariant: on a topic, every quantity has a unit in its own key or in the key of the table that
+contains it.
 """
 
 from __future__ import annotations
@@ -11,23 +12,23 @@ from collections.abc import Mapping
 from typing import Any
 
 _CONVERTED = {"_rad": ("_deg", 180.0 / math.pi), "_ns": ("_ms", 1e-6)}
-"""Suffix of a key in the core, suffix on MQTT, and conversion factor."""
+"""Conversion by suffix of the key in the core: suffix on MQTT, and factor."""
 _TABLES = {"segments": "segments_rad", "flexion": "flexion_rad"}
-"""Tables of ``holdout`` with values in radians by segment or joint, and method."""
+"""Tables in ``holdout`` whose values by method are in radians, per segment or joint."""
 _PARAMETERS = ("sensors", "regression")
-"""Tables of quaternions and coefficients, which are published with all digits. With four digits, an
-orientation computed from the table would have an error of about 0.1 degrees."""
+"""Tables of quaternions and coefficients, which are published with all digits. With four digits,
+orientations computed from them would have an error of about 0.1 degrees."""
 _DIGITS = 4
 
 
 def quality_payload(quality: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `quality` in the units of MQTT, figures rounded to four significant digits.
+    """Return `quality` in the units of MQTT, with numbers rounded to four significant digits.
 
     Parameters
     ----------
     quality
-        ``Calibration.quality``: nested mappings whose keys end in ``_rad``, ``_m``, ``_s`` or
-        ``_ns``, or have no unit. The unit of a key applies to all values below it.
+        Nested mappings of ``Calibration.quality``. Keys end in ``_rad``, ``_m``, ``_s`` or ``_ns``,
+        or have no unit. The unit of a key applies to all values below it.
     """
     found = dict(quality)
     if isinstance(holdout := found.get("holdout"), Mapping):

@@ -1,6 +1,6 @@
-"""Writes the outputs of the core to the MQTT topics, by way of the outbox.
+"""Writer that publishes the outputs of the core on the MQTT topics, through the outbox.
 
-Invariant: no method waits for a broker. docs/mqtt.md documents topics, rates and retained flags.
+Invariant: no method waits for a broker. docs/mqtt.md describes topics, rates and retained flags.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ _STREAMS: dict[type, tuple[Topic, Callable[[Any, int], bytes]]] = {
     RunningCenters: (topics.OPTICAL_CENTERS, encode_centers),
     StickFigure: (topics.OPTICAL_STICKS, encode_sticks),
 }
-"""Topic and encoder of each output whose payload contains its own instant."""
+"""Topic and encoder of each output whose payload contains its own time."""
 
 
 class TopicWriter:
@@ -82,15 +82,15 @@ class TopicWriter:
     Parameters
     ----------
     rig
-        Provides names, base topic and rates.
+        Rig that defines names, base topic and rates.
     outbox
-        Receives the messages.
+        Outbox to which the messages are added.
     clock
-        Converts stamps to UNIX time.
+        Clock that converts stamps to UNIX time.
     spool
-        Receives events and decimated poses, for the case of an outage; None without a spool.
+        Spool that stores events and decimated poses during an outage; None without a spool.
     latency
-        Measures encoding and writing of every frame.
+        Object that measures the encoding and writing of every frame.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class TopicWriter:
         self.configure(rig)
 
     def configure(self, rig: Rig) -> None:
-        """Publish the layout of `rig`, and clear the retained topics of removed devices."""
+        """Publish the configuration of `rig`, and clear the retained topics of removed devices."""
         self._pose_ui_rate = RateDivider(rig.mqtt.pose_ui_hz)
         self._joint_rate = RateDivider(rig.mqtt.joint_hz)
         late_hz = 0.0 if rig.mqtt.spool is None else rig.mqtt.spool.pose_hz
@@ -129,7 +129,7 @@ class TopicWriter:
         self._announce(rig)
 
     def _announce(self, rig: Rig) -> None:
-        """Publish the discovery message of Home Assistant; remove it if it is switched off."""
+        """Publish the discovery message for Home Assistant, or remove it if it is switched off."""
         topic, settings = discovery_topic(rig.mqtt), rig.mqtt.home_assistant
         if self._discovery is not None and topic != self._discovery:
             self._outbox.retain(self._discovery, b"")
@@ -152,10 +152,10 @@ class TopicWriter:
         self._outbox.retain(topic, encode(payload | {"components": self._components | removed}))
 
     def event(self, event: Event) -> None:
-        """Ignore the inputs of the core."""
+        """Do nothing, because inputs of the core are not published."""
 
     def output(self, output: Output) -> None:
-        """Publish one output of the core; ignore jobs and calibrations to be stored."""
+        """Publish one output of the core; ignore calibration jobs and calibrations to store."""
         match output:
             case LimbState():
                 self._publish_limb_state(output)
@@ -185,7 +185,7 @@ class TopicWriter:
                 pass
 
     def _publish(self, topic: Topic, payload: bytes, value: str = "") -> None:
-        """Add a message to the queue of its topic; `value` replaces the placeholder."""
+        """Add a message to the outbox; `value` replaces the placeholder in the topic."""
         name = topic.name(self._base, value)
         if topic.retained:
             self._outbox.retain(name, payload)
@@ -244,11 +244,11 @@ class TopicWriter:
         )
 
     def _publish_reply(self, reply: Reply) -> None:
-        """Publish on the topic that the client requested, or on ``bridge/response/COMMAND``."""
+        """Publish a reply on the client's response topic, or on ``bridge/response/COMMAND``."""
         address = reply.reply_to
         topic = address.topic or topics.RESPONSE.name(self._base, reply.command)
 
-        # An error contains a list of faults; an error of the core has exactly one fault.
+        # A reply may contain a list of faults. An error of the core has exactly one fault.
         error = None
         if reply.error is not None:
             fault = {key: reply.error.get(key) for key in ("key", "message")}
@@ -278,7 +278,7 @@ class TopicWriter:
 
 
 def _sides(chain: Chain) -> dict[str, Any]:
-    """Return the side of a limb; for a branched limb also the connections."""
+    """Return the side of a limb; for a branched limb, also the connections of its joints."""
     if not chain.parents:
         return {"side": "left" if chain.left_side else "right"}
     parts = body_parts(chain)

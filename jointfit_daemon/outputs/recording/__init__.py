@@ -1,4 +1,4 @@
-"""Recordings: writing and reading of all inputs and outputs of the core in MCAP files."""
+"""Recordings: all inputs and outputs of the core in MCAP files, with writer and reader."""
 
 from jointfit_daemon.outputs.recording._blocks import RecordingError
 from jointfit_daemon.outputs.recording._channels import (

@@ -1,7 +1,7 @@
-"""Reads the records of a recording, also after damaged places.
+"""Reader of the records of a recording that continues after damaged records.
 
-Invariant: no content of a file raises anything but `RecordingError`, or takes more memory than a
-record of `MOST_RECORD_BYTES` and its decompressed content.
+Invariant: whatever a file contains, the only exception is `RecordingError`, and the memory used is
+at most one record of `MOST_RECORD_BYTES` and its decompressed content.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from typing import BinaryIO
 
 MOST_RECORD_BYTES = 64 * 1024 * 1024
-"""Largest record, and largest content of a chunk, bytes; the recorder writes chunks of 1 MiB."""
+"""Largest record, and largest content of a chunk, bytes. The recorder writes chunks of 1 MiB."""
 _PREFIX = struct.Struct("<BQ")
-"""Format of opcode and length of a record."""
+"""Format of the opcode and the length of a record."""
 _RECORD_START = re.compile(
     rb"\x06.{7}\0.{28}\x04\0\0\0zstd|\x0c.{5}\0\0\0.\0\0\0jointfit\.", re.DOTALL
 )
-"""Pattern of the start of a compressed chunk, or of metadata of a recording."""
+"""Pattern of the start of a compressed chunk, or of a recording's metadata."""
 _LONGEST_START = 64
-"""Number of bytes that exceeds every match of `_RECORD_START`."""
+"""Number of bytes that is larger than every match of `_RECORD_START`."""
 _WINDOW_BYTES = 1024 * 1024
-"""Number of bytes that are searched at once."""
+"""Number of bytes that are searched in one step."""
 _MOST_WASTED_RATIO = 20
 """Largest ratio of the bytes read in damaged records to the size of the file. It limits the time
-that a malicious file can take."""
+that reading a malicious file can take."""
 
 
 class RecordingError(ValueError):
@@ -48,13 +48,13 @@ class RecordingError(ValueError):
 
 
 class ChunkBlock(NamedTuple):
-    """A chunk with the right checksum."""
+    """A chunk whose checksum is correct."""
 
     start: int
     """Position of the chunk in the file, bytes."""
     end: int
     content: bytes
-    """Records of the chunk."""
+    """Decompressed records of the chunk."""
 
 
 class MetadataBlock(NamedTuple):
@@ -67,7 +67,7 @@ class MetadataBlock(NamedTuple):
 
 
 class AttachmentBlock(NamedTuple):
-    """An attachment with the right checksum."""
+    """An attachment whose checksum is correct."""
 
     start: int
     end: int
@@ -92,7 +92,7 @@ Block: TypeAlias = ChunkBlock | MetadataBlock | AttachmentBlock | DamagedBlock |
 
 
 class _DamageError(ValueError):
-    """A record is damaged; `read_bytes` bytes of its content were read before the error."""
+    """A record is damaged. The error occurred after `read_bytes` bytes of its content."""
 
     def __init__(self, text: str, read_bytes: int = 0) -> None:
         super().__init__(text)
@@ -128,7 +128,7 @@ def read_blocks(path: Path) -> Iterator[Block]:
 
 
 def _check_header(file: BinaryIO, path: Path, size: int) -> int:
-    """Check magic bytes and header; return the position of the first record."""
+    """Check the magic bytes and the header; return the position of the first record."""
     if size == 0:
         raise RecordingError(f"{path}: the file is empty")
     file.seek(0)
@@ -159,7 +159,7 @@ _LONGEST_HEADER = 4096
 
 
 def _read_record(file: BinaryIO, place: int, size: int) -> tuple[Block | None, int]:
-    """Return the record at `place` (None for an unused kind) and the next position."""
+    """Return the record at `place` and the next position; the record is None for unused kinds."""
     file.seek(place)
     prefix = file.read(_PREFIX.size)
     if prefix.startswith(MCAP0_MAGIC) and place + len(MCAP0_MAGIC) == size:
@@ -183,7 +183,7 @@ def _read_record(file: BinaryIO, place: int, size: int) -> tuple[Block | None, i
     try:
         return _READERS[opcode](place, end, content), end
     except _READING_ERRORS as error:
-        # If the next record begins at the expected position, the length is right.
+        # If another record begins at the expected position, the length is correct.
         if _starts_record(file, end, size):
             return DamagedBlock(place, end, f"a damaged record: {error}"), end
         raise _DamageError(f"a damaged record: {error}", length) from error
@@ -206,7 +206,7 @@ _MESSAGE_INDEX = struct.Struct("<BQHI")
 
 
 def _starts_message_index(start: bytes) -> bool:
-    """Return whether both lengths in a message index agree, since the index has no checksum."""
+    """Return whether the two lengths in a message index agree, because it has no checksum."""
     if len(start) < _MESSAGE_INDEX.size:
         return False
     opcode, length, _, entries_bytes = _MESSAGE_INDEX.unpack_from(start)
@@ -215,7 +215,7 @@ def _starts_message_index(start: bytes) -> bool:
 
 
 def _find_record(file: BinaryIO, place: int, size: int) -> int:
-    """Return the position of the next record that can be found, or else the end of the file."""
+    """Return the position of the next record found, or the end of the file if there is none."""
     while place < size:
         file.seek(place)
         window = file.read(_WINDOW_BYTES + _LONGEST_START)
@@ -236,10 +236,10 @@ def _read_chunk(start: int, end: int, content: bytes) -> Block:
 
     data = chunk.data
     if chunk.compression == "zstd":
-        # A frame that claims another size could expand to any number of bytes.
+        # A compressed frame that declares another size could expand to any number of bytes.
         if zstandard.get_frame_parameters(data).content_size != chunk.uncompressed_size:
             raise _DamageError("the compressed size of a chunk contradicts its content")
-        # Use a new decompressor, because a shared decompressor is not safe in several threads.
+        # A new decompressor is used, because a shared decompressor is not thread-safe.
         data = zstandard.ZstdDecompressor(max_window_size=MOST_RECORD_BYTES).decompress(data)
     elif chunk.compression:
         raise _DamageError(f"unknown compression {chunk.compression[:20]!r}")
@@ -267,7 +267,7 @@ _READERS = {
     Opcode.METADATA: _read_metadata,
     Opcode.ATTACHMENT: _read_attachment,
 }
-"""Opcodes of the records that are read; all other records repeat their content."""
+"""Opcodes of the records that are read. All other records repeat the content of these records."""
 _READING_ERRORS = (
     ValueError,
     OverflowError,
@@ -276,7 +276,7 @@ _READING_ERRORS = (
     zstandard.ZstdError,
     MemoryError,
 )
-"""Errors of the library for damaged content; ValueError includes UnicodeDecodeError."""
+"""Exceptions of the libraries for damaged content; ValueError includes UnicodeDecodeError."""
 
 
 def _stream(content: bytes) -> ReadDataStream:

@@ -6,7 +6,7 @@ event/KIND      every other input event of the core                  JSON
 output/KIND     outputs of the core: `OUTPUT_KINDS`                  JSON
 daemon/KIND     health and notices of the daemon around the core     JSON
 snapshot/KIND   events that restore the state at the start of a file or after a gap
-recording/gap   messages that the disk did not take
+recording/gap   messages that could not be written to the disk
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 PROFILE = "jointfit"
 """Profile in the header of the file."""
 FORMAT = 1
-"""Version of the channels and metadata; a reader refuses later versions."""
+"""Version of the channels and metadata. A reader rejects later versions."""
 RECORDING_METADATA = "jointfit.recording"
 """Name of the metadata record that describes the file."""
 CHANNEL_METADATA = "jointfit.channel"
@@ -57,13 +57,13 @@ OUTPUT_KINDS: dict[type, str] = {
     DeviceStatus: "output/device",
     DeviceInfo: "output/device-info",
 }
-"""Channel of every output that is recorded."""
+"""Channel of each recorded output."""
 STATE = OUTPUT_KINDS[LimbState]
 EVENT_CHANNELS = {event: EVENT + kind for event, kind in EVENT_KINDS.items()}
 
 
 def encode_output(output: Output) -> tuple[str, bytes] | None:
-    """Return channel and content of an output; None for an output that is not recorded."""
+    """Return channel and content of an output; None if the output is not recorded."""
     channel = OUTPUT_KINDS.get(type(output))
     if channel is None:
         return None
@@ -77,18 +77,18 @@ _FILE_NAME = re.compile(r"(?P<rig>.+)-\d{8}T\d{6}-\d{4,}\.mcap(\.part)?")
 
 
 def recorded_rig_name(file_name: str) -> str | None:
-    """Return the rig of a file by its name; None for other files."""
+    """Return the name of the rig from the name of a recording; None for other files."""
     match = _FILE_NAME.fullmatch(file_name)
     return None if match is None else match["rig"]
 
 
 class ChannelForm(NamedTuple):
-    """Description of one channel for the container."""
+    """Description of one channel in the MCAP file."""
 
     encoding: str
     """Message encoding."""
     schema: str
-    """Name of the schema; empty without a schema."""
+    """Name of the schema; empty if there is none."""
     metadata: dict[str, str]
     """Metadata of the channel, such as ``clock`` and ``stamp_means``."""
 
@@ -116,7 +116,7 @@ _STAMPS = {
 
 
 def schema_of(name: str) -> bytes:
-    """Return the JSON Schema of the name, as in `ChannelForm.schema`."""
+    """Return the JSON Schema with the name `ChannelForm.schema`."""
     kind = name.removeprefix("jointfit.")
     fields = {key: _TYPES[letter] for key, letter in _FIELDS.get(kind, {}).items()}
     required = [key for key, letter in _FIELDS.get(kind, {}).items() if letter.islower()]
@@ -135,7 +135,7 @@ _TYPES: dict[str, dict[str, Any]] = {
     "s": {"type": "string"}, "S": {"type": ["string", "null"]}, "b": {"type": "boolean"},
     "o": {"type": "object"}, "O": {"type": ["object", "null"]}, "a": {"type": "array"},
 }  # fmt: skip
-"""Types of fields; a lower-case letter is never null."""
+"""Types of fields. A lower-case letter means that the value is never null."""
 _FIELDS: dict[str, dict[str, str]] = {
     "tick": {"t_ns": "i"},
     "configured": {
@@ -184,4 +184,4 @@ _FIELDS: dict[str, dict[str, str]] = {
         "reason": "s",
     },
 }
-"""Fields of the JSON channels, by the name of their schema; schemas without fields are objects."""
+"""Fields of the JSON channels, by the name of the schema. A schema without fields is an object."""

@@ -1,6 +1,6 @@
-"""Description of one file of a recording, and of the messages that are missing in it.
+"""Descriptions of one file of a recording, and of missing messages in it.
 
-Invariant: a changed bit in a description is detected, because metadata carry their own checksum.
+Invariant: a changed bit in a description is detected, because metadata contain a checksum.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _CHECKSUM = "crc32"
-"""Key of the checksum in metadata records, for which MCAP has no checksum."""
+"""Key of the checksum in metadata records. The MCAP format itself has no such checksum."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingInfo:
-    """One file of a recording."""
+    """Description of one file of a recording."""
 
     format: int
     """Version of the channels and metadata."""
@@ -33,11 +33,11 @@ class RecordingInfo:
     began_with_daemon: bool
     """Whether the session contains every event since the start of the daemon."""
     unix_offset_ns: int
-    """UNIX time minus CLOCK_MONOTONIC in all stamps of this file."""
+    """UNIX time minus CLOCK_MONOTONIC, ns; it applies to all stamps of this file."""
     first_sequence: int
-    """Sequence number of the first message."""
+    """Sequence number of the first message in this file."""
     start_t_ns: int
-    """Beginning of this file, CLOCK_MONOTONIC ns."""
+    """Time at which this file begins, CLOCK_MONOTONIC ns."""
     software: str
     """Names and versions of the programs that wrote the file."""
 
@@ -70,7 +70,7 @@ class RecordingInfo:
 
 @dataclass(frozen=True, slots=True)
 class RecordingGap:
-    """A gap: consecutive messages that are missing in a recording."""
+    """A gap, which is a range of consecutive messages missing in a recording."""
 
     first_sequence: int
     count: int

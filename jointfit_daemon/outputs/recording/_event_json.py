@@ -1,7 +1,7 @@
 """JSON form of the input events and outputs of the core in a recording.
 
 Invariant: conversion to JSON and back returns an equal event. The bytes of a `ChunkArrived` are
-recorded unchanged.
+recorded unchanged, not as JSON.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ UnchunkedEvent: TypeAlias = (
     | CalibrationStored
     | UnixOffset
 )
-"""Any event that is recorded as JSON."""
+"""Type of the events that are recorded as JSON."""
 EVENT_KINDS: dict[type, str] = {
     Tick: "tick",
     Configured: "configured",
@@ -57,7 +57,7 @@ EVENT_KINDS: dict[type, str] = {
     CalibrationStored: "stored",
     UnixOffset: "unix",
 }
-"""Name of every event that is recorded as JSON; chunks are recorded as bytes."""
+"""Name of each event type that is recorded as JSON. Chunks are recorded as bytes."""
 
 _EVENTS: dict[str, Any] = {name: event for event, name in EVENT_KINDS.items()}
 _FIELD_TYPES: dict[str, type[int | str]] = {
@@ -66,12 +66,12 @@ _FIELD_TYPES: dict[str, type[int | str]] = {
 }  # fmt: skip
 """Expected types of the fields of events."""
 _NOT_RECORDED = ("reply_to",)
-"""Fields of events that a replay does not need."""
+"""Fields of events that are not recorded, because a replay does not need them."""
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_PASSTHROUGH_DATACLASS
 
 
 class DamagedEventError(ValueError):
-    """The content of a message describes no event."""
+    """The content of a message cannot be converted to an event."""
 
 
 def encode_state(state: LimbState) -> bytes:
@@ -97,12 +97,12 @@ def encode_event(event: UnchunkedEvent) -> bytes:
 
 
 def decode_event(kind: str, data: bytes) -> UnchunkedEvent:
-    """Return the event of the name `kind` with the JSON content `data`.
+    """Return the event with the name `kind` and the JSON content `data`.
 
     Raises
     ------
     DamagedEventError
-        The content describes no event.
+        The content cannot be converted to an event.
     ConfigError
         The rig of the recording cannot be loaded (a driver is missing).
     """
@@ -137,7 +137,8 @@ def _event(kind: str, given: dict[str, Any]) -> UnchunkedEvent:
 
 
 def _to_json(value: object) -> object:
-    # First convert named tuples, which orjson does not write. A limb state contains ten of them.
+    # Named tuples are converted first, because orjson does not support them. A limb state contains
+    # ten.
     if isinstance(value, tuple):
         names: tuple[str, ...] | None = getattr(value, "_fields", None)
         return list(value) if names is None else dict(zip(names, value, strict=True))

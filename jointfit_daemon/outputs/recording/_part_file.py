@@ -1,6 +1,7 @@
 """One file of a recording that is being written.
 
-Invariant: after a failed write the file continues at the same byte, so it has no damaged place.
+Invariant: after a failed write, the next write continues at the same byte, so the file has no
+damaged range.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.recording._description import RecordingInfo
 
 UNFINISHED = ".part"
-"""Suffix of the name of a file that is being written."""
+"""Suffix of the file name while the file is being written."""
 _SEQUENCES = 2**32
-"""MCAP stores sequence numbers modulo this number."""
+"""Modulus of the sequence numbers in MCAP files."""
 _CHUNK_BYTES = 1024 * 1024
-"""A chunk that reaches this size is closed before the next flush, bytes."""
+"""Size at which a chunk is closed before the next flush, bytes."""
 
 
 class RecordedAttachment(NamedTuple):
@@ -46,7 +47,7 @@ class RecordedAttachment(NamedTuple):
 
 
 class PartFile:
-    """One file: created as ``NAME.mcap.part``, renamed to ``NAME.mcap`` when it is complete.
+    """One file, created as ``NAME.mcap.part`` and renamed to ``NAME.mcap`` when it is complete.
 
     Parameters
     ----------
@@ -55,15 +56,15 @@ class PartFile:
     info
         Description of the file.
     attachments
-        Documents at the beginning of the file.
+        Documents to store at the beginning of the file.
     suffix
-        Suffix of the file name during writing.
+        Suffix of the file name while the file is being written.
 
     Raises
     ------
     OSError
-        The file cannot be created. FileExistsError means that it exists, possibly under its final
-        name.
+        The file cannot be created. FileExistsError means that the file exists, possibly with its
+        final name.
     """
 
     def __init__(
@@ -85,13 +86,13 @@ class PartFile:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
         self._buffer = _UnwrittenBytes()
-        # Message indexes take 16 bytes a message, but Foxglove and PlotJuggler need them.
+        # Message indexes take 16 bytes per message, but Foxglove and PlotJuggler need them.
         self._writer: Any = Writer(cast("IO[bytes]", self._buffer), _CHUNK_BYTES)
         self._writer.start(PROFILE, info.software)
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {"": 0}
 
-        # The description is written twice, because a file without description is lost.
+        # The description is written twice, because a file without a description cannot be read.
         unix_ns = info.start_t_ns + info.unix_offset_ns
         self._writer.add_metadata(RECORDING_METADATA, info.metadata())
         for name, media_type, data in attachments:
@@ -100,12 +101,12 @@ class PartFile:
 
     @property
     def size_bytes(self) -> int:
-        """Size of the file, including bytes that are not yet written."""
+        """Size of the file, including bytes that are not written yet."""
         return self._buffer.tell()
 
     @property
     def unwritten_bytes(self) -> int:
-        """Number of bytes that are not yet written to the disk."""
+        """Number of bytes that are not written to the disk yet."""
         return self._buffer.unwritten_bytes
 
     def add(self, channel: str, log_ns: int, publish_ns: int, sequence: int, data: bytes) -> None:
@@ -124,7 +125,8 @@ class PartFile:
                 form.schema, "jsonschema", schema
             )
 
-        # Write a second definition outside of the chunk, because the chunk may be damaged.
+        # The definition is also written outside of the chunk, because the chunk may be damaged
+        # later.
         number: int = self._writer.register_channel(
             channel, form.encoding, self._schemas[form.schema], form.metadata
         )
@@ -138,14 +140,14 @@ class PartFile:
         Raises
         ------
         OSError
-            Not all bytes were written; the next call writes the rest.
+            Some bytes were not written; the next call writes them.
         """
         self._writer.flush()
         self._buffer.write_to(self._fd)
         os.fdatasync(self._fd)
 
     def finish(self, next_sequence: int, reason: str) -> None:
-        """Write the end and the index, and give the file its final name.
+        """Write the end and the index of the file, and rename it to its final name.
 
         Parameters
         ----------
@@ -157,7 +159,7 @@ class PartFile:
         Raises
         ------
         OSError
-            The end was not written; the name of the file remains unfinished.
+            The end was not written; the file keeps the suffix of an unfinished file.
         """
         try:
             self._writer.flush()
@@ -185,7 +187,7 @@ class PartFile:
 
 
 def sync_directory(directory: Path) -> None:
-    """Write the directory entry of new file names to the disk."""
+    """Write the directory entries of new files to the disk."""
     fd = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(fd)
@@ -194,7 +196,7 @@ def sync_directory(directory: Path) -> None:
 
 
 class _UnwrittenBytes:
-    """Collects the bytes that the library writes, because it loses bytes after a failed write."""
+    """Buffer for the bytes of the MCAP library, which loses bytes if a write fails."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -212,10 +214,10 @@ class _UnwrittenBytes:
         return self._written + len(self._data)
 
     def flush(self) -> None:
-        """Do nothing: `write_to` writes."""
+        """Do nothing, because `write_to` writes the bytes."""
 
     def write_to(self, fd: int) -> None:
-        """Write all bytes to `fd`; after an OSError the rest remains."""
+        """Write all bytes to `fd`. After an OSError, the unwritten bytes stay in the buffer."""
         done = 0
         try:
             while done < len(self._data):

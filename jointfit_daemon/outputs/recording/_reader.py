@@ -1,7 +1,7 @@
-"""Reads finished and damaged recordings, also of a crashed or running daemon.
+"""Reader of recordings, including damaged recordings and those of a crashed or running daemon.
 
-Invariant: messages are returned in the order in which they were processed, and each missing message
-is part of exactly one `RecordingGap`.
+Invariant: messages are returned in the order in which the daemon processed them. Each missing
+message is part of exactly one `RecordingGap`.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event
 
 _PART_NAME = re.compile(r"(?P<stem>.+-\d{8}T\d{6})-(?P<part>\d{4,})\.mcap(\.part)?")
-"""Pattern of the name of a file of a session."""
+"""Pattern of the names of a session's files."""
 _MESSAGE = struct.Struct("<BQHIQQ")
 """Format of opcode, length, channel, sequence number, log time and publish time of a message."""
 _PREFIX = struct.Struct("<BQ")
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)  # comparing an enumeration is slow
 _RESTORING = {SNAPSHOT, GAP.partition("/")[0] + "/"}
-"""Prefixes of channels whose messages have no own sequence number."""
+"""Prefixes of channels whose messages have no sequence number of their own."""
 _SEQUENCES, _HALF = 2**32, 2**31
 
 
@@ -66,12 +66,13 @@ class RecordedMessage(NamedTuple):
     """One message of a recording."""
 
     sequence: int
-    """Number of the message in the session. A snapshot has the number of the message after it."""
+    """Number of the message in the session. A snapshot has the number of the message that follows
+    it."""
     channel: str
     t_ns: int
     """Instant of arrival, CLOCK_MONOTONIC ns."""
     publish_t_ns: int
-    """Instant of the content if known, CLOCK_MONOTONIC ns."""
+    """Time to which the content refers, CLOCK_MONOTONIC ns, if it is known."""
     data: bytes
 
     def event(self) -> Event | None:
@@ -80,7 +81,7 @@ class RecordedMessage(NamedTuple):
         Raises
         ------
         RecordingError
-            The content is not an event.
+            The content cannot be converted to an event.
         ConfigError
             The rig of the recording cannot be loaded (a driver is missing).
         """
@@ -97,14 +98,14 @@ class RecordedMessage(NamedTuple):
 
 @lru_cache(maxsize=256)
 def _channel_parts(channel: str) -> tuple[str, str]:
-    """Return the prefix of a channel, with its slash, and its name."""
+    """Return the prefix of a channel, including its slash, and the rest of the name."""
     prefix, slash, name = channel.partition("/")
     return prefix + slash, name
 
 
 @dataclass(frozen=True)
 class RecordedPart:
-    """One file of a recording."""
+    """One file of a recording that can be read."""
 
     path: Path
     info: RecordingInfo
@@ -112,7 +113,7 @@ class RecordedPart:
     """Attachments by name, such as ``rig.json``."""
 
     def messages(self) -> Iterator[RecordedMessage | DamagedBlock | PartEnd]:
-        """Yield all messages of this file, its damaged places, and its end."""
+        """Yield all messages of this file, its damaged ranges, and its end."""
         topics: dict[int, str] = {}
         expected, offset_ns = self.info.first_sequence, self.info.unix_offset_ns
         end = PartEnd(None, "", complete=False)
@@ -131,7 +132,7 @@ class RecordedPart:
         yield end
 
     def survey(self) -> PartSurvey:
-        """Return the end and the damaged places; the whole file is read."""
+        """Read the whole file; return its end and its damaged ranges."""
         found = [item for item in self.messages() if isinstance(item, DamagedBlock | PartEnd)]
         (end,) = [item for item in found if isinstance(item, PartEnd)]
         return PartSurvey([item for item in found if isinstance(item, DamagedBlock)], end)
@@ -148,7 +149,7 @@ class PartEnd(NamedTuple):
     """End of a file."""
 
     next_sequence: int | None
-    """Sequence number after the last message; None for a file that was not closed."""
+    """Sequence number after the last message; None if the file was not closed."""
     reason: str
     """Reason of the end: ``rotated``, ``stopped``, ``recovered``, or empty."""
     complete: bool
@@ -173,7 +174,7 @@ def _messages(
 ) -> Iterator[RecordedMessage]:
     """Yield the messages of a chunk, and add its channels to `topics`.
 
-    The checksum of the chunk is right, so a wrong length means a file that was made by hand.
+    The checksum of the chunk is correct, so only a file made by hand can contain a wrong length.
     """
     place, size = 0, len(content)
     while place + _PREFIX.size <= size:
@@ -183,7 +184,8 @@ def _messages(
             return
         if opcode == _MESSAGE_OPCODE and length >= _MESSAGE.size - _PREFIX.size:
             _, _, number, low, log_ns, publish_ns = _MESSAGE.unpack_from(content, place)
-            # Numbers are stored modulo 2**32; the difference to the last number is far smaller.
+            # The file stores numbers modulo 2**32. The step from the previous number is far
+            # smaller.
             expected += (low - expected + _HALF) % _SEQUENCES - _HALF
             data = content[place + _MESSAGE.size : end]
             yield RecordedMessage(
@@ -213,7 +215,7 @@ class Recording:
 
     @property
     def name(self) -> str:
-        """``[rig] name``."""
+        """Name of the rig, ``[rig] name``."""
         return self.info.rig
 
     @property
@@ -228,7 +230,7 @@ class Recording:
 
     @cached_property
     def rig_table(self) -> dict[str, Any] | None:
-        """The parsed rig.toml at the beginning; None if the recording contains none."""
+        """The parsed rig.toml at the start of the recording; None if it is not recorded."""
         with suppress(ValueError, KeyError):
             table = orjson.loads(self.parts[0].documents["rig.json"])
             return table if isinstance(table, dict) else None
@@ -237,8 +239,8 @@ class Recording:
     def messages(self) -> Iterator[RecordedMessage | RecordingGap]:
         """Yield all messages in the order of processing, and the gaps between them.
 
-        Snapshots are yielded at the beginning and after gaps only: elsewhere the events before
-        them have the same content.
+        Snapshots are yielded only at the beginning and after gaps. Elsewhere, the preceding events
+        have the same content.
 
         Raises
         ------
@@ -255,7 +257,7 @@ class Recording:
                     yield from sequencer.follow(item)
 
     def events(self) -> Iterator[Event]:
-        """Yield the input events of the core in order; errors are the same as of `messages`."""
+        """Yield the input events of the core in order; the errors are those of `messages`."""
         for message in self.messages():
             if isinstance(message, RecordedMessage):
                 event = message.event()
@@ -269,22 +271,22 @@ class Recording:
                 yield message.data
 
     def gaps(self) -> list[RecordingGap]:
-        """Return all gaps; reads all files."""
+        """Read all files and return all gaps."""
         return [message for message in self.messages() if isinstance(message, RecordingGap)]
 
 
 class _Sequencer:
-    """Finds gaps by the sequence numbers, and selects the snapshots that are necessary."""
+    """Detects gaps by the sequence numbers, and selects the snapshots that are necessary."""
 
     def __init__(self, info: RecordingInfo) -> None:
         self._expected = info.first_sequence
         self._t_ns = info.start_t_ns
         self._restoring = True
         self.damage = ""
-        """Last damaged place, the reason of the next gap."""
+        """Most recent damaged range, which is the reason of the next gap."""
 
     def continues(self, item: RecordedMessage) -> bool:
-        """Return whether a message is the next one, and count it; False for snapshots and gaps."""
+        """Count the next message and return True; return False for snapshots and after gaps."""
         if item.sequence != self._expected or _channel_parts(item.channel)[0] in _RESTORING:
             return False
         self._expected, self._t_ns, self._restoring = item.sequence + 1, item.t_ns, False
@@ -329,14 +331,14 @@ def open_recording(path: Path) -> Recording:
     Parameters
     ----------
     path
-        Any file of a session, or a folder that contains the files of one session; the other files
-        of the session are found by their names.
+        Any file of a session, or a folder with the files of exactly one session. The other files of
+        the session are found by their names.
 
     Raises
     ------
     RecordingError
-        A file is not a recording or of a later version; the folder contains no recording, or
-        several.
+        A file is not a recording, or was written by a later version. Or the folder contains no
+        recording, or several.
     OSError
         A file cannot be read.
     """
@@ -379,7 +381,7 @@ def session_files(path: Path) -> list[Path]:
             if (one := _name_match(other)) is not None and one["stem"] == match["stem"]
         ]
 
-    # A file that was completed while it was listed appears once.
+    # A file that was renamed during the listing is used once.
     complete = {other.name for other in found}
     return sorted(p for p in found if p.name.removesuffix(UNFINISHED) not in complete - {p.name})
 
@@ -394,7 +396,7 @@ def open_part(path: Path) -> RecordedPart:
     Raises
     ------
     RecordingError
-        The file is not a recording, or of a later version.
+        The file is not a recording, or was written by a later version.
     OSError
         The file cannot be read.
     """
@@ -414,7 +416,7 @@ def open_part(path: Path) -> RecordedPart:
 
 
 def _read_info(path: Path, values: dict[str, str]) -> RecordingInfo | None:
-    """Return the description; None if damaged, because the file has a second copy."""
+    """Return the description of a file; None for a damaged copy, because there are two."""
     try:
         version = int(unsealed(values)["format"])
     except (ValueError, KeyError):
@@ -431,12 +433,12 @@ def _read_info(path: Path, values: dict[str, str]) -> RecordingInfo | None:
 
 
 def read_events(path: Path) -> Iterator[Event]:
-    """Yield the input events of the recording at `path` in order, as `Recording.events`.
+    """Yield the input events of the recording at `path` in order; see `Recording.events`.
 
     Raises
     ------
     RecordingError
-        The file is not a recording, of a later version, or contains a damaged event.
+        The file is not a recording, was written by a later version, or contains a damaged event.
     OSError
         The file cannot be read.
     """

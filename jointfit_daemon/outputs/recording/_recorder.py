@@ -1,7 +1,7 @@
-"""The recorder: a sink of the core that passes events and outputs to a thread.
+"""The recorder: a sink of the core that passes events and outputs to a writing thread.
 
 Invariant: `event` and `output` append to a list of limited size and return. Messages that exceed
-the limit are counted, and the recording contains a gap in their place.
+the limit are counted, and the recording contains a gap instead of them.
 """
 
 from __future__ import annotations
@@ -35,40 +35,40 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output
 
 FLUSH_S = 0.3
-"""Interval between the starts of two writes, s. A kill loses the messages of this time and of the
-duration of two writes.
-"""
+"""Interval between the starts of two writes, s. If the daemon is killed, the messages of this
+interval and of two writes are lost."""
 _SHORTEST_PAUSE_S = 0.02
-"""Shortest pause between two writes to a slow disk, s."""
+"""Shortest pause between two writes, s; it applies to slow disks."""
 PENDING_BYTES = 16 * 1024 * 1024
-"""Largest memory of messages that wait for a slow disk, bytes: ten seconds of four IMUs."""
+"""Largest memory for messages that wait for a slow disk, bytes. Four IMUs fill it in ten
+seconds."""
 _MESSAGE_BYTES: dict[type, int] = {LimbState: 6000}
-"""Memory of messages by their type, bytes."""
+"""Memory that a message occupies, by its type, bytes."""
 _OTHER_BYTES = 500
-"""Memory of any other message, bytes; the data of a chunk are added."""
+"""Memory that any other message occupies, bytes, without the data of a chunk."""
 _FREE_S = 5.0
-"""Interval between measurements of the free space, s."""
+"""Interval between measurements of the free disk space, s."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingHealth:
-    """State of the present recording, or of the last one."""
+    """State of the current recording; of the last recording if none is running."""
 
     file: str = ""
-    """Name of the open file, or else of the last file; empty without a file."""
+    """Name of the open file, or of the last file if none is open; empty if there was none."""
     duration_s: float = 0.0
-    """Time from the start of the recording to now, or to the end of the recording."""
+    """Time from the start of the recording to now or to its end, s."""
     written_bytes: int = 0
     backlog_bytes: int = 0
-    """Memory of messages that are not yet written, bytes."""
+    """Memory of the messages that are not written yet, bytes."""
     lost: int = 0
     """Number of messages that could not be written."""
     failure: str | None = None
-    """Reason why messages are not written at present; None while writing works."""
+    """Reason why messages cannot be written at present; None if there is no fault."""
     free_bytes: int | None = None
-    """Free space for recordings; None while unknown."""
+    """Free disk space for recordings, bytes; None while unknown."""
     active: bool = False
-    """Whether the recorder is started."""
+    """Whether the recorder is running."""
 
 
 class Recorder:
@@ -77,15 +77,15 @@ class Recorder:
     Parameters
     ----------
     directory
-        Folder of the files; created if absent.
+        Folder for the files, which is created if necessary.
     name
-        Beginning of the file names, which is followed by the time.
+        Beginning of the file names; the time follows it.
     limits
-        Conditions for the end of a file and for the deletion of old files.
+        Limits at which a file ends and at which old files are deleted.
     report
-        Function that receives each interruption and resumption.
+        Function that is called at each interruption and resumption of writing.
     autostart
-        Whether to record from the first event on.
+        Whether recording starts with the first event.
     """
 
     def __init__(
@@ -101,9 +101,10 @@ class Recorder:
         self._limits = limits or RecordingLimits()
         self._report = report
         self._writing = asyncio.Lock()
-        """Lock of the writing thread, which allows one call at a time."""
+        """Lock that permits one call at a time in the writing thread."""
         self._changing = asyncio.Lock()
-        """Lock of starts and stops, so that each answer contains the state after its request."""
+        """Lock around starts and stops, so that each answer describes the state after its own
+        request."""
         self._writer: SessionWriter | None = None
         self._snapshot = self._before = Snapshot()
         self._t_ns = time.monotonic_ns()
@@ -122,7 +123,7 @@ class Recorder:
         self._gap: RecordingGap | None = None
 
     def begin(self, *, with_daemon: bool = False) -> SessionWriter:
-        """Record from now on; the file is created by the next write."""
+        """Start recording. The next write creates the file."""
         self._clear()
         self._before = self._snapshot
         self._began_s = time.monotonic()
@@ -144,7 +145,7 @@ class Recorder:
             self._snapshot = self._snapshot.after_event(event)
 
     def output(self, output: Output) -> None:
-        """Record one output, if it is of a recorded kind."""
+        """Record one output if its type is recorded."""
         kind = type(output)
         if kind in OUTPUT_KINDS:
             self._add(output, _MESSAGE_BYTES.get(kind, _OTHER_BYTES))
@@ -152,7 +153,7 @@ class Recorder:
             self._snapshot = self._snapshot.after_output(output, self._t_ns)
 
     def daemon_message(self, channel: str, content: object) -> None:
-        """Record a message of the daemon around the core."""
+        """Record a message of the daemon outside the core."""
         self._add(DaemonMessage(channel, time.monotonic_ns(), content), _OTHER_BYTES)
 
     def _add(self, message: object, size_bytes: int) -> None:
@@ -167,7 +168,7 @@ class Recorder:
     # --- state -------------------------------------------------------------------------------
 
     def health(self) -> RecordingHealth:
-        """Return the state of the recording that runs, or else of the last recording."""
+        """Return the state of the running recording, or of the last one if none is running."""
         if self._writer is None:
             return replace(self._last, free_bytes=self._free_bytes)
         return self._health(self._writer)
@@ -186,23 +187,23 @@ class Recorder:
 
     @property
     def directory(self) -> Path:
-        """Folder of the files."""
+        """Folder that contains the files."""
         return self._directory
 
     @property
     def path(self) -> Path | None:
-        """The open file; None before the first write and after the last write."""
+        """Path of the open file; None before the first write and after the last write."""
         return None if self._writer is None else self._writer.file
 
     # --- writing -----------------------------------------------------------------------------
 
     async def start(self) -> RecordingHealth:
-        """Begin to record and return once the file exists; do nothing if a recording runs.
+        """Start recording and return when the file exists; do nothing if a recording is running.
 
         Raises
         ------
         OSError
-            The file cannot be created: nothing is recorded.
+            The file cannot be created, so nothing is recorded.
         """
         async with self._changing:
             writer = self._writer
@@ -216,7 +217,7 @@ class Recorder:
             return self._health(writer)
 
     async def stop(self) -> RecordingHealth:
-        """Write the rest, close the file and return its last state; do nothing without a file."""
+        """Write all messages, close the file, return its last state; do nothing if none is open."""
         async with self._changing, self._writing:
             writer = self._writer
             if writer is not None:
@@ -238,9 +239,9 @@ class Recorder:
         return self.health()
 
     async def run(self) -> None:
-        """Write every 0.3 s until cancelled; then write the rest and close the file.
+        """Write every 0.3 s until cancelled, then write the rest and close the file.
 
-        Unfinished files of earlier runs are repaired meanwhile.
+        Unfinished files of earlier runs are repaired at the same time.
         """
         stopped = threading.Event()
         repair = asyncio.create_task(self._repair(stopped), name="recording repair")
@@ -260,7 +261,7 @@ class Recorder:
             self.close()
 
     def _measure_free_space(self) -> None:
-        # The folder is created by the first recording.
+        # The folder may not exist, because the first recording creates it.
         places = (self._directory, *self._directory.parents)
         try:
             place = next(place for place in places if place.exists())
@@ -289,14 +290,14 @@ class Recorder:
                 self._pass_reports(writer)
 
     def close(self) -> None:
-        """Write the rest and close the file, without a thread."""
+        """Write the rest and close the file in the calling thread."""
         writer, self._writer = self._writer, None
         if writer is not None:
             _close(writer, self._take_rest())
             self._pass_reports(writer)
 
     def _take_rest(self) -> list[Batch]:
-        """Return the waiting messages, and the gap after them, if any."""
+        """Return the waiting messages, and the gap after them if there is one."""
         rest = [self._take()]
         return rest if self._gap is None else [*rest, self._take()]
 
@@ -307,7 +308,7 @@ class Recorder:
         batch = Batch(self._first_sequence, messages, before, self._snapshot, gap)
         self._first_sequence = batch.next_sequence
 
-        # Messages that exceeded the limit follow this batch, and precede the next batch.
+        # Messages above the limit come after this batch and before the next batch.
         self._gap = None
         if self._lost:
             now_ns = time.monotonic_ns()
@@ -334,9 +335,9 @@ def _close(writer: SessionWriter, rest: list[Batch]) -> None:
 
 
 async def _in_thread(work: Callable[[], None]) -> None:
-    """Run `work` in a thread; a cancellation waits for its end, because a thread cannot be stopped.
+    """Run `work` in a thread. A cancellation takes effect after the end of `work`.
 
-    Later work must follow it.
+    A thread cannot be stopped, and later work must not overlap with it.
     """
     running = asyncio.create_task(asyncio.to_thread(work), name="recording writer")
     try:

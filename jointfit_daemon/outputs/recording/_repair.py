@@ -1,6 +1,6 @@
-"""Copies the readable messages of a damaged or unfinished recording to a clean file.
+"""Repair of a damaged or unfinished recording: its readable messages are copied to a clean file.
 
-Invariant: the source is not changed, and no partial copy is left behind.
+Invariant: the source is not changed, and an incomplete copy is deleted.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _COPYING = ".repair"
-"""Suffix of the copy during writing."""
+"""Suffix of the copy while it is being written."""
 DAMAGED = ".bad"
-"""Suffix that a repaired source file gets if it is damaged before its end."""
+"""Suffix given to the source after the repair if the source is damaged before its end."""
 _FLUSH_MESSAGES = 4096
 """Number of messages between two writes."""
 _PAUSE_MESSAGES, _PAUSE_S = 32, 0.001
-"""Number of messages copied at once in a running daemon, and the following pause, s."""
+"""Number of messages that a running daemon copies without a pause, and the pause after them, s."""
 
 
 class RepairStoppedError(Exception):
-    """The repair was stopped before its end."""
+    """The repair was stopped before it was complete."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,11 +49,12 @@ class RepairResult:
     seconds: float
     """Time from the first to the last message, s."""
     gaps: tuple[RecordingGap, ...]
-    """Number of missing messages before the end."""
+    """Gaps of missing messages before the end."""
     unreadable_bytes: int
-    """Number of bytes of the source that belong to no record: damaged, or partly written."""
+    """Number of bytes of the source that belong to no record, because they are damaged or
+    incomplete."""
     closed: bool
-    """Whether the source was closed; otherwise the messages of its last second may be missing."""
+    """Whether the source was closed. If not, messages of its last second may be missing."""
 
 
 def repair_recording(
@@ -68,18 +69,18 @@ def repair_recording(
     Parameters
     ----------
     source
-        The file; it may be unfinished or damaged.
+        File to repair. It may be unfinished or damaged.
     target
-        Name of the clean file, which must not exist.
+        Path of the clean file, which must not exist.
     pause
-        Whether to pause after every 32 messages, because the process acquires data.
+        Whether to pause after every 32 messages, because the process also acquires data.
     stopped
-        Function that returns whether to stop early.
+        Function that returns True to stop the repair.
 
     Raises
     ------
     RecordingError
-        The source is not a recording, contains no message, or is being written.
+        The source is not a recording, contains no message, or another process is writing it.
     FileExistsError
         The target exists.
     OSError
@@ -144,7 +145,7 @@ def _copy(
 
 @contextmanager
 def _unused(source: Path) -> Iterator[None]:
-    """Check that no daemon writes the file."""
+    """Raise an error if a daemon is writing the file."""
     fd = os.open(source, os.O_RDONLY | os.O_CLOEXEC)
     try:
         try:
@@ -165,8 +166,9 @@ def repair_unfinished(
 ) -> list[RepairResult | str]:
     """Repair the files that earlier runs of `rig` left unfinished.
 
-    A repaired file gets its final name. The unfinished file is deleted. If it was damaged before
-    its end, or a file with the final name exists, it is renamed to ``….bad`` instead.
+    A repaired file gets its final name, and the unfinished file is deleted. The unfinished file is
+    renamed to ``….bad`` instead if it was damaged before its end, or if a file with the final name
+    exists.
 
     Returns
     -------

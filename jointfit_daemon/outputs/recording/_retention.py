@@ -11,16 +11,16 @@ if TYPE_CHECKING:
 
 
 def delete_oldest(directory: Path, rig: str, keep_bytes: float) -> list[Path]:
-    """Delete complete recordings of `rig`, the oldest first, until its files fit `keep_bytes`.
+    """Delete the oldest complete recordings of `rig` until all its files fit into `keep_bytes`.
 
     Parameters
     ----------
     directory
         Folder of the recordings.
     rig
-        Beginning of the file names; files of other rigs are not deleted.
+        Beginning of the file names. Files of other rigs are not deleted.
     keep_bytes
-        Largest sum of the sizes, the open file included, bytes.
+        Largest total size of the files, including the open file, bytes.
 
     Returns
     -------

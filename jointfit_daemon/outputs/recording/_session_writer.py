@@ -1,7 +1,7 @@
-"""Writes the messages of one session to its files; every method blocks and runs in a thread.
+"""Writer of the messages of one session to its files. Every method blocks, and runs in a thread.
 
-Invariant: no failure of the disk raises. Messages that cannot be written are counted, and a gap is
-recorded as soon as writing works again.
+Invariant: a failure of the disk raises no exception. Messages that cannot be written are counted,
+and a gap is recorded as soon as writing works again.
 """
 
 from __future__ import annotations
@@ -47,20 +47,20 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 MOST_UNWRITTEN_BYTES = 16 * 1024 * 1024
-"""Largest number of bytes that wait for a full disk: minutes of four IMUs. Later messages are
-lost."""
+"""Largest number of bytes that wait while the disk is full, equal to minutes of four IMUs. Later
+messages are lost."""
 RETRY_S = 1.0
 """Interval between attempts to create a file, s."""
 ABANDON_S = 5.0
-"""Time after which an unwritable file is abandoned for a new file, s."""
+"""Time after which an unwritable file is replaced by a new file, s."""
 _FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors that end when files are deleted; with these errors a file is not abandoned."""
+"""Errors that end when files are deleted. With these errors the file is not replaced."""
 _YIELD_MESSAGES, _YIELD_S = 32, 0.0005
-"""Number of messages encoded at once, and the pause after them, s. The event loop waits for the
-interpreter lock for less than half a millisecond."""
+"""Number of messages encoded at once, and the pause after them, s. With these pauses, the event
+loop waits for the interpreter lock for less than half a millisecond."""
 _LONGEST_PAUSED_S = 0.05
-"""Time after which a batch is encoded without pauses, s. On a busy machine the pauses take long,
-and a kill loses messages that are not written."""
+"""Time after which the rest of a batch is encoded without pauses, s. On a busy machine the pauses
+take long, and a kill of the process loses unwritten messages."""
 
 PROGRAM = f"jointfitd {__version__}"
 """Name and version of this program."""
@@ -69,7 +69,7 @@ SOFTWARE = f"{PROGRAM}, {LIBRARY_IDENTIFIER}, Python {sys.version.split()[0]}"
 
 
 class DaemonMessage(NamedTuple):
-    """A message of the daemon around the core."""
+    """A message of the daemon outside the core."""
 
     channel: str
     t_ns: int
@@ -78,7 +78,7 @@ class DaemonMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """A batch of consecutive messages."""
+    """Consecutive messages that are written together."""
 
     first_sequence: int
     messages: Sequence[object]
@@ -88,7 +88,7 @@ class Batch:
     after: Snapshot
     """State after the last message."""
     gap: RecordingGap | None
-    """Number of lost messages immediately before the first message."""
+    """Gap of lost messages immediately before the first message; None without a gap."""
 
     @property
     def next_sequence(self) -> int:
@@ -97,7 +97,7 @@ class Batch:
 
 
 class RecordingReport(NamedTuple):
-    """A change of the recording that is reported."""
+    """A change in the state of the recording that must be reported."""
 
     text: str
     level: NoticeLevel = NoticeLevel.INFO
@@ -110,17 +110,18 @@ class RecordingLimits:
     file_bytes: float = float("inf")
     file_s: float = float("inf")
     keep_bytes: float = float("inf")
-    """Largest size of all recordings of the rig; the oldest complete files are deleted."""
+    """Largest total size of the rig's recordings, bytes. Above it, the oldest complete files are
+    deleted."""
 
 
 @dataclass(slots=True)
 class SessionWriter:
-    """Writes one session.
+    """Writes the files of one session.
 
     Parameters
     ----------
     directory
-        Folder of the files; created if absent.
+        Folder for the files, which is created if necessary.
     rig
         Beginning of the file names.
     began_with_daemon
@@ -128,7 +129,7 @@ class SessionWriter:
     limits
         Limits at which a file ends and the next file begins.
     pause_s
-        Pause after every 32 messages, s.
+        Duration of the pause after every 32 messages, s.
     """
 
     directory: Path
@@ -138,13 +139,13 @@ class SessionWriter:
     pause_s: float = _YIELD_S
     session: str = field(default_factory=lambda: uuid4().hex)
     fault: str | None = None
-    """Reason why messages are not written at present; None while writing works."""
+    """Reason why messages cannot be written at present; None if there is no fault."""
     lost: int = 0
     """Number of messages that could not be written."""
     written_bytes: int = 0
-    """Size of all finished files and of the present file, bytes."""
+    """Total size of all finished files and the current file, bytes."""
     reports: list[RecordingReport] = field(default_factory=list)
-    """Changes that are not yet reported; the owner empties the list."""
+    """Changes that are not reported yet. The owner of this object empties the list."""
     _part: PartFile | None = None
     _number: int = 0
     _stem: str = ""
@@ -160,16 +161,16 @@ class SessionWriter:
 
     @property
     def file(self) -> Path | None:
-        """The open file; None without a file."""
+        """Path of the open file; None if no file is open."""
         return None if self._part is None else self._part.open_path
 
     @property
     def unwritten_bytes(self) -> int:
-        """Number of encoded bytes that are not yet written."""
+        """Number of encoded bytes that are not written yet."""
         return 0 if self._part is None else self._part.unwritten_bytes
 
     def write(self, batch: Batch) -> None:
-        """Write all messages of `batch`, then begin a new file if a limit is reached."""
+        """Write all messages of `batch`. Begin a new file afterwards if a limit is reached."""
         if batch.gap is not None:
             self._lose(batch.gap)
 
@@ -178,7 +179,7 @@ class SessionWriter:
             self._lose_messages(batch.first_sequence, batch.next_sequence)
             return
 
-        # Record the messages that were lost before `batch`, and the state after them.
+        # Record the gap of messages that were lost before `batch`, and the state after them.
         if self._gap is not None:
             gap, self._gap = self._gap, None
             part.add(GAP, gap.to_t_ns, gap.to_t_ns, batch.first_sequence, orjson.dumps(gap))
@@ -202,14 +203,14 @@ class SessionWriter:
             self._finish(part, batch.next_sequence, "rotated")
 
     def close(self, next_sequence: int) -> None:
-        """Finish the present file; a file that cannot be finished is repaired later."""
+        """Finish the current file. A file that cannot be finished is repaired later."""
         if self._part is not None:
             self._finish(self._part, next_sequence, "stopped")
 
     # --- files -------------------------------------------------------------------------------
 
     def _open(self, batch: Batch) -> PartFile | None:
-        """Create the next file; return None if creating fails."""
+        """Create the next file and return it; return None if it cannot be created."""
         now_s = time.monotonic()
         if now_s < self._retry_s:
             return None
@@ -258,7 +259,10 @@ class SessionWriter:
             self.reports.append(RecordingReport(text))
 
     def _create(self, info: RecordingInfo, attachments: Sequence[RecordedAttachment]) -> PartFile:
-        """Create the file of `info`; all files of a session are named for its first second."""
+        """Create the file of `info`.
+
+        The names of all files contain the first second of the session.
+        """
         unix_s = (info.start_t_ns + info.unix_offset_ns) // 10**9
         while True:
             if not self._stem:
@@ -281,7 +285,7 @@ class SessionWriter:
             return part
 
     def _flush(self, part: PartFile) -> bool:
-        """Write all waiting bytes; return whether this succeeded."""
+        """Write all waiting bytes; return False if this failed."""
         try:
             part.flush()
         except OSError as error:
@@ -356,7 +360,7 @@ class SessionWriter:
     # --- losses ------------------------------------------------------------------------------
 
     def _lose(self, gap: RecordingGap) -> None:
-        """Store the numbers of consecutive lost messages until the gap can be recorded."""
+        """Store which consecutive messages were lost, until the gap can be recorded."""
         self.lost += gap.count
         before = self._gap
         if before is not None:
@@ -367,7 +371,7 @@ class SessionWriter:
         self._gap = gap
 
     def _lose_messages(self, first: int, following: int) -> None:
-        """Count all messages from `first` up to, but not including, `following` as lost."""
+        """Count all messages from `first` up to, but not including, `following`, as lost."""
         if following > first:
             now_ns = time.monotonic_ns()
             reason = self.fault or "the disk is too slow"

@@ -1,4 +1,4 @@
-"""State of the core's inputs, which a recording contains if it begins after the daemon."""
+"""State of the core's inputs, which restores the state at the beginning of a recording."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """Configuration, calibration, open sources and UNIX time at one instant."""
+    """Configuration, calibration, open sources and UNIX time offset at one instant."""
 
     configured: Configured | None = None
-    """The configuration in force, with the calibration in force."""
+    """The configuration and the calibration in force."""
     calibrated_t_ns: int = 0
     """Instant to which `Configured.calibration_age_s` refers, CLOCK_MONOTONIC ns."""
     unix_offset_ns: int | None = None
     opened: Mapping[str, SourceOpened] = field(default_factory=lambda: MappingProxyType({}))
-    """Open sources by their name."""
+    """Open sources by their id."""
 
     def after_event(self, event: Event) -> Snapshot:
         """Return the state after an input event."""
@@ -66,7 +66,7 @@ class Snapshot:
         return found
 
     def after_output(self, output: Output, t_ns: int) -> Snapshot:
-        """Return the state after an output; `t_ns` is the stamp of the previous event."""
+        """Return the state after an output; `t_ns` is the stamp of the event before the output."""
         if not isinstance(output, CalibrationReady) or self.configured is None:
             return self
         configured = replace(self.configured, calibration=output.calibration, calibration_age_s=0.0)
@@ -104,4 +104,4 @@ SNAPSHOT_TYPES = (
     CalibrationSelected,
     CalibrationStored,
 )
-"""Events that change a snapshot."""
+"""Types of the events that change a snapshot."""

@@ -1,4 +1,4 @@
-"""Spool: events and decimated poses of a broker outage, on disk until they are delivered."""
+"""Spool: stores events and decimated poses on disk during a broker outage, until delivery."""
 
 from jointfit_daemon.outputs.spool._spool import Spool, SpoolHealth
 from jointfit_daemon.outputs.spool._spool_files import SpoolFiles

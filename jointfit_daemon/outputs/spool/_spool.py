@@ -1,12 +1,12 @@
-"""Delivers events and decimated poses of a broker outage after its end, also after a restart.
+"""Delivery of events and decimated poses after the end of a broker outage, also after a restart.
 
-While the daemon is connected, only the messages of the last seconds are stored, in memory: a loss
-of the connection is noticed late, and messages sent before may not have arrived. During an outage
-messages are written to disk. After the outage they are sent in order, at least once, behind all
-other messages.
+While the daemon is connected, only the messages of the last seconds are stored, in memory. They are
+needed because a loss of the connection is detected late, and messages sent before may not have
+arrived. During an outage, messages are written to disk. After the outage, they are sent in order,
+at least once, after all other messages.
 
-Invariant: `Spool.add` appends to a list of limited size and returns. Messages that exceed a limit
-are counted, the oldest messages first.
+Invariant: `Spool.add` appends to a list of limited size and returns. Above a limit, the oldest
+messages are dropped and counted.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 BEFORE_S = 10.0
-"""Age of the messages that are stored when the connection is lost, s: a silent loss is noticed
-within 8 s."""
+"""Age of the messages that are stored when the connection is lost, s. A loss without a notification
+is detected within 8 s."""
 START_S = 3.0
-"""Time after the start within which a first connection is not an outage, s."""
+"""Time after the start during which a missing connection is not an outage, s."""
 WRITE_S = 0.5
-"""Interval between two writes during an outage, s: a kill of the daemon loses the messages of this
-time."""
+"""Interval between two writes during an outage, s. If the daemon is killed, the messages of one
+interval are lost."""
 SUBSCRIBE_S = 5.0
-"""Time of a connection before the delivery begins, s: after a restart of the broker, subscribers
-need time to reconnect."""
+"""Time between a new connection and the start of the delivery, s. After a restart of the broker,
+subscribers need this time to reconnect."""
 MOST_PENDING = 2000
-"""Largest number of messages that wait for the disk."""
+"""Largest number of messages that wait to be written to the disk."""
 BATCH = 16
-"""Largest number of messages in delivery at once."""
+"""Largest number of messages that are being delivered at the same time."""
 _POLL_S = 0.02
 """Interval between checks whether a batch was delivered, s."""
 
@@ -55,13 +55,13 @@ class SpoolHealth:
     """Number of messages that wait for the broker."""
     stored_bytes: int
     delivered: int
-    """Number of messages that the broker has accepted since the start."""
+    """Number of messages that the broker has accepted since the daemon started."""
     dropped: int
-    """Number of messages deleted because the spool was full."""
+    """Number of messages that were deleted because the spool was full."""
     damaged: int
-    """Number of lines of the files that cannot be read."""
+    """Number of unreadable lines in the files."""
     failure: str | None
-    """Reason why messages are not stored at present; None while storing works."""
+    """Reason why messages cannot be stored at present; None if there is no fault."""
 
 
 class Link(Protocol):
@@ -69,7 +69,7 @@ class Link(Protocol):
 
     connected: bool
     connects: int
-    """Number of connections so far."""
+    """Number of times that the connection was established."""
 
     @property
     def outbox(self) -> Outbox:
@@ -86,9 +86,9 @@ class Spool:
     Parameters
     ----------
     files
-        Files of the spool.
+        Files in which messages are stored.
     link
-        Function that returns the connection to the present broker.
+        Function that returns the connection to the current broker.
     """
 
     def __init__(self, files: SpoolFiles, link: Callable[[], Link]) -> None:
@@ -99,15 +99,15 @@ class Spool:
         self._starting_until_s = time.monotonic() + START_S
         self._began = False
         """Whether a missing connection counts as an outage: the daemon was connected before, or has
-        waited too long."""
+        waited longer than `START_S`."""
         self._delivered = self._dropped = 0
         self._position = (0, 0)
-        """Number of the file in delivery, and number of its messages that the broker has
+        """Number of the file that is being delivered, and number of its messages that the broker
         accepted."""
         self._failure: str | None = None
 
     def add(self, topic: str, payload: bytes) -> None:
-        """Store a message for the case of an outage; `topic` is the name below the base."""
+        """Store a message in case of an outage; `topic` is relative to the base topic."""
         now_s, message = time.monotonic(), SpooledMessage(topic, payload)
         if not self._link().connected:
             self._begin_outage(now_s)
@@ -119,7 +119,7 @@ class Spool:
             self._recent.popleft()
 
     def _begin(self) -> None:
-        """Process a new connection; the outbox sends messages from before the first connection."""
+        """Process a new connection. Before the first connection, the outbox stores the messages."""
         if not self._began:
             self._began = True
             self._pending.clear()
@@ -148,7 +148,7 @@ class Spool:
         )
 
     async def run(self) -> None:
-        """Write and deliver until cancelled; then write the rest of an outage."""
+        """Write and deliver messages until cancelled, then write the rest of an outage."""
         await self._with_files(self._files.load)
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -172,7 +172,7 @@ class Spool:
             await asyncio.sleep(WRITE_S)
 
     def _store_pending(self) -> None:
-        """Write the waiting messages; messages that the disk refuses remain in the queue."""
+        """Write the waiting messages. Messages that the disk does not accept stay in the queue."""
         pending, self._pending = self._pending, deque()
         try:
             self._files.append(pending)
@@ -193,7 +193,7 @@ class Spool:
             await asyncio.sleep(WRITE_S)
 
     async def _deliver_file(self) -> None:
-        """Send the oldest file, and delete it once the broker has accepted all messages."""
+        """Send the oldest file, and delete it when the broker has accepted all its messages."""
         found = await self._with_files(self._files.oldest)
         if found is None:
             return
@@ -213,7 +213,7 @@ class Spool:
         await self._with_files(lambda: self._files.remove(number))
 
     async def _with_files(self, work: Callable[[], T]) -> T | None:
-        """Run `work` in a thread, one at a time; a failure of the disk is stored."""
+        """Run `work` in a thread, one call at a time; store the reason if the disk fails."""
         async with self._using_files:
             running = asyncio.create_task(asyncio.to_thread(work), name="spool files")
             try:

@@ -1,11 +1,11 @@
-"""Files of the spool: messages in the order of their writing, in files of limited size.
+"""Files of the spool: messages in the order in which they were written, in files of limited size.
 
-A line is the CRC-32 of the rest in hexadecimal digits, the topic below the base, and the payload,
-separated by spaces. A process appends only to files that it created, so only the last line of a
-file can be torn by a power cut.
+A line consists of the CRC-32 of the rest in hexadecimal digits, the topic relative to the base, and
+the payload, separated by spaces. A process appends only to files that it created. A power cut can
+therefore damage only the last line of a file.
 
-Invariant: the files exceed `keep_bytes` by at most one file. When a new file is needed, the oldest
-file is deleted and its messages are counted. A line with a wrong CRC is counted and skipped.
+Invariant: the total size exceeds `keep_bytes` by at most one file. When a new file is needed, the
+oldest file is deleted and its messages are counted. A line with a wrong CRC is counted and skipped.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 FILES = 16
-"""Number of files of a full spool; one file is deleted at once."""
+"""Number of files in a full spool. Files are deleted one at a time."""
 _TOPIC = re.compile(r"[!-~]{1,200}")
-"""A topic: printable ASCII. A client rejects topics with wildcards, spaces or control
+"""Pattern of a topic: printable ASCII. Subscribers reject topics with wildcards, spaces or control
 characters."""
 _WILDCARDS = frozenset("+#")
 _NUMBERED = re.compile(r"(\d{8})\.spool")
@@ -33,7 +33,7 @@ class SpooledMessage(NamedTuple):
     """One message that waits for the broker."""
 
     topic: str
-    """Topic below the base."""
+    """Topic relative to the base topic."""
     payload: bytes
 
 
@@ -43,7 +43,7 @@ class SpoolFiles:
     Parameters
     ----------
     folder
-        Folder of the files; created by the first message.
+        Folder for the files, which is created with the first message.
     keep_bytes
         Largest size of all files.
     """
@@ -51,24 +51,24 @@ class SpoolFiles:
     def __init__(self, folder: Path, keep_bytes: int) -> None:
         self._folder, self._keep_bytes = folder, keep_bytes
         self._counts: dict[int, int] = {}
-        """Number of messages by file number, oldest first."""
+        """Number of messages in each file, by file number, oldest first."""
         self._sizes: dict[int, int] = {}
         self._open: int | None = None
         """File to which this process appends."""
         self._last = 0
         self.dropped = 0
-        """Number of messages deleted because the spool was full."""
+        """Number of messages that were deleted because the spool was full."""
         self.damaged = 0
-        """Number of lines that cannot be read."""
+        """Number of unreadable lines."""
 
     @property
     def waiting(self) -> int:
-        """Number of messages."""
+        """Number of stored messages."""
         return sum(self._counts.values())
 
     @property
     def size_bytes(self) -> int:
-        """Size of all files."""
+        """Total size of the files, bytes."""
         return sum(self._sizes.values())
 
     def load(self) -> None:
@@ -98,7 +98,7 @@ class SpoolFiles:
         Raises
         ------
         OSError
-            The disk does not accept the messages; no message is written.
+            The disk does not accept the messages. In this case, no message is written.
         """
         lines = [_line(message) for message in messages]
         if not lines:
@@ -132,7 +132,7 @@ class SpoolFiles:
             self.remove(oldest)
 
     def oldest(self) -> tuple[int, list[SpooledMessage]] | None:
-        """Return number and messages of the oldest file; no more messages are added to this file.
+        """Return number and messages of the oldest file; this file gets no further messages.
 
         Raises
         ------
