@@ -12,21 +12,21 @@ class Material(NamedTuple):
     reference: str
 
 
-SEEDED = Material("none; seeded random numbers", "exact by construction")
+SEEDED = Material("none; random numbers with a fixed seed", "true values, known by construction")
 SIMULATED_SUBJECTS = Material(
     "simulated subjects, one per random seed, with different sensor-to-segment alignment, heading, "
     "soft-tissue artefact, markers and sensor errors",
     "true bone orientations, not available to the estimators",
 )
 KNEE = Material(
-    "1 adult (OpenCap subject 4), right leg; 4 virtual IMUs: orientations of skin-marker "
-    "clusters plus orientation errors recorded from real filters",
+    "1 adult (OpenCap subject 4), right leg, 4 virtual IMUs (orientations of skin-marker "
+    "clusters plus recorded errors of real orientation filters)",
     "musculoskeletal model fitted to other markers",
 )
 BOTH_KNEES = Material(
-    "1 adult (OpenCap subject 4), both legs; 8 virtual IMUs: orientations of skin-marker "
-    "clusters plus orientation errors recorded from real filters",
-    "inverse kinematics of the subject's model without any marker of thighs and shanks",
+    "1 adult (OpenCap subject 4), both legs, 8 virtual IMUs (orientations of skin-marker "
+    "clusters plus recorded errors of real orientation filters)",
+    "inverse kinematics of the subject's model without the markers of thighs and shanks",
 )
 BOARD = Material(
     "1 IMU on a rigid board (BROAD, trials 02 slow and 07 fast); no soft tissue",
@@ -38,16 +38,16 @@ LOWER_LIMBS = Material(
 )
 SIMULATED_MARKERS = Material(
     "markers simulated on the movements of 1 adult (OpenCap subject 4)",
-    "simulated positions of the markers and joint angles",
+    "simulated marker positions and joint angles",
 )
 OPENSIM_MODELS = Material(
     "2 adults (OpenCap subject 4, OpenSim gait2354)",
-    "OpenSim's InverseKinematicsTool on the unchanged models, unit weights",
+    "OpenSim's InverseKinematicsTool on otherwise unchanged models, with unit weights",
 )
 MODEL_CENTERS = Material(
     "2 adults (OpenCap subject 4, OpenSim gait2354)",
-    "joint centres of scaled models, posed by OpenSim's inverse kinematics; their joints move "
-    "4 to 18 mm relative to the markers",
+    "joint centres of scaled models in the poses of OpenSim's inverse kinematics; the "
+    "joints of the models move by 4 to 18 mm relative to the markers",
 )
 SIMULATED_CLOCKS = Material(
     "simulated device clocks, transports and movements", "clocks and movements of the simulator"
@@ -58,8 +58,9 @@ LIVE_RIG = Material(
 )
 THIS_MACHINE = Material("the machine of the run", "CLOCK_MONOTONIC and CPU time of the process")
 RECORDED_LEGS = Material(
-    "1 adult (OpenCap subject 4), both legs; 8 virtual IMUs: orientations of clusters of skin "
-    "markers, with eight assignments of recorded filter errors to the sensors",
-    "inverse kinematics of the subject's model without any marker of thighs and shanks, once "
-    "with the model's fitted marker positions, once with those of the static trial",
+    "1 adult (OpenCap subject 4), both legs, 8 virtual IMUs (orientations of skin-marker "
+    "clusters plus recorded filter errors, in eight assignments to the sensors)",
+    "inverse kinematics of the subject's model without the markers of thighs and shanks; "
+    "computed twice, with the fitted marker positions of the model and with the marker "
+    "positions of the static trial",
 )

@@ -174,18 +174,19 @@ def _best(found: dict[str, Errors]) -> tuple[float, ...]:
 
 _DATA = (FOLDER, SUBJECT)
 WALKING_FLEXION = (
-    "in walking the thigh and shank errors of patent12 are nearly equal and cancel in flexion; the "
-    "training movements do not show which correction extrapolates to walking"
+    "in walking, the thigh and shank errors of patent12 are nearly equal and cancel in "
+    "flexion; the training movements do not determine which correction is valid in walking"
 )
 JUMP_FLEXION = "not known"
 EXCHANGED_FLEXION = (
-    "flexion depends on which sensor has which filter error; the average over the assignments is "
-    "slightly worse than that of the best other method"
+    "the error of flexion depends on the assignment of filter errors to sensors; its mean "
+    "over the assignments is slightly larger than the mean of the best other method"
 )
 SHORT_TRAINING = (
-    "the first 60 % of a 1.3 s walk contain half a stride, so cross-validation underestimates the "
-    "error of the rest; equal weights of short and long movements in the variance increase this "
-    "coverage, and make the standard deviations of movements left out too large"
+    "the first 60 % of a 1.3 s walk contain only half a stride, so cross-validation "
+    "underestimates the error of the rest; with equal weights of short and long movements "
+    "in the variance, this coverage is larger, but the standard deviations of held-out "
+    "movements are too large"
 )
 EXPERIMENTS = (
     Experiment(

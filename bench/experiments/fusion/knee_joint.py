@@ -107,7 +107,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "knee-normalized-errors",
-        "Root mean square of error over stated standard deviation, three trained movements",
+        "RMS of the ratio of the error to its stated standard deviation, three trained movements",
         normalized_errors,
         KNEE,
         _DATA,

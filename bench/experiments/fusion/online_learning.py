@@ -334,8 +334,9 @@ def _anew(one: Person, calibration: Calibration, dice: np.random.Generator) -> P
 
 
 REDONNED = (
-    f"Models refined online; then every sensor re-donned (turned by {TURN_DEG:g} deg, soft-tissue "
-    f"artefact {100 * OTHER_SKIN:g} % different) with a new static pose only"
+    f"Errors after online learning, and after all sensors were then re-donned (turned by "
+    f"{TURN_DEG:g}°, soft-tissue artefact {100 * OTHER_SKIN:g} % different) with only a new static "
+    "pose"
 )
 EXPERIMENTS = (
     Experiment(

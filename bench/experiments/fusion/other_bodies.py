@@ -106,7 +106,8 @@ def other_bodies(_: Path) -> list[Result]:
 EXPERIMENTS = (
     Experiment(
         "simulated-leg-other-bodies",
-        f"{len(SEEDS)} simulated subjects with other bones, sensor places and soft tissue",
+        f"{len(SEEDS)} simulated subjects with other bone lengths, sensor orientations and "
+        "soft-tissue artefact",
         other_bodies,
         SIMULATED_SUBJECTS,
         long=True,

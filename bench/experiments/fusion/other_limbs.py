@@ -150,7 +150,7 @@ def _rms_deg(angles: Array) -> float:
 EXPERIMENTS = tuple(
     Experiment(
         f"simulated-{limb}",
-        f"Live angles of {len(SEEDS)} simulated subjects: {what}",
+        f"Live errors of {len(SEEDS)} simulated subjects: {what}",
         partial(spread, limb),
         SIMULATED_SUBJECTS,
         long=True,

@@ -172,21 +172,23 @@ def _experiment(name: str, title: str, training: Training, misses: Mapping[str, 
 
 
 RISING = (
-    "the correction extrapolates from squats; if expert a also fades from a leverage ratio of 1 "
-    "on, this error decreases, and those of the jump and of the squats themselves increase"
+    "the correction extrapolates from squats; if the weight of expert a also decreases "
+    "from a leverage ratio of 1 on, this error decreases, but the errors of the jump and "
+    "of the squats increase"
 )
 WALKING = (
-    "the correction extrapolates from squats; other weights of the experts and the trend, by their "
-    "leverage, do not reduce the error to the threshold"
+    "the correction extrapolates from squats; other weights of experts and trend as a "
+    "function of the leverage ratio do not reduce the error to the threshold"
 )
 LONG_AXIS = (
-    "most of the squared error is a rotation about the long axis with a nearly straight knee, "
-    "alike in thigh and shank; in this rotation the two references differ most, too "
-    "(recorded-legs-straight-knee)"
+    "most of the squared error is a rotation about the long axis while the knee is nearly "
+    "straight; this rotation is nearly equal in thigh and shank, and the two references "
+    "also differ most in it (recorded-legs-straight-knee)"
 )
 TILT = (
-    "the first 60 % of the walk contain only its beginning; a larger weight of expert b inside the "
-    "training range reduces the error, and impairs sit-to-stand when it is not trained"
+    "the first 60 % of the walk contain only its beginning; a larger weight of expert b "
+    "inside the training range reduces this error, but increases the error of untrained "
+    "sit-to-stand"
 )
 PUSH_OFF = "the first 60 % of the jump end before the push-off"
 AFTER_SQUATS = {
@@ -215,7 +217,7 @@ LATER_PARTS = {
 EXPERIMENTS = (
     _experiment(
         "recorded-legs-later-parts",
-        "Trained on the first 60 % of four movements, later parts of each",
+        "Errors in the later parts of four movements, after training on their first 60 %",
         guided,
         LATER_PARTS,
     ),
@@ -229,7 +231,7 @@ EXPERIMENTS = (
     ),
     _experiment(
         "recorded-legs-after-squats",
-        "Trained on the first 60 % of the squats alone, four movements",
+        "Errors in four movements, after training on the first 60 % of the squats alone",
         squats_alone,
         AFTER_SQUATS,
     ),

@@ -109,14 +109,14 @@ def segment_scores(model: SegmentModel, part: SegmentInputs) -> Array:
 
 
 LONG_AXIS = (
-    "with a nearly straight knee the sensors do not observe the rotation about the long axis, in "
-    "which the two references differ most, too"
+    "while the knee is nearly straight, the sensors do not observe the rotation about the "
+    "long axis; the two references also differ most in this rotation"
 )
-SHORT = "the first 60 % of this movement do not show the error of the rest"
+SHORT = "the errors in the first 60 % of this movement do not represent the errors in the rest"
 APART = (
-    "the variance grows with the distance from the training range alone; growth with the sensor "
-    "disagreement, selected on simulated subjects, widens it here, and makes the share of "
-    "flexion-coverage-recorded within 1 sd too large"
+    "the variance depends only on the distance from the training range; a variance that "
+    "also grows with the sensor disagreement, selected on simulated subjects, is larger "
+    "here, but makes the share within 1 sd in flexion-coverage-recorded too large"
 )
 MISSES = {
     "later parts, fitted, walking1: thigh": SHORT,

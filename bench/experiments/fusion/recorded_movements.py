@@ -224,9 +224,9 @@ def _donned(trial: KneeTrial, seed: int) -> KneeTrial:
 
 _DATA = (FOLDER,)
 WALKING_FLEXION = (
-    "in walking the thigh and shank errors of patent12 are large, nearly equal, and cancel in "
-    "flexion; the "
-    "training movements do not show which correction extrapolates to walking"
+    "in walking, the thigh and shank errors of patent12 are large but nearly equal, so "
+    "they cancel in flexion; the training movements do not determine which correction is "
+    "valid in walking"
 )
 EXPERIMENTS = (
     Experiment(
@@ -254,7 +254,8 @@ EXPERIMENTS = (
     ),
     Experiment(
         "heading-and-redonning",
-        "Subject turned after the training; sensors re-donned at slightly other places",
+        "Errors after the subject turned, and after the sensors were re-donned at slightly"
+        " different positions",
         turned_and_donned,
         KNEE,
         _DATA,

@@ -244,7 +244,8 @@ EXPERIMENTS = (
     *(
         Experiment(
             IDS[method],
-            f"Live knee flexion and segments of {len(SEEDS)} simulated subjects, {method}",
+            f"Live errors of knee flexion and segments, {len(SEEDS)} simulated subjects, "
+            f"method {method}",
             _row(method),
             SIMULATED_SUBJECTS,
             long=True,

@@ -209,17 +209,19 @@ def chosen_evenness(subject: OpensimSubject, trained: Sequence[str]) -> float:
 
 _OPENSIM = ("opensim",)
 UNTRAINED = (
-    "soft-tissue artefact in sit-to-stand does not occur in walking, from which the positions were "
-    "learned; a smaller prior improves walking and impairs the other movements"
+    "the marker positions were refined on walking, which does not contain the soft-tissue "
+    "artefact of sit-to-stand; a smaller prior improves walking and impairs the other "
+    "movements"
 )
 PRIOR = (
-    "a smaller prior meets the threshold and impairs the untrained movements, so the default "
-    "remains; at its default accuracy OpenSim's tool also stops before its own minimum"
+    "a smaller prior meets the threshold but impairs the untrained movements, so the "
+    "default prior was not changed; in addition, OpenSim's tool at its default accuracy "
+    "stops before the minimum of the error"
 )
 EXPERIMENTS = (
     Experiment(
         "opensim-gait-scaled",
-        "gait2354 as scaled: refined markers in OpenSim's inverse kinematics",
+        "gait2354 as scaled, with refined markers: error in OpenSim's inverse kinematics",
         scaled_only,
         OPENSIM_MODELS,
         (GAIT,),
@@ -238,7 +240,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "opensim-walking-only",
-        "Markers refined on walking alone, in OpenSim's inverse kinematics",
+        "Markers refined on walking alone: error in OpenSim's inverse kinematics",
         walking_alone,
         OPENSIM_MODELS,
         (OPENCAP,),
@@ -248,7 +250,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "opensim-three-movements",
-        "Markers refined on three movements, in OpenSim's inverse kinematics",
+        "Markers refined on three movements: error in OpenSim's inverse kinematics",
         three_movements,
         OPENSIM_MODELS,
         (OPENCAP,),

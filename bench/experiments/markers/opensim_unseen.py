@@ -108,17 +108,19 @@ def _share_of_torso_and_arms(data: Path) -> dict[str, float]:
 
 
 WALKING = (
-    "walking improves least: soft tissue moves the thigh markers otherwise in walking than in "
-    "squats, jump, sit-to-stand and static pose, from which the positions were learned"
+    "walking improves least, because soft tissue displaces the thigh markers differently "
+    "in walking than in the movements used for the refinement (squats, jump, sit-to-stand "
+    "and static pose)"
 )
 EVEN = (
-    "the movements with most soft-tissue artefact, walking and the jump, improve least when they "
-    "are not trained; no frame was in a local minimum of inverse kinematics"
+    "walking and the jump have the most soft-tissue artefact and improve least if they are"
+    " not trained; no frame was in a local minimum of inverse kinematics"
 )
 EXPERIMENTS = (
     Experiment(
         "opensim-every-movement-unseen",
-        "Pelvis and legs, every movement unseen once, in OpenSim's inverse kinematics",
+        "Markers of pelvis and legs, refined on all movements but one: error of this "
+        "movement in OpenSim's inverse kinematics",
         every_movement,
         OPENSIM_MODELS,
         (OPENCAP,),

@@ -116,7 +116,8 @@ def repeatability(data: Path, teams: int = TEAMS) -> list[Result]:
 EXPERIMENTS = (
     Experiment(
         "marker-refinement-operators",
-        "Six operators place the markers of one subject, 10 mm an axis, five groups: repeatability",
+        "Repeatability of joint angles if six operators place the markers of one subject "
+        "with errors of 10 mm per axis, in five groups",
         repeatability,
         SIMULATED_MARKERS,
         recordings=(FOLDER,),

@@ -303,8 +303,9 @@ def _angles_off(model: ChainModel, fitted: ChainModel, true: ChainState, y: Arra
 
 
 FREE_FEET = (
-    "markers leave the orientation of a foot undetermined; with heel and toe locked the "
-    "improvement exceeds the threshold, and movements without noise give the same value"
+    "the markers do not determine the orientation of a foot; with locked markers at heel "
+    "and toe, the reduction exceeds the threshold; movements without noise give the same "
+    "value"
 )
 EXPERIMENTS = (
     Experiment(

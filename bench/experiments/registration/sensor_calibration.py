@@ -45,8 +45,9 @@ GRAVITY, FIELD = 9.81, 48.0
 NOISE = (0.003, 0.03, 0.3)
 """Standard deviations of rate, rad/s, force, m/s², and field, uT."""
 SIMULATED_SENSORS = Material(
-    "12 simulated sensors: bias 0.6 deg/s and 0.3 m/s², scale errors 2 %, hard iron 25 uT and soft "
-    "iron 8 % of 48 uT (standard deviations), white noise",
+    "12 simulated sensors with bias (0.6 deg/s and 0.3 m/s²), scale errors (2 %), hard-"
+    "iron errors (25 uT) and soft-iron errors (8 % of 48 uT), all as standard deviations, "
+    "and white noise",
     "orientations of the simulation, without acceleration",
 )
 POSES = DIRECTIONS[[0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 14, 15]]

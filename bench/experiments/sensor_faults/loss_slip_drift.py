@@ -269,15 +269,17 @@ EXPERIMENTS = (
             (
                 "squats",
                 "squats1",
-                "seated, right leg, placed reference, 3 of 8 deals: without filter errors, too, "
-                "the soft tissue of thigh and shank turns by another angle than in squats of the "
-                "same knee flexion",
+                "the alarms occur while the subject sits, in the right leg, with the "
+                "reference from placed markers, in 3 of 8 deals; there the soft tissue of "
+                "thigh and shank rotates by another angle than in squats at the same knee "
+                "flexion, even without filter errors",
             ),
             (
                 "walking",
                 "walking1",
-                "1 of 96 movements: the thigh sensors in squats, left leg, placed reference, whose "
-                "knee flexion exceeds that of the training",
+                "the alarm occurs in 1 of 96 movements, for the thigh sensors of the left "
+                "leg in squats, with the reference from placed markers; the knee flexes "
+                "further in these squats than in the training",
             ),
         )
     ),

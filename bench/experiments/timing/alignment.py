@@ -294,27 +294,27 @@ def honesty(_data: Path) -> list[Result]:
 EXPERIMENTS: tuple[Experiment, ...] = (
     Experiment(
         "interpolation-shaken",
-        "Interpolation of a body shaken at 550 °/s RMS",
+        "Error of the interpolation of a body that is shaken at 550 °/s RMS",
         interpolation,
         SIMULATED_CLOCKS,
     ),
     Experiment(
         "interpolation-recorded-board",
-        "Interpolation of a recorded board",
+        "Error of the interpolation of a recorded board",
         board,
         BOARD,
         ("broad_excerpts",),
     ),
     Experiment(
         "extrapolation-recorded-board",
-        "Extrapolation by up to one sample period at 95 Hz, recorded board",
+        "Error of extrapolation by up to one sample period at 95 Hz, recorded board",
         ahead,
         BOARD,
         ("broad_excerpts",),
     ),
     Experiment(
         "alignment-latency",
-        "Latency added by alignment, four IMUs at 100 Hz, shaken",
+        "Latency added by the alignment of four shaken IMUs at 100 Hz",
         latency,
         SIMULATED_CLOCKS,
     ),

@@ -350,7 +350,7 @@ EXCERPTS, WHOLE, NEED = ("broad_excerpts",), ("broad",), ("h5py",)
 EXPERIMENTS = (
     Experiment(
         "lag-ten-second-windows",
-        "Lag from ten seconds of motion",
+        "Error of the lag from ten seconds of motion",
         ordinary,
         BOARD,
         EXCERPTS + WHOLE,
@@ -379,21 +379,21 @@ EXPERIMENTS = (
     ),
     Experiment(
         "lag-fast-excerpt",
-        "Lag, one minute of the fast trial",
+        "Error of the lag, one minute of the fast trial",
         partial(excerpts, FAST, FAST_SD_MS, (4.17, 0.05)),
         BOARD,
         EXCERPTS,
     ),
     Experiment(
         "lag-slow-excerpt",
-        "Lag, one minute of the slow trial",
+        "Error of the lag, one minute of the slow trial",
         partial(excerpts, SLOW, SLOW_SD_MS, (4.05, 0.2)),
         BOARD,
         EXCERPTS,
     ),
     Experiment(
         "lag-uncertainty-recorded",
-        "Largest lag error over its standard deviation, windows of whole trials",
+        "Largest ratio of the lag error to its standard deviation, windows of whole trials",
         honest,
         BOARD,
         WHOLE,

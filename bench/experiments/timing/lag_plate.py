@@ -51,7 +51,7 @@ def on_the_plate(_: Path) -> list[Result]:
 EXPERIMENTS = (
     Experiment(
         "lag-plate",
-        "Lag found in the align phase, eight simulated plates",
+        "Error of the lag from the align phase, eight simulated plates",
         on_the_plate,
         SIMULATED_SUBJECTS,
         long=True,

@@ -148,7 +148,7 @@ def drifting(_: Path) -> list[Result]:
 EXPERIMENTS = (
     Experiment(
         "lag-drift-live",
-        "Lag tracked while running, device clocks off by 50 ppm",
+        "Lag tracked during operation, with clock errors of 50 ppm",
         drifting,
         SIMULATED_CLOCKS,
     ),

@@ -94,7 +94,7 @@ def _smooth(omega: np.ndarray, rates: Rates) -> np.ndarray:
 EXPERIMENTS = (
     Experiment(
         "lag-all-trials",
-        "Largest lag error over its standard deviation, all trials and short passages",
+        "Largest ratio of the lag error to its standard deviation, all trials and short passages",
         all_trials,
         BOARD,
         ("broad",),

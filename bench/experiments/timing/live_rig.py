@@ -81,7 +81,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "live-rig-restarts",
-        "Live rig, clocks within 50 ppm, six device restarts",
+        "Errors of stamps in a live rig, with clock errors of up to 50 ppm and six device restarts",
         _restarts,
         LIVE_RIG,
         packages=("orjson",),
