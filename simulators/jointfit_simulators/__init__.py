@@ -1,1 +1,1 @@
-"""Virtual hardware: a limb of known geometry as real bytes on ptys, CAN and sockets."""
+"""Virtual hardware: moves a limb of known geometry, and sends real bytes of its devices."""

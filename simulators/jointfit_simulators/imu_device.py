@@ -1,7 +1,7 @@
-"""Protocol class of a virtual IMU, independent of the transport.
+"""Interface of a virtual IMU, independent of the transport.
 
-A device answers its handshake and encodes the orientations passed to `ImuDevice.push`. All
-protocols thus send the same simulated motion.
+A device answers the handshake of its driver, and encodes the orientations passed to
+`ImuDevice.push`. All devices thus send the same simulated motion.
 """
 
 from __future__ import annotations
@@ -10,14 +10,15 @@ from collections.abc import Callable
 from typing import Protocol
 
 WireNoise = Callable[[bytes], bytes]
-"""Function applied to the bytes sent to the host; the identity is a line without noise."""
+"""Function that is applied to the bytes sent to the host. The identity is a line without noise."""
 
 Quaternion = tuple[float, float, float, float]
-"""Hamilton unit quaternion (w, x, y, z), sensor coordinates to world coordinates (ENU, z up)."""
+"""Hamilton unit quaternion (w, x, y, z), from sensor coordinates to world coordinates (ENU, z up).
+"""
 
 
 def clean_wire(data: bytes) -> bytes:
-    """Return `data` unchanged: a wire without noise."""
+    """Return `data` unchanged, as a wire without noise."""
     return data
 
 
@@ -26,15 +27,15 @@ class ImuDevice(Protocol):
 
     @property
     def streaming(self) -> bool:
-        """Whether the device is in measurement mode (on CAN: whether its bus is open)."""
+        """Whether the device is in measurement mode, or on CAN, whether its bus is open."""
 
     @property
     def rate_hz(self) -> float:
-        """Samples per second, as configured by the host or the constructor."""
+        """Sample rate, Hz, which the host or the constructor has set."""
 
     @property
     def sent(self) -> int:
-        """Number of complete samples written to the wire."""
+        """Number of complete samples that were written to the wire."""
 
     def push(self, device_ns: int, q_world_sensor: Quaternion) -> None:
         """Encode one sample and send it now.
@@ -42,15 +43,15 @@ class ImuDevice(Protocol):
         Parameters
         ----------
         device_ns
-            Time of the device clock since power-up, ns; the device converts it to ticks.
+            Time of the device clock since power-up, ns. The device converts it to ticks.
         q_world_sensor
-            Unit quaternion, sensor to the sensor's own world (ENU).
+            Unit quaternion from the sensor to the sensor's own world (ENU).
 
         Notes
         -----
-        A device that does not stream counts the sample but sends nothing. On a full wire (no
-        reader) the whole sample is lost and not counted as sent.
+        A device that does not stream counts the sample but sends nothing. If the wire is full (no
+        reader), the whole sample is lost and not counted as sent.
         """
 
     async def run(self) -> None:
-        """Serve until cancelled: answer the handshake."""
+        """Answer the handshake of the driver until cancelled."""

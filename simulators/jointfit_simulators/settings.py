@@ -1,10 +1,10 @@
-"""Settings of the simulator: each error source of the virtual hardware, with its default.
+"""Settings of the simulator: the error sources of the virtual hardware, with their defaults.
 
-Angles are in degrees and lengths in millimetres here, because users edit these values. All other
+Angles are in degrees and lengths are in millimetres, because users edit these values. All other
 simulator modules use radians and metres.
 
-Invariant: each random stream is seeded by `Knobs.seed` and the name of its purpose, so changing
-one setting leaves the random draws of all other purposes unchanged.
+Invariant: the seed of each random stream depends on `Knobs.seed` and the name of its purpose. A
+change of one setting therefore does not affect the random numbers for other purposes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Knobs:
 
     seed: int = 1
     rate_hz: float = 100.0
-    """IMU samples per second written to rig.toml; the driver may configure another rate."""
+    """IMU sample rate in rig.toml, Hz. The driver may configure another rate."""
     mocap_hz: float = 120.0
     transition_s: float = 1.5
     """Duration of the blend between two motions."""
@@ -43,7 +43,7 @@ class Knobs:
     orientation_white_deg: float = 0.3
     """RMS of the white orientation noise, applied in the sensor frame."""
     soft_tissue_common_deg: float = 5.0
-    """RMS soft-tissue rotation shared by all sensors of a segment, over walking and squats."""
+    """RMS soft-tissue rotation common to all sensors of a segment, over walking and squats."""
     soft_tissue_sensor_deg: float = 3.0
     """RMS soft-tissue rotation of each single sensor, over walking and squats."""
     soft_tissue_random_share: float = 0.15
@@ -54,30 +54,32 @@ class Knobs:
     represents muscle tension, impact oscillation and creep, which differ from step to step.
     """
     soft_tissue_knee_share: float = 0.65
-    """Share of the repeatable variance driven by the knee; hip or ankle drive the remainder."""
+    """Share of the repeatable variance that the knee causes. The hip or the ankle causes the
+    remainder."""
     mount_deg: float = 20.0
     """Largest sensor-to-segment misalignment, about a random axis."""
     heading_spread_deg: float = 90.0
     """Largest heading difference between the sensors' world frames."""
     optical_heading_deg: float = 180.0
-    """Largest heading of the subject in the optical world, to either side."""
+    """Largest heading of the subject in the optical world, in both directions."""
     world_tilt_deg: float = 0.0
     """Fault: inclination error of a sensor's world frame."""
     world_tilt_sensor: str = ""
-    """Sensor with the inclination fault; empty: all sensors."""
+    """Sensor with the inclination fault; an empty text selects all sensors."""
 
     clock_offset_s: float = 3000.0
     """Longest uptime of a device at the start of the run."""
     clock_skew_ppm: float = 50.0
-    """Largest clock skew, fast or slow."""
+    """Largest clock skew, positive or negative."""
     clock_jitter_us: float = 20.0
     """Standard deviation of the time-stamp jitter."""
     latency_uart_ms: float = 2.0
     latency_can_ms: float = 1.0
     latency_mocap_ms: float = 6.0
-    """Minimum delays from sampling to transmission, by transport."""
+    """Minimum delay from sampling to transmission by the cameras. The settings for UART and CAN
+    have the same meaning."""
     latency_jitter_ms: float = 0.5
-    """Mean of the exponential delay added to the minimum."""
+    """Mean of the exponentially distributed delay in addition to the minimum."""
     dropout: float = 0.005
     """Share of samples that are taken but not sent."""
 
@@ -88,19 +90,19 @@ class Knobs:
     marker_soft_tissue_mm: float = 5.0
     """RMS soft-tissue displacement of a marker relative to bone, over walking and squats."""
     marker_common_share: float = 0.5
-    """Share of the marker displacement variance common to all markers of a cluster."""
+    """Share of the marker displacement variance that is common to all markers of a cluster."""
     marker_noise_mm: float = 0.2
     """RMS length of the marker position noise."""
 
     line_flip_per_byte: float = 0.0
-    """Probability per byte of a flipped bit on a serial line."""
+    """Probability of a flipped bit per byte on a serial line."""
     line_burst_per_byte: float = 0.0
     """Probability per byte that a burst of random bytes starts."""
     line_burst_bytes: int = 16
-    """Longest burst in bytes."""
+    """Maximum length of a burst, bytes."""
 
     def random(self, purpose: str) -> np.random.Generator:
-        """Return the random generator of a purpose; it depends on `seed` and `purpose` only."""
+        """Return the random generator for a purpose, which depends on `seed` and `purpose` only."""
         return np.random.default_rng([self.seed, zlib.crc32(purpose.encode())])
 
 
@@ -132,7 +134,7 @@ def perfect(knobs: Knobs) -> Knobs:
 
 
 def apply_settings(knobs: Knobs, settings: Iterable[str]) -> Knobs:
-    """Return `knobs` with ``NAME=VALUE`` settings applied.
+    """Return `knobs` with the changes in ``NAME=VALUE`` settings.
 
     Raises
     ------
@@ -155,6 +157,6 @@ def apply_settings(knobs: Knobs, settings: Iterable[str]) -> Knobs:
 
 
 def knobs_from_toml(path: Path) -> Knobs:
-    """Return the settings of a TOML file of ``name = value`` lines; others have defaults."""
+    """Return the settings in a TOML file with ``name = value`` lines; others have defaults."""
     table = read_toml(path)
     return apply_settings(Knobs(), [f"{name}={value}" for name, value in table.items()])

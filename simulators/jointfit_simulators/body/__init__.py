@@ -1,4 +1,4 @@
-"""Moving limbs of known geometry: joints, motions, soft tissue, sensor and marker placement."""
+"""Moving limbs of known geometry: joints, motions, soft tissue, sensors and markers."""
 
 from jointfit_simulators.body._chain_model import (
     leg_parts,

@@ -1,7 +1,7 @@
-"""Chain model of a simulated subject, as TOML and as OpenSim 4.
+"""Chain model of a simulated subject, in TOML and OpenSim 4 format.
 
 Invariant: both files describe the same model. The markers of thigh, shank and foot have errors of
-about a centimetre, like those of a scaled model. Two markers of the pelvis are exact and locked.
+about a centimetre, as in a scaled model. Two markers of the pelvis are exact and locked.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Vector = tuple[float, float, float]
 
 
 class Part(NamedTuple):
-    """One segment and the joint to its parent."""
+    """One segment, with the joint to its parent."""
 
     name: str
     parent: str | None
@@ -38,7 +38,7 @@ class Part(NamedTuple):
 
 
 class SampleMarker(NamedTuple):
-    """One marker of the model; position in the segment frame (z up, x right), m."""
+    """One marker of the model, with its position in the segment frame (z up, x right), m."""
 
     name: str
     segment: str
@@ -46,7 +46,7 @@ class SampleMarker(NamedTuple):
 
 
 def leg_parts(geometry: LegGeometry) -> list[Part]:
-    """Return pelvis, thigh, shank and foot; the knee is a hinge."""
+    """Return pelvis, thigh, shank and foot. The knee is a hinge."""
     return [
         Part("pelvis", None, "free", (0.0, 0.0, 0.0)),
         Part("thigh", "pelvis", "ball", geometry.hip_in_pelvis),
@@ -61,7 +61,7 @@ def misplaced_markers(
     templates: Mapping[str, Array],
     parts: Sequence[Part],
 ) -> list[SampleMarker]:
-    """Return the markers of `parts`, displaced at random except those of the pelvis."""
+    """Return the markers of `parts`; all except the pelvis markers are displaced at random."""
     markers = []
     for part in parts:
         true = templates[part.name]
@@ -95,7 +95,7 @@ _COORDINATES = {"free": 6, "ball": 3, "hinge": 1}
 
 
 def model_osim(parts: Sequence[Part], markers: Sequence[SampleMarker]) -> str:
-    """Return the model as an OpenSim 4 file: x forward, y up, z right."""
+    """Return the model as an OpenSim 4 file (x forward, y up, z right)."""
     document = ET.Element("OpenSimDocument", Version="40000")
     model = ET.SubElement(document, "Model", name="sample_leg")
     ET.SubElement(model, "Ground", name="ground")

@@ -1,7 +1,8 @@
 """Forward kinematics of a right leg: bones and joint centres from joint angles (ground truth).
 
-Base world: z up; the subject faces +y at pelvis heading 0. Segment frames: origin at the proximal
-joint centre, z from the distal to the proximal joint centre, y anterior, x to the right.
+In the base world, z is up, and the subject faces +y at pelvis heading 0. The origin of a segment
+frame is the proximal joint centre. Its z axis extends from the distal to the proximal joint centre,
+y is anterior, and x is to the right.
 
 Invariant: in upright stance every segment frame is parallel to the base world.
 """
@@ -21,24 +22,27 @@ if TYPE_CHECKING:
 PARTS = ("pelvis", "thigh", "shank", "foot")
 
 COORDINATES = 31
-"""Columns of a coordinate array: the posture of limb and plate at one instant."""
+"""Number of columns of a coordinate array, which contains the posture of limb and plate."""
 PELVIS_POSITION = slice(0, 3)
-"""Position of the pelvis origin (mid-pelvis) in the base world, m."""
+"""Columns of the pelvis position (mid-pelvis) in the base world, m."""
 PELVIS_TURN = slice(3, 6)
-"""Heading (about z), tilt (about x), list (about y): intrinsic z-x-y, rad."""
+"""Columns of the pelvis angles heading (about z), tilt (about x) and list (about y), intrinsic
+z-x-y, rad."""
 HIP = slice(6, 9)
-"""Flexion, adduction, internal rotation, rad; likewise KNEE and ANKLE."""
+"""Columns of flexion, adduction and internal rotation, rad. KNEE and ANKLE have the same order."""
 KNEE = slice(9, 12)
 ANKLE = slice(12, 15)
 LEG_ANGLES = slice(6, 15)
 PLATE_POSITION = slice(15, 18)
-"""Position of the plate's centre, m."""
+"""Columns of the position of the plate's centre, m."""
 PLATE_TURN = slice(18, 21)
-"""Rotation vector of the plate, rad."""
+"""Columns of the plate's rotation vector, rad."""
 ON_PLATE = 21
-"""Place of the sensors: 1 on the plate, 0 on the leg; intermediate values during the transfer."""
+"""Column with the location of the sensors: 1 on the plate, 0 on the leg, and values between during
+the transfer."""
 LEFT_HIP = slice(22, 25)
-"""Angles of the left leg, rad, with the signs of the right one; likewise LEFT_KNEE, LEFT_ANKLE."""
+"""Columns of the angles of the left hip, rad, with the signs of the right leg. LEFT_KNEE and
+LEFT_ANKLE have the same order."""
 LEFT_KNEE = slice(25, 28)
 LEFT_ANKLE = slice(28, 31)
 LEFT_LEG_ANGLES = slice(22, 31)
@@ -51,13 +55,13 @@ class LegGeometry:
     thigh_m: float = 0.42
     shank_m: float = 0.40
     hip_in_pelvis: tuple[float, float, float] = (0.09, 0.02, -0.07)
-    """Hip joint centre in pelvis coordinates: right, anterior, up."""
+    """Hip joint centre in pelvis coordinates (right, anterior, up), m."""
     ankle_height_m: float = 0.08
-    """Ankle joint centre above the sole."""
+    """Height of the ankle joint centre above the sole, m."""
 
     @property
     def standing_pelvis(self) -> tuple[float, float, float]:
-        """Pelvis origin in upright stance over the origin of the world, m."""
+        """Pelvis origin in upright stance above the origin of the world, m."""
         leg = self.ankle_height_m + self.shank_m + self.thigh_m
         return (0.0, 0.0, leg - self.hip_in_pelvis[2])
 
@@ -68,12 +72,12 @@ class LegGeometry:
 
 
 class LegPose(NamedTuple):
-    """Bones at n instants, base world."""
+    """Bones at n times in the base world."""
 
     orientations: dict[str, Rotation]
-    """Rotations of each part (n): part coordinates to base world."""
+    """Rotations from part coordinates to the base world at n times, by part."""
     origins: dict[str, Array]
-    """Origin of each part, shape (n, 3), m: pelvis origin, hip, knee, ankle."""
+    """Origin of each part, shape (n, 3), m: pelvis origin, hip, knee and ankle."""
 
 
 def joint_rotation(flexion_sign: int, angles: Array) -> Rotation:
@@ -81,13 +85,14 @@ def joint_rotation(flexion_sign: int, angles: Array) -> Rotation:
 
     .. math:: R = R_x(s f) R_y(a) R_z(i)
 
-    with flexion *f*, adduction *a*, internal rotation *i* (Grood and Suntay's order), and s = +1
-    for hip flexion and ankle dorsiflexion, s = -1 for knee flexion (heel back).
+    Here *f* is the flexion, *a* the adduction, and *i* the internal rotation, in the order of Grood
+    and Suntay. The sign s is +1 for hip flexion and ankle dorsiflexion, and -1 for knee flexion
+    (heel back).
 
     Parameters
     ----------
     flexion_sign
-        Sign *s*.
+        Sign *s* of the flexion.
     angles
         Flexion, adduction, rotation, rad, shape (n, 3).
     """
@@ -112,7 +117,7 @@ def leg_pose(geometry: LegGeometry, coordinates: Array) -> LegPose:
 
 
 def included_angle(thigh: Rotation, shank: Rotation) -> Array:
-    """Return the inner angle of two long axes, rad, shape (n,); pi if straight."""
+    """Return the inner angle between two long axes, rad, shape (n,); pi if straight."""
     down = np.array([0.0, 0.0, -1.0])
     a, b = thigh.apply(down), shank.apply(down)
     bend = np.arctan2(np.linalg.norm(np.cross(a, b), axis=-1), np.sum(a * b, axis=-1))

@@ -1,8 +1,9 @@
 """Description of a limb that the simulator can move.
 
-A limb is a chain of at most four body parts, or both legs with the pelvis. Its posture has the
-columns of ``_limb.py``: position and orientation of the base (pelvis, or thorax of the arm), three
-angles of each of three joints (of both legs), and the plate.
+A limb is a chain of at most four body parts, or two legs with the pelvis. Its posture has the
+columns of ``_limb.py``: position and orientation of the base, the angles of the joints, and the
+plate. The base is the pelvis, or the thorax for an arm. Each of the three joints (per leg) has
+three angles.
 
 Invariant: in the static pose every segment frame is parallel to the base world.
 """
@@ -29,11 +30,11 @@ class Connection(NamedTuple):
     parent: str
     child: str
     side: str | None = None
-    """``right`` or ``left`` at the begin of a branch."""
+    """Side of the branch, ``right`` or ``left``, if the joint begins a branch."""
 
 
 class RigChain(NamedTuple):
-    """The limb as rig.toml describes it, from proximal to distal."""
+    """Description of the limb in rig.toml, from proximal to distal."""
 
     joints: tuple[str, ...]
     """Joints from proximal to distal; empty for a branched limb."""
@@ -41,13 +42,13 @@ class RigChain(NamedTuple):
     proximal: str | None = None
     distal: str | None = None
     lengths_m: Mapping[str, float] = {}
-    """Lengths of segments with one joint centre only, which markers do not determine."""
+    """Lengths of segments with a single joint centre, m. Markers do not determine these lengths."""
     connections: tuple[Connection, ...] = ()
-    """Joints of a branched limb."""
+    """Joints of a branched limb; empty for other limbs."""
 
 
 class MainJoint(NamedTuple):
-    """The joint whose angles the ground-truth log contains."""
+    """The joint whose angles are in the log of the ground truth."""
 
     name: str
     columns: slice
@@ -58,25 +59,26 @@ class MainJoint(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class LimbKind:
-    """Anatomy, instruments and movements of one kind of limb."""
+    """Anatomy, sensors, markers and movements of one type of limb."""
 
     name: str
     pose: Callable[[Array], LegPose]
-    """Bones for coordinates of shape (n, COORDINATES)."""
+    """Function that returns the bones for coordinates of shape (n, COORDINATES)."""
     joints: Mapping[str, str]
-    """Joints, and the part whose origin is the joint centre."""
+    """Name of each joint, and the part whose origin is the joint centre."""
     main: MainJoint
     sensors: Mapping[str, str]
-    """Default sensor ids and their segments."""
+    """Segment of each default sensor, by sensor id."""
     clusters: Mapping[str, tuple[str, ...]]
-    """Markers of each part, and of the plate."""
+    """Markers of each part and of the plate."""
     templates: Callable[[np.random.Generator], Mapping[str, Array]]
-    """Marker positions in the frame of each part, drawn with errors of the operator, m."""
+    """Function that returns marker positions in the frame of each part, with random placement
+    errors, m."""
     adjacent: Mapping[str, tuple[slice, ...]]
     """Joints that move the soft tissue of each part, as columns of a coordinate array."""
     motions: Mapping[str, StyledMotion]
     reference: tuple[str, ...]
-    """Motions over which soft-tissue artefact has the RMS values of the settings."""
+    """Motions in which the soft-tissue artefact has the RMS values of the settings."""
     facts: Mapping[str, object]
-    """Lengths and joint centres for the ground-truth log, m."""
+    """Lengths and joint centres for the log of the ground truth, m."""
     chain: RigChain

@@ -1,4 +1,4 @@
-"""The limbs of the simulator by name: leg, legs, arm, trunk."""
+"""The limbs of the simulator, by name: leg, legs, arm and trunk."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 SENSORS = {"S1": "thigh", "S2": "thigh", "S3": "shank", "S4": "shank"}
-"""Default sensor ids of the leg and their segments."""
+"""Segment of each default sensor of the leg, by sensor id."""
 LEG_CHAIN = RigChain(("hip", "knee", "ankle"), ("thigh", "shank"), "pelvis", "foot")
-"""The leg as rig.toml describes it."""
+"""Description of the leg in rig.toml."""
 
 
 def leg(geometry: LegGeometry) -> LimbKind:
-    """Return a right leg of given bone lengths."""
+    """Return a right leg with the given bone lengths."""
     return LimbKind(
         name="leg",
         pose=partial(leg_pose, geometry),
@@ -38,7 +38,7 @@ def leg(geometry: LegGeometry) -> LimbKind:
         reference=("walk", "squat"),
         facts={
             "lengths_m": {"thigh": geometry.thigh_m, "shank": geometry.shank_m},
-            "joint_centers_m": {  # each in the frame of the proximal part
+            "joint_centers_m": {  # in the frame of the proximal part
                 "hip_in_pelvis": list(geometry.hip_in_pelvis),
                 "knee_in_thigh": [0.0, 0.0, -geometry.thigh_m],
                 "ankle_in_shank": [0.0, 0.0, -geometry.shank_m],

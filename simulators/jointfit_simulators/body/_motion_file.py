@@ -1,6 +1,7 @@
-"""Motions from files: joint angles over time, as TOML keys, NPZ arrays or OpenSim kinematics.
+"""Motions from files with joint angles over time, as TOML keys, NPZ arrays or OpenSim tables.
 
-TOML: degrees, clinical signs, one table for each key; a cubic spline interpolates the keys::
+A TOML file contains degrees with clinical signs, and one table for each key. A cubic spline
+interpolates the keys::
 
     loop = true                     # otherwise the last posture is held
     [[key]]
@@ -10,11 +11,12 @@ TOML: degrees, clinical signs, one table for each key; a cubic spline interpolat
     ankle = [0, 0, 0]
     pelvis = [0, 0, 0]              # heading, tilt, list
 
-NPZ, radians: ``t`` (n,) seconds and any of ``hip knee ankle pelvis`` (n, 3).
+An NPZ file contains ``t`` (n,), s, and some of the arrays ``hip``, ``knee``, ``ankle`` and
+``pelvis`` (n, 3), rad.
 
-MOT or STO: the coordinates of OpenSim's lower-limb models, right leg. Their axes (x forward, y up,
-z right) are the project's axes in the order (y, z, x). Their pelvis rotates by tilt, list and
-rotation, in this order.
+A MOT or STO file contains coordinates of OpenSim's lower-limb models for the right leg. The axes of
+these models (x forward, y up, z right) are the axes y, z and x of this project. Their pelvis
+rotates by tilt, list and rotation, in this order.
 """
 
 from __future__ import annotations
@@ -84,13 +86,13 @@ _READERS = {".toml": _read_toml, ".npz": _read_npz, ".mot": _read_opensim, ".sto
 
 
 def motion_from_file(path: Path, style: MovementStyle) -> Motion:
-    """Return the motion of a file; splines between its keys have two continuous derivatives.
+    """Return the motion in a file; splines between its keys have two continuous derivatives.
 
     Raises
     ------
     ValueError
-        Unknown suffix, fewer than two keys, times that do not increase, or a loop with different
-        first and last postures.
+        The suffix is unknown, the file has fewer than two keys, the times do not increase, or the
+        first and last postures of a loop differ.
     """
     if path.suffix.lower() not in _READERS:
         raise ValueError(f"{path}: unknown motion file; expected one of {', '.join(_READERS)}")

@@ -1,6 +1,6 @@
 """Sequence of motions with smooth blends, which can be changed during the run.
 
-Invariant: a switch changes later coordinates only, with two continuous derivatives.
+Invariant: a new motion changes later coordinates only, with two continuous derivatives.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ class Step(NamedTuple):
 
 
 class UnknownMotionError(LookupError):
-    """The motion does not exist; the message lists the existing ones."""
+    """The motion does not exist; the message lists the available motions."""
 
 
 def parse_motion_script(text: str) -> tuple[Step, ...]:
-    """Return the steps of ``"plate:20,stand:8,walk:60"``; the last motion continues.
+    """Return the steps of a text ``"plate:20,stand:8,walk:60"``; the last motion continues.
 
     Raises
     ------
     ValueError
-        A step is not NAME or NAME:SECONDS with positive seconds.
+        A step does not have the form NAME or NAME:SECONDS with positive seconds.
     """
     steps = []
     for part in text.split(","):
@@ -51,14 +51,14 @@ def parse_motion_script(text: str) -> tuple[Step, ...]:
 
 
 class MotionScript:
-    """Sequence of motions of one run; each newer motion fades in over the older ones.
+    """Sequence of motions of one run; a new motion gradually replaces the old motions.
 
     Parameters
     ----------
     motions
         Available motions by name.
     steps
-        Motions from `start_s` on; the last one continues.
+        Sequence of motions from `start_s` on. The last motion continues.
     start_s
         Start of the first step, s.
     transition_s
@@ -88,13 +88,13 @@ class MotionScript:
             raise UnknownMotionError(f"no motion {name!r}; there are: {', '.join(self._motions)}")
 
     def play(self, name: str, t_s: float) -> None:
-        """Start motion `name` at instant `t_s` and discard later steps."""
+        """Start the motion `name` at the time `t_s`; discard later steps."""
         self._check(name)
         earlier = [layer for layer in self._layers if layer[0] < t_s]
         self._layers = [*(earlier or self._layers[:1]), (t_s, name)]
 
     def name_at(self, t_s: float) -> str:
-        """Return the motion that plays or fades in at `t_s`."""
+        """Return the name of the motion that plays or begins at `t_s`."""
         begun = [name for start, name in self._layers if start <= t_s]
         return begun[-1] if begun else self._layers[0][1]
 
@@ -107,7 +107,7 @@ class MotionScript:
             del self._layers[: covered[-1]]
 
     def coordinates(self, t_s: Array) -> Array:
-        """Return the coordinates at instants `t_s` of shape (n,), shape (n, COORDINATES)."""
+        """Return the coordinates, shape (n, COORDINATES), at the times `t_s` of shape (n,)."""
         start, name = self._layers[0]
         blended = self._motions[name](t_s - start)
         for start, name in self._layers[1:]:

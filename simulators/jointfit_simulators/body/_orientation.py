@@ -1,7 +1,7 @@
 """Rotations of the simulator, based on SciPy, with scalar-first quaternions.
 
-Invariant: the estimator's kinematics are not imported, so an error in them cannot also be in the
-ground truth.
+Invariant: the kinematics of the estimator are not imported. An error in them therefore cannot be in
+the ground truth.
 """
 
 from __future__ import annotations

@@ -23,7 +23,8 @@ CLUSTERS: dict[str, tuple[str, ...]] = {
     "foot": ("F1", "F2", "F3", "F4"),
     **PLATE_MARKERS,
 }
-"""Markers of leg and plate by body part; C is for calf (S is a sensor), R for the rigid plate."""
+"""Markers of leg and plate, by body part. The prefix C means calf, because S is a sensor; R means
+rigid plate."""
 
 PLATE_TEMPLATE = np.array(
     [
@@ -34,22 +35,23 @@ PLATE_TEMPLATE = np.array(
         (0.03, 0.02, 0.09),
     ]
 )
-"""Marker positions in the frame of the plate, asymmetric, m, shape (5, 3)."""
+"""Asymmetric marker positions in the frame of the plate, m, shape (5, 3)."""
 _PLACEMENT_M = 0.008
 """Standard deviation of each coordinate of a marker on the skin, m."""
 
 
 def random_misalignment(random: np.random.Generator, most_rad: float) -> Rotation:
-    """Return a rotation by up to `most_rad` about a random axis, as sensor alignment."""
+    """Return a sensor alignment: a rotation by at most `most_rad` about a random axis."""
     axis = random.standard_normal(3)
     return Rotation.from_rotvec(axis / np.linalg.norm(axis) * random.uniform(0, most_rad))
 
 
 def marker_templates(random: np.random.Generator, geometry: LegGeometry) -> dict[str, Array]:
-    """Return marker positions in the frame of each part, upright stance, shape (4, 3).
+    """Return marker positions in the frame of each part, m, shape (4, 3).
 
-    Pelvis: anterior and posterior iliac spines. Thigh and shank: clusters of four on the lateral
-    and anterior side, distributed along the bone. Foot: heel, instep and toes.
+    The pelvis markers are on the anterior and posterior iliac spines. Thigh and shank have clusters
+    of four on the lateral and anterior side, distributed along the bone. The foot markers are on
+    heel, instep and toes.
     """
     thigh, shank = geometry.thigh_m, geometry.shank_m
     nominal = {
@@ -85,7 +87,7 @@ def marker_templates(random: np.random.Generator, geometry: LegGeometry) -> dict
 def place_markers(
     nominal: Mapping[str, Sequence[tuple[float, float, float]]], random: np.random.Generator
 ) -> dict[str, Array]:
-    """Return marker positions with the placement errors of an operator, m, shape (markers, 3)."""
+    """Return marker positions with an operator's placement errors, m, shape (markers, 3)."""
     return {
         part: np.array(points) + random.normal(0.0, _PLACEMENT_M, (len(points), 3))
         for part, points in nominal.items()

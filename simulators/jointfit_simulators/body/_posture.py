@@ -1,4 +1,4 @@
-"""Functions common to all motions: posture coordinates from joint angles, motions in turn.
+"""Functions for all motions: posture coordinates from joint angles, and sequences of motions.
 
 Invariant: all functions have two continuous derivatives.
 """
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 PLATE_ON_TABLE = (0.55, 0.35, 0.90)
 """Position of the plate on its table, m."""
 _MIX_S = 4.0
-"""Duration of each motion in turn, s."""
+"""Duration of each motion in a repeated sequence, s."""
 _MIX_BLEND_S = 1.0
-"""Duration of the blend between two of them, s."""
+"""Duration of the blend between two motions of the sequence, s."""
 FLEXION, ADDUCTION, ROTATION = 0, 1, 2
-"""Columns of a joint."""
+"""Indices of the angles of a joint."""
 HEADING, TILT, LIST = 0, 1, 2
-"""Columns of the orientation of the pelvis."""
+"""Indices of the orientation angles of the pelvis."""
 
 
 def column(part: slice, axis: int) -> int:
@@ -71,7 +71,7 @@ def upright(style: MovementStyle, t: Array) -> Array:
 
 
 def rest(t: Array, base: tuple[float, float, float]) -> Array:
-    """Return zero angles with the base of the limb at a position (m), the plate on its table."""
+    """Return zero angles, with the limb's base at `base` (m) and the plate on its table."""
     coordinates = np.zeros((len(t), COORDINATES))
     coordinates[:, PELVIS_POSITION] = base
     coordinates[:, PLATE_POSITION] = PLATE_ON_TABLE
@@ -79,7 +79,7 @@ def rest(t: Array, base: tuple[float, float, float]) -> Array:
 
 
 def on_plate(coordinates: Array, t: Array) -> Array:
-    """Move the sensors to the plate, rotated by hand about every axis; return `coordinates`."""
+    """Move the sensors to the plate, which turns about every axis; return `coordinates`."""
     coordinates[:, ON_PLATE] = 1.0
     rates_hz, phases = np.array([0.31, 0.23, 0.17]), np.array([0.0, 1.1, 2.3])
     turns = np.sin(2 * np.pi * t[:, None] * rates_hz + phases)
@@ -91,11 +91,11 @@ def on_plate(coordinates: Array, t: Array) -> Array:
 def in_turn(
     parts: Sequence[Callable[[MovementStyle, Array], Array]], style: MovementStyle, t: Array
 ) -> Array:
-    """Repeat motions in turn, `_MIX_S` each, with smooth blends."""
+    """Repeat a sequence of motions of `_MIX_S` each, with smooth blends."""
     coordinates = np.zeros((len(t), COORDINATES))
     place = (t / _MIX_S) % len(parts)
 
-    # the weights of all motions add up to 1 at every instant
+    # The sum of the weights of all motions is always 1.
     for index, part in enumerate(parts):
         since = ((place - index) % len(parts)) * _MIX_S
         weight = smootherstep(since / _MIX_BLEND_S) * smootherstep(
@@ -131,7 +131,7 @@ def deviation(style: MovementStyle, t: Array) -> Array:
 
 
 def ground(style: MovementStyle, coordinates: Array) -> None:
-    """Translate the pelvis so that the ankle has its position in upright stance."""
+    """Translate the pelvis so that the ankle is at its position in upright stance."""
     ankle = leg_pose(style.geometry, coordinates).origins["foot"]
     coordinates[:, PELVIS_POSITION] += np.array(style.geometry.standing_ankle) - ankle
 

@@ -1,7 +1,7 @@
-"""Band-limited random signals that can be evaluated at any time, in any order.
+"""Band-limited random signals, which can be evaluated at any times in any order.
 
-Invariant: a signal depends on time and its seed only, so streams of different rates sample the same
-signal and a run is reproducible.
+Invariant: a signal depends on the time and its seed only. Streams of different rates therefore
+sample the same signal, and a run is reproducible.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 LINES = 48
-"""Number of sinusoids; with fewer, the signal repeats visibly and its RMS fluctuates."""
+"""Number of sinusoids. With fewer sinusoids, the signal repeats visibly and its RMS fluctuates."""
 
 
 class RandomSignal:
@@ -22,14 +22,14 @@ class RandomSignal:
 
     .. math:: x_c(t) = \sum_k a_{ck}\cos 2\pi f_k t + b_{ck}\sin 2\pi f_k t
 
-    (Rice's sum of sinusoids, Bell Syst. Tech. J. 23, 1944). The :math:`f_k` are stratified over
-    the band. The amplitudes are scaled so that every channel has exactly its RMS over a time much
-    longer than ``1/low_hz``.
+    This is Rice's sum of sinusoids (Bell Syst. Tech. J. 23, 1944). The :math:`f_k` are stratified
+    over the band. The amplitudes are scaled so that every channel has exactly its RMS over a time
+    much longer than ``1/low_hz``.
 
     Parameters
     ----------
     random
-        Source of frequencies and amplitudes, used by the constructor only.
+        Random generator of frequencies and amplitudes. Only the constructor uses it.
     channels
         Number of signals.
     low_hz, high_hz
@@ -54,7 +54,7 @@ class RandomSignal:
         self._amplitudes = amplitudes * (rms / np.sqrt(power))
 
     def at(self, t_s: Array) -> Array:
-        """Return the signals at instants `t_s` of shape (n,), shape (n, channels)."""
+        """Return the signals, shape (n, channels), at the times `t_s` of shape (n,)."""
         phase = t_s[:, None] * self._omega
         waves = np.concatenate((np.cos(phase), np.sin(phase)), axis=1)
         signals: Array = waves @ self._amplitudes

@@ -1,12 +1,13 @@
-"""Recorded trials: sensors, bones and markers, interpolated between samples.
+"""Recorded trials with sensors, bones and markers, interpolated between samples.
 
 The recording already contains soft-tissue artefacts and sensor alignment. The motion ``trial``
-plays it once and holds the last posture. ``stand`` holds the static pose: the sensor biases if
-known (every segment is then upright by definition), otherwise the first instant.
+plays it once and then keeps the last posture. The motion ``stand`` is the static pose. This pose
+follows from the sensor biases if they are known, with every segment upright by definition.
+Otherwise, it is the first recorded frame.
 
-File types by suffix: ``.npz`` or ``.sto`` (quaternions) for sensors, ``.trc`` for markers,
-``.json`` for biases (``{"q_bias": {"S1": [w, x, y, z]}}``). Files are y up, as written by OpenSim,
-except NPZ files that specify another axis.
+The file type follows from the suffix: ``.npz`` or ``.sto`` (quaternions) for sensors, ``.trc`` for
+markers, ``.json`` for biases (``{"q_bias": {"S1": [w, x, y, z]}}``). Files are y up, as OpenSim
+writes them, except NPZ files that specify another axis.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 BONES = {"femur": "thigh", "tibia": "shank", "thigh": "thigh", "shank": "shank"}
-"""Bone names of recordings (without their side) and the segments of the rig."""
+"""Segment of the rig for each bone name of a recording (without its side)."""
 
 OPENCAP_CLUSTERS = {
     "pelvis": ("r.ASIS", "L.ASIS", "r.PSIS", "L.PSIS"),
@@ -46,12 +47,12 @@ OPENCAP_CLUSTERS = {
 
 @dataclass(frozen=True)
 class RecordedTrial:
-    """Recorded data of one trial, z up, on one time axis from 0."""
+    """Recorded data of one trial, z up, with one time axis that begins at 0."""
 
     orientations: OrientationTrial
     markers: MarkerTrajectories | None = None
     biases: Mapping[str, Array] = field(default_factory=dict)
-    """q_sensor_segment of the static pose, by sensor."""
+    """Orientation q_sensor_segment in the static pose, by sensor."""
 
     @property
     def seconds(self) -> float:
@@ -60,12 +61,12 @@ class RecordedTrial:
 
 
 def read_recorded_trial(paths: Sequence[Path]) -> RecordedTrial:
-    """Return the trial of several files.
+    """Return the trial that several files contain.
 
     Raises
     ------
     ValueError
-        The number of files with sensors is not one, or the type of a file is unknown.
+        The number of sensor files is not one, or the type of a file is unknown.
     """
     orientations: list[OrientationTrial] = []
     markers: MarkerTrajectories | None = None
@@ -107,9 +108,9 @@ class InterpolatedTrack:
     Parameters
     ----------
     t_s
-        Shape (n,), s, increasing.
+        Increasing times, s, shape (n,).
     values
-        Shape (n, 3) or (n, 4); NaN makes the two adjacent intervals unknown.
+        Values, shape (n, 3) or (n, 4). A NaN makes the two adjacent intervals unknown.
     rotation
         Whether the values are unit quaternions.
     """
@@ -121,12 +122,13 @@ class InterpolatedTrack:
             self._values = values * np.append(1.0, np.cumprod(np.where(turned, -1.0, 1.0)))[:, None]
 
     def at(self, t_s: Array) -> Array:
-        """Return the values at instants of shape (n,), clipped to the recorded time."""
+        """Return the values at times of shape (n,), which are limited to the recorded time."""
         right = np.clip(np.searchsorted(self._t_s, t_s, side="right"), 1, len(self._t_s) - 1)
         begin, end = self._t_s[right - 1], self._t_s[right]
         share = np.clip((t_s - begin) / (end - begin), 0.0, 1.0)[:, None]
 
-        # at a sample use it alone, so that a NaN of the adjacent sample has no effect
+        # Exactly at a sample, only this sample is used, so a NaN of the adjacent sample has no
+        # effect.
         before, after = self._values[right - 1], self._values[right]
         values = np.where(share == 0, before, np.where(share == 1, after, 0.0))
         between = ((share > 0) & (share < 1))[:, 0]
@@ -137,6 +139,6 @@ class InterpolatedTrack:
 
 
 def interpolated_markers(markers: MarkerTrajectories) -> InterpolatedTrack:
-    """Return all markers as one track, z up, flattened to shape (n, 3 * markers)."""
+    """Return all markers as one track, z up, with the shape (n, 3 * markers)."""
     flat = to_z_up(markers.positions).reshape(len(markers.t_s), -1)
     return InterpolatedTrack(markers.t_s - markers.t_s[0], flat, rotation=False)

@@ -1,9 +1,10 @@
-"""Soft-tissue artefact: a repeatable part that depends on posture, and a random part.
+"""Soft-tissue artefact, with a repeatable part that depends on posture, and a random part.
 
-One model serves rotations of sensors (rad) and displacements of markers (m).
+The same model is used for rotations of sensors (rad) and displacements of markers (m).
 
 Invariant: both parts are zero in upright stance. The repeatable part is a smooth function of the
-adjacent joint angles; the random part is band-limited and scales with the same posture.
+adjacent joint angles. The random part is band-limited, and its magnitude depends on the same
+angles.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ ADJACENT: dict[str, tuple[slice, ...]] = {
     "shank": (KNEE, ANKLE),
     "foot": (ANKLE,),
 }
-"""Joints adjacent to each part of the leg, as columns of a coordinate array."""
+"""Columns of the joints adjacent to each part of the leg, in a coordinate array."""
 
 _NOISE_HZ = (0.3, 3.0)
 """Frequency band of the random part, Hz."""
 _ROUNDING = 0.05
-"""Rounding of the posture magnitude near upright stance, where its derivative is undefined."""
+"""Smoothing of the posture magnitude near upright stance, where its derivative is undefined."""
 
 
 def _features(coordinates: Array, joint: slice) -> Array:
@@ -56,7 +57,7 @@ def _rms_length(vectors: Array) -> float:
 def _mixing(
     random: np.random.Generator, features: Array, vectors: int, common_share: float
 ) -> Array:
-    """Return random directions for the features of one joint; RMS length 1 over all vectors."""
+    """Return random directions for the features of one joint, with RMS length 1 overall."""
     kinds = features.shape[1]
     common = random.standard_normal((kinds, 1, 3))
     common /= _rms_length(np.tensordot(features, common, 1))
@@ -75,14 +76,15 @@ class SoftTissue:
 
     .. math:: d(t) = \sum_j \Phi(\theta_j) C_j + g(\theta)\,n(t)
 
-    with :math:`\Phi = (\sin f, 1-\cos f, \tfrac12\sin 2f, \sin a, \sin i)` of each adjacent joint
-    *j*, random :math:`C_j`, band-limited noise *n* (0.3 to 3 Hz) and *g* the magnitude of
-    :math:`\Phi`. Scaled so that the RMS length over all vectors and the `reference` is `rms`.
+    Here :math:`\Phi = (\sin f, 1-\cos f, \tfrac12\sin 2f, \sin a, \sin i)` are the features of each
+    adjacent joint *j*, and :math:`C_j` is random. *n* is band-limited noise (0.3 to 3 Hz), and *g*
+    is the magnitude of :math:`\Phi`. The sum is scaled so that its RMS length over all vectors and
+    the `reference` is `rms`.
 
     Parameters
     ----------
     random
-        Source of the directions and the noise.
+        Random generator of the directions and the noise.
     part
         Body part, a key of `adjacent`.
     vectors
@@ -90,17 +92,17 @@ class SoftTissue:
     rms
         RMS length over the reference, m or rad.
     random_share
-        Share of the variance in the noise.
+        Share of the variance that the noise causes.
     knee_share
-        Share of the repeatable variance driven by the second joint of the limb (the knee), for
+        Share of the repeatable variance that the second joint of the limb (the knee) causes, for
         parts with two joints.
     reference
         Coordinates of the reference motions of the limb, shape (n, COORDINATES).
     common_share
-        Share of the variance in the displacement of the mean of all points; the remainder moves
+        Share of the variance that the mean displacement of all points causes. The remainder moves
         the points relative to their mean.
     adjacent
-        Joints adjacent to each part.
+        Columns of the joints adjacent to each part.
     """
 
     def __init__(
@@ -124,7 +126,7 @@ class SoftTissue:
         ]
         features = [_features(reference, joint) for joint in self._joints]
 
-        # repeatable part, scaled to the RMS over the reference
+        # Repeatable part, scaled to its RMS over the reference.
         self._gains = [
             share / np.mean(np.sum(values**2, axis=1))
             for share, values in zip(shares, features, strict=True)
@@ -137,7 +139,8 @@ class SoftTissue:
         )
         self._mixing *= rms * np.sqrt(1 - random_share) / _rms_length(self._repeatable(reference))
 
-        # random part; subtracting the mean of k vectors reduces their variance by (k - 1) / k
+        # Random part. Subtracting the mean of k vectors reduces their variance by the factor (k -
+        # 1) / k.
         magnitude = np.sqrt(np.mean(self._magnitude(reference) ** 2))
         noise_rms = rms * np.sqrt(random_share) / magnitude
         noise = partial(random_vector_signal, random, low_hz=_NOISE_HZ[0], high_hz=_NOISE_HZ[1])

@@ -1,4 +1,4 @@
-"""Interface of a subject, simulated or recorded: base world (z up), m, rad."""
+"""Interface of a simulated or recorded subject. Positions are in the base world (z up), m."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ if TYPE_CHECKING:
 
 
 class GroundTruth(NamedTuple):
-    """Bones at n instants."""
+    """Bones at n times."""
 
     orientations: Mapping[str, Rotation]
-    """Orientation of each segment: segment coordinates to base world."""
+    """Rotation from segment coordinates to the base world, by segment."""
     joints: Mapping[str, Array]
     """Centre of each joint, m, shape (n, 3); NaN if unknown."""
     angles: Array
     """Flexion, adduction (or bending) and rotation of the main joint, rad, shape (n, 3)."""
     included: Array
-    """Inner angle of the main joint, rad, shape (n,): pi when straight."""
+    """Inner angle of the main joint, rad, shape (n,); pi when straight."""
     joint: str = "knee"
     """Name of the main joint."""
 
 
 class Observation(NamedTuple):
-    """Error-free measurements of one block of time, each stream at its own instants."""
+    """Error-free measurements of one block of time. Each stream has its own sampling times."""
 
     sensors: Sequence[Array]
-    """q_base_sensor of each sensor, with alignment and soft-tissue artefact, shape (n, 4)."""
+    """Orientation q_base_sensor of each sensor, with alignment and soft-tissue artefact, shape (n,
+    4)."""
     markers: Array
     """Marker positions on the skin, m, shape (m, markers, 3); NaN if not recorded."""
     bones: Mapping[str, tuple[Rotation, Array]]
-    """Orientation and origin (m) of bones that the cameras stream as bodies."""
+    """Orientation and origin (m) of each bone that the cameras stream as a rigid body."""
     truth: GroundTruth
 
 
@@ -44,7 +45,7 @@ class InstrumentedSubject(Protocol):
 
     @property
     def sensors(self) -> Mapping[str, str]:
-        """Sensor ids and their segments."""
+        """Segment of each sensor, by sensor id."""
 
     @property
     def clusters(self) -> Mapping[str, tuple[str, ...]]:
@@ -56,24 +57,24 @@ class InstrumentedSubject(Protocol):
 
     @property
     def visible_bones(self) -> tuple[str, ...]:
-        """Segments whose bones the cameras stream as bodies: the reference of a recording."""
+        """Segments whose bones the cameras stream as rigid bodies, the reference of a recording."""
 
     @property
     def chain(self) -> RigChain:
-        """The limb as rig.toml describes it."""
+        """Description of the limb in rig.toml."""
 
     @property
     def facts(self) -> Mapping[str, object]:
-        """Constant properties for the ground-truth log; JSON values."""
+        """Constant properties for the log of the ground truth, as JSON values."""
 
     def play(self, name: str, t_s: float) -> None:
         """Start another motion; raise UnknownMotionError for an unknown name."""
 
     def motion_at(self, t_s: float) -> str:
-        """Return the name of the motion at an instant."""
+        """Return the name of the motion at the time `t_s`."""
 
     def discard_before(self, t_s: float) -> None:
-        """Discard the state for instants before `t_s`, which are not requested again."""
+        """Discard the state for times before `t_s`, which will not be requested again."""
 
     def observe(self, sensors: Sequence[Array], cameras: Array, truth: Array) -> Observation:
-        """Return the observation at the instants (s) of each sensor, the cameras, the log."""
+        """Return the observation at the given times (s) of each sensor, the cameras and the log."""

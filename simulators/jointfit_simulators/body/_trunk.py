@@ -1,7 +1,7 @@
-"""The trunk: pelvis, thorax and head; bones, markers and movements.
+"""The trunk (pelvis, thorax and head): bones, markers and movements.
 
-Angles of a joint are forward flexion, bending to the right and rotation to the left of the upper
-part relative to the lower one.
+The angles of a joint describe the upper part relative to the lower part: forward flexion, bending
+to the right, and rotation to the left.
 
 Invariant: a motion has two continuous derivatives.
 """
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 LUMBAR, NECK = HIP, KNEE
-"""Columns of the joints: the first and second joint of the limb."""
+"""Columns of the first and second joint of the limb."""
 PELVIS_AT = (0.0, 0.0, 1.0)
 """Origin of the pelvis in the base world, m."""
 LUMBAR_IN_PELVIS = (0.0, 0.0, 0.08)
-"""Lumbar joint centre in pelvis coordinates: right, anterior, up, m."""
+"""Lumbar joint centre in pelvis coordinates (right, anterior, up), m."""
 THORAX_M = 0.42
 """Height of the neck above the lumbar joint, m."""
 
@@ -60,11 +60,12 @@ _MARKERS = {
     "thorax": ((0.0, 0.11, 0.36), (0.02, 0.12, 0.20), (0.06, -0.10, 0.38), (-0.06, -0.11, 0.22)),
     "head": ((0.08, 0.06, 0.16), (-0.08, 0.06, 0.15), (0.06, -0.09, 0.17), (-0.02, 0.03, 0.22)),
 }  # fmt: skip
-"""Nominal marker positions in the frame of each part, m; a frame begins at its lower joint."""
+"""Nominal marker positions in the frame of each part, m. The origin of a frame is its lower joint.
+"""
 
 
 def trunk_pose(coordinates: Array) -> LegPose:
-    """Return the bones for coordinates of shape (n, COORDINATES); origins are the lower joints."""
+    """Return the bones for coordinates of shape (n, COORDINATES), with lower joints as origins."""
     pelvis = Rotation.from_euler("ZXY", coordinates[:, PELVIS_TURN])
     thorax = pelvis * joint_rotation(-1, coordinates[:, LUMBAR])
     head = thorax * joint_rotation(-1, coordinates[:, NECK])
@@ -113,7 +114,7 @@ def side_bend(style: MovementStyle, t: Array) -> Array:
 
 
 def twist(style: MovementStyle, t: Array) -> Array:
-    """Turn the thorax by 35 degrees to either side, slightly bent."""
+    """Turn the thorax by 35 degrees to either side with the trunk slightly bent."""
     coordinates = _moving(style, t)
     coordinates[:, column(LUMBAR, ROTATION)] += np.radians(35) * np.sin(2 * np.pi * 0.35 * t)
     coordinates[:, column(LUMBAR, FLEXION)] += np.radians(10 + 8 * np.sin(2 * np.pi * 0.21 * t))

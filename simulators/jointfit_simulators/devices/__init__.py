@@ -1,4 +1,4 @@
-"""Virtual IMUs and a virtual motion-capture server that behave like real devices."""
+"""Virtual IMUs and virtual motion-capture servers that behave like real devices."""
 
 from jointfit_simulators.devices._bno085_device import Bno085Device, Bno085DeviceOptions
 from jointfit_simulators.devices._cameras import CameraFrames, Cameras

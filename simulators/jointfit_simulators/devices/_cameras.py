@@ -1,9 +1,9 @@
-"""Simulated optical measurement: marker noise, occlusion and rigid-body fits.
+"""Simulated optical measurement with marker noise, occlusion and rigid-body fits.
 
-Coordinates are in the optical world, z up, m; the server converts to its own axes.
+Coordinates are in the optical world (z up), in m. The server converts them to its own axes.
 
 Invariant: rigid bodies are fitted to the skin markers. Only the reference bones of a recording are
-passed through.
+streamed without a fit.
 """
 
 from __future__ import annotations
@@ -22,35 +22,35 @@ if TYPE_CHECKING:
     from jointfit_simulators.settings import Knobs
 
 _FIT = 3
-"""Number of visible markers from which a rigid body is tracked."""
+"""Minimum number of visible markers of a tracked rigid body."""
 _UP_TO_Y = Rotation.from_euler("x", 90, degrees=True)
 
 
 class CameraFrames(NamedTuple):
-    """Camera frames of one block; occluded markers and untracked bodies are NaN."""
+    """Camera frames of one block. Occluded markers and untracked bodies are NaN."""
 
     markers: Array
-    """Marker positions, shape (n, markers, 3)."""
+    """Marker positions, m, shape (n, markers, 3)."""
     body_positions: Array
-    """Positions of the rigid bodies, shape (n, bodies, 3)."""
+    """Positions of the rigid bodies, m, shape (n, bodies, 3)."""
     body_orientations: Array
-    """q_world_body, shape (n, bodies, 4)."""
+    """Orientations q_world_body of the rigid bodies, shape (n, bodies, 4)."""
 
 
 class Cameras:
     """Optical system that records one subject.
 
-    Rigid bodies are defined as by an operator: from the markers in upright stance, with axes
-    parallel to the (y-up) optical world and the pivot at the mean marker position.
+    Rigid bodies are defined as an operator defines them: from the markers in upright stance. Their
+    axes are parallel to the optical world (y up), and their pivot is the mean marker position.
 
     Parameters
     ----------
     knobs
-        Occlusion and marker noise.
+        Settings with occlusion and marker noise.
     subject
         Subject with markers.
     rate_hz
-        Camera frames per second.
+        Frame rate of the cameras, Hz.
     """
 
     def __init__(self, knobs: Knobs, subject: InstrumentedSubject, *, rate_hz: float) -> None:
@@ -74,15 +74,15 @@ class Cameras:
         self._random = knobs.random("cameras")
         self._noise_m = knobs.marker_noise_mm / 1e3 / np.sqrt(3)
 
-        # transition probabilities of the Markov chain, from mean burst length and occluded share
+        # Transition probabilities of the Markov chain, from mean burst length and occluded share.
         self._reappear = min(1.0, 1 / max(knobs.occlusion_burst_s * rate_hz, 1.0))
         self._vanish = self._reappear * knobs.occlusion / max(1e-9, 1 - knobs.occlusion)
         self._hidden = self._random.random(len(self.markers)) < knobs.occlusion
         self.covered = False
-        """Whether everything is occluded."""
+        """Whether all markers are occluded."""
         self._absent: set[str] = set()
         self._labels = list(range(len(self.markers)))
-        """Marker whose position each label has."""
+        """Index of the marker whose position each label has."""
 
     def hide(self, marker: str) -> None:
         """Occlude one marker."""
@@ -122,7 +122,10 @@ class Cameras:
         return CameraFrames(markers, np.stack(positions, axis=1), np.stack(orientations, axis=1))
 
     def _occluded(self, n: int) -> NDArray[np.bool_]:
-        """Return the occlusion of each marker, shape (n, markers): a two-state Markov chain."""
+        """Return whether each marker is occluded, shape (n, markers).
+
+        The occlusion is a two-state Markov chain.
+        """
         draws = self._random.random((n, len(self.markers)))
         hidden = np.empty((n, len(self.markers)), dtype=np.bool_)
         now = self._hidden
@@ -136,7 +139,8 @@ class Cameras:
 def _fit(template: Array, markers: Array) -> tuple[Array, Array]:
     """Return position (n, 3) and orientation (n, 4) of a body from its markers (n, k, 3).
 
-    The rotation over the visible markers is Kabsch's; with fewer than three it is NaN.
+    The rotation is fitted to the visible markers (Kabsch). With fewer than three markers, it is
+    NaN.
     """
     visible = np.isfinite(markers[:, :, 0])
     weight = (visible / np.maximum(visible.sum(axis=1, keepdims=True), 1))[:, :, None]

@@ -1,7 +1,7 @@
 """Clock and transport models of virtual devices.
 
-A device clock has an offset, a skew and jitter relative to host CLOCK_MONOTONIC (the true time),
-and its transport adds a delay.
+A device clock has an offset, a skew and jitter relative to host CLOCK_MONOTONIC, which is the true
+time. The transport of a device adds a delay.
 
 Invariant: a device samples at whole periods of its own clock.
 """
@@ -30,7 +30,7 @@ class SimulatedClock:
     boot_ns
         Host time of power-up, ns.
     skew
-        Relative frequency error; a clock with +50e-6 gains 50 us per second.
+        Relative frequency error. A clock with +50e-6 gains 50 us per second.
     """
 
     def __init__(self, boot_ns: int, skew: float) -> None:
@@ -47,30 +47,30 @@ class SimulatedClock:
 
 
 class ClockFault(NamedTuple):
-    """Prescribed clock error of one device, in place of a random one."""
+    """Prescribed clock error of one device, which replaces a random error."""
 
     skew_ppm: float
     """Skew, ppm; positive if the clock is fast."""
     up_s: float | None = None
-    """Time since power-up at the start of the run, s; None: random."""
+    """Time since power-up at the start of the run, s; None for a random time."""
 
     @classmethod
     def parse(cls, text: str) -> ClockFault:
-        """Return the fault of ``SKEW_PPM`` or ``SKEW_PPM,UP_S``; raise ValueError otherwise."""
+        """Return the fault from ``SKEW_PPM`` or ``SKEW_PPM,UP_S``; raise ValueError otherwise."""
         skew_ppm, _, up_s = text.partition(",")
         return cls(float(skew_ppm), float(up_s) if up_s else None)
 
 
 @dataclass(frozen=True, slots=True)
 class PlannedSamples:
-    """Samples of one device in one block of time; arrays of shape (n,)."""
+    """Samples of one device in one block of time. All arrays have the shape (n,)."""
 
     host_ns: NDArray[np.int64]
-    """True sampling times, host clock."""
+    """True sampling times on the host clock, ns."""
     device_ns: NDArray[np.int64]
-    """Time stamps of the device."""
+    """Time stamps of the device, ns."""
     due_ns: NDArray[np.int64]
-    """Host times of transmission; never decreasing."""
+    """Host times of transmission, ns, which never decrease."""
     dropped: NDArray[np.bool_]
     """Whether the sample is dropped before transmission."""
 
@@ -83,11 +83,11 @@ class SampleTiming:
     knobs
         Magnitudes of clock, latency and drop-out errors.
     name
-        Device; it selects the random stream.
+        Name of the device, which selects the random stream.
     latency_ms
         Minimum delay of the transport, ms.
     now_ns
-        Host time of the start of the run, ns.
+        Host time at the start of the run, ns.
     """
 
     def __init__(self, knobs: Knobs, name: str, *, latency_ms: float, now_ns: int) -> None:
@@ -102,12 +102,12 @@ class SampleTiming:
         self._last_due_ns = 0
 
     def set_fault(self, fault: ClockFault, now_ns: int) -> None:
-        """Replace the random clock by that of `fault`, at the start `now_ns` of the run."""
+        """Replace the random clock by the clock of `fault`; the run starts at `now_ns`."""
         up_ns = now_ns - self.clock.boot_ns if fault.up_s is None else round(fault.up_s * NS)
         self.clock = SimulatedClock(now_ns - up_ns, fault.skew_ppm * 1e-6)
 
     def device_ns(self, host_ns: int) -> int:
-        """Return the device time at a host time, by the clock in use now."""
+        """Return the device time at a host time, from the current clock."""
         return self.clock.device_ns(host_ns)
 
     def reboot(self, host_ns: int) -> None:
@@ -125,7 +125,7 @@ class SampleTiming:
         jitter = np.rint(self._random.standard_normal(n) * self._jitter_ns).astype(np.int64)
         delay = self._latency_ns + self._random.exponential(1.0, n) * self._latency_jitter_ns
 
-        # the transport preserves the order of the samples
+        # The transport preserves the order of the samples.
         due = np.maximum.accumulate(np.append(self._last_due_ns, host_ns + delay.astype(np.int64)))
         self._last_due_ns = int(due[-1])
         dropped = self._random.random(n) < self._dropout

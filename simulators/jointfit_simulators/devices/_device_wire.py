@@ -1,4 +1,4 @@
-"""Wire of a simulated IMU, without its protocol: power, losses, wrong speed."""
+"""Wire of a simulated IMU, independent of its protocol: power, losses, wrong speed."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from jointfit_simulators.wires import CanWire
 
 _BITS = 10
-"""Bits of one byte on the line, 8N1."""
+"""Number of bits per byte on a serial line (8N1)."""
 
 
 class SerialDevice(ABC):
-    """IMU on a pty; the devices derive from this.
+    """Base class of IMUs on a pseudo-terminal (pty).
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class SerialDevice(ABC):
     """
 
     garbage_bits: ClassVar[int] = 0x7F
-    """Bits of the garbage at a wrong speed, which contains no message."""
+    """Bit mask of the invalid bytes at a wrong speed. They contain no message."""
 
     def __init__(
         self, link: Path, wire_noise: WireNoise = clean_wire, baud: int | None = None
@@ -42,7 +42,7 @@ class SerialDevice(ABC):
         self._line = PtyLine(link)
         self._noise = wire_noise
         self.baud = baud
-        """Speed of the device, bit/s; None: any."""
+        """Line speed of the device, bit/s; None accepts any speed."""
         self._timer: asyncio.TimerHandle | None = None
         self._epoch_ns = self._last_ns = self._to_lose = 0
         self.sent = 0
@@ -60,10 +60,10 @@ class SerialDevice(ABC):
         return self.sample_bytes * _BITS * 1_000_000_000 // baud if baud else 0
 
     def edge(self, device_ns: int) -> None:  # noqa: B027 - most devices have no sync input
-        """Ignore an edge: no message reports it."""
+        """Ignore an edge, because no message reports it."""
 
     def lose(self, count: int) -> None:
-        """Lose the next `count` samples: they are numbered, but not sent."""
+        """Lose the next `count` samples, which are numbered but not sent."""
         self._to_lose += count
 
     def unplug(self) -> None:
@@ -95,25 +95,25 @@ class SerialDevice(ABC):
         return self.baud in {None, self._line.host_baud}
 
     def _after(self, delay_s: float, act: Callable[[], None]) -> None:
-        """Call `act` in `delay_s` seconds, instead of an earlier delayed call."""
+        """Call `act` after `delay_s` seconds; this call replaces an earlier delayed call."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = asyncio.get_running_loop().call_later(delay_s, act)
 
     def _write(self, wire: bytes) -> bool:
-        """Send bytes to the host; return whether all were sent."""
-        if not self._same_speed:  # the same number of bytes, none of them correct
+        """Send bytes to the host; return whether all bytes were sent."""
+        if not self._same_speed:  # send as many invalid bytes
             wire = bytes((byte * 7 + 1) & self.garbage_bits for byte in wire)
         return self._line.write(self._noise(wire))
 
 
 class CanDevice:
-    """IMU on a CAN wire; the devices derive from this.
+    """Base class of IMUs on a CAN wire.
 
     Parameters
     ----------
     wire
-        Bus; several devices may share it.
+        CAN bus, which several devices may share.
     """
 
     def __init__(self, wire: CanWire) -> None:
@@ -128,7 +128,7 @@ class CanDevice:
         return self.wire.is_open
 
     def edge(self, device_ns: int) -> None:
-        """Ignore an edge on the sync input: no message reports it."""
+        """Ignore an edge on the sync input, because no message reports it."""
 
     def unplug(self) -> None:
         """Disconnect the wire."""

@@ -1,12 +1,12 @@
 r"""Inertial and magnetic signals of a sensor that rotates in place.
 
-They follow without noise from two successive orientations:
+The signals follow from two successive orientations, without noise:
 
 .. math:: \omega = \log(q_{k-1}^{*} q_k) / T, \qquad f = R_k^{T} (0, 0, g), \qquad
     m = R_k^{T} (0, \cos\delta, -\sin\delta)
 
-The device has an orientation but no position, so the specific force contains gravity only. A device
-with `SensorErrors` measures these signals with bias, scale errors and noise.
+A simulated device has an orientation but no position, so the specific force contains gravity only.
+A device with `SensorErrors` measures these signals with bias, scale errors and noise.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 GRAVITY = 9.81
 """Specific force at rest, m/s^2."""
 DIP_RAD = radians(65.0)
-"""Inclination of the magnetic field below the horizon; its magnitude is 1, its heading north."""
+"""Inclination of the magnetic field below the horizon, rad. The field has the magnitude 1 and
+points north."""
 
 
 class InertialSignals:
@@ -34,7 +35,7 @@ class InertialSignals:
     Parameters
     ----------
     errors
-        Errors of the sensor; by default it measures exactly.
+        Errors of the sensor; the default is exact measurements.
     """
 
     def __init__(self, errors: SensorErrors | None = None) -> None:
@@ -47,7 +48,7 @@ class InertialSignals:
         self._q: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
     def update(self, device_ns: int, q_world_sensor: Quaternion) -> None:
-        """Add the orientation at the next instant."""
+        """Add the orientation at the next time."""
         if self._last is not None:
             at_ns, before = self._last
             self._turn = _rotation_between(before, q_world_sensor)
@@ -56,7 +57,7 @@ class InertialSignals:
 
     @property
     def rate(self) -> Vector:
-        """Angular rate over the last interval, sensor axes, rad/s; 0 before the second instant."""
+        """Angular rate over the last interval, sensor axes, rad/s; 0 before the second time."""
         x, y, z = self._turn
         step_s = self._step_s
         true = (x / step_s, y / step_s, z / step_s) if step_s > 0.0 else (0.0, 0.0, 0.0)
@@ -69,7 +70,7 @@ class InertialSignals:
 
     @property
     def field(self) -> Vector:
-        """Magnetic field, sensor axes, of magnitude 1."""
+        """Magnetic field in sensor axes, with magnitude 1."""
         true = _to_sensor(self._q, (0.0, cos(DIP_RAD), -sin(DIP_RAD)))
         return self._measured(true, self._errors.magnetometer)
 
@@ -103,7 +104,7 @@ def _scaled(vector: Vector, scale: float) -> Vector:
 
 
 def _rotation_between(before: Quaternion, after: Quaternion) -> Vector:
-    """Return the rotation vector of before* after, rad."""
+    """Return the rotation vector of conj(before) ⊗ after, rad."""
     a, b, c, d = before
     w, x, y, z = after
     v = (

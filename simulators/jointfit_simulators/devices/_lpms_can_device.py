@@ -1,6 +1,6 @@
-"""Virtual LP-Research LPMS sensor on CAN: CANopen style, sequential, or LP-BUS in CAN frames.
+"""Virtual LP-Research LPMS sensor on CAN, in CANopen, sequential or LP-BUS format.
 
-Invariant: all four channel frames are sent in each period, although two or three carry nothing.
+Invariant: all four channel frames are sent in each period, although two or three contain no data.
 """
 
 from __future__ import annotations
@@ -38,21 +38,21 @@ WRAPPED = 1300
 
 @dataclass(frozen=True, slots=True)
 class LpmsCanDeviceOptions:
-    """Settings of the sensor, made over its UART."""
+    """Settings of the sensor, which a user makes over its UART."""
 
     mode: Literal["canopen", "sequential", "lpbus"] = "canopen"
     node: int = 1
     ids: tuple[int, int, int, int] | None = None
-    """Identifiers of the channel frames; None: those of `node` in CANopen style."""
+    """Identifiers of the channel frames; the default is the CANopen identifiers of `node`."""
     precision: Precision = "int16"
     mapping: tuple[int, int, int, int] = (1, 2, 3, 4)
-    """Channels of w, x, y and z, from 1."""
+    """Channel numbers of w, x, y and z, from 1."""
     unit: int = 10_000
     rate_hz: float = 100.0
     world: World = "NWU"
     world_to_sensor: bool = True
     heartbeat_hz: float = 1.0
-    """Rate of the heartbeat in CANopen style, Hz; 0 sends none."""
+    """Rate of the CANopen heartbeat, Hz; 0 disables the heartbeat."""
     sends_idle_frames: bool = True
     """Whether channel frames without a component of the quaternion are sent."""
     first_tick: int = 0
@@ -64,7 +64,7 @@ class LpmsCanDevice(CanDevice):
     Parameters
     ----------
     wire
-        Bus; several devices may share it.
+        CAN bus, which several devices may share.
     options
         Settings of the sensor.
     """
@@ -82,13 +82,13 @@ class LpmsCanDevice(CanDevice):
         self._to_lose = 0
         self._to_lose_frames: dict[int, int] = {}
         self.swapped = False
-        """Whether the frames of a period leave in descending order."""
+        """Whether the frames of a period are sent in descending order."""
         self.counter = 0
-        """Number of samples since power-up; it is not sent."""
+        """Number of samples since power-up. The sensor does not send this number."""
 
     @property
     def line_ns(self) -> int:
-        """Transmission time of a period's frames, ns."""
+        """Transmission time of the frames of one period, ns."""
         bitrate = self.wire.bitrate
         frames = self._channel_frames((1.0, 0.0, 0.0, 0.0))
         bits = sum(frame_bits(len(frame.data), extended=False) for frame in frames)
@@ -118,7 +118,7 @@ class LpmsCanDevice(CanDevice):
         self._to_lose_frames[index] = self._to_lose_frames.get(index, 0) + count
 
     def power_cycle(self) -> None:
-        """Interrupt the power supply: the first heartbeat afterwards reports a start."""
+        """Interrupt the power supply; the first heartbeat afterwards reports a start."""
         self.counter = 0
         if self._options.mode == "canopen":
             self.wire.send([encode_heartbeat(HEARTBEAT + self._options.node, BOOTED)])
@@ -137,7 +137,7 @@ class LpmsCanDevice(CanDevice):
         return (w, -x, -y, -z) if self._options.world_to_sensor else (w, x, y, z)
 
     def _channel_frames(self, q: Quaternion) -> list[CanFrame]:
-        """Return the frames of one period, without those to be lost."""
+        """Return the frames of one period, except the frames that are to be lost."""
         options = self._options
         unit = options.unit if options.precision == "int16" else 1
         channels = [0.0] * (4 * PER_FRAME[options.precision])
@@ -155,7 +155,7 @@ class LpmsCanDevice(CanDevice):
         return frames[::-1] if self.swapped else frames
 
     def _wrapped_frames(self, device_ns: int, q: Quaternion) -> list[CanFrame]:
-        """Return a data packet of LP-BUS in pieces of at most 8 bytes."""
+        """Return an LP-BUS data packet in frames of at most 8 bytes."""
         tick = self._options.first_tick + device_ns * TABLES[1].tick_hz // _NS
         data = self._layout.encode(tick, self._native(q), floats=True)
         wire = encode(LpmsCommand.DATA, data, self._options.node)

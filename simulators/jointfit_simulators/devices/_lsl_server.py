@@ -1,8 +1,8 @@
-"""Simulated program that sends motion capture to the Lab Streaming Layer: a real outlet of liblsl.
+"""Simulated program that sends motion capture to the Lab Streaming Layer (LSL) with liblsl.
 
 Invariant: coordinates of an occluded marker or body are NaN, or `LslServerOptions.absent`.
-A sample is stamped with its exposure, on the clock of LSL plus the difference of the simulated
-sender.
+The stamp of a sample is its exposure time on the clock of LSL, plus the clock difference of the
+simulated sender.
 """
 
 from __future__ import annotations
@@ -36,38 +36,39 @@ class LslServerOptions:
     stream: str = "Simulated cameras"
     stream_type: str = "MoCap"
     source_id: str = ""
-    """Identifier of the source; empty: one of this process and object."""
+    """Identifier of the source; the default is unique for this process and object."""
     rate_hz: float = 100.0
-    """Nominal rate; 0: irregular."""
+    """Nominal rate, Hz; 0 is an irregular rate."""
     up_axis: Axis = "y"
     unit: Literal["m", "cm", "mm"] = "m"
     description: Literal["mocap", "labels", "none"] = "mocap"
-    """Channels with marker, object, type and unit, with labels alone, or without description."""
+    """Description of the channels: ``mocap`` has marker, object, type and unit, and ``labels`` has
+    labels alone."""
     channel_format: Literal["float32", "double64", "string"] = "double64"
     absent: float = math.nan
-    """Value of every channel of an occluded marker or body."""
+    """Value in every channel of an occluded marker or body."""
     device_ns: Callable[[int], int] = same_clock
     """Conversion from host CLOCK_MONOTONIC to the clock of the stamps, both in ns."""
 
 
 class LslServer:
-    """Simulated sender; the stream exists from the start.
+    """Simulated sender. Its stream exists from the start.
 
     Attributes
     ----------
     ready : asyncio.Event
-        Set while `run` is active.
+        Event that is set while `run` is active.
     number : int
-        Number of the next frame, which LSL does not send.
+        Number of the next frame. LSL does not send this number.
     sent : int
-        Number of frames sent.
+        Number of sent frames.
     command_port : int
-        0: liblsl selects the ports.
+        Always 0, because liblsl selects the ports.
 
     Raises
     ------
     ValueError
-        pylsl is not installed.
+        The package pylsl is not installed.
     """
 
     def __init__(self, options: LslServerOptions | None = None) -> None:
@@ -90,7 +91,7 @@ class LslServer:
         self.plug()
 
     async def run(self) -> None:
-        """Wait until cancelled: liblsl sends in threads of its own."""
+        """Wait until cancelled, because liblsl sends in its own threads."""
         self.ready.set()
         try:
             await asyncio.Event().wait()
@@ -106,7 +107,7 @@ class LslServer:
         self._outlet = self._lsl.StreamOutlet(self._info(), chunk_size=1, max_buffered=10)
 
     def restart(self) -> None:
-        """End and begin the stream."""
+        """End the stream, and begin it again."""
         self.unplug()
         self.plug()
         self.number = 0
@@ -116,7 +117,7 @@ class LslServer:
         if self._outlet is None:
             return
 
-        # occluded markers and bodies have the value of absence in every channel
+        # Occluded markers and bodies have the value `absent` in every channel.
         absent = self.options.absent
         values: list[float] = []
         for name in self.options.markers:
@@ -153,7 +154,7 @@ class LslServer:
         if options.description == "none":
             return info
 
-        # the convention for motion capture: label, type and owner of each channel
+        # The LSL convention for motion capture requires label, type and owner of each channel.
         channels = info.desc().append_child("channels")
         for name in options.markers:
             for axis in _AXES:

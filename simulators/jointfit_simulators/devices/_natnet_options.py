@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def same_clock(host_ns: int) -> int:
-    """Return `host_ns`: the server has the clock of the host."""
+    """Return `host_ns`, for a server with the clock of the host."""
     return host_ns
 
 
@@ -29,32 +29,35 @@ class NatNetServerOptions:
     transport: Literal["unicast", "multicast"] = "unicast"
     group: str = "239.255.42.99"
     command_port: int = 0
-    """UDP port on loopback; 0: any free port."""
+    """UDP port on the loopback interface; 0 selects a free port."""
     data_port: int = 0
     up_axis: Axis = "y"
     rate_hz: float = 120.0
-    """Nominal frame rate, for `timestamp` and the request ``FrameRate``."""
+    """Nominal frame rate, Hz, for `timestamp` and the request ``FrameRate``."""
     clock_hz: int = 10_000_000
     device_ns: Callable[[int], int] = same_clock
     """Conversion from host CLOCK_MONOTONIC to the server clock, both in ns."""
     received_after_ns: int = 4_600_000
-    """Delay from exposure to the stamp `received`; `transmit` is the true time of sending."""
+    """Time from the exposure to the stamp `received`, ns. The stamp `transmit` is the true time of
+    sending."""
     precision_ns: Callable[[int], int] | None = None
-    """Conversion from host CLOCK_MONOTONIC to PTP time, both in ns; None: cameras without PTP."""
+    """Conversion from host CLOCK_MONOTONIC to PTP time, both in ns; None for cameras without PTP.
+    """
     exposure_stamps: bool = True
-    """Whether frames have exposure stamps; USB cameras send 0."""
+    """Whether frames have exposure stamps. USB cameras send 0."""
     hiding: Hiding = "missing"
     """Representation of occluded markers."""
     loss: float = 0.0
     duplication: float = 0.0
     reordering: float = 0.0
-    """Probabilities per frame; a reordered frame is sent after its successor."""
+    """Probability that a frame is sent after its successor. `loss` and `duplication` are also
+    probabilities per frame."""
     hostile: float = 0.0
-    """Probability per frame of a wrong count or length."""
+    """Probability that a frame contains a wrong count or length."""
     wire_noise: WireNoise = clean_wire
     """Noise applied to each frame."""
     keepalive_s: float = 10.0
-    """Time without a message after which a unicast client is dropped, s."""
+    """Time without a message after which a unicast client is disconnected, s."""
     copy_to_data_port: bool = False
-    """Whether unicast frames are also sent to the announced data port of the client's address."""
+    """Whether unicast frames are also sent to the client's address at the announced data port."""
     seed: int = 1

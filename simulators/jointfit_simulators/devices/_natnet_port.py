@@ -1,4 +1,7 @@
-"""UDP socket of a simulated NatNet server. Invariant: it is bound to loopback only."""
+"""UDP socket of a simulated NatNet server.
+
+Invariant: it is bound to the loopback interface only.
+"""
 
 from __future__ import annotations
 
@@ -18,14 +21,14 @@ _MAX_DATAGRAM = 65_507
 
 
 class NatNetPort:
-    """Command socket on loopback that can be unplugged and plugged in again.
+    """Command socket on the loopback interface, which can be unplugged and plugged in again.
 
     Parameters
     ----------
     command_port : int
-        UDP port; 0: any free port, which `plug` opens again.
+        UDP port; 0 selects a free port, which `plug` opens again.
     data_port : int
-        Announced port for data; 0: any free port.
+        Announced port for data; 0 selects a free port.
     """
 
     def __init__(self, command_port: int = 0, data_port: int = 0) -> None:
@@ -40,7 +43,7 @@ class NatNetPort:
         self.plug()
 
     def plug(self) -> None:
-        """Open the socket; no effect if open."""
+        """Open the socket; do nothing if it is open."""
         if self._socket is not None:
             return
         opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -59,12 +62,15 @@ class NatNetPort:
         opened, self._socket = self._socket, None
         if opened is None:
             return
-        with contextlib.suppress(RuntimeError):  # no loop: the port is not served
+        with contextlib.suppress(RuntimeError):  # without an event loop, the port is not served
             asyncio.get_running_loop().remove_reader(opened)
         opened.close()
 
     async def serve(self, handle: Callable[[bytes, Address], None]) -> None:
-        """Call `handle` for every datagram until cancelled, also across unplugging."""
+        """Call `handle` for every datagram until cancelled.
+
+        The calls continue after the port was unplugged and plugged in.
+        """
         loop = asyncio.get_running_loop()
         self._handle = handle
         if self._socket is not None:
@@ -82,7 +88,7 @@ class NatNetPort:
             return False
         try:
             self._socket.sendto(data, address)
-        except OSError:  # closed client or full queue: UDP loses the datagram
+        except OSError:  # client closed or queue full; UDP loses the datagram
             return False
         return True
 

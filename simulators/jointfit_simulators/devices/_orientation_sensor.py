@@ -1,4 +1,4 @@
-"""Orientation error model of an IMU: world frame, slow drift and white noise."""
+"""Model of the orientation error of an IMU: world frame, slow drift and white noise."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from jointfit_simulators.settings import Knobs
 
 _DRIFT_HZ = (0.005, 0.1)
-"""Frequency band of the slow error, Hz: periods of ten seconds to minutes, typical of fusion
+"""Frequency band of the slow error, Hz. Its periods of ten seconds to minutes are typical of fusion
 filters."""
 
 
@@ -22,15 +22,16 @@ class OrientationSensor:
 
     .. math:: \hat q(t) = e(t)\; q_{W_s W}\; q(t)\; n(t)
 
-    with the sensor's own world :math:`W_s` (a heading; an inclination only as a fault), the slow
-    error *e* on the world side, like that of fusion filters, and the white noise *n*.
+    Here :math:`W_s` is the sensor's own world, which differs by a heading, and by an inclination
+    only as a fault. The slow error *e* is on the world side, as in fusion filters, and *n* is white
+    noise.
 
     Parameters
     ----------
     knobs
-        Magnitudes of the errors.
+        Settings with the magnitudes of the errors.
     name
-        Sensor; it selects the random streams.
+        Sensor id, which selects the random streams.
     """
 
     def __init__(self, knobs: Knobs, name: str) -> None:
@@ -54,7 +55,7 @@ class OrientationSensor:
         self._white_rad = np.radians(knobs.orientation_white_deg) / np.sqrt(3)
 
     def report(self, t_s: Array, q_base_sensor: Array) -> Array:
-        """Return the measured q_world_sensor, shape (n, 4); NaN inputs give NaN."""
+        """Return the measured q_world_sensor, shape (n, 4); a NaN input yields NaN."""
         known = np.isfinite(q_base_sensor[:, 0])
         measured = np.full_like(q_base_sensor, np.nan)
         noise = self._white.standard_normal((len(t_s), 3)) * self._white_rad

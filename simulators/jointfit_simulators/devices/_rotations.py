@@ -1,4 +1,4 @@
-"""Forms in which devices send an orientation, from a Hamilton unit quaternion (w, x, y, z)."""
+"""Conversion of a Hamilton unit quaternion (w, x, y, z) to the formats that devices send."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ if TYPE_CHECKING:
     from jointfit_simulators.imu_device import Quaternion
 
 TINY = 1e-12
-"""Rotation below which the small-angle limit is used, rad."""
+"""Rotation angle below which the small-angle limit is used, rad."""
 
 
 def rotation_rows(q: Quaternion) -> tuple[Vector, Vector, Vector]:
-    """Return the rotation matrix by rows."""
+    """Return the rows of the rotation matrix."""
     w, x, y, z = q
     return (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -31,7 +31,7 @@ def roll_pitch_yaw_deg(q: Quaternion) -> tuple[float, float, float]:
 
 
 def rotation_vector(q: Quaternion) -> Vector:
-    """Return the rotation vector 2 log(q), rad, of norm at most pi."""
+    """Return the rotation vector 2 log(q), rad, whose norm is at most pi."""
     w, x, y, z = q if q[0] >= 0.0 else (-q[0], -q[1], -q[2], -q[3])
     length = sqrt(x * x + y * y + z * z)
     scale = 2.0 * atan2(length, w) / length if length > TINY else 2.0

@@ -16,7 +16,7 @@ IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 @dataclass(frozen=True, slots=True)
 class VectorErrors:
-    """Errors of one vector: measured = `matrix` true + `bias` + noise, limited to the range."""
+    """Errors of one vector: measured = `matrix` · true + `bias` + noise, limited to the range."""
 
     bias: Vector = (0.0, 0.0, 0.0)
     """Bias in the unit of the vector."""
@@ -25,7 +25,7 @@ class VectorErrors:
     noise_sd: float = 0.0
     """Standard deviation of white noise, in the unit of the vector."""
     limit: float = float("inf")
-    """End of the range; larger values are sent as this one."""
+    """Limit of the measuring range. Larger values are replaced by this value."""
 
     def measure(self, true: Vector, random: Random) -> Vector:
         """Return the measurement of a vector in sensor axes."""
@@ -44,13 +44,13 @@ class VectorErrors:
 
 @dataclass(frozen=True, slots=True)
 class SensorErrors:
-    """Errors of all three vectors of a sensor; none by default."""
+    """Errors of all three vectors of a sensor; the default is no errors."""
 
     gyroscope: VectorErrors = field(default_factory=VectorErrors)
-    """Angular rate, rad/s."""
+    """Errors of the angular rate, rad/s."""
     accelerometer: VectorErrors = field(default_factory=VectorErrors)
-    """Specific force, m/s^2."""
+    """Errors of the specific force, m/s^2."""
     magnetometer: VectorErrors = field(default_factory=VectorErrors)
-    """Magnetic field relative to the earth's."""
+    """Errors of the magnetic field, relative to the earth's field."""
     seed: int = 0
-    """Seed of the noise."""
+    """Random seed of the noise."""

@@ -1,6 +1,6 @@
 """Faults of a sensor during a run: stuck output, slip and heading drift.
 
-Faults change the measured orientations only. A command takes effect with the next block, at most
+A fault changes the measured orientations only. A command takes effect with the next block, at most
 0.2 s later.
 """
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 SLIP_S = 0.3
 """Duration of a slip, s."""
 _SLIP_AXIS = np.array([0.6, -0.5, 0.62]) / np.linalg.norm([0.6, -0.5, 0.62])
-"""Axis of a slip in the sensor frame, oblique to all sensor axes."""
+"""Axis of a slip in the sensor frame. It is oblique to all sensor axes."""
 
 
 class SensorFaults:
@@ -32,25 +32,25 @@ class SensorFaults:
         self._now_s = -np.inf
 
     def stick(self) -> None:
-        """Repeat the next output from now on."""
+        """Repeat the next orientation until `free` is called."""
         self._stuck = True
 
     def free(self) -> None:
-        """End the stuck output; slip and heading remain."""
+        """End the stuck output; slip and heading error remain."""
         self._stuck, self._held = False, None
 
     def slip(self, angle_rad: float) -> None:
-        """Rotate the sensor on the segment by an angle, added to earlier slips."""
+        """Rotate the sensor on the segment by an angle, in addition to earlier slips."""
         self._before_rad = self._slipped_rad
         self._slipped_rad += angle_rad
         self._slip_s = self._now_s
 
     def drift(self, rate_rad_s: float) -> None:
-        """Rotate the sensor's world about the vertical from now on; 0 stops at that heading."""
+        """Rotate the sensor's world about the vertical at a constant rate; 0 stops the drift."""
         self._rate_rad_s = rate_rad_s
 
     def apply(self, t_s: Array, measured: Array) -> Array:
-        """Return q_world_sensor with the faults, shape (n, 4); NaN inputs give NaN."""
+        """Return q_world_sensor with the faults, shape (n, 4); a NaN input yields NaN."""
         if not len(t_s):
             return measured
         before_s = float(t_s[0]) if np.isinf(self._now_s) else self._now_s
@@ -59,7 +59,7 @@ class SensorFaults:
         share = np.clip((t_s - self._slip_s) / SLIP_S, 0.0, 1.0)
         slipped = self._before_rad + share * (self._slipped_rad - self._before_rad)
 
-        # heading drift rotates the world side, a slip the sensor side
+        # A heading drift is multiplied on the world side, and a slip on the sensor side.
         known = np.isfinite(measured[:, 0])
         if (np.any(turned) or np.any(slipped)) and np.any(known):
             world = Rotation.from_rotvec(turned[known, None] * np.array([0.0, 0.0, 1.0]))

@@ -1,4 +1,4 @@
-"""TCP port of a simulated server. Invariant: it is bound to loopback only."""
+"""TCP port of a simulated server. Invariant: it is bound to the loopback interface only."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LOOPBACK = "127.0.0.1"
 _BACKLOG = 16
 _READ = 1 << 16
 _MOST_QUEUED = 1 << 20
-"""Bytes that a client leaves unread before frames to it are dropped."""
+"""Number of unread bytes at which frames to a client are dropped."""
 
 
 class TcpClient:
@@ -23,7 +23,7 @@ class TcpClient:
     Parameters
     ----------
     connected : socket.socket
-        Its connection.
+        Socket of the connection.
     """
 
     def __init__(self, connected: socket.socket) -> None:
@@ -34,7 +34,7 @@ class TcpClient:
         self._unsent = bytearray()
 
     def send(self, data: bytes, *, pieces: int = 1) -> bool:
-        """Send data, in several segments if wanted; return whether they fit into the queue."""
+        """Send data in `pieces` segments; return whether the data fit into the queue."""
         if len(self._unsent) > _MOST_QUEUED:
             return False
         size = -(-len(data) // pieces)
@@ -44,12 +44,12 @@ class TcpClient:
         return True
 
     def _flush(self) -> None:
-        with contextlib.suppress(OSError):  # a closed client; its end is read later
+        with contextlib.suppress(OSError):  # client closed; a later read detects it
             sent = self.socket.send(self._unsent)
             del self._unsent[:sent]
 
-        # no later frame may follow to continue this one, so the event loop continues it
-        with contextlib.suppress(RuntimeError, ValueError, OSError):  # no loop, or closed
+        # No further frame might trigger the rest of this frame, so the event loop sends the rest.
+        with contextlib.suppress(RuntimeError, ValueError, OSError):  # no event loop, or closed
             loop = asyncio.get_running_loop()
             loop.remove_writer(self.socket)
             if self._unsent:
@@ -62,7 +62,7 @@ class TcpPort:
     Parameters
     ----------
     port : int
-        TCP port; 0: any free port, which `plug` opens again.
+        TCP port; 0 selects a free port, which `plug` opens again.
     """
 
     def __init__(self, port: int = 0) -> None:
@@ -74,7 +74,7 @@ class TcpPort:
         self.plug()
 
     def plug(self) -> None:
-        """Open the port; no effect if open."""
+        """Open the port; do nothing if it is open."""
         if self._listening is not None:
             return
         opened = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
@@ -93,7 +93,7 @@ class TcpPort:
             self.drop(client)
         opened, self._listening = self._listening, None
         if opened is not None:
-            with contextlib.suppress(RuntimeError):  # no loop: the port is not served
+            with contextlib.suppress(RuntimeError):  # without an event loop, the port is not served
                 asyncio.get_running_loop().remove_reader(opened)
             opened.close()
 
@@ -109,7 +109,7 @@ class TcpPort:
     async def serve(
         self, joined: Callable[[TcpClient], None], handle: Callable[[TcpClient, bytes], None]
     ) -> None:
-        """Call `joined` for each new client and `handle` for its bytes, until cancelled."""
+        """Call `joined` for each new client, and `handle` for its bytes, until cancelled."""
         loop = asyncio.get_running_loop()
         self._joined, self._handle = joined, handle
         if self._listening is not None:
@@ -126,7 +126,7 @@ class TcpPort:
     def _accept(self) -> None:
         if self._listening is None or self._joined is None:
             return
-        with contextlib.suppress(OSError):  # the client has gone
+        with contextlib.suppress(OSError):  # the client has disconnected
             client = TcpClient(self._listening.accept()[0])
             self.clients.append(client)
             asyncio.get_running_loop().add_reader(client.socket, self._read, client)
@@ -146,12 +146,12 @@ class TcpPort:
 
 
 class TextServer:
-    """Server that sends one text to every client and ignores what it receives.
+    """Server that sends one text to every client, and ignores all received bytes.
 
     Parameters
     ----------
     text : bytes
-        Its text.
+        Text that the server sends.
     """
 
     def __init__(self, text: bytes) -> None:

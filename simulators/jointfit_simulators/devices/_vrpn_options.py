@@ -19,35 +19,38 @@ class VrpnServerOptions:
     """Constant properties of a server."""
 
     bodies: tuple[str, ...] = ()
-    """Rigid bodies; each is a tracker of its own, unless `sensors` places it elsewhere."""
+    """Rigid bodies. Each body has its own tracker, unless `sensors` assigns the body to another
+    tracker."""
     sensors: Mapping[str, tuple[str, int]] = field(default_factory=dict)
-    """Tracker and sensor of bodies that share a tracker."""
+    """Tracker and sensor number of each body that shares a tracker."""
     markers: tuple[str, ...] = ()
-    """Markers that are sent as trackers without orientation."""
+    """Markers that the server sends as trackers without orientation."""
     port: int = 0
-    """TCP and UDP port on loopback; 0: any free port."""
+    """TCP and UDP port on the loopback interface; 0 selects a free port."""
     connections: frozenset[str] = frozenset({"tcp", "classic"})
-    """Accepted forms of connection."""
+    """Accepted types of connection."""
     version: tuple[int, int] = (7, 38)
     up_axis: Axis = "y"
     unit: Literal["m", "mm"] = "m"
     device_ns: Callable[[int], int] = same_clock
     """Conversion from host CLOCK_MONOTONIC to the server's clock, both in ns."""
     spread_us: int = 20
-    """Time between the messages of one frame, µs."""
+    """Time between successive messages of one frame, µs."""
     described_late: bool = False
-    """Whether a tracker is described with its first pose, and not with the connection."""
+    """Whether the description of a tracker precedes its first pose. Otherwise, it is sent after
+    connection."""
     answers_ping: bool = True
     velocities: bool = False
-    """Whether every pose is followed by a velocity."""
+    """Whether a velocity follows every pose."""
     loss: float = 0.0
     duplication: float = 0.0
     reordering: float = 0.0
-    """Probabilities per datagram; a reordered one is sent after its successor."""
+    """Probability that a datagram is sent after its successor. `loss` and `duplication` are also
+    probabilities per datagram."""
     hostile: float = 0.0
-    """Probability per message of a wrong length."""
+    """Probability that a message contains a wrong length."""
     segment_bytes: int = 0
-    """Size of the pieces in which a frame is sent by TCP; 0: whole."""
+    """Size of the TCP segments in which a frame is sent, bytes; 0 sends whole frames."""
     wire_noise: WireNoise = clean_wire
     """Noise applied to the messages of each frame."""
     seed: int = 1

@@ -1,4 +1,4 @@
-"""Sockets of a simulated VRPN server. Invariant: they are bound to loopback only."""
+"""Sockets of a simulated VRPN server. Invariant: they are bound to the loopback interface only."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LOOPBACK = "127.0.0.1"
 _TRIES = 50
 _READ_BYTES = 1 << 16
 _MOST_UNSENT = 1 << 20
-"""Bytes that a client may leave unread before it is disconnected."""
+"""Number of unread bytes at which a client is disconnected."""
 
 
 class VrpnPeer:
@@ -48,10 +48,10 @@ class VrpnPeer:
         return self.open
 
     def close(self) -> None:
-        """Close the connection; no effect if closed."""
+        """Close the connection; do nothing if it is closed."""
         if self.open:
             self.open = False
-            with contextlib.suppress(RuntimeError):  # the event loop is closed
+            with contextlib.suppress(RuntimeError):  # event loop closed
                 self._loop.remove_reader(self._socket)
             self._socket.close()
 
@@ -69,12 +69,12 @@ class VrpnPeer:
 
 
 class VrpnPort:
-    """TCP and UDP port of the same number, which can be unplugged and plugged in again.
+    """TCP and UDP port with the same number, which can be unplugged and plugged in again.
 
     Parameters
     ----------
     port : int
-        Port number; 0: any free one, which `plug` opens again.
+        Port number; 0 selects a free port, which `plug` opens again.
     """
 
     def __init__(self, port: int = 0) -> None:
@@ -86,7 +86,7 @@ class VrpnPort:
         self.plug()
 
     def plug(self) -> None:
-        """Open both sockets; no effect if open."""
+        """Open both sockets; do nothing if they are open."""
         if self._tcp is not None:
             return
         for _ in range(_TRIES):
@@ -98,7 +98,7 @@ class VrpnPort:
                 number = int(tcp.getsockname()[1])
                 udp.bind((LOOPBACK, number))
                 tcp.listen()
-            except OSError:  # UDP has another user of this number
+            except OSError:  # another program uses this UDP port
                 tcp.close()
                 udp.close()
                 if self.port:
@@ -115,7 +115,7 @@ class VrpnPort:
         """Close both sockets; connections to the port are then refused."""
         for opened in (self._tcp, self._udp):
             if opened is not None:
-                with contextlib.suppress(RuntimeError):  # no loop: the port is not served
+                with contextlib.suppress(RuntimeError):  # no event loop uses the port
                     asyncio.get_running_loop().remove_reader(opened)
                 opened.close()
         self._tcp = self._udp = None
@@ -125,7 +125,10 @@ class VrpnPort:
         connected: Callable[[socket.socket], None],
         handle: Callable[[bytes, Address], None],
     ) -> None:
-        """Call back for every connection and datagram until cancelled, also across unplugging."""
+        """Call the callbacks for every connection and datagram until cancelled.
+
+        The calls continue after the port was unplugged and plugged in.
+        """
         self._serving = (connected, handle)
         self._watch()
         try:
@@ -139,7 +142,7 @@ class VrpnPort:
                 task.cancel()
 
     def connect_back(self, address: Address) -> None:
-        """Connect to a client that listens."""
+        """Connect to a client that listens at `address`."""
         task = asyncio.get_running_loop().create_task(self._connect_back(address))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -150,7 +153,7 @@ class VrpnPort:
             return False
         try:
             self._udp.sendto(data, address)
-        except OSError:  # closed client or full queue: UDP loses the datagram
+        except OSError:  # client closed or queue full; UDP loses the datagram
             return False
         return True
 

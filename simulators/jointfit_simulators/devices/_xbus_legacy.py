@@ -1,4 +1,4 @@
-"""Messages of a simulated older Xbus device: MTData, and its replies about them."""
+"""Messages of a simulated older Xbus device: MTData, and replies to requests about MTData."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 def legacy_content(
     layout: MTDataLayout, world: World, counter: int, q: Quaternion, inertial: InertialSignals
 ) -> bytes:
-    """Return the data of one MTData.
+    """Return the data of one MTData message.
 
     Parameters
     ----------
     layout : MTDataLayout
         Fields of the message.
     world : World
-        World of the device, unless its settings say NED.
+        World of the device if its settings do not select NED.
     counter : int
-        Sample counter.
+        Counter of the sample.
     q : Quaternion
-        Orientation, sensor to ENU world.
+        Orientation from sensor to ENU world.
     inertial : InertialSignals
-        Rates, accelerations and magnetic field.
+        Angular rate, acceleration and magnetic field.
     """
     native = native_of(q, "NED" if layout.settings & NED else world)
     columns = zip(*rotation_rows(native), strict=True)

@@ -1,4 +1,4 @@
-"""Sync inputs of a virtual Xbus device: conversion of edges to trigger indications."""
+"""Sync inputs of a virtual Xbus device, which convert edges to trigger indications."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 MOST_ENTRIES = 10
-"""Number of settings that the device can store."""
+"""Maximum number of settings that the device can store."""
 _ITEMS = {IN1: Item.TRIGGER_IN1, IN2: Item.TRIGGER_IN2}
 _MOST_PENDING = 16
-"""Number of edges per line that wait for a message; older ones are dropped."""
+"""Maximum number of edges per line that wait for a message. Older edges are dropped."""
 
 
 class SyncInputs:
@@ -25,16 +25,16 @@ class SyncInputs:
     Parameters
     ----------
     entries
-        Synchronisation settings in flash at the start.
+        Synchronisation settings that are initially in flash.
     """
 
     def __init__(self, entries: Iterable[setup.SyncSetting] = ()) -> None:
         self.entries = tuple(entries)
-        """Synchronisation settings in force."""
+        """Active synchronisation settings."""
         self.reset()
 
     def store(self, data: bytes) -> bool:
-        """Replace the settings by those of a request; return False if the request is invalid."""
+        """Replace the settings by those in `data`; return False if `data` is invalid."""
         entries = setup.decode_sync(data)
         if entries is None or len(entries) > MOST_ENTRIES:
             return False
@@ -43,7 +43,7 @@ class SyncInputs:
         return True
 
     def reset(self) -> None:
-        """Restart the counts of edges and drop pending ones."""
+        """Restart the counts of edges, and drop pending edges."""
         self._edges: dict[int, int] = {}
         self._reported: dict[int, int] = {}
         self._pending: dict[Item, deque[Trigger]] = {
@@ -63,7 +63,7 @@ class SyncInputs:
                 self._pending[_ITEMS[line]].append(edge)
 
     def next_triggers(self, items: Iterable[int]) -> dict[int, Trigger]:
-        """Remove and return the edges for the next message, at most one for each item."""
+        """Remove and return the edges for the next message, at most one edge per item."""
         return {
             int(item): pending.popleft()
             for item, pending in self._pending.items()

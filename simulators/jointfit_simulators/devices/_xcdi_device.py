@@ -1,6 +1,6 @@
-"""Virtual Xsens MTi-600 on CAN: XCDI groups on a shared wire, with faults.
+"""Virtual Xsens MTi-600 on CAN, which sends XCDI message groups on a shared wire, with faults.
 
-Invariant: clock and group counter continue while the host does not listen.
+Invariant: clock and group counter continue while the host does not receive.
 """
 
 from __future__ import annotations
@@ -34,16 +34,17 @@ _FILTER_VALID = 0x02
 
 @dataclass(frozen=True, slots=True)
 class XcdiDeviceOptions:
-    """Settings of the device, made over its UART."""
+    """Settings of the device, which a user makes over its UART."""
 
     ids: XcdiIds = field(default_factory=XcdiIds)
-    """CAN identifiers; messages with the identifier None are not sent."""
+    """CAN identifiers. A message with the identifier None is not sent."""
     rate_hz: float = 100.0
     sample_time_unit: str = "100us"
-    """``100us`` or ``1us``; the vendor's documents disagree."""
+    """Unit of the sample time, ``100us`` or ``1us``. The vendor's documents contradict each other.
+    """
     byte_order: ByteOrder = "big"
     first_tick: int = 0
-    """Clock at power-up, ticks."""
+    """Clock value at power-up, ticks."""
     first_counter: int = 0
 
 
@@ -53,7 +54,7 @@ class XcdiDevice(CanDevice):
     Parameters
     ----------
     wire
-        Bus; several devices may share it.
+        CAN bus, which several devices may share.
     options
         Settings of the device.
     """
@@ -62,10 +63,10 @@ class XcdiDevice(CanDevice):
         super().__init__(wire)
         self._options = options or XcdiDeviceOptions()
         self.rate_hz = self._options.rate_hz
-        """Configured groups per second."""
+        """Configured rate of message groups, Hz."""
         self.counter = self._options.first_counter
         """Number of the next group."""
-        self._to_lose: dict[DataId | None, int] = {}  # None: whole groups
+        self._to_lose: dict[DataId | None, int] = {}  # the key None stands for whole groups
 
     @property
     def line_ns(self) -> int:
@@ -92,7 +93,7 @@ class XcdiDevice(CanDevice):
             self.sent += frames[-1].can_id == self._options.ids.quaternion
 
     def group(self, device_ns: int, q_world_sensor: Quaternion) -> list[CanFrame]:
-        """Return the next group, without the frames to be lost."""
+        """Return the next group, except the frames that are to be lost."""
         self._last_ns = device_ns
         counter, self.counter = self.counter, (self.counter + 1) % COUNTER_MODULUS
         tick_ns = TICK_NS[self._options.sample_time_unit]
@@ -114,7 +115,7 @@ class XcdiDevice(CanDevice):
         ]
 
     def lose(self, count: int) -> None:
-        """Lose the next `count` groups: the counter increments, but they are not sent."""
+        """Lose the next `count` groups; the counter increments, but they are not sent."""
         self._to_lose[None] = self._to_lose.get(None, 0) + count
 
     def lose_frames(self, data_id: DataId, count: int) -> None:
@@ -129,7 +130,7 @@ class XcdiDevice(CanDevice):
             )
 
     def power_cycle(self) -> None:
-        """Interrupt the power supply: clock and counter restart."""
+        """Interrupt the power supply; clock and counter restart."""
         self._epoch_ns, self.counter = self._last_ns, self._options.first_counter
 
     def _lost(self, data_id: DataId | None) -> bool:

@@ -1,4 +1,4 @@
-"""Recordings of the daemon as virtual devices: their bytes again, at the recorded intervals."""
+"""Virtual devices that send the bytes of a recording at the recorded times."""
 
 from jointfit_simulators.recorded._recorded_devices import RecordedCameras
 from jointfit_simulators.recorded._recorded_scene import RecordedScene

@@ -1,6 +1,6 @@
-"""Plays a recording on virtual devices, and writes the rig.toml of the daemon that reads them.
+"""Plays a recording on virtual devices, and writes a rig.toml for them.
 
-Invariant: the intervals between chunks of all sources are the recorded ones.
+Invariant: the time intervals between the chunks of all sources equal the recorded intervals.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class RecordedScene:
     session
         Rig and chunks of the recording.
     directory
-        Folder of rig.toml and of the links to the ports.
+        Folder for rig.toml and for the links to the ports.
     broker
-        Host and port of the broker for rig.toml.
+        Host and port of the broker in the new rig.toml.
 
     Raises
     ------
@@ -98,7 +98,7 @@ class RecordedScene:
             device.unplug()
 
     async def run(self, report: Callable[[dict[str, object]], None]) -> None:
-        """Send the recording once after all devices are connected; report begin and end."""
+        """Send the recording once after all devices are connected; report start and end."""
         serving = [
             asyncio.create_task(device.run(), name=f"device {name}")
             for name, device in self._devices.items()
@@ -134,7 +134,7 @@ class RecordedScene:
         order = sorted(
             (t_ns, name, data) for name, device in active.items() for t_ns, data in device.chunks
         )
-        first_ns = order[0][0]  # answers of the handshake came before
+        first_ns = order[0][0]  # answers of the handshake are earlier
         report({"playing": round((order[-1][0] - first_ns) / _NS, 3)})
         for t_ns, name, data in order:
             due_ns = begin_ns + t_ns - first_ns

@@ -1,4 +1,4 @@
-"""The recorded rig.toml as text, with the ports of the virtual devices."""
+"""Conversion of the recorded rig.toml to a rig.toml for the virtual devices."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 _SECRETS = ("username", "password_file", "request_key_file", "tls", "insecure")
-"""Keys of ``[mqtt]`` that belong to the broker of the recording."""
+"""Keys of ``[mqtt]`` that apply to the broker of the recording only."""
 
 
 def rig_for_devices(
@@ -21,20 +21,20 @@ def rig_for_devices(
     command_port: int | None,
     broker: tuple[str, int],
 ) -> dict[str, Any]:
-    """Return the parsed rig with the virtual devices and another broker.
+    """Return the parsed rig with the ports of the virtual devices and another broker.
 
     Parameters
     ----------
     rig
-        The recorded rig.
+        Parsed rig.toml of the recording.
     ports
         Serial port of each device on a UART.
     buses
         Serial port of the adapter of each CAN bus.
     command_port
-        UDP port of the camera server on loopback; None without one.
+        UDP port of the motion-capture server on the loopback interface; None without a server.
     broker
-        Host and port.
+        Host and port of the broker.
     """
     found: dict[str, Any] = dict(rig)
     found["imu"] = [
@@ -45,7 +45,7 @@ def rig_for_devices(
             name: {"interface": "slcan", "channel": port} for name, port in buses.items()
         }
     if command_port is not None:
-        # addresses of the recorded network are not of this machine
+        # This machine does not have the addresses of the recorded network.
         others = ("local", "interface", "local_address")
         mocap = {key: value for key, value in rig["mocap"].items() if key not in others}
         found["mocap"] = {**mocap, "server": "127.0.0.1", "command_port": command_port}

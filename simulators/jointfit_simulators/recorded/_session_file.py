@@ -1,4 +1,4 @@
-"""Chunks of the sources and the rig of a recording, read with the library of the container."""
+"""Reads the rig and the chunks of all sources in a recording, with the MCAP library."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _SOURCE = "source/"
-"""Beginning of the channels with chunks."""
+"""Prefix of the channel names that contain chunks."""
 _RIG = "rig.json"
 """Name of the attachment with the parsed rig.toml."""
 _PART_NAME = re.compile(r"(.+-\d{8}T\d{6})-\d{4,}\.mcap")
@@ -26,23 +26,23 @@ class UnplayableRecordingError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class RecordedSession:
-    """Data that the devices of a session sent."""
+    """Rig of a session, and the data that its devices sent."""
 
     rig: dict[str, Any]
-    """The parsed rig.toml."""
+    """Parsed content of rig.toml."""
     chunks: dict[str, list[tuple[int, bytes]]]
-    """Arrival since the first chunk of all sources, ns, and bytes, by source."""
+    """Chunks by source: arrival time since the first chunk of all sources, ns, and bytes."""
 
 
 def read_session_chunks(path: Path) -> RecordedSession:
-    """Return rig and chunks of the recording at `path`, any file of a session or their folder.
+    """Return the rig and the chunks of a recording; `path` is a file or folder of a session.
 
     Raises
     ------
     UnplayableRecordingError
         The file is not a recording, or damaged.
     OSError
-        It cannot be read.
+        The file cannot be read.
     """
     rig: dict[str, Any] | None = None
     found: dict[str, list[tuple[int, bytes]]] = {}
@@ -74,7 +74,7 @@ def read_session_chunks(path: Path) -> RecordedSession:
 
 
 def _files_of(path: Path) -> list[Path]:
-    """Return the files of the session of `path`, in order."""
+    """Return the files of the session to which `path` belongs, in order."""
     match = None if path.is_dir() else _PART_NAME.fullmatch(path.name)
     if match is None and not path.is_dir():
         return [path]

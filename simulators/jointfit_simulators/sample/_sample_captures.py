@@ -1,7 +1,7 @@
-"""Captures of the three wires for the sample data. Invariant: no port is opened.
+"""Captures for the sample data on three types of wires. Invariant: no port is opened.
 
-The same movement as raw bytes of an Xbus UART, as the text of ``candump -L`` and as a pcap file
-(raw IPv4, nanoseconds) with the datagrams of a NatNet server.
+All captures contain the same movement: as raw bytes of an Xbus UART, as the text of ``candump -L``,
+and as a pcap file (raw IPv4, nanoseconds) with the datagrams of a NatNet server.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _LOOPBACK = bytes([127, 0, 0, 1])
 
 
 def xbus_bytes(samples: Iterable[tuple[int, Quaternion]]) -> bytes:
-    """Return MTData2 messages from (device time, ns; orientation, sensor to ENU world)."""
+    """Return MTData2 messages for pairs of device time (ns) and orientation (sensor to ENU)."""
     messages = []
     for counter, (device_ns, q) in enumerate(samples):
         items: list[tuple[int, Value]] = [
@@ -57,7 +57,7 @@ def xbus_bytes(samples: Iterable[tuple[int, Quaternion]]) -> bytes:
 
 
 def candump_text(groups: Iterable[tuple[int, Sequence[CanFrame]]], channel: str) -> str:
-    """Return a ``candump -L`` log from (arrival, ns; frames)."""
+    """Return a ``candump -L`` log for pairs of arrival time (ns) and CAN frames."""
     lines = []
     for t_ns, frames in groups:
         for place, frame in enumerate(frames):
@@ -74,16 +74,17 @@ def natnet_pcap(
     frames: Iterable[tuple[int, Markers, Bodies]],
     rate_hz: float,
 ) -> bytes:
-    """Return a capture of a NatNet 3.1 server: its description, then one datagram per frame.
+    """Return a capture of a NatNet 3.1 server: the description, and one datagram per frame.
 
     Parameters
     ----------
     clusters
-        Markers by body part; each part is a marker set and a rigid body of the project.
+        Markers by body part. Each part is a marker set and a rigid body of the project.
     frames
-        Exposure (ns since the first), markers and rigid bodies, m, z up; None if occluded.
+        Exposure time (ns since the first frame), markers and rigid bodies, m, z up; None if
+        occluded.
     rate_hz
-        Frames per second.
+        Frame rate, Hz.
     """
     bodies = tuple(
         RigidBodyAsset(part.capitalize(), tuple(names), number)

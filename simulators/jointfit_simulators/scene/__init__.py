@@ -1,4 +1,4 @@
-"""A whole scene in real time: a subject, its devices, their streams, and the ground truth."""
+"""Real-time scene of a subject, its devices, their streams, and the ground truth."""
 
 from jointfit_simulators.scene._imu_families import ids_toml
 from jointfit_simulators.scene._phase_follower import PhaseFollower

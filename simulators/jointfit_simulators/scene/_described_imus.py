@@ -1,7 +1,8 @@
-"""Self-described IMUs of a scene: each sensor has another table, in rig.toml and in the device.
+"""IMUs of a scene whose messages a table describes; each sensor has another table.
 
-The first two sensors send integers: in binary frames, or in a CAN frame behind one with the time.
-The next two send text lines, or a quaternion of floats in two CAN frames; and so on.
+The table is in rig.toml and in the simulated device. The first two sensors send integers, in binary
+frames or in a CAN frame that follows a frame with the time. The next two sensors send text lines,
+or a quaternion of floats in two CAN frames. The following sensors repeat these formats.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ if TYPE_CHECKING:
     from jointfit_simulators.wires import CanWire
 
 _COUNTS = 32767
-"""Counts of 1 in quaternions of 16-bit integers."""
+"""Number of counts for 1 in quaternions of 16-bit integers."""
 _US = 1e-6
 (_TIME,), (_COUNTER,) = SLOTS["time"], SLOTS["counter"]
 
 
 def binary_frames(port: Path, rate_hz: float, noise: WireNoise) -> tuple[TableDevice, list[str]]:
-    """Return a device with big-endian frames of 18 bytes, and its keys in rig.toml."""
+    """Return a device that sends big-endian frames of 18 bytes, and its keys in rig.toml."""
     fields = {
         slot: TableField(8 + 2 * slot, "i", 16, "big", scale=1 / _COUNTS) for slot in range(4)
     }
@@ -63,7 +64,7 @@ def binary_frames(port: Path, rate_hz: float, noise: WireNoise) -> tuple[TableDe
 
 
 def text_lines(port: Path, rate_hz: float, noise: WireNoise) -> tuple[TableDevice, list[str]]:
-    """Return a device with lines as an Arduino sketch prints them, and its keys in rig.toml."""
+    """Return a device that sends text lines like an Arduino sketch, and its keys in rig.toml."""
     columns = {0: 5, 1: 2, 2: 3, 3: 4, _TIME: 0, _COUNTER: 1}
     fields = {slot: TableField(column, "f", 64) for slot, column in columns.items()}
     fields[_TIME] = TableField(0, "u", 32, scale=_US)
@@ -83,7 +84,7 @@ def text_lines(port: Path, rate_hz: float, noise: WireNoise) -> tuple[TableDevic
 
 
 def time_and_integers(bus: CanWire, first_id: int, rate_hz: float) -> tuple[TableDevice, list[str]]:
-    """Return a device that sends as an SBG Ellipse does, and its keys in rig.toml."""
+    """Return a device that sends like an SBG Ellipse, and its keys in rig.toml."""
     fields = {slot: TableField(2 * slot, "i", 16, scale=1 / _COUNTS, frame=1) for slot in range(4)}
     fields[_TIME] = TableField(0, "u", 32, scale=_US)
     table = CanTable(((first_id, False), (first_id + 1, False)), fields)
@@ -98,7 +99,7 @@ def time_and_integers(bus: CanWire, first_id: int, rate_hz: float) -> tuple[Tabl
 
 
 def halves_of_floats(bus: CanWire, first_id: int, rate_hz: float) -> tuple[TableDevice, list[str]]:
-    """Return a device without time that sends two floats a frame, and its keys in rig.toml."""
+    """Return a device without time that sends two floats per frame, and its keys in rig.toml."""
     fields = {slot: TableField(4 * (slot % 2), "f", 32, frame=slot // 2) for slot in range(4)}
     table = CanTable(((first_id, False), (first_id + 1, False)), fields)
     options = TableDeviceOptions(fields, rate_hz, world="NWU", world_to_sensor=True)

@@ -1,8 +1,9 @@
 """Virtual devices of a scene and their tables in rig.toml.
 
-By default every other sensor uses a UART (Xbus, one pty each) and the others use CAN (XCDI, behind
-one SLCAN adapter on a pty or on a python-can bus). The optical system is a NatNet server on
-loopback. The families of devices are in `_imu_families` and `_mocap_families`.
+By default, every second sensor uses a UART (Xbus, one pseudo-terminal each). The other sensors use
+CAN (XCDI), on an SLCAN adapter with a pseudo-terminal or on a python-can bus. The optical system is
+a NatNet server on the loopback interface. The families of devices are in `_imu_families` and
+`_mocap_families`.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ class SceneHardware:
     tables: list[str] = field(default_factory=list)
     """``[[imu]]`` and ``[can.*]`` tables for rig.toml."""
     ports: dict[str, str] = field(default_factory=dict)
-    """Port of each device or bus."""
+    """Port of each device or bus, by name."""
 
 
 def create_hardware(
@@ -50,24 +51,25 @@ def create_hardware(
     now_ns: int,
     sync_line: bool = False,
 ) -> SceneHardware:
-    """Create and power the devices of a scene.
+    """Create the devices of a scene, and switch them on.
 
     Parameters
     ----------
     knobs
-        Error magnitudes.
+        Settings with the magnitudes of all errors.
     sensors
-        Segment of each sensor id.
+        Segment of each sensor, by sensor id.
     directory
-        Directory of the symbolic links to the ptys.
+        Directory of the symbolic links to the pseudo-terminals.
     wires
-        Family of each sensor; one of `IMU_FAMILIES`.
+        Family of each sensor, from `IMU_FAMILIES`.
     can
         ``slcan``, or INTERFACE:CHANNEL of python-can, such as ``socketcan:vcan0``.
     now_ns
-        Host time of the start of the run, ns.
+        Host time at the start of the run, ns.
     sync_line
-        Whether a sync line is connected; devices that can are then configured to report its edges.
+        Whether a sync line is connected. Devices with a sync input are then configured to report
+        its edges.
     """
     hardware = SceneHardware()
     for number, (name, segment) in enumerate(sensors.items(), start=1):
@@ -94,7 +96,7 @@ def create_hardware(
         driver = family.driver or wires[name]
         head = [f'id = "{name}"', f'segment = "{segment}"', f'driver = "{driver}"']
         rate = f"rate_hz = {knobs.rate_hz:g}"
-        # the rate is first: the keys of a family may end with a table of their own
+        # The rate precedes the keys of a family, because these keys may end with a table.
         hardware.tables.append("\n".join(["[[imu]]", *head, rate, *imu.keys, ""]))
     return hardware
 

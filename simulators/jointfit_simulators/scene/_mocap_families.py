@@ -1,6 +1,6 @@
-"""Families of motion-capture servers that a scene can create, by the name of their driver.
+"""Families of motion-capture servers that a scene can create, by driver name.
 
-A new family is one function and one entry of `MOCAP_FAMILIES`.
+A new family needs one function and one entry in `MOCAP_FAMILIES`.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ _TAI_MINUS_UTC_S = 37
 
 
 class MocapServer(Protocol):
-    """Virtual motion-capture server on loopback, whose port is open from the start."""
+    """Virtual motion-capture server on the loopback interface. Its port is open from the start."""
 
     ready: asyncio.Event
     """Event that is set while `run` answers."""
     number: int
     """Number of the next frame."""
     command_port: int
-    """Port at which clients connect."""
+    """Port to which clients connect."""
 
     @property
     def sent(self) -> int:
-        """Number of frames sent, summed over clients."""
+        """Number of sent frames, summed over the clients."""
 
     def push(self, exposure_host_ns: int, markers: Markers, bodies: Bodies) -> None:
         """Send one frame now.
@@ -54,11 +54,11 @@ class MocapServer(Protocol):
         Parameters
         ----------
         exposure_host_ns : int
-            Exposure time, host CLOCK_MONOTONIC, ns; independent of the time of sending.
+            Exposure time, host CLOCK_MONOTONIC, ns. It is independent of the time of sending.
         markers : mapping of str to (x, y, z) or None
-            World z up, m; None if occluded.
+            Position in the world (z up), m; None if occluded.
         bodies : mapping of str to (position, quaternion) or None
-            World z up, m, q_world_body (w, x, y, z); None if untracked.
+            Position in the world (z up), m, and q_world_body (w, x, y, z); None if untracked.
         """
 
     async def run(self) -> None:
@@ -68,7 +68,7 @@ class MocapServer(Protocol):
         """Close the port and disconnect all clients."""
 
     def restart(self) -> None:
-        """Close and open the server; frame numbers restart."""
+        """Close and reopen the server; frame numbers restart."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,33 +76,35 @@ class CameraPlace:
     """Camera data that a scene streams through a server."""
 
     knobs: Knobs
-    """Camera rate and random seed."""
+    """Settings with camera rate and random seed."""
     clusters: Mapping[str, tuple[str, ...]]
     """Marker names of each body part."""
     bodies: Sequence[str]
-    """Tracked rigid bodies; those without markers are last."""
+    """Tracked rigid bodies. Bodies without markers are last."""
     timing: SampleTiming
     """Clock of the server."""
     ptp: bool
-    """Whether cameras and host are synchronized by PTP, for families that report its time."""
+    """Whether cameras and host are synchronized by PTP. Some families report PTP time."""
     command_port: int
-    """Port on loopback at which clients connect; 0 selects a free port."""
+    """Port on the loopback interface to which clients connect; 0 selects a free port."""
 
     @property
     def markers_by_body(self) -> dict[str, tuple[str, ...]]:
-        """Markers of each rigid body, without those for bodies that have none of their own."""
+        """Markers of each rigid body that has its own markers."""
         owned = {part.capitalize(): names for part, names in self.clusters.items()}
         return owned | {body: () for body in self.bodies if body not in owned}
 
 
 @dataclass(frozen=True, slots=True)
 class MocapFamily:
-    """Motion-capture family of a scene, by its driver."""
+    """Motion-capture servers of one driver."""
 
     create: Callable[[CameraPlace], tuple[MocapServer, list[str]]]
-    """Returns a server, and the lines of the ``[mocap]`` table after its driver."""
+    """Function that returns a server, and the lines that follow the driver in the ``[mocap]``
+    table."""
     sync_line: bool = False
-    """Whether ``sync_line`` may be set: its frames mark the exposures that cause an edge."""
+    """Whether ``sync_line`` is supported. A frame then states whether its exposure causes an edge.
+    """
 
 
 def _natnet(place: CameraPlace) -> tuple[NatNetServer, list[str]]:
@@ -117,7 +119,7 @@ def _natnet(place: CameraPlace) -> tuple[NatNetServer, list[str]]:
         seed=place.knobs.seed,
     )
     if place.ptp:
-        # PTP counts TAI; its offset from the host clock is measured once
+        # PTP uses the time scale TAI. Its offset from the host clock is measured once.
         offset_ns = time.time_ns() - time.monotonic_ns() + _TAI_MINUS_UTC_S * NS
         options = replace(
             options, bitstream=(4, 1), precision_ns=lambda host_ns: host_ns + offset_ns
@@ -189,7 +191,8 @@ def _lsl_markers(place: CameraPlace) -> tuple[LslServer, list[str]]:
             markers=tuple(name for names in place.clusters.values() for name in names),
             bodies=tuple(place.bodies),
             rate_hz=place.knobs.mocap_hz,
-            # liblsl sends its own clock, which the scene cannot change: stamps must be on it.
+            # liblsl sends its own clock, which the scene cannot change, so the stamps are on this
+            # clock.
         )
     )
     lines = [f'source_id = "{server.source_id}"', f'up_axis = "{server.options.up_axis}"']
@@ -203,4 +206,4 @@ MOCAP_FAMILIES = {
     "vicon": MocapFamily(_vicon),
     "vrpn": MocapFamily(_vrpn),
 }
-"""Families by driver."""
+"""Families, by driver name."""

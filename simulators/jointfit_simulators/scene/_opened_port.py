@@ -1,9 +1,9 @@
-"""First opening of a simulated serial port by a host.
+"""Detects the first opening of a simulated serial port by a host.
 
-The bytes of a serial device without a reader are lost, but a pty stores them for the first reader,
-which discards an unknown part of them. A device that sends without being asked therefore begins
-when its port has been opened, as boards do that DTR restarts: every sample that counts as sent then
-reaches the reader.
+Without a reader, the bytes of a real serial device are lost. A pseudo-terminal (pty) stores them
+for the first reader, which discards an unknown part of them. A device that sends without a request
+therefore begins when its port has been opened, as a board that DTR restarts. Every sample that
+counts as sent then reaches the reader.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 RESTART_S = 0.2
-"""Time from the opening to the first sample, s: longer than a host discards old input."""
+"""Time from the opening to the first sample, s. In this time, a host discards old input."""
 _CONTROL_MODES = 2
 """Index of the control modes in the result of tcgetattr."""
 
 
 class OpenedPort:
-    """Whether a host has opened a port for the first time.
+    """Detector of the first opening of a port by a host.
 
     Parameters
     ----------
@@ -43,10 +43,10 @@ class OpenedPort:
         return self._opened_s is not None and time.monotonic() - self._opened_s > RESTART_S
 
     def _is_configured(self) -> bool:
-        """Return whether a program set the modes of a local line, as all serial libraries do."""
+        """Return whether a program has set the modes of the port, as all serial libraries do."""
         try:
             port = os.open(self._link, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
-        except OSError:  # unplugged
+        except OSError:  # the port is unplugged
             return False
         try:
             return bool(termios.tcgetattr(port)[_CONTROL_MODES] & termios.CLOCAL)

@@ -1,6 +1,6 @@
-"""Stream of camera frames: planned in blocks, sent one by one.
+"""Stream of camera frames, which are planned in blocks and sent one by one.
 
-The optical world is z up here; the server converts to its own axes.
+The optical world has z up in this module. The server converts to its own axes.
 
 Invariant: a frame contains its exposure time, even if it is sent late.
 """
@@ -31,13 +31,13 @@ class OpticalStream:
     Parameters
     ----------
     knobs
-        Camera rate.
+        Settings with the camera rate.
     cameras
         Source of the frames.
     timing
-        Exposure times and the server's clock.
+        Exposure times, and clock of the server.
     server
-        Receiver of the frames; None without an optical system.
+        Server that sends the frames; None without an optical system.
     """
 
     def __init__(
@@ -45,28 +45,28 @@ class OpticalStream:
     ) -> None:
         self.cameras = cameras
         self.on_sample: SampleCallback | None = None
-        """Called for every frame sent, with the id ``mocap``."""
+        """Callback for every sent frame, with the id ``mocap``."""
         self._server = server
         self._timing = timing
         self._period_ns = NS / knobs.mocap_hz
         self._planned: deque[tuple[int, Markers, Bodies]] = deque()
         self.running = server is not None
-        """Whether frames are sent; the cameras continue to expose."""
+        """Whether frames are sent. The cameras expose frames in any case."""
 
     @property
     def sent(self) -> int:
-        """Number of frames sent; zero without a client."""
+        """Number of sent frames; 0 without a client."""
         return self._server.sent if self._server else 0
 
     def plan(self, begin_ns: int, end_ns: int) -> NDArray[np.int64]:
-        """Plan the exposures of a block and return their true host times, ns."""
+        """Plan the exposures of a block; return their true host times, ns."""
         if self._server is None:
             return np.empty(0, dtype=np.int64)
         self._block = self._timing.samples(begin_ns, end_ns, self._period_ns)
         return self._block.host_ns
 
     def fill(self, observation: Observation) -> list[int]:
-        """Add markers to the planned frames and return the transmission times, ns."""
+        """Add markers to the planned frames; return the transmission times, ns."""
         if self._server is None:
             return []
         frames = self.cameras.capture(observation)
@@ -95,5 +95,5 @@ class OpticalStream:
                 self.on_sample("mocap", number, frame[0])
 
     def discard(self) -> None:
-        """Discard the frames that are planned but not sent."""
+        """Discard the planned frames that are not yet sent."""
         self._planned.clear()

@@ -1,6 +1,6 @@
 """Selection of motions by the calibration phase that a daemon publishes over MQTT.
 
-Invariant: the module subscribes to the topic ``calibration`` (docs/mqtt.md) only and publishes
+Invariant: the module subscribes only to the topic ``calibration`` (docs/mqtt.md), and publishes
 nothing.
 """
 
@@ -35,12 +35,12 @@ MOTIONS_OF_PHASES: dict[str, dict[str, _Motions]] = {
     }
     for limb, motions in _FUNCTIONAL.items()
 }
-"""Motions of each limb in each phase, in turn, and their durations in s.
+"""Sequence of motions in each phase, by limb, with their durations, s.
 
-In other phases the subject stands."""
+In other phases, the subject stands."""
 _OTHER_PHASES = (("stand", 5.0),)
 _RETRY_S = 1.0
-"""Delay before the next connection to the broker, s."""
+"""Time before the next attempt to connect to the broker, s."""
 
 
 class PhaseFollower:
@@ -51,9 +51,9 @@ class PhaseFollower:
     rig
         Broker address and base topic.
     play
-        Called with the name of the motion to start.
+        Callback that receives the name of the motion to start.
     report
-        Called with a message when the broker connection is lost or restored.
+        Callback that receives a message when the broker connection is lost or restored.
     limb
         ``leg``, ``legs``, ``arm`` or ``trunk``.
     """
@@ -94,7 +94,7 @@ class PhaseFollower:
                         f"no broker at {broker}: start one there, or set --mqtt-host and"
                         " --mqtt-port"
                     )
-                    if lost != reported:  # once, not every second
+                    if lost != reported:  # report once, not every second
                         reported = lost
                         self._report(lost)
                 await asyncio.sleep(_RETRY_S)
@@ -122,7 +122,7 @@ class PhaseFollower:
         )
 
     async def _play_in_turn(self, motions: tuple[tuple[str, float], ...]) -> None:
-        """Play the motions after the first, in turn."""
+        """Play all motions after the first motion, one after another."""
         if len(motions) == 1:
             return
         for at, (name, seconds) in enumerate(cycle(motions)):

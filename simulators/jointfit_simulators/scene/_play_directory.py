@@ -1,4 +1,4 @@
-"""Lock and stored command port of the directory of a simulation.
+"""Lock and stored command port in the directory of a simulation.
 
 Invariant: only one simulator process uses a directory. The operating system releases the lock when
 the process ends.
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 STATE_FILE = ".jointfit-sim.json"
-"""Lock file; contains ``{"pid": …, "command_port": …}`` for the next run."""
+"""Name of the lock file. It contains ``{"pid": …, "command_port": …}`` for the next run."""
 _LARGEST = 1000
-"""Bytes read of the lock file, more than this module writes."""
+"""Maximum number of bytes that are read from the lock file, more than this module writes."""
 _PORTS = range(1, 65536)
 
 
 class DirectoryInUseError(ValueError):
-    """Another simulator uses the directory; the message names its process."""
+    """Another simulator uses the directory. The message names its process."""
 
 
 class PortInUseError(ValueError):
@@ -36,17 +36,17 @@ class PortInUseError(ValueError):
 
 
 class PlayDirectory:
-    """A simulation directory locked by this process."""
+    """A simulation directory that this process has locked."""
 
     def __init__(self, path: Path, file: int) -> None:
         self._path, self._file = path, file
         self._before = _state(file)
 
     def command_port(self, asked: int | None) -> int:
-        """Return the command port for the NatNet server; 0 selects any free port.
+        """Return the command port for the NatNet server; 0 selects a free port.
 
-        Without a requested port, the port of the previous run in this directory is returned if it
-        is free, so that a running daemon reconnects to the server.
+        Without a requested port, the function returns the port of the previous run in this
+        directory if it is free. A running daemon can then reconnect to the server.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class PlayDirectory:
 
 @contextmanager
 def play_directory(path: Path) -> Iterator[PlayDirectory]:
-    """Create and lock the directory for the duration of the block.
+    """Create the directory, and lock it during the ``with`` block.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def _state(file: int) -> dict[str, object]:
 
 
 def _taken(port: int) -> str | None:
-    """Return why `port` cannot be bound, or None."""
+    """Return the reason why `port` cannot be bound, or None."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind((LOOPBACK, port))

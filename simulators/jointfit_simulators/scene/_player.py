@@ -1,7 +1,7 @@
-"""Real-time scheduler of a scene: plans blocks 0.2 s ahead and sends each sample at its due time.
+"""Real-time scheduler of a scene, which plans blocks of 0.2 s and sends each sample in time.
 
-Deadlines are absolute. Overdue samples are sent at once, in order and with their own time stamps.
-After an interruption of seconds (a suspended machine) the missed time is skipped.
+Transmission times are absolute. Overdue samples are sent at once, in order and with their own time
+stamps. After an interruption of some seconds (a suspended machine), the missed time is skipped.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ if TYPE_CHECKING:
 BLOCK_NS = NS // 5
 """Duration of a planned block, ns."""
 AHEAD_NS = NS // 10
-"""Remaining part of a block at which the next block is planned, ns."""
+"""Remaining time of a block at which the next block is planned, ns."""
 SKIP_NS = 2 * NS
 """Duration of an interruption above which the missed time is skipped, ns."""
 TRUTH_NS = NS // 100
-"""Interval of the ground truth, ns."""
+"""Time between two samples of the ground truth, ns."""
 _FLUSH_NS = NS // 10
-"""Interval between two writes of the ground-truth log, ns."""
+"""Time between two writes to the log of the ground truth, ns."""
 
 
 class PlannedStream(Protocol):
     """Stream with planned samples."""
 
     on_sample: SampleCallback | None
-    """Called for every sample sent."""
+    """Callback for every sent sample."""
 
     def emit(self, *, sending: bool) -> None:
         """Send the next planned sample, or drop it if not `sending`."""
@@ -61,11 +61,11 @@ class ScenePlayer:
     imus
         IMU streams by sensor id; empty for a scene with cameras only.
     optical
-        Stream of the cameras.
+        Stream of the camera frames.
     truth
-        Ground-truth log.
+        Log of the ground truth.
     origin_ns
-        Host time at which the subject's time is 0, ns.
+        Host time that corresponds to the subject's time 0, ns.
     sync_line
         Whether each camera exposure produces an edge on the sync line of all sensors.
     """
@@ -88,9 +88,9 @@ class ScenePlayer:
         self._planned_ns = origin_ns
         self._due: list[tuple[int, int]] = []  # heap of transmission time and stream number
         self.paused = False
-        """Whether transmission is paused; samples due meanwhile are dropped."""
+        """Whether transmission is paused. Samples that are due during the pause are dropped."""
         self.left_out_ns = 0
-        """Time skipped after interruptions, ns."""
+        """Total time that was skipped after interruptions, ns."""
 
     def motion(self) -> str:
         """Return the name of the current motion."""
@@ -101,7 +101,7 @@ class ScenePlayer:
         self._subject.play(name, (self._planned_ns - self._origin_ns) / NS)
 
     async def run(self) -> None:
-        """Play until cancelled."""
+        """Send the samples of all streams until cancelled."""
         flushed_ns = 0
         while True:
             now_ns = time.monotonic_ns()
@@ -124,7 +124,7 @@ class ScenePlayer:
             await asyncio.sleep(max(0.0, (wake_ns - time.monotonic_ns()) / NS))
 
     def finish(self) -> None:
-        """Stop sending and write the ground truth up to now."""
+        """Stop sending, and write the ground truth up to the current time."""
         self.paused = True
         self._due.clear()
         for stream in self._streams:
@@ -134,7 +134,7 @@ class ScenePlayer:
     def _plan_block(self) -> None:
         begin_ns, end_ns = self._planned_ns, self._planned_ns + BLOCK_NS
 
-        # instants of all streams
+        # Sampling times of all streams
         imu_ns = [imu.plan(begin_ns, end_ns) for imu in self._imus]
         exposures_ns = self._optical.plan(begin_ns, end_ns)
         if self._sync_line:
@@ -143,13 +143,13 @@ class ScenePlayer:
         first = -(-begin_ns // TRUTH_NS) * TRUTH_NS
         truth_ns = np.arange(first, end_ns, TRUTH_NS, dtype=np.int64)
 
-        # observation of the subject at these instants
+        # Observation of the subject at these times
         imu_s = [self._seconds(t_ns) for t_ns in imu_ns]
         imu_s = imu_s or [np.empty(0) for _ in self._subject.sensors]
         truth_s = self._seconds(truth_ns)
         observation = self._subject.observe(imu_s, self._seconds(exposures_ns), truth_s)
 
-        # measurements and their transmission times
+        # Measurements and their transmission times
         due_ns = [
             imu.fill(t_s, q)
             for imu, t_s, q in zip(self._imus, imu_s, observation.sensors, strict=bool(self._imus))

@@ -1,4 +1,4 @@
-"""Text of the rig.toml for a scene, complete and ready for the daemon."""
+"""Text of a complete rig.toml for a scene."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from jointfit_simulators.body import RigChain
 
 _SHORTEST_S = 45.0
-"""Default of ``functional_min_s`` in the daemon, s; limited to the duration of the phase."""
+"""Default of ``functional_min_s`` in the daemon, s. The value is limited to the duration of the
+phase."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +23,7 @@ class RigOptions:
 
     name: str = "demo"
     output_rate_hz: float = 100.0
-    mqtt_host: str = "127.0.0.1"  # not every machine can resolve "localhost"
+    mqtt_host: str = "127.0.0.1"  # some machines cannot resolve "localhost"
     mqtt_port: int = 1883
     mqtt_base: str = "jointfit/demo"
     mqtt_version: str = "5"
@@ -55,21 +56,21 @@ def rig_toml(
     options
         Names, broker and calibration settings.
     devices
-        ``[[imu]]`` and ``[can.*]`` tables.
+        Text of the ``[[imu]]`` and ``[can.*]`` tables.
     mocap
         First lines of the ``[mocap]`` table; empty without an optical system.
     clusters
         Marker names of each body part.
     bones
-        Segments with a rigid body as reference instead of markers.
+        Segments whose reference is a rigid body instead of markers.
     plate
         Whether the optical system tracks the plate.
     chain
-        Joints and segments.
+        Joints and segments of the limb.
     chain_model
-        File name of the chain model; None without one.
+        File name of the chain model, if there is one.
     planar
-        Whether the rig follows a planar movement by cameras alone.
+        Whether the rig measures a planar movement with cameras alone.
     """
     head, *keys = _chain_table(options, clusters if mocap else {}, chain, chain_model)
     limb = [head, *(['motion = "planar"'] if planar else []), *keys]
@@ -104,7 +105,7 @@ def _chain_table(
     chain: RigChain,
     chain_model: str | None,
 ) -> list[str]:
-    """Return the lines of ``[chain]``; body parts without sensors must be `tracked`."""
+    """Return the lines of the ``[chain]`` table; `tracked` contains all parts without sensors."""
     limb = ["[chain]"]
     if chain.joints:
         limb.append(f"joints = {_names(chain.joints)}")

@@ -1,8 +1,9 @@
-r"""Log of the true sampling times, one JSON object per line, for clock experiments.
+r"""Log of the true sampling times for clock experiments, with one JSON object per line.
 
 Invariant: only samples that were sent are logged.
 
-A sample is identified by its device and its number on the wire; numbers restart with the device::
+A sample is identified by its device and its transmitted number. The numbers restart with the
+device::
 
     {"id": "S1", "number": 4711, "host_ns": true instant of sampling, host CLOCK_MONOTONIC}
 """
@@ -23,7 +24,7 @@ class SampleLog:
     Parameters
     ----------
     path
-        Output file; overwritten.
+        Output file. An existing file is overwritten.
     """
 
     def __init__(self, path: Path) -> None:

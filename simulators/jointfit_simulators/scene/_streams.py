@@ -108,20 +108,20 @@ class ImuStream:
         """Number of samples that were taken while the device was unplugged, paused or not
         measuring, or before the first opening of the port."""
         self.refused = 0
-        """Number of samples rejected by a full line."""
+        """Number of samples that a full line rejected."""
 
     def add_edges(self, edges_ns: NDArray[np.int64]) -> None:
-        """Plan edges on the sync line at these host times, ns."""
+        """Plan edges of the sync line at the given host times, ns."""
         self._edges.extend(edges_ns.tolist())
 
     def plan(self, begin_ns: int, end_ns: int) -> NDArray[np.int64]:
-        """Plan the samples of a block and return their true host times, ns."""
+        """Plan the samples of a block; return their true host times, ns."""
         rate_hz = self.device.rate_hz or self._default_hz
         self._block = self.timing.samples(begin_ns, end_ns, NS / rate_hz)
         return self._block.host_ns
 
     def fill(self, t_s: Array, q_base_sensor: Array) -> list[int]:
-        """Add orientations to the planned samples and return the transmission times, ns."""
+        """Add orientations to the planned samples; return the transmission times, ns."""
         measured = self.faults.apply(t_s, self.sensor.report(t_s, q_base_sensor))
         lost = self._block.dropped | ~np.isfinite(measured[:, 0])
         for true_ns, stamp, q, dropped in zip(
@@ -131,7 +131,7 @@ class ImuStream:
             orientation = None if dropped else cast("Quaternion", tuple(q))
             self._planned.append((true_ns, stamp, orientation))
 
-        # the host receives a sample with its last byte
+        # The host receives a sample with the last byte of the sample.
         return cast("list[int]", (self._block.due_ns + self.device.line_ns).tolist())
 
     def emit(self, *, sending: bool = True) -> None:
@@ -158,11 +158,11 @@ class ImuStream:
 
     def _is_read(self) -> bool:
         if self._port is not None and self._port.is_read:
-            self._port = None  # read from now on
+            self._port = None  # the host reads from now on
         return self._port is None
 
     def discard(self) -> None:
-        """Discard the samples that are planned but not sent."""
+        """Discard the planned samples that are not yet sent."""
         self._planned.clear()
 
     def unplug(self) -> None:

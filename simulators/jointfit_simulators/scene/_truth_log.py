@@ -1,21 +1,22 @@
-r"""Ground-truth log of a run, one JSON object per line.
+r"""Log of the ground truth of a run, with one JSON object per line.
 
-Values are true, not measured: optical world, z up; m, rad; quaternions (w, x, y, z).
+The values are true, not measured. They are in the optical world (z up), in m and rad, with
+quaternions (w, x, y, z).
 
-Invariant: a line is written after its instant and is in the file within 0.2 s.
+Invariant: a line is written after its time, and is in the file within 0.2 s.
 
-First line: ``{"truth": 1, "t_ns": …, "knobs": {…}, "lengths_m": {…}, "joint": "knee", …}``.
-Then, at 100 Hz::
+The first line is ``{"truth": 1, "t_ns": …, "knobs": {…}, "lengths_m": {…}, "joint": "knee", …}``.
+The other lines follow at 100 Hz::
 
     {"t_ns": host CLOCK_MONOTONIC, "motion": "walk",
      "q_world_segment": {"pelvis": [w, x, y, z], "thigh": …, "shank": …, "foot": …},
      "joint_m": {"hip": [x, y, z], "knee": …, "ankle": …},
      "knee": {"flexion": …, "adduction": …, "rotation": …}, "included": …}
 
-The angles are those of the main joint: ``knee``, ``elbow`` or ``lumbar``. Knee flexion is positive
-with the heel back, adduction with the foot towards the midline, rotation with the toes towards the
-midline. Lumbar flexion is positive forward, ``adduction`` is bending to the right, and rotation is
-positive to the left. The included angle is pi when straight. Unknown is null.
+The angles belong to the main joint: ``knee``, ``elbow`` or ``lumbar``. Knee flexion is positive
+with the heel back, adduction with the foot towards the midline, and rotation with the toes towards
+the midline. Lumbar flexion is positive forward, ``adduction`` is bending to the right, and rotation
+is positive to the left. The included angle is pi when straight. An unknown value is null.
 """
 
 from __future__ import annotations
@@ -37,17 +38,17 @@ if TYPE_CHECKING:
     from jointfit_simulators.body import GroundTruth, Rotation
 
 VERSION = 1
-"""Version of the format, in the first line."""
+"""Version of the format, which the first line contains."""
 _OPTIONS = orjson.OPT_SERIALIZE_NUMPY | orjson.OPT_APPEND_NEWLINE
 
 
 class TruthLog:
-    """Writer of the ground-truth log.
+    """Writer of the log of the ground truth.
 
     Parameters
     ----------
     path
-        Output file; overwritten.
+        Output file. An existing file is overwritten.
     facts
         Contents of the first line.
     """
@@ -66,9 +67,9 @@ class TruthLog:
         Parameters
         ----------
         t_ns
-            Host time of each instant, ns, shape (n,).
+            Host times, ns, shape (n,).
         motions
-            Name of the motion at each instant.
+            Name of the motion at each time.
         truth
             Ground truth in the base world.
         world

@@ -1,4 +1,4 @@
-"""Virtual wires: serial lines on ptys, CAN buses, line noise."""
+"""Virtual wires: serial lines on pseudo-terminals (pty), CAN buses, and line noise."""
 
 from jointfit_simulators.wires._can_wire import CanWire, PythonCanWire, SlcanAdapter
 from jointfit_simulators.wires._line_noise import line_noise

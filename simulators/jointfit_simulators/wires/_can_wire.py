@@ -1,6 +1,6 @@
-"""Virtual CAN wires: an SLCAN adapter on a pty, and python-can buses.
+"""Virtual CAN wires: an SLCAN adapter on a pseudo-terminal (pty), and python-can buses.
 
-Several devices share one wire. Each may call ``run``; one of them serves the wire.
+Several devices share one wire. Each device may call ``run``, and one of the calls serves the wire.
 
 Invariant: frames sent while the host has not opened the bus are lost.
 """
@@ -38,14 +38,14 @@ _ANSWERS = {"V": b"V1013\r", "v": b"v0100\r", "N": b"NA123\r", "F": b"F00\r", ""
 
 
 class CanWire(Protocol):
-    """CAN bus as seen by a device."""
+    """CAN bus to which a device is connected."""
 
     bitrate: int | None
-    """Bit rate from which the transmission time of a frame follows, bit/s; None: no delay."""
+    """Bit rate that determines the transmission time of a frame, bit/s; None for no delay."""
 
     @property
     def is_open(self) -> bool:
-        """Whether the host listens, as far as the wire can detect it."""
+        """Whether the host receives, as far as the wire can detect it."""
 
     def send(self, frames: Iterable[CanFrame]) -> bool:
         """Send `frames`; return whether all were sent."""
@@ -54,14 +54,14 @@ class CanWire(Protocol):
         """Run the bus until cancelled."""
 
     def unplug(self) -> None:
-        """Disconnect the wire; no effect if disconnected."""
+        """Disconnect the wire; do nothing if it is disconnected."""
 
     def plug(self) -> None:
         """Connect the wire."""
 
 
 class SlcanAdapter:
-    """SLCAN adapter with a pty as its serial port.
+    """SLCAN adapter whose serial port is a pseudo-terminal (pty).
 
     Parameters
     ----------
@@ -70,9 +70,10 @@ class SlcanAdapter:
     wire_noise
         Noise applied to each write on the serial line.
     bus_bitrate
-        Bit rate of the sensors, bit/s; the host receives nothing at another rate. None: any.
+        Bit rate of the sensors, bit/s. At another rate, the host receives nothing. None accepts any
+        rate.
     mute
-        Execute commands without an answer, as some adapters do.
+        Whether the adapter executes commands without an answer, as some adapters do.
     """
 
     def __init__(
@@ -88,25 +89,25 @@ class SlcanAdapter:
         self._decoder = SlcanCodec(115_200, "adapter")
         self._serving = asyncio.Lock()
         self.is_open = False
-        """Whether the host opened the bus."""
+        """Whether the host has opened the bus."""
         self._stamping = False
         self.bitrate: int | None = None
-        """Bit rate set by the host, bit/s."""
+        """Bit rate that the host has set, bit/s."""
 
     def send(self, frames: Iterable[CanFrame]) -> bool:
-        """Send `frames` to the host; either all or none."""
+        """Send all `frames` to the host or none of them."""
         if not self.is_open or self._bus_bitrate not in {None, self.bitrate}:
             return False
         stamp = time.monotonic_ns() // _NS_PER_MS if self._stamping else None
         return self._line.write(self._noise(b"".join(encode_frame(f, stamp) for f in frames)))
 
     async def run(self) -> None:
-        """Serve until cancelled; wait while another device serves the adapter."""
+        """Serve the adapter until cancelled; wait while another device serves it."""
         async with self._serving:
             await self._line.serve(self._receive)
 
     def unplug(self) -> None:
-        """Disconnect the adapter; it loses power and its settings."""
+        """Disconnect the adapter, which then loses power and its settings."""
         self._line.unplug()
         self.is_open = self._stamping = False
         self.bitrate = None
@@ -145,7 +146,7 @@ class PythonCanWire:
     Parameters
     ----------
     interface, channel
-        Names of python-can.
+        Names of interface and channel in python-can.
     """
 
     def __init__(self, interface: str, channel: str) -> None:
@@ -156,11 +157,11 @@ class PythonCanWire:
 
     @property
     def is_open(self) -> bool:
-        """Whether the wire is plugged in; listeners on a bus cannot be detected."""
+        """Whether the wire is connected; receivers on a bus cannot be detected."""
         return self._bus is not None
 
     def send(self, frames: Iterable[CanFrame]) -> bool:
-        """Send `frames`; return False if the bus is absent, down or full."""
+        """Send `frames`; return False if the bus is missing, down or full."""
         if self._bus is None:
             return False
 
@@ -178,7 +179,7 @@ class PythonCanWire:
         return True
 
     async def run(self) -> None:
-        """Wait until cancelled; the devices on this bus receive nothing."""
+        """Wait until cancelled, because the devices on this bus receive nothing."""
         await asyncio.get_running_loop().create_future()
 
     def unplug(self) -> None:

@@ -1,7 +1,7 @@
 """Serial line noise: flipped bits and bursts of random bytes.
 
-Invariant: a flip preserves the number of bytes, a burst is inserted between bytes, and zero noise
-returns the data unchanged.
+Invariant: a flip preserves the number of bytes, and a burst is inserted between bytes. With zero
+noise, the data are unchanged.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Serial line based on a pty, with a symbolic link to the host's end.
+"""Serial line based on a pseudo-terminal (pty), with a symbolic link to the host's end.
 
-Invariant: the slave stays open on this side, so the host can close and reopen its port; only
+Invariant: this process keeps the host's end open, so the host can close and reopen its port. Only
 ``unplug`` hangs up.
 """
 
@@ -31,17 +31,17 @@ _SPEEDS = {
 
 
 class PtyLine:
-    """Serial line, plugged in from the start.
+    """Serial line, which is connected from the start.
 
     Parameters
     ----------
     link
-        Symbolic link to the host's port; replaced if it exists.
+        Symbolic link to the host's port. An existing link is replaced.
     """
 
     def __init__(self, link: Path) -> None:
         self.link = link
-        self._fds: tuple[int, int] | None = None  # of the device and of the host
+        self._fds: tuple[int, int] | None = None  # device end, host end
         self._rest = b""
         self._loop: asyncio.AbstractEventLoop | None = None
         self._receive: Callable[[bytes], None] = _ignore
@@ -50,13 +50,13 @@ class PtyLine:
 
     @property
     def host_baud(self) -> int | None:
-        """Speed of the host's port, bit/s; None if unplugged or not a standard speed."""
+        """Speed of the host's port, bit/s; None if unplugged or if the speed is not standard."""
         if self._fds is None:
             return None
         return _SPEEDS.get(termios.tcgetattr(self._fds[1])[_INPUT_SPEED])
 
     def plug(self) -> None:
-        """Create the line; no effect if it exists."""
+        """Create the line; do nothing if it exists."""
         if self._fds is not None:
             return
         device, host = os.openpty()
@@ -69,7 +69,7 @@ class PtyLine:
             self._loop.add_reader(device, self._readable)
 
     def unplug(self) -> None:
-        """Hang up and remove the link; no effect if unplugged."""
+        """Hang up, and remove the link; do nothing if the line is unplugged."""
         if self._fds is None:
             return
         if self._loop is not None:
@@ -81,7 +81,7 @@ class PtyLine:
         self.link.unlink(missing_ok=True)
 
     def write(self, data: bytes) -> bool:
-        """Write all of `data` or nothing; return False on a full line (no reader)."""
+        """Write all of `data` or nothing; return False if the line is full (no reader)."""
         if self._fds is None or not self._flush():
             return False
         self._rest = data
@@ -89,12 +89,13 @@ class PtyLine:
         return True
 
     def _flush(self) -> bool:
-        """Write the rest of an earlier message; return whether all is written."""
+        """Write the rest of an earlier message; return whether nothing remains."""
         if self._rest and self._fds is not None:
             with suppress(BlockingIOError):
                 self._rest = self._rest[os.write(self._fds[0], self._rest) :]
 
-            # no later write may follow to continue this one, so the event loop continues it
+            # No further write might trigger the rest of this message, so the event loop writes the
+            # rest.
             if self._loop is not None:
                 self._loop.remove_writer(self._fds[0])
                 if self._rest:
@@ -102,12 +103,14 @@ class PtyLine:
         return not self._rest
 
     async def serve(self, receive: Callable[[bytes], None]) -> None:
-        """Pass bytes of the host to `receive` until cancelled, also across unplugging.
+        """Pass bytes from the host to `receive` until cancelled.
+
+        The transfer continues after the line was unplugged and plugged in.
 
         Raises
         ------
         RuntimeError
-            The line is already served.
+            Another call already serves the line.
         """
         if self._loop is not None:
             raise RuntimeError(f"{self.link}: the line is already served")
@@ -137,4 +140,4 @@ class PtyLine:
 
 
 def _ignore(_: bytes) -> None:
-    """Ignore bytes received while the line is not served."""
+    """Ignore bytes that arrive while no call serves the line."""

@@ -1,7 +1,8 @@
-"""Bytes of simulated serial ports that their hosts have not read yet.
+"""Unread bytes of simulated serial ports.
 
-Closing a pty discards them, whereas a real device that falls silent loses nothing: a host that is
-behind, as on a busy machine, reads them later.
+If a simulated pseudo-terminal (pty) is closed, its unread bytes are lost. A real device that stops
+sending loses no bytes, and a busy host reads them later. The simulator therefore waits before it
+closes a port.
 """
 
 from __future__ import annotations
@@ -20,20 +21,21 @@ if TYPE_CHECKING:
 
 _INTERVAL_S = 0.02
 _IDLE_S = 0.3
-"""Time without unread bytes after which all is read, s: the kernel delivers in pieces of 4 KB."""
+"""Time without unread bytes after which all bytes are read, s. The kernel delivers in blocks of 4
+KB."""
 _STALLED_S = 2.0
-"""Time without change after which nobody reads, s."""
+"""Time without change after which no host reads, s."""
 _MOST_S = 6.0
-"""Longest wait, s: a host that polls its device is answered without end."""
+"""Longest wait, s. Without this limit, a host that polls its device would delay the end forever."""
 
 
 async def wait_until_read(links: Iterable[Path]) -> None:
-    """Wait until the hosts have read all bytes of their ports, or none reads any more.
+    """Wait until the hosts have read all bytes of their ports, or no host reads.
 
     Parameters
     ----------
     links
-        Symbolic links to the hosts' ends; those that are no serial port are left out.
+        Symbolic links to the hosts' ends. Links to other files than serial ports are ignored.
     """
     ports = tuple(links)
     unread = _unread(ports)
@@ -48,14 +50,14 @@ async def wait_until_read(links: Iterable[Path]) -> None:
 
 
 def _unread(ports: Iterable[Path]) -> list[int]:
-    """Return the number of unread bytes of each port; 0 for one that cannot be opened."""
+    """Return the number of unread bytes of each port; 0 if a port cannot be opened."""
     return [_unread_bytes(port) for port in ports]
 
 
 def _unread_bytes(link: Path) -> int:
     try:
         port = os.open(link, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
-    except OSError:  # unplugged, or the channel of a real bus
+    except OSError:  # the port is unplugged, or is the channel of a real bus
         return 0
     try:
         size: int = struct.unpack("i", fcntl.ioctl(port, termios.FIONREAD, bytes(4)))[0]
