@@ -1,7 +1,8 @@
 """Decoder of the driver of LPMS sensors on a serial line: chunks in, samples out.
 
 A data packet does not name its outputs. The driver reads their mask before the stream begins, and
-the reply is part of the recorded bytes: the decoder takes the mask from there.
+the reply is part of the recorded bytes: the decoder takes the mask from there. Without a reply, it
+finds the quaternion by its norm.
 
 Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
 """
@@ -15,6 +16,7 @@ from typing_extensions import override
 
 from jointfit_daemon.model import DeviceEvent, ImuSample, TickClock
 from jointfit_drivers.lpms._orientation import LpmsConvention, LpmsOrientation
+from jointfit_drivers.lpms._output_search import ArrivedPacket, OutputSearch
 from jointfit_drivers.lpms._tick_rate import TickRateCheck
 from jointfit_drivers.refusals import Refusals
 from jointfit_drivers.serial_decoder import SerialMessageDecoder
@@ -72,6 +74,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         self._orientation = LpmsOrientation(LpmsConvention.of(settings), _NORM_REMEDY)
         self._layout = PacketLayout(self._table, self._table.quaternion)
         self._configuration = LpmsConfiguration()
+        self._search = OutputSearch(self._table)
         self._held: _Packet | None = None
         self._ticks_per_s = settings.ticks_per_s
         self._ticks_clock = TickClock(0, TICK_MODULUS, ticks_per_s=self._ticks_per_s)
@@ -104,21 +107,37 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
     @override
     def flush(self) -> list[Decoded]:
         """Discard a pending message and a packet that waits for confirmation."""
-        return super().flush() + self._drop_held()
+        out = super().flush() + self._decode_packets(self._search.flush())
+        return out + self._drop_held()
 
     @override
     def _take(self, message: LpBusMessage) -> list[Decoded]:
         if message.command == _DATA and message.data:
-            return self._decode_packet(message)
-        return self._property_events(message)
+            packet = ArrivedPacket(message, self._arrival_of(message))
+            if self._configuration.outputs is not None:
+                return self._decode_packet(packet)
+            return self._decode_packets(self._search.take(packet))
 
-    def _decode_packet(self, message: LpBusMessage) -> list[Decoded]:
+        out = self._property_events(message)
+        if self._configuration.outputs is not None:
+            for packet in self._search.release():
+                out += self._decode_packet(packet)
+        return out
+
+    def _decode_packets(self, ready: list[ArrivedPacket]) -> list[Decoded]:
+        """Return the content of packets whose outputs the search determined."""
+        if ready:
+            self._layout = self._search.layout
+        out, self._search.events = self._search.events, []
+        return out + [event for packet in ready for event in self._decode_packet(packet)]
+
+    def _decode_packet(self, arrived: ArrivedPacket) -> list[Decoded]:
         """Return the content of a data packet after the check of its time."""
+        message, arrival_ns = arrived
         measurement = self._layout.decode(message.data)
         if measurement is None or "quaternion" not in self._layout.places:
             return self._length_warning(message)  # a sound message, of other outputs
 
-        arrival_ns = self._arrival_of(message)
         out: list[Decoded] = []
         if not self._check.done:
             out += self._time_warning(measurement.tick, arrival_ns)
@@ -244,10 +263,14 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         self._sizes.add(size)
         floats, shorts = self._layout.sizes
         names = " + ".join(self._layout.places) or "no output"
+        cause = "its outputs were changed, or its firmware is newer than this version"
+        if self._configuration.outputs is None:
+            cause = (
+                "no reply of the sensor names its outputs, and no quaternion was found by its norm"
+            )
         text = (
             f"data packets of {size} bytes, expected {floats} (32 bit) or {shorts} (16 bit) of "
-            f"{names}: its outputs were changed, or its firmware is newer than this version: let "
-            "the driver connect again, or enable the quaternion alone"
+            f"{names}: {cause}: let the driver connect again, or enable the quaternion alone"
         )
         return [DeviceEvent("warning", text, {"data_bytes": size})]
 

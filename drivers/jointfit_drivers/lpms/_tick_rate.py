@@ -18,6 +18,9 @@ _CONTRADICTIONS = 2
 """Consecutive spans that prove another unit."""
 _NEAR = 0.05
 """Largest relative deviation of a measured rate."""
+_MOST_RATIO = 4.0
+"""Largest ratio of an unusual rate to the configured one that is reported. The stamps of a file of
+raw bytes are not arrivals: they are closer together."""
 _USUAL_HZ = (400, 500, 800, 1000)
 _NS = 1e9
 
@@ -80,5 +83,10 @@ class TickRateCheck:
         if self._contradictions < _CONTRADICTIONS:
             return None
         self.done = True
-        near = (hz for hz in _USUAL_HZ if abs(ticks / hz - 1) <= _NEAR)
-        return TimeUnitFault(ticks, next(near, None), abs(seconds - 1) <= _NEAR)
+        usual_hz = next((hz for hz in _USUAL_HZ if abs(ticks / hz - 1) <= _NEAR), None)
+        sends_seconds = abs(seconds - 1) <= _NEAR
+        if not (usual_hz or sends_seconds or self._is_seconds):
+            ratio = ticks / self._ticks_per_s
+            if not 1 / _MOST_RATIO <= ratio <= _MOST_RATIO:
+                return None
+        return TimeUnitFault(ticks, usual_hz, sends_seconds)

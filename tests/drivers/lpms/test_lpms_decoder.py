@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import struct
 from itertools import pairwise
+from random import Random
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 from jointfit_daemon.model import Chunk, Corrupt, DeviceEvent, ImuSample
 from jointfit_daemon.tools.discovery import decode_stream
 from jointfit_drivers.lpms import LpmsDecoder, LpmsImu, LpmsSettings
+from jointfit_drivers.lpms._tick_rate import TickRateCheck
 from jointfit_protocols.lpms import encode
 from jointfit_protocols.lpms.configuration import (
     GENERATION_1,
@@ -195,6 +198,75 @@ def test_float_seconds_that_nothing_announces_are_reported() -> None:
     assert len(samples(fed(decoder(1, device_time="seconds"), seconds(20.0)))) == 700
     back = fed(decoder(1, device_time="seconds"), [packet(n, 4 * n) for n in range(700)])
     assert texts(back, "warning") == ['device time is no float seconds: set device_time = "ticks"']
+
+
+ORDERS = {  # by the register lists of the vendor: values before the quaternion, and behind it
+    1: ((3, 3, 3, 3), (3, 3, 1, 1, 1, 1)),
+    3: ((3,) * 11, (3, 3, 1, 1, 1)),
+}
+
+
+@pytest.mark.parametrize("generation", [1, 3])
+@pytest.mark.parametrize(("code", "unit"), [("f", 1), ("h", 10_000), ("h", 1_000)])
+def test_the_quaternion_is_found_without_a_reply_that_names_the_outputs(
+    generation: int, code: str, unit: int
+) -> None:
+    rng = Random(generation)
+    for _ in range(20):
+        before, behind = (
+            sum(rng.sample(sizes, rng.randint(0, len(sizes)))) for sizes in ORDERS[generation]
+        )
+        if (before, behind) == (0, 0):
+            continue
+        wires, wanted = [], []
+        for number in range(17):
+            w, x, y, z = native_of(orientation(number), "NWU")
+            q = (w, -x, -y, -z)
+            rest = [rng.uniform(-3, 3) for _ in range(before + behind)]
+            values = [unit * value for value in (*rest[:before], *q, *rest[before:])]
+            numbers = values if code == "f" else map(round, values)
+            data = struct.pack(f"<I{before + 4 + behind}{code}", 5 * number, *numbers)
+            wires.append(encode(LpmsCommand.DATA, data))
+            wanted.append(q)
+        under_test = decoder(generation)
+        found = fed(under_test, wires)
+        for sample, q in zip(samples(found), wanted, strict=True):
+            assert sample.q_native == pytest.approx(q, abs=1.0 / unit if unit > 1 else 1e-6)
+        (text,) = (one for one in texts(found, "info") if "by their norm" in one)
+        assert f"values {before + 1} to {before + 4} of {before + 4 + behind}" in text
+        assert not texts(found, "warning")
+
+
+def test_an_acceleration_at_rest_is_no_quaternion() -> None:
+    """Gravity in g has norm 1, together with a rate of 0 before or behind it."""
+    rng, wires = Random(1), []
+    for number in range(20):
+        force = [rng.gauss(mean, 0.002) for mean in (0.6, 0.0, 0.8)]
+        rate = [rng.gauss(0.0, 0.002) for _ in range(3)]
+        values = (*rate, *force, 20.0, 1.0, -40.0, 0.5, 0.5, -0.5, 0.5)
+        wires.append(encode(LpmsCommand.DATA, struct.pack("<I13f", 5 * number, *values)))
+    found = fed(decoder(1), wires)
+    assert [one.q_native for one in samples(found)] == [(0.5, 0.5, -0.5, 0.5)] * 20
+
+
+def test_packets_before_a_reply_with_the_outputs_are_decoded_with_it() -> None:
+    values = struct.pack("<I7f", 5, 0.1, 0.2, 0.3, 0.5, 0.5, 0.5, -0.5)
+    mask = (1 << 18 | 1 << 16).to_bytes(4, "little")  # angular velocity and quaternion
+    wires = [encode(LpmsCommand.DATA, values), encode(0x04, mask)]
+    (sample,) = samples(fed(decoder(1), wires))
+    assert sample.q_native == (0.5, 0.5, 0.5, -0.5)
+    short = decoder(1)
+    assert not samples(fed(short, wires[:1]))
+    assert [one.q_native for one in samples(short.flush())] == [(0.5, 0.5, 0.5, -0.5)]
+
+
+@pytest.mark.parametrize(("ratio", "reported"), [(1, False), (3, True), (30, False)])
+def test_the_stamps_of_a_file_of_raw_bytes_do_not_contradict_the_device_time(
+    ratio: int, reported: bool
+) -> None:
+    check = TickRateCheck(500, is_seconds=False)
+    found = [check.feed(500 * ratio * second, second * 10**9) for second in range(10)]
+    assert any(found) == reported
 
 
 def test_packets_of_another_length_are_reported_once_with_both_lengths() -> None:

@@ -1,0 +1,159 @@
+"""Place of the quaternion in data packets whose outputs are unknown.
+
+A data packet does not name its outputs. A capture without the replies to the driver's reads, or of
+another program, therefore shows only the length of its packets. The outputs have a fixed order, so
+that few places remain for the quaternion, and its norm is 1 in every packet. An acceleration at
+rest may have norm 1, too, but with a larger deviation.
+
+Invariant: a function of the packets fed; at most `_MOST_HELD` packets are stored.
+"""
+
+from __future__ import annotations
+
+from math import isfinite, sqrt
+from typing import TYPE_CHECKING, NamedTuple
+
+from jointfit_daemon.model import DeviceEvent
+from jointfit_protocols.lpms import unit_of
+from jointfit_protocols.lpms.measurement import PacketLayout
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from jointfit_daemon.model import Decoded
+    from jointfit_protocols.lpms import LpBusMessage
+    from jointfit_protocols.lpms.configuration import CommandTable, LpmsOutput
+
+_FEWEST, _DECIDING, _MOST_HELD = 4, 16, 256
+"""Packets after which a search ends: without a possible place, with one, and with several."""
+_TOLERANCE = 0.01
+"""Largest deviation of the norm from 1."""
+_CLEARER = 5.0
+"""Least ratio of the deviations of two places of which one is selected."""
+_ROUNDING = 1e-4
+"""Deviation of a norm by rounding; smaller deviations are not compared."""
+
+
+class ArrivedPacket(NamedTuple):
+    """A data packet and the arrival of its first byte, monotonic ns."""
+
+    message: LpBusMessage
+    arrival_ns: int
+
+
+class OutputSearch:
+    """Search for the outputs of one sensor.
+
+    Parameters
+    ----------
+    table : CommandTable
+        Generation of the sensor.
+    """
+
+    def __init__(self, table: CommandTable) -> None:
+        self._table = table
+        self._alone = PacketLayout(table, table.quaternion)
+        self.layout = self._alone
+        """Layout of the packets: quaternion alone until another layout is found."""
+        self._size: int | None = None  # of the packets that `layout` describes
+        self._held: list[ArrivedPacket] = []
+        self.events: list[Decoded] = []
+        """Events since they were last taken."""
+
+    def take(self, packet: ArrivedPacket) -> list[ArrivedPacket]:
+        """Add a packet; return the packets, in order, that can be decoded by `layout`."""
+        data = packet.message.data
+        if len(data) == self._size:
+            return [packet]
+        if not self._held and _deviation(self._alone, data) is not None:
+            self.layout, self._size = self._alone, len(data)
+            return [packet]
+
+        ready: list[ArrivedPacket] = []
+        if self._held and len(self._held[0].message.data) != len(data):
+            ready = self._end(self._alone)
+        self._held.append(packet)
+        count = len(self._held)
+        if count == _FEWEST or count >= _DECIDING:
+            found = self._find()
+            if not found or count >= (_DECIDING if len(found) == 1 else _MOST_HELD):
+                ready += self._end(found[0] if len(found) == 1 else self._alone)
+        return ready
+
+    def flush(self) -> list[ArrivedPacket]:
+        """End the search: return the stored packets."""
+        found = self._find() if self._held else []
+        return self._end(found[0] if len(found) == 1 else self._alone) if self._held else []
+
+    def release(self) -> list[ArrivedPacket]:
+        """Return the stored packets, because a reply names the outputs."""
+        ready, self._held = self._held, []
+        return ready
+
+    def _end(self, layout: PacketLayout) -> list[ArrivedPacket]:
+        ready, self._held = self._held, []
+        self.layout, self._size = layout, len(ready[0].message.data)
+        if layout is not self._alone:
+            place = layout.places["quaternion"]
+            precision = "float32" if self._size == layout.sizes[0] else "int16"
+            text = (
+                f"its outputs are unknown, because it sent no reply with its settings: values "
+                f"{place.start + 1} to {place.stop} of {layout.values} ({precision}) are the "
+                "quaternion by their norm"
+            )
+            known = {"first_value": place.start + 1, "precision": precision}
+            self.events.append(DeviceEvent("info", text, known))
+        return ready
+
+    def _find(self) -> list[PacketLayout]:
+        """Return the layouts that fit the stored packets; one if it fits clearly best."""
+        rated = []
+        for layout in self._layouts(len(self._held[0].message.data)):
+            deviations = [_deviation(layout, packet.message.data) for packet in self._held]
+            known = [one for one in deviations if one is not None]
+            if len(known) == len(deviations):
+                rated.append((max(_ROUNDING, sqrt(sum(x * x for x in known) / len(known))), layout))
+        rated.sort(key=lambda one: one[0])
+        if len(rated) > 1 and rated[1][0] >= _CLEARER * rated[0][0]:
+            return [rated[0][1]]
+        return [layout for _, layout in rated]
+
+    def _layouts(self, size: int) -> list[PacketLayout]:
+        """Return a layout for each possible place of the quaternion in packets of `size` bytes."""
+        outputs = self._table.outputs
+        at = next(k for k, output in enumerate(outputs) if output.name == "quaternion")
+        before, behind = _masks(outputs[:at]), _masks(outputs[at + 1 :])
+        found = []
+        for width in (4, 2):
+            rest, odd = divmod(size - 4 - 4 * width, width)
+            found += [
+                PacketLayout(self._table, mask | self._table.quaternion | behind[rest - first])
+                for first, mask in before.items()
+                if not odd and rest - first in behind
+            ]
+        return found
+
+
+def _masks(outputs: Sequence[LpmsOutput]) -> dict[int, int]:
+    """Return a mask for each possible number of values of some of the outputs."""
+    masks = {0: 0}
+    for output in outputs:
+        for count, mask in list(masks.items()):
+            masks.setdefault(count + output.values, mask | 1 << output.bit)
+    return masks
+
+
+def _deviation(layout: PacketLayout, data: bytes) -> float | None:
+    """Return the deviation of the quaternion's norm from 1; None if there is no quaternion."""
+    measurement = layout.decode(data)
+    if measurement is None:
+        return None
+    values = measurement.values[layout.places["quaternion"]]
+    square = sum(value * value for value in values)
+    if not isfinite(square):
+        return None
+    if measurement.floats:
+        deviation = abs(sqrt(square) - 1)
+        return deviation if deviation <= _TOLERANCE else None
+    unit = unit_of(values)
+    return None if unit is None else abs(sqrt(square) / unit - 1)
