@@ -1,8 +1,9 @@
 """Robust fusion of several estimates of one center.
 
-Each estimate is weighted by its information matrix: other markers determine the center along the
-direction in which one marker's estimate is weak. An estimate that differs from the others by more
-than its covariance allows has a reduced weight and is named in a flag.
+Each estimate is weighted by its information matrix. If the estimate from one marker is uncertain in
+a direction, other markers therefore determine the center in this direction. An estimate that
+differs from the others by more than its covariance allows has a reduced weight, and a flag names
+it.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
     .. math:: I_k = C_k^{-1}, \qquad C = \Big(\sum_k w_k I_k\Big)^{-1}, \qquad
               c = C \sum_k w_k I_k c_k
 
-    with :math:`C_k` the covariance of estimate k and w_k = min(1, κ/D_k)². κ is `TOLERATED`, and
-    D_k the Mahalanobis distance of estimate k from the center fused from the other estimates,
+    where :math:`C_k` is the covariance of estimate k and w_k = min(1, κ/D_k)². κ is `TOLERATED`.
+    D_k is the Mahalanobis distance of estimate k from the center fused from the other estimates,
     divided by the root of the dimension. The information :math:`I_k` is zero along unobserved
     directions. If the estimates differ by more than their covariances predict, C is increased
     accordingly.
@@ -42,9 +43,10 @@ def fuse_centers(estimates: Sequence[CenterEstimate], *, robust: bool = True) ->
     ----------
     estimates : sequence of CenterEstimate
         Estimates of equal dimension in one parent frame, with independent errors. Noise of the
-        parent's markers is common to all markers; `RunningSphere` models it.
+        parent's markers is common to all estimates and is not modeled here; `RunningSphere` models
+        it.
     robust : bool
-        Reduce the weight of estimates that contradict the others.
+        Whether to reduce the weight of estimates that contradict the others.
 
     Returns
     -------
@@ -99,7 +101,7 @@ def _seen(total: Array) -> Array:
 
 
 def _weight(i: int, w: Array, knowledge: Array, centers: Array) -> float:
-    """Return Huber's weight of estimate i from its distance to the center fused from the others."""
+    """Return the Huber weight of estimate i, from its distance to the center of the others."""
     others = np.where(np.arange(len(w)) == i, 0.0, w)
     total = np.einsum("k,kab->ab", others, knowledge)
     B = _seen(total)

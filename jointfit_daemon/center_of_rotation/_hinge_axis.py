@@ -23,16 +23,16 @@ _FEWEST = 4
 def hinge_axis_sd(points: Array, axis: Array | None) -> float | None:
     r"""Return the standard deviation of a hinge's axis from the paths of markers, rad.
 
-    The axis is the common normal of the marker paths. The axis error equals the error of two slopes
-    β. They regress the marker positions e along the axis on the positions x across the axis, both
-    relative to their means,
+    The axis is the common normal of the marker paths. The error of the axis equals the error of two
+    slopes β. β is the regression of the marker positions e along the axis on the positions x
+    perpendicular to the axis, both relative to their means,
 
     .. math:: e_{tj} = x_{tj}^T \beta, \qquad
               \mathrm{Cov}(\beta) = s_e^2 \Big( \sum_{tj} x_{tj} x_{tj}^T \Big)^{-1}
               \frac{1+\rho}{1-\rho}
 
-    with :math:`s_e^2` the residual variance and ρ the correlation of e from frame to frame, for
-    frame t and marker j. Soft-tissue artefact and rotations about another axis are part of
+    for frame t and marker j, where :math:`s_e^2` is the residual variance and ρ the correlation of
+    e from frame to frame. Soft-tissue artefact and rotations about another axis are part of
     :math:`s_e`.
 
     Parameters
@@ -40,12 +40,12 @@ def hinge_axis_sd(points: Array, axis: Array | None) -> float | None:
     points : ndarray, shape (n, k, 3)
         Markers of the child in the parent's coordinates, m; NaN if not visible.
     axis : ndarray, shape (3,), or None
-        Unit axis.
+        Unit vector along the axis.
 
     Returns
     -------
     float or None
-        Root mean variance of the two directions across the axis; None without an axis.
+        Root mean variance of the two directions perpendicular to the axis; None without an axis.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1))
     if axis is None or np.count_nonzero(seen) < _FEWEST:

@@ -1,7 +1,7 @@
-r"""Trajectory of a joint in the world, from a center of rotation fixed in each of two segments.
+r"""Trajectory of a joint in the world, from the centers of rotation fixed in two segments.
 
-A center of rotation is estimated once, in the coordinates of a segment. The pose of the segment
-then gives the position of the joint in every frame, also where the other segment is occluded.
+A center of rotation is estimated once, in the coordinates of a segment. The position of the joint
+in every frame is then computed from the pose of the segment, even if the other segment is occluded.
 
 Invariant: a frame without a pose of either segment has no position (NaN).
 """
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.center_of_rotation._result import CenterEstimate
 
 _LEAST_VARIANCE_M2 = 1e-12
-"""Smallest variance assigned to a side, m²; it limits the weight of a side without noise."""
+"""Smallest variance of a side, m², which limits the weight of a side without noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +35,9 @@ class JointSide:
     poses: BodyPoses
     """Poses of the segment in the world; NaN where unknown."""
     basis: Array
-    """Matrix from segment coordinates, shape (d,), to the coordinates of `poses`: the identity in
-    space, the basis of the plane in a planar method. Shape (3, d)."""
+    """Matrix, shape (3, d), that converts segment coordinates, shape (d,), to the coordinates of
+    `poses`. It is the identity in space, and the basis of the plane in a planar method.
+    """
     markers: Array
     """Markers of the segment in its coordinates, m, shape (m, d)."""
     fit_rms: float
@@ -52,11 +53,13 @@ class JointTrajectory:
     positions: Array
     """Position of the joint, m, shape (n, 3); NaN where neither segment has a pose."""
     error: Array
-    """Predicted RMS error of the position, m, shape (n,), along the directions in which the center
-    was observed; NaN where the position is unknown."""
+    """Predicted RMS error of the position in the observed directions, m, shape (n,); NaN where the
+    position is unknown.
+    """
     sides_apart: float
-    """RMS distance between the two joint positions computed from the two segments, m. In a planar
-    method, the distance within the plane. NaN if only one segment is used."""
+    """RMS distance between the joint positions computed from the two segments, m. A planar method
+    uses the distance within the plane. NaN if only one segment is used.
+    """
 
 
 def joint_trajectory(sides: Sequence[JointSide], frames: int) -> JointTrajectory:
@@ -68,8 +71,8 @@ def joint_trajectory(sides: Sequence[JointSide], frames: int) -> JointTrajectory
     The sum is over the segments k with a pose in frame t, :math:`c_k` is the center in segment k.
     :math:`s_k^2` is the trace of the covariance of the center. :math:`f_k^2` is the trace of the
     covariance of the segment's pose error at the center. Both centers are estimated from the same
-    movement, so their errors are added with equal sign. The pose errors are independent. The
-    predicted error E is
+    movement, so their errors s are assumed to be fully correlated. The pose errors f are
+    independent. The predicted error E is
 
     .. math:: E^2 = \Big( \sum_k w_k s_k \Big)^2 + \sum_k w_k^2 f_k^2
 
@@ -86,13 +89,14 @@ def joint_trajectory(sides: Sequence[JointSide], frames: int) -> JointTrajectory
     sides : sequence of JointSide
         One or two segments; a side with a refused center is not used.
     frames : int
-        Number of frames n; it sets the length of the result if no side is usable.
+        Number of frames n, which is the length of the result if no side is usable.
 
     Returns
     -------
     JointTrajectory
-        Errors hold for markers that are rigid on the bone. A radial residual beyond the noise of
-        the markers (soft-tissue artefact, a moving center) is counted as motion of the joint.
+        Trajectory. The errors are valid for markers that are rigidly fixed to the bone. A radial
+        residual beyond the noise of the markers counts as motion of the joint; the cause is
+        soft-tissue artefact or a moving center.
     """
     usable = sorted(
         (side for side in sides if side.estimate.refused is None),
@@ -140,7 +144,7 @@ def _agreeing_track(side: JointSide, reference: Array) -> Array:
         center = center + unseen.T @ (unseen @ (other[shared].mean(axis=0) - center))
 
     found = _in_world(side, center)
-    if len(center) == len("xy"):  # the position normal to the plane is the mean of the markers
+    if len(center) == len("xy"):  # normal to the plane, the mean of the markers is used
         normal = np.cross(*side.basis.T)
         found = found + normal * ((reference - found)[shared] @ normal).mean()
     return found
@@ -150,12 +154,12 @@ def _pose_variance(side: JointSide) -> float:
     """Return the variance of the pose error at the center along the observed directions, m²."""
     m, d = side.markers.shape
     estimate = side.estimate
-    # m markers have m·d coordinates, of which the fit of the pose uses d (d + 1) / 2
+    # m markers have m·d coordinates; the fit of the pose uses d (d + 1) / 2 degrees of freedom
     noise = side.fit_rms * sqrt(m / (m * d - d * (d + 1) / 2))
     covariance = planar_noise if d == len("xy") else spatial_noise
     of_point = covariance(estimate.center, side.markers, noise)
 
-    # variance per direction that the marker noise does not explain: motion of the joint
+    # variance per direction that the marker noise does not explain is motion of the joint
     excess = max(estimate.residual**2 - float(np.trace(of_point)) / d, 0.0)
     per_direction = of_point + (excess - noise**2) * np.eye(d)
     unseen = estimate.unseen.reshape(-1, d) if len(estimate.unseen) else np.zeros((0, d))

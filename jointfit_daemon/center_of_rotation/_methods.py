@@ -37,7 +37,9 @@ if TYPE_CHECKING:
 
 
 _ASK_EVERY = 50
-"""Number of frames between two estimates of a stream; each estimate updates the outlier weights."""
+"""Number of frames between two estimates of a running method. Each estimate updates the outlier
+weights.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +54,7 @@ class EstimationMethod:
     planar: bool
     """Whether the method works in a plane; points in space are projected along `Movement.axis`."""
     run: Callable[..., CenterEstimate]
-    """Function of the movement and of its fields in `needs`."""
+    """Function of the movement and of the fields in `needs` that returns the estimate."""
 
 
 def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterEstimate:
@@ -61,20 +63,24 @@ def estimate_center(movement: Movement | Array, method: str = "auto") -> CenterE
     Parameters
     ----------
     movement : Movement or ndarray
-        An array, shape (n, k, d) or (n, d), stands for `Movement` with these points only.
+        Input data. An array, shape (n, k, d) or (n, d), is equivalent to a `Movement` with only
+        these points.
     method : str
-        A key of `METHODS`, or ``auto``: ``geometric`` in a plane; ``score`` if the poses of both
-        bodies are known, with the markers of both or without `points`; otherwise ``sphere``.
+        A key of `METHODS`, or ``auto``. ``auto`` selects ``geometric`` in a plane. In space it
+        selects ``score`` if the poses of both bodies are known, and either the markers of both are
+        known or `points` is missing. Otherwise it selects ``sphere``.
 
     Returns
     -------
     CenterEstimate
-        If the movement does not determine a center, `refused` is set to the cause and the remedy.
+        Estimate. If the movement does not determine a center, `refused` contains the cause and the
+        remedy.
 
     Raises
     ------
     ValueError
-        Unknown method, or the movement lacks a required field. Unusable data are refused instead.
+        The method is unknown, or the movement lacks a required field. Unusable data do not raise an
+        error, but return a refused estimate.
     """
     if not isinstance(movement, Movement):
         movement = Movement(np.asarray(movement, dtype=np.float64))
@@ -113,11 +119,12 @@ def _automatic(movement: Movement) -> str:
 
 
 def _beyond_parent(found: CenterEstimate, parent: Array | None) -> CenterEstimate:
-    """Refuse an estimate whose rotation is no larger than the noise of the parent's frame."""
+    """Refuse an estimate whose rotation is within the rotation noise of the parent's frame."""
     if parent is None or found.refused is not None or len(found.center) < 3:
         return found
     turn = sqrt(NOISE_FACTOR) * turn_noise(parent, found.noise)
-    # for directions spread evenly over an arc, the mean angle to their mean is a quarter of the arc
+    # directions spread evenly over an arc have a mean distance of a quarter of the arc to the
+    # middle
     if found.arc / 4.0 > turn:
         return found
     why = (

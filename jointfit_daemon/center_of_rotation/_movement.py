@@ -22,17 +22,17 @@ PARENT_TURN_RAD = radians(0.8)
 """Largest rotation of the child relative to the parent that the parent's marker noise may cause,
 rad.
 
-Noise of 1 mm of markers 10 cm from their mean rotates the fitted parent frame by half of this
-value. Such rotations cannot be distinguished from joint rotations.
+If the markers are 10 cm from their mean, noise of 1 mm rotates the fitted parent frame by half of
+this value. Such rotations cannot be distinguished from joint rotations.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class BodyPoses:
-    """Pose of a body part over time: a point x of the body is at R(q) x + t in the world."""
+    """Pose of a body part over time. A point x of the body has the world position R(q) x + t."""
 
     q: Array
-    """q_world_body, scalar first, shape (n, 4); NaN where not known."""
+    """Orientation q_world_body, scalar first, shape (n, 4); NaN where unknown."""
     t: Array
     """Position of the body's origin in the world, m, shape (n, 3)."""
 
@@ -50,34 +50,41 @@ class Movement:
     """Data of a movement; `METHODS` lists the fields that each method needs."""
 
     points: Array | None = None
-    """Markers of the child in the parent's coordinates, m, shape (n, k, 3), or (n, k, 2) in a
-    plane."""
+    """Marker positions of the child in the parent's coordinates, m, shape (n, k, 3), or (n, k, 2)
+    in a plane.
+    """
     parent: BodyPoses | None = None
     child: BodyPoses | None = None
     parent_markers: Array | None = None
-    """The parent's own markers in its coordinates, m, shape (m, 3). If given, the effect of their
-    noise on `points` is separated from the noise of the child's markers."""
+    """Markers of the parent in the parent's coordinates, m, shape (m, 3). If they are given, the
+    effect of their noise on `points` is separated from the noise of the child's markers.
+    """
     child_markers: Array | None = None
-    """The child's own markers in its coordinates, m, shape (k, 3). None: the median of `points` in
-    the child's coordinates, if `child` is given."""
+    """Markers of the child in the child's coordinates, m, shape (k, 3). If None, the median of
+    `points` in the child's coordinates is used, which requires `child`.
+    """
     residuals: Array | None = None
-    """Residual of the cameras for each of `points`, m, shape (n, k); NaN where unknown. Only ratios
-    of residuals are used: a frame with a larger residual is noisier."""
+    """Residual that the optical system reports for each of `points`, m, shape (n, k); NaN where
+    unknown. Only ratios of residuals are used. A frame with a larger residual counts as noisier.
+    """
     angles: Array | None = None
-    """Angle of the child about the joint's axis relative to the parent, rad, shape (n,), from
-    inertial sensors: for ``oriented``."""
+    """Angle of the child about the joint's axis relative to the parent, rad, shape (n,). It is
+    measured by inertial sensors, for the method ``oriented``.
+    """
     axis: Array | None = None
     """Normal of the plane for planar methods on points in space, shape (3,); estimated if None."""
     near: Array | None = None
-    """Initial center, m, shape (d,); the mean of the markers if None. Along unobserved directions
-    the estimate keeps the initial value."""
+    """Initial center, m, shape (d,); the mean of the markers if None. The estimate has this value
+    along unobserved directions.
+    """
     interval: float = 0.01
     """Time between frames, s."""
 
     def both_markers(self) -> tuple[Array, Array] | None:
-        """Return the markers of parent and child in own coordinates, m, shape (n, k, 3) each.
+        """Return the markers of parent and child, each in coordinates of its body, m.
 
-        None if the markers of either body are unknown, fewer than three, or on a line.
+        The result is None if the markers of either body are unknown, fewer than three, or on a
+        line.
         """
         child = self.child_markers
         if child is None and not (self.points is None or self.parent is None or self.child is None):
@@ -93,5 +100,5 @@ class Movement:
 
     @property
     def least_turn(self) -> float:
-        """Return the largest apparent rotation due to noise of a moving parent's frame, rad."""
+        """Return the largest apparent rotation that noise of a moving parent causes, rad."""
         return PARENT_TURN_RAD if self.parent is not None else 0.0

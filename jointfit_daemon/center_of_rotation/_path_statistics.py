@@ -25,9 +25,9 @@ def lag_one_correlation(e: Array, seen: NDArray[np.bool_]) -> float:
 
 
 def variance_inflation(rho: float) -> float:
-    r"""Return :math:`(1+\rho)/(1-\rho)`: the factor on the variance for correlated residuals.
+    r"""Return :math:`(1+\rho)/(1-\rho)`, the increase of the variance for correlated residuals.
 
-    With a lag-one correlation ρ below 1, n frames count as n divided by this factor.
+    If the lag-one correlation is ρ, the effective number of frames is n divided by this factor.
     """
     return (1.0 + rho) / (1.0 - rho)
 
@@ -42,12 +42,12 @@ def radial_residuals(v: Array, m: Array, w: Array) -> tuple[Array, Array]:
     m : ndarray, shape (d,)
         Center, m.
     w : ndarray, shape (n, k)
-        Weights of the mean distance; zero where a point is missing.
+        Weight of each point in the mean distance; zero where a point is missing.
 
     Returns
     -------
     e, J : ndarray, shapes (n, k) and (n, k, d)
-        Distances minus their weighted means, m, and dimensionless derivatives.
+        Distances minus their weighted means, m, and their dimensionless derivatives.
     """
     d = v - m
     u = np.linalg.norm(d, axis=-1)

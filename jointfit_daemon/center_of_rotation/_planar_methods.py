@@ -45,8 +45,9 @@ OFF_AXIS = (
     "or score, or give the axis"
 )
 LIMITS = CircleLimits(sd=inf)
-"""No limit on the error: if the user chose the method, the result is returned with its
-uncertainty."""
+"""Acceptance limits without a limit on the error. The user chose the method, so the result is
+returned with its uncertainty.
+"""
 _GRID_STEP_M = 0.005
 
 
@@ -70,7 +71,7 @@ def oriented(p: Array, movement: Movement) -> CenterEstimate:
 
 
 def grid(p: Array, _: Movement) -> CenterEstimate:
-    """Search the grid nodes around the circle fit of one marker; this is a baseline method."""
+    """Search the grid nodes around the circle fit of one marker, as a baseline method."""
     about = replace(circle_estimate(p, limits=LIMITS), method="grid")
     if about.refused is not None:
         return about
@@ -82,17 +83,17 @@ def grid(p: Array, _: Movement) -> CenterEstimate:
 
 
 def three_frames(p: Array, movement: Movement) -> CenterEstimate:
-    """Estimate from the first, middle and last frame of one marker, with the noise of all frames.
+    """Estimate the center from three frames of one marker, with the noise of all frames.
 
-    If the cameras report a residual for every position, the noise of a frame is proportional to the
-    residual.
+    The frames are the first, middle and last position on the arc. If the optical system reports a
+    residual for every position, the noise of a frame is proportional to the residual.
     """
     whole = circle_estimate(p, limits=LIMITS)
     if whole.refused is not None:
         return replace(whole, method="three_frames")
     visible = np.asarray(np.isfinite(p).all(axis=1))
     seen = p[visible]
-    # first, middle and last along the arc, not in time: a movement may end where it began
+    # the order is along the arc, not in time, because a movement may end where it began
     turn = np.unwrap(np.arctan2(*(seen - whole.center).T[::-1]))
     order = np.argsort(turn)
     middle = int(np.argmin(np.abs(turn - turn[order[[0, -1]]].mean())))
@@ -119,7 +120,7 @@ def geometric(points: Array, movement: Movement) -> CenterEstimate:
 
 
 def each(fit: MarkerFit) -> MarkerFit:
-    """Fit each marker alone and return the fused center."""
+    """Return a function that fits each marker separately and fuses the centers."""
 
     def fit_all(points: Array, movement: Movement) -> CenterEstimate:
         stated = movement.residuals
@@ -151,7 +152,7 @@ def fit_in_plane(name: str, fit: MarkerFit, movement: Movement, points: Array) -
     if found.refused is not None and len(found.unseen):
         return replace(refusal(found.method, 3, found.frames, found.refused), flags=found.flags)
 
-    # the center in the plane is a line in space
+    # a center in the plane is a line in space, whose direction is unobserved
     across = np.cross(plane[:, 0], plane[:, 1])
     stay = np.nanmean(points, axis=(0, 1)) if movement.near is None else movement.near
     return replace(

@@ -1,7 +1,7 @@
-"""The result type of all estimators of a center of rotation.
+"""Result type of all estimators of a center of rotation.
 
-Invariant: directions without information are listed in `unseen`, an unusable center has a reason
-in `refused`, and no field of a usable estimate is NaN.
+Invariant: `unseen` lists the directions without information. If a center is unusable, `refused`
+contains the reason. No field of a usable estimate is NaN.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CenterEstimate:
-    """Estimated point that is fixed in both the parent and the child segment.
+    """Estimate of the point that is fixed in both the parent and the child segment.
 
     All estimators return this type. A `JointCenter` of the calibration contains a `CenterEstimate`,
-    which priors combine with the other joints of the chain.
+    and combines it with the prior and with the other joints of the chain.
     """
 
     method: str
@@ -33,34 +33,40 @@ class CenterEstimate:
     noise: float
     """Standard deviation of each coordinate of a point, estimated from the residuals, m."""
     residual: float
-    """RMS residual, m (radial; for SCoRE the distance between the two sides)."""
+    """RMS residual, m. It is radial, or for SCoRE the distance between the points of the two
+    segments.
+    """
     radii: Array
     """Distance of each marker from the center, m, shape (k,)."""
     arc: float
     """Angle covered by the markers about the center, rad."""
     bound: float
-    """Cramér-Rao bound of the RMS error for `noise` that is independent from frame to frame, m; inf
-    if a direction is unobserved. The bound depends on the movement, not on the method."""
+    """Cramér-Rao bound of the RMS error, m; inf if a direction is unobserved. It assumes `noise`
+    that is independent from frame to frame. The bound depends on the movement, not on the method.
+    """
     conditioning: float
-    """T, the curvature of the path divided by the standard error of the curvature; a circle with T
-    below 6 is not usable."""
+    """T, the curvature of the path divided by the standard error of the curvature. A circle with T
+    below 6 is not usable.
+    """
     frames: int
     effective_frames: float
-    """Effective number of frames, after forgetting and correlation from frame to frame."""
+    """Effective number of frames, which forgetting and the correlation between frames reduce."""
     unseen: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    """Unit directions in which nothing was observed, shape (u, d)."""
+    """Unit vectors of the unobserved directions, shape (u, d)."""
     axis: Array | None = None
     """Unit axis of a hinge in the parent's coordinates, shape (3,); None if there is no hinge."""
     axis_sd: float | None = None
-    """Standard deviation of the axis in each direction across it, rad; None if not computed."""
+    """Standard deviation of the axis in each direction perpendicular to it, rad; None if unknown.
+    """
     leverage: Array | None = None
     """Covariance of the center per m² of radial soft-tissue artefact, shape (d, d); None if not
     computed. The artefact repeats with posture, so more frames do not reduce it."""
     flags: tuple[str, ...] = ()
     """Findings about the data, e.g. ``orientation_inconsistent``."""
     within95: float | None = None
-    """Squared Mahalanobis distance eᵀC⁻¹e of the 95 % error ellipse of this method; None: use the
-    quantile of chi-square."""
+    """Squared Mahalanobis distance eᵀC⁻¹e of the 95 % error ellipse of this method. If None, use
+    the quantile of the chi-square distribution.
+    """
     refused: str | None = None
     """Cause and remedy if the center must not be used; None if the center is usable."""
 
@@ -73,7 +79,7 @@ class CenterEstimate:
 
 
 def refusal(method: str, d: int, frames: int, reason: str) -> CenterEstimate:
-    """Return a refused estimate: no information in any direction, and the reason in `refused`."""
+    """Return a refused estimate without information in any direction, with the reason."""
     return CenterEstimate(
         method=method,
         center=np.full(d, np.nan),

@@ -1,4 +1,4 @@
-"""Center estimates from circle moments: covariance, bound, and acceptance.
+"""Center estimates from the moments of circle points, with covariance, bound and acceptance.
 
 A refused estimate names the cause and the remedy.
 """
@@ -49,9 +49,10 @@ class CircleLimits:
     arc: float = radians(10.0)
     """Smallest arc of the movement, rad."""
     sd: float = inf
-    """Largest accepted predicted RMS error, m. Noise that increases the curvature of the arc by
-    chance reduces the predicted error. A limit near the expected error therefore selects biased
-    centers outside their error ellipses."""
+    """Largest accepted predicted RMS error, m. If noise increases the curvature of the arc by
+    chance, the predicted error is too small. A limit near the expected error therefore selects
+    biased centers, which are outside their error ellipses.
+    """
 
 
 def circle_estimate(
@@ -77,8 +78,8 @@ def circle_estimate(
     Returns
     -------
     CenterEstimate
-        Estimate that equals, except for rounding, the estimate of a `RunningCircle` fed with these
-        points.
+        Estimate. Except for rounding it equals the estimate of a `RunningCircle` that processed the
+        same points.
     """
     p = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     seen = seen_places(p)
@@ -106,7 +107,7 @@ def publish(
     frames: int,
     limits: CircleLimits,
 ) -> CenterEstimate:
-    """Fit a circle and return its estimate, or the reason of a refusal.
+    """Fit a circle and return its estimate, which may be refused.
 
     Parameters
     ----------
@@ -130,7 +131,7 @@ def publish(
         reason = "noise hides the curvature: increase the range of motion or bring cameras closer"
         return refused_circle(method, (m.x, m.y), frames, reason)
 
-    # correlated noise of neighbouring frames reduces their effective number
+    # correlation between the noise of neighbouring frames reduces the effective number of frames
     judged = circle_statistics(m, *circle)
     alike = lagged(*circle) / judged.residual if judged.residual > 0.0 else 0.0
     wider = variance_inflation(min(max(alike, 0.0), 0.99) if isfinite(alike) else 0.0)
@@ -162,7 +163,7 @@ def publish(
 
 
 def objection(radius: float, arc: float, T: float, sd: float, limits: CircleLimits) -> str | None:
-    """Return why a circle must not be used, with the remedy; None if the circle is usable."""
+    """Return the reason to reject a circle, with the remedy; None if the circle is usable."""
     if not limits.reach[0] <= radius <= limits.reach[1]:
         return (
             f"the marker would be {radius:.2f} m from the center, not {limits.reach[0]:g} to "
@@ -199,7 +200,7 @@ def refused_circle(method: str, at: ArrayLike, frames: int, reason: str) -> Cent
 
 
 def _reason_without_circle(m: CircleMoments[float], frames: int) -> str | None:
-    spread = max(m.xx + m.yy, 0.0)  # a difference this small is rounding of equal points
+    spread = max(m.xx + m.yy, 0.0)  # negative only by rounding
     if frames == 0:
         return "the marker is missing in every frame: check its name, the cameras and occlusion"
     if frames < 4 or m.effective <= 3.0:
@@ -212,7 +213,7 @@ def _reason_without_circle(m: CircleMoments[float], frames: int) -> str | None:
 
 
 def arc_about(points: Array, center: Array) -> float:
-    """Return the angle between the two outermost points, seen from a center, rad, at most 2π.
+    """Return the angle at the center between the two outermost points, rad, at most 2π.
 
     Points have shape (n, 2), m, with NaN where hidden, and the center has shape (2,), m.
     """

@@ -1,7 +1,7 @@
 """Algebraic circle fits in closed form: Kåsa, Pratt, Taubin and Hyper.
 
-The fits need no start value and no iteration over points. They accept one circle or arrays of
-circles. Hyper is the default because it has no essential bias. Source: Al-Sharadqah and Chernov
+The fits need no start value and no iteration over points. They process one set of points or arrays
+of sets. Hyper is the default because it has no essential bias. Source: Al-Sharadqah and Chernov
 2009.
 """
 
@@ -39,7 +39,7 @@ class Circles(NamedTuple):
     radius: Array
     """Radius of the circle, m."""
     covariance: Array
-    """Covariance of the center, m², shape (..., 2, 2)."""
+    """Covariance matrix of the center, m², shape (..., 2, 2)."""
     noise: Array
     """Standard deviation of each coordinate of a point, m."""
     conditioning: Array
@@ -115,7 +115,7 @@ def smallest_roots(m: CircleMoments[Array], method: str = "hyper") -> Array:
 def circle_from_root(
     m: CircleMoments[Number], eta: Number, method: str = "hyper"
 ) -> tuple[Number, Number, Number]:
-    r"""Return the center (a, b) from the centroid, m, and R², m², for a root that is not singular.
+    r"""Return the center (a, b) relative to the centroid, m, and R², m², for a non-singular root.
 
     .. math::
         \Delta &= \eta^2 - \eta M_z + C \\
@@ -124,7 +124,8 @@ def circle_from_root(
         R^2 &= a^2 + b^2 + M_z + \{0, 2\eta, 0, -2\eta\}
     """
     z = m.xx + m.yy
-    # Δ = η² - ηMz + C is computed as a product and a remainder: on short arcs the plain sum cancels
+    # Δ = η² - ηMz + C is computed as a difference of products, because the sum cancels on short
+    # arcs
     twice = 2.0 * ((m.xx - eta) * (m.yy - eta) - m.xy * m.xy)
     a = (m.xz * (m.yy - eta) - m.yz * m.xy) / twice
     b = (m.yz * (m.xx - eta) - m.xz * m.xy) / twice
@@ -149,13 +150,13 @@ def temper(
 
     .. math:: S = (I + C/R^2)^{-1}, \qquad d' = S d, \qquad C' = S C S
 
-    for the vector d from the centroid to the center, with covariance C. On a short arc the
-    estimated curvature κ has a nearly normal error s, and the distance of the center is 1/κ. The
-    mean square error of 1/κ is dominated by the few cases near κ = 0, and 1/κ is too large on
-    average. The distance 1/κ is therefore replaced by κ/(κ² + s²), Zellner's minimum expected loss
-    estimator of an inverse (1978). The replacement removes the tail of the error distribution, and
-    the bias to second order. The error is 1 + 1/T² times the Cramér-Rao bound, without the
-    replacement 1 + 4.5/T² times. On long arcs S is the identity.
+    where d is the vector from the centroid to the center, with covariance C. On a short arc the
+    error of the estimated curvature κ is nearly normal with standard deviation s, and the distance
+    of the center is 1/κ. The mean square error of 1/κ is dominated by the few cases near κ = 0, and
+    1/κ is too large on average. The distance 1/κ is therefore replaced by κ/(κ² + s²), Zellner's
+    minimum expected loss estimator of an inverse (1978). The replacement removes the tail of the
+    error distribution, and the bias to second order. The error is 1 + 1/T² times the Cramér-Rao
+    bound. Without the replacement the factor is 1 + 4.5/T². On long arcs S is nearly the identity.
     """
     xx, xy, yy = cov
     p, q, r = 1.0 + xx / square, xy / square, 1.0 + yy / square
@@ -184,19 +185,19 @@ def fit_circles(
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
     tempered : bool
-        Shrink centers with `temper`; False gives the textbook center.
+        Whether to shrink centers with `temper`. False returns the textbook center.
     correlated : bool
-        Increase the covariance for the correlation between successive residuals; the points must be
-        in order of time.
+        Whether to increase the covariance for the correlation between successive residuals. The
+        points must then be in order of time.
 
     Returns
     -------
     Circles
-        `valid` is False, and center and radius NaN, for fewer than four points, points on a line,
-        points at one position, and arcs within the noise.
+        Circles. `valid` is False, and center and radius are NaN, in these cases: fewer than four
+        points, points on a line, points at one position, and arcs that do not exceed the noise.
     """
     m = moments_of(points)
-    with np.errstate(all="ignore"):  # sets without a circle are masked below
+    with np.errstate(all="ignore"):  # results without a circle are masked below
         eta = smallest_roots(m, method)
         a, b, square = circle_from_root(m, eta, method)
         judged = circle_statistics(m, a, b, square)
@@ -239,7 +240,8 @@ def fit_circle(points: ArrayLike, *, method: CircleMethod = "hyper") -> tuple[fl
     Raises
     ------
     ValueError
-        Fewer than three points, points on a line or at one position, or points without curvature.
+        There are fewer than three points, or the points are on a line, at one position, or without
+        curvature.
     """
     p = np.asarray(points, dtype=np.float64)
     m = moments_of_one(p) if len(p) > 2 else None

@@ -1,7 +1,7 @@
 """Geometric circle fit: the maximum-likelihood estimate by Levenberg-Marquardt.
 
-On points without outliers the estimate equals that of the Hyper fit. In addition, the geometric fit
-supports Huber's loss and several markers with one center.
+On points without outliers the estimate equals the estimate of the Hyper fit. In addition, the
+geometric fit supports the Huber loss and several markers with one center.
 """
 
 from __future__ import annotations
@@ -49,19 +49,19 @@ def geometric_estimate(
 
     .. math:: \min_c \sum_{tk} \rho\left( |x_{tk} - c| - R_k \right)
 
-    with x_tk the position of marker k in frame t, R_k the mean distance of marker k from the center
-    c, and ρ Huber's loss. Several markers have one common center. Markers at different angles about
-    the joint reduce the error by much more than √k, because their weak directions differ.
-    Correlated residuals of neighboring frames (lag-one correlation r) increase the covariance by
-    (1 + r)/(1 - r), as in the other circle fits.
+    where x_tk is the position of marker k in frame t, R_k the mean distance of marker k from the
+    center c, and ρ the Huber loss. Several markers have one common center. Markers at different
+    angles about the joint reduce the error by much more than √k, because their weak directions
+    differ. Correlated residuals of neighboring frames (lag-one correlation r) increase the
+    covariance by (1 + r)/(1 - r), as in the other circle fits.
 
     Parameters
     ----------
     points : array_like, shape (n, 2) or (n, k, 2)
         Positions in the parent's coordinates, m; NaN where missing.
     robust : bool
-        Use Huber's loss with a bound of 1.5 standard deviations, estimated from the median
-        residual.
+        Whether to use the Huber loss, with a bound of 1.5 standard deviations. The standard
+        deviation is estimated from the median residual.
     start : array_like, shape (2,), optional
         Initial center, m; the Hyper fit of the best conditioned marker if None.
     limits : CircleLimits, optional
@@ -129,12 +129,13 @@ def _accept_estimate(
     count = int(seen.sum())
     free = 2 + x.shape[1]
 
-    # Huber's variance: mean squared influence over the squared share of points within the bound
+    # variance by Huber: mean squared influence divided by the squared share of points within the
+    # bound
     pull = float((w**2 * e**2)[seen].sum()) / max(count - free, 1)
     variance = pull / max(float((w[seen] >= 1.0).mean()), 0.1) ** 2
     information = np.einsum("tk,tka,tkb->ab", seen.astype(np.float64), J, J)
 
-    # noise also changes the directions; this contribution to H is not information
+    # noise also changes the directions; its contribution to H is not information and is subtracted
     u2 = np.maximum(((x - c) ** 2).sum(axis=-1), 1e-6)
     across = np.eye(2) * float((seen / u2).sum()) - np.einsum(
         "tk,tka,tkb->ab", seen / u2**2, x - c, x - c

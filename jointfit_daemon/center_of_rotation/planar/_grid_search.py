@@ -1,7 +1,7 @@
 """Grid search for the center with the smallest variance of distances.
 
-This is the published baseline of the planar method. On short arcs the extent of the grid limits the
-accuracy, on long arcs the step of the grid.
+This is the published baseline of the planar method. The accuracy is limited by the extent of the
+grid on short arcs, and by the step of the grid on long arcs.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _AT_ONCE = 400_000
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Square grid of nodes with a node in the middle."""
+    """Square grid of nodes with a node at its center."""
 
     middle: tuple[float, float] = (0.0, 0.0)
     """Middle of the grid, m."""
@@ -41,7 +41,7 @@ class Grid:
 
 
 def grid_center(points: ArrayLike, grid: Grid) -> Array:
-    r"""Return the grid node with the smallest variance of distances, for any number of movements.
+    r"""Return the grid node with the smallest variance of distances, for each point set.
 
     .. math:: J(p) = \sum_n d_n^2 - \Big(\sum_n d_n\Big)^2 / N, \qquad d_n = |p - x_n|
 
@@ -57,7 +57,8 @@ def grid_center(points: ArrayLike, grid: Grid) -> Array:
     Returns
     -------
     ndarray, shape (..., 2)
-        Node with the smallest cost J, m; of several equal nodes, the first in row order.
+        Node with the smallest cost J, m. If several nodes have the same cost, the first in row
+        order is returned.
     """
     p = np.asarray(points, dtype=np.float64)
     flat = p.reshape(-1, *p.shape[-2:])

@@ -1,7 +1,8 @@
 """Central moments of the points of a circle, and the fit statistics derived from them.
 
-Invariant: fit, noise and covariance depend on nine moments only, so batch, windowed and forgetting
-fits give the same result. Every formula accepts floats (one circle) and arrays (many circles).
+Invariant: fit, noise and covariance depend only on nine moments. Batch, windowed and forgetting
+fits with the same moments therefore return the same result. Every formula accepts floats (one
+circle) and arrays (many circles).
 """
 
 from __future__ import annotations
@@ -19,27 +20,29 @@ if TYPE_CHECKING:
 Number = TypeVar("Number", float, Array)
 
 GATE = 6.0
-"""Smallest T of a published center, with T the curvature divided by its standard error. From this T
-on, the error is within 15 % of the Cramér-Rao bound."""
+"""Smallest T of a published center, where T is the curvature divided by its standard error. If T is
+at least this value, the error is within 15 % of the Cramér-Rao bound.
+"""
 LOG_20 = log(20.0)
 FARTHEST_M = 1e4
 """Largest valid coordinate, m; larger coordinates are treated as missing, like NaN."""
 ROUNDING = 1e-13
-"""Share of the points' variance below which a difference of moments is attributed to rounding."""
+"""Fraction of the points' variance below which a difference of moments is attributed to rounding.
+"""
 
 
 class CircleMoments(NamedTuple, Generic[Number]):
-    """Weighted moments of points about their centroid; z is the squared distance to it."""
+    """Weighted moments of points about their centroid; z is the squared distance from it."""
 
     weight: Number
     """Sum of the weights."""
     effective: Number
-    """(Σw)²/Σw²: the equivalent number of points of equal weight."""
+    """Equivalent number of points of equal weight, (Σw)²/Σw²."""
     x: Number
     """Centroid, m."""
     y: Number
     xx: Number
-    """Weighted means of the products that the field names state, m², m³, m⁴."""
+    """Weighted mean of the product that the field name states, m², m³ or m⁴."""
     xy: Number
     yy: Number
     xz: Number
@@ -48,7 +51,7 @@ class CircleMoments(NamedTuple, Generic[Number]):
 
 
 class CircleStatistics(NamedTuple, Generic[Number]):
-    """Statistics of a circle whose center is at (a, b) from the centroid."""
+    """Statistics of a circle with the center (a, b) relative to the centroid."""
 
     noise: Number
     """Variance of each coordinate of a point, m²."""
@@ -100,7 +103,7 @@ def moments_of(points: ArrayLike, weights: ArrayLike | None = None) -> CircleMom
     pairs = ((x, x), (x, y), (y, y), (x, z), (y, z))
     means = [np.einsum("...n,...n,...n->...", share, u, v) for u, v in pairs]
 
-    # Mzz = var z + (Mxx + Myy)²: z about its mean avoids cancellation
+    # Mzz is computed as var z + (Mxx + Myy)², because z about its mean avoids cancellation
     zz = np.einsum("...n,...n,...n->...", share, z, z) + (means[0] + means[2]) ** 2
     xx, xy, yy, xz, yz = means
     return CircleMoments(total, effective, middle[..., 0], middle[..., 1], xx, xy, yy, xz, yz, zz)
@@ -126,7 +129,7 @@ def moments_of_one(points: Array, weights: Array | None = None) -> CircleMoments
 
 
 def sum_of_squares(m: CircleMoments[Number], a: Number, b: Number, square: Number) -> Number:
-    r"""Return the mean of (|p - c|² - R²)² for the center (a, b) from the centroid, m⁴.
+    r"""Return the mean of (|p - c|² - R²)² for the center (a, b) relative to the centroid, m⁴.
 
     .. math:: U = M_{zz} + 4a^2 M_{xx} + 4b^2 M_{yy} + 8ab M_{xy} + c_0^2
               - 4a M_{xz} - 4b M_{yz} - 2 c_0 M_z, \qquad c_0 = R^2 - a^2 - b^2
@@ -144,10 +147,10 @@ def noise_of(
 ) -> tuple[Number, Number]:
     """Return the noise variance of a coordinate and the mean square of the radial residuals, m².
 
-    Parameters are those of `circle_statistics`.
+    The parameters have the same meaning as in `circle_statistics`.
     """
     u = sum_of_squares(m, a, b, square)
-    u = (u + abs(u)) * 0.5  # for a perfect fit, rounding may make the mean square negative
+    u = (u + abs(u)) * 0.5  # negative only by rounding of a perfect fit
     residual = u / (4.0 * square)
     return residual * m.effective / (m.effective - 3.0), residual
 
@@ -155,7 +158,8 @@ def noise_of(
 def arc_shows(m: CircleMoments[Number], noise: Number) -> Any:
     """Return whether the covariance of the points minus the noise covariance is positive definite.
 
-    Otherwise the arc is within the noise, and variances of `circle_statistics` may be negative.
+    Otherwise the arc does not exceed the noise, and variances of `circle_statistics` may be
+    negative.
     """
     sxx, syy = m.xx - noise, m.yy - noise
     trace = sxx + syy
@@ -174,21 +178,22 @@ def circle_statistics(
         \mathrm{Cov} &= \frac{\hat\sigma^2 R^2}{n} S^{-1} \left( 1 + \left(5 -
             \tfrac52 \sqrt{\lambda_2/\lambda_1}\right) \hat\sigma^2/\lambda_1 \right)
 
-    with n the effective number of points. The noise variance is subtracted from the moments because
-    noise widens the arc and would count as curvature. Without the subtraction, the predicted error
-    on an arc of 20° is half the true error. The factor in round brackets accounts for noise along
-    the arc, which disturbs the reference of the curvature. Its constant 5 is exact for a parabola:
-    noise on t adds 5σ²/var t to the variance of t² over evenly spread t. The constant 5/2, which
-    applies to a whole circle, was found by simulation. The factor matters for σ above R/30.
+    where n is the effective number of points. The noise variance is subtracted from the moments,
+    because noise widens the arc, which would count as curvature. Without the subtraction, the
+    predicted error on an arc of 20° is half the true error. The factor in round brackets accounts
+    for noise along the arc, which affects the estimate of the curvature. The constant 5 is exact
+    for a parabola with evenly spread abscissas t. Noise on t adds 5σ²/var t to the variance of t².
+    The constant 5/2, which applies to a whole circle, was found by simulation. The factor is
+    relevant for σ above R/30.
 
     Parameters
     ----------
     m : CircleMoments
-        Moments of at least four effective points for which `arc_shows` is true.
+        Moments of at least four effective points, for which `arc_shows` returns true.
     a, b : float or ndarray
-        Center from the centroid, m.
+        Center relative to the centroid, m.
     square : float or ndarray
-        R², m², above zero.
+        Squared radius R², m², above zero.
     """
     noise, residual = noise_of(m, a, b, square)
     sxx, syy = m.xx - noise, m.yy - noise
@@ -210,24 +215,24 @@ def ellipse_scale(effective: float, conditioning: float) -> float:
 
     .. math:: e^T C^{-1} e \le g^2(T)\, \nu \left( 0.05^{-2/\nu} - 1 \right), \qquad \nu = n - 3
 
-    The second factor is twice the quantile of F with 2 and ν degrees of freedom, because the noise
-    is estimated, too. The first factor corrects the selection of published centers. A center is
-    published if its T, which is nearly T₀ + N(0, 1), exceeds `GATE`. Close to the gate, most
-    published centers have too large a curvature, and are therefore too close to the markers. The
-    factor
+    The second factor is twice the quantile of the F distribution with 2 and ν degrees of freedom,
+    because the noise is also estimated. The first factor corrects the selection of published
+    centers. A center is published if its T exceeds `GATE`. T is nearly T₀ + N(0, 1), where T₀ is
+    the true value. If T₀ is close to the gate, most published centers have too large a curvature,
+    and are therefore too close to the markers. The factor
 
     .. math:: g(T) = 1 + 12.6\, e^{-(T-6)/0.455} + 0.172\, (6/T)^{2.25}
 
-    was fitted so that 94.9 to 95.1 % of the published centers are covered for any true T₀, down to
-    movements of which 3 % are published (a test integrates it). The last term accounts for the
-    curvature of the error distribution far from the gate.
+    was fitted so that 94.9 to 95.1 % of the published centers are covered for any T₀, down to
+    movements of which 3 % are published. A test computes this coverage by integration. The last
+    term accounts for the asymmetry of the error distribution far from the gate.
 
     Parameters
     ----------
     effective : float
         Effective number of points, above 3.
     conditioning : float
-        T of the center.
+        Value of T of the center.
 
     Returns
     -------

@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 METHOD = "oriented"
 MAX_FRAMES = 300
 INCONSISTENT = 13.8
-"""Squared Mahalanobis distance of the two estimates that chance exceeds once in a thousand."""
+"""Squared Mahalanobis distance of two estimates that is exceeded by chance once in a thousand
+cases.
+"""
 _LEAST_NOISE_M = 1e-4
 _PASSES = 40
 _FAR_M = 1.0
@@ -40,14 +42,14 @@ _FAR_M = 1.0
 
 @dataclass(frozen=True, slots=True)
 class AngleNoise:
-    """Error model of the child's angle; values are in rad unless stated otherwise."""
+    """Error model of the measured angle of the child. Values are in rad unless stated otherwise."""
 
     slow: float = radians(1.5)
-    """Standard deviation of the slow part: soft-tissue artefact and heading drift."""
+    """Standard deviation of the slow part, which soft-tissue artefact and heading drift cause."""
     time: float = 1.0
     """Correlation time of the slow part, s."""
     white: float = radians(1.0)
-    """Standard deviation of the white part."""
+    """Standard deviation of the white noise."""
     gain: float = 0.02
     """Standard deviation of the scale error, rad/rad."""
 
@@ -82,34 +84,35 @@ def oriented_estimate(
     subtracts the contribution of marker noise to aᵀMa. This contribution decreases with the
     distance of the center, and would bias c outward.
 
-    The guard is a limited translation (Efron and Morris 1971). Let Δ be the difference between the
-    center with angles and the center of the circle fit. With E the covariance of Δ for angle errors
-    as stated, and s² = ΔᵀE⁻¹Δ, the result is
+    The guard limits the effect of the angles (limited translation, Efron and Morris 1971). Let Δ be
+    the difference between the center with angles and the center of the circle fit. Let E be the
+    covariance of Δ under the error model `noise`, and s² = ΔᵀE⁻¹Δ. The result is
 
     .. math:: c = c_{circle} + \Delta \min(1, \lambda/s), \qquad
               \lambda = 0.7 \left( 1 + (6/T)^2/2 \right)
 
-    so that an angle error of any size adds no more than λ²E to the mean square error. λ increases
-    where the error of the circle fit has a heavier tail than its covariance.
+    so that an angle error of any size adds no more than λ²E to the mean square error. λ is larger
+    for small T, where the error of the circle fit has a heavier tail than its covariance implies.
 
     Parameters
     ----------
     points : array_like, shape (n, 2)
         Marker in the parent's coordinates, m; NaN where missing. More than 300 frames are averaged.
     angles : array_like, shape (n,)
-        Angle of the child about the joint's axis relative to the parent, rad, from any zero; NaN if
-        unknown.
+        Angle of the child about the joint's axis relative to the parent, rad; NaN if unknown. The
+        zero of the angle is arbitrary.
     interval : float
         Time between frames, s.
     noise : AngleNoise, optional
         Error model of the angles.
     limits : CircleLimits, optional
-        Acceptance limits. T is the radius over the combined center's largest standard error.
+        Acceptance limits. T is the radius divided by the largest standard error of the combined
+        center.
 
     Returns
     -------
     CenterEstimate
-        Has the flag ``orientation_inconsistent`` if path and angles are inconsistent.
+        Estimate. It has the flag ``orientation_inconsistent`` if path and angles are inconsistent.
     """
     x, theta, times = _thin(points, angles, interval)
     allowed = limits or CircleLimits()
@@ -129,8 +132,9 @@ def oriented_estimate(
         return replace(alone, method=METHOD)
     sigma = max(_path_noise(x), _LEAST_NOISE_M)
 
-    # The covariance of the scale uses the angles predicted from the path, to second order. It must
-    # not contain the angle noise, which is correlated with the residuals and would bias the center.
+    # The covariance of the scale error uses angles that are predicted from the path, to second
+    # order. Measured angles contain noise that is correlated with the residuals and would bias the
+    # center.
     d = (x - x.mean(axis=0)) / max(float(x.std()), 1e-9)
     one, u, v = np.ones(len(x)), d[:, 0], d[:, 1]
     terms = np.column_stack((one, u, v, u * u, u * v, v * v))
@@ -161,26 +165,27 @@ def oriented_estimate(
 
 
 def guarded(center: Array, C: Array, circle: Circles) -> tuple[Array, Array, float]:
-    """Limit the distance of an aided center from the circle fit of the path alone.
+    """Limit the distance of a center with angles from the circle fit of the path alone.
 
     Parameters
     ----------
     center : ndarray, shape (2,)
         Center estimated with the angles, m.
     C : ndarray, shape (2, 2)
-        Covariance of `center`, m², if the angle errors are as stated.
+        Covariance of `center` under the error model of the angles, m².
     circle : Circles
         Circle fit of the path alone. If the circle is not valid, the center is returned unchanged.
 
     Returns
     -------
     center, covariance, s2 : ndarray, ndarray, float
-        The covariance includes a term for a remaining inconsistency of path and angles.
+        Limited center, its covariance, and s². The covariance includes a term for a remaining
+        inconsistency of path and angles.
     """
     if not bool(circle.valid):
         return center, C, 0.0
     spread, axes = np.linalg.eigh(circle.covariance)
-    # E may be nearly singular or negative; a quarter of the circle's variance is its lower bound
+    # E may be nearly singular or negative, so a quarter of the circle's variance is the lower bound
     apart = np.einsum("ai,ab,bi->i", axes, circle.covariance - C, axes)
     apart = np.maximum(apart, 0.25 * np.maximum(spread, 1e-18))
     delta = center - circle.center
@@ -215,7 +220,7 @@ def _path_noise(x: Array) -> float:
     circle = fit_circles(x)
     if bool(circle.valid):
         return float(circle.noise)
-    # the arc is nearly straight: use the direction across the path, or a flat parabola
+    # A nearly straight arc: the noise is measured across the path, or about a flat parabola.
     d = x - x.mean(axis=0)
     along, across = (d @ np.linalg.svd(d, full_matrices=False)[2].T).T
     terms = np.column_stack((np.ones(len(x)), along, along**2))
@@ -223,14 +228,14 @@ def _path_noise(x: Array) -> float:
 
 
 def _solve(x: Array, theta: Array, sigma: float, Sigma: Array) -> tuple[Array, Array, float] | None:
-    """Minimize J by Gauss-Newton from plain least squares.
+    """Minimize J by Gauss-Newton iteration from a plain least-squares solution.
 
     Returns
     -------
     center, covariance, residual or None
         Center, m, its covariance, m², and the RMS radial residual, m; None where J has no minimum.
     """
-    # start: linear least squares of x = c + R(θ) p, which is attenuated
+    # start at the linear least-squares solution of x = c + R(θ) p, which is attenuated
     c, s, one, zero = np.cos(theta), np.sin(theta), np.ones_like(theta), np.zeros_like(theta)
     A = np.concatenate((np.column_stack((one, zero, c, -s)), np.column_stack((zero, one, s, c))))
     found = np.linalg.lstsq(A, x.T.ravel(), rcond=None)[0]
@@ -277,7 +282,7 @@ def _normal(
     H = Je.T @ Je / sigma**2 + Ja.T @ MJ
     g = Je.T @ e / sigma**2 + MJ.T @ a
 
-    # the distance has a lower bound: the compensation diverges for a point close to the center
+    # points close to the center are excluded, because the compensation diverges there
     counted = np.where(q > rho0 / 2, np.diag(M) / q**4, 0.0)
     g[:2] -= sigma**2 * counted @ d
     return H, g

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 _LEAST_SPREAD_M2 = 1e-12
-"""Sum of squared distances from the mean, m², below which markers are at one place."""
+"""Sum of squared distances from the mean, m², below which markers are at one position."""
 
 
 def planar_noise(points: Array, parent: Array, noise: float) -> Array:
@@ -20,9 +20,9 @@ def planar_noise(points: Array, parent: Array, noise: float) -> Array:
               + \frac{λ_⊥ λ_⊥^T}{\sum_j |d_j|^2} \right], \quad λ = x - \bar y,
               \quad d_j = y_j - \bar y
 
-    to first order in the noise, with m parent markers y_j of noise σ and their mean ȳ. λ is the
-    lever arm of the point x, λ_⊥ is λ rotated by 90°. For rotations about one axis, the result
-    equals that of `spatial_noise`.
+    to first order in the noise. y_j are the m parent markers with noise σ, and ȳ is their mean. λ
+    is the lever arm of the point x, and λ_⊥ is λ rotated by 90°. For rotations about one axis,
+    `spatial_noise` returns the same result.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def planar_noise(points: Array, parent: Array, noise: float) -> Array:
     Raises
     ------
     ValueError
-        Fewer than two markers, or all at one place: the frame is undetermined.
+        The markers do not determine a frame: there are fewer than two, or all are at one position.
     """
     middle = parent.mean(axis=0)
     spread = float(((parent - middle) ** 2).sum())

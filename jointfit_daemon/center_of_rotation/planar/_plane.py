@@ -1,4 +1,4 @@
-"""The plane normal to a joint axis."""
+"""Plane perpendicular to a joint axis."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ if TYPE_CHECKING:
 
 
 def plane_of(axis: ArrayLike) -> Array:
-    """Return two unit directions normal to an axis, right-handed with the axis, shape (3, 2).
+    """Return two unit vectors normal to an axis, right-handed with the axis, shape (3, 2).
 
-    For the x axis the directions are exactly y and z. A center (a, b) found in the plane is ``plane
-    @ (a, b)`` in space, plus any multiple of the axis.
+    For the x axis the vectors are exactly y and z. A center (a, b) in the plane is ``plane @ (a,
+    b)`` in space, plus any multiple of the axis.
 
     Raises
     ------
     ValueError
-        The axis has no length.
+        The axis has the length 0.
     """
     n = np.asarray(axis, dtype=np.float64)
     length = float(np.linalg.norm(n))
     if not length > 0.0:
         raise ValueError("an axis needs a length: (0, 0, 0) has no plane across it")
     n = n / length
-    # y is farthest from typical flexion axes; z is used if the axis is y
+    # y is nearly perpendicular to typical flexion axes; z is used if the axis is close to y
     guide = np.eye(3)[1 if abs(n[1]) < 0.9 else 2]
     first = guide - n * (n @ guide)
     first /= np.linalg.norm(first)

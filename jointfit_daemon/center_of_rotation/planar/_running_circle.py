@@ -1,4 +1,4 @@
-"""Circle fit of a stream of points at constant cost per frame.
+"""Circle fit of a stream of points, at constant cost per frame.
 
 Invariant: the result equals the batch fit of all frames with the same weights. Ten sums determine
 the circle, its covariance and the lag-one correlation of the residuals. The sums are plain floats
@@ -42,21 +42,22 @@ class RunningCircle:
     Parameters
     ----------
     forgetting : float
-        Factor on the weight of all earlier frames at each new frame, in (0, 1]. The factor
-        exp(-Δt/τ) gives the time constant τ for frames Δt apart.
+        Factor by which the weight of all earlier frames is multiplied at each new frame, in (0, 1].
+        For frames at intervals Δt, the factor exp(-Δt/τ) has the time constant τ.
     window : int, optional
-        Number of most recent valid frames that count. It cannot be combined with forgetting.
+        Number of most recent valid frames that are used. It cannot be combined with forgetting.
     method : str
         ``kasa``, ``pratt``, ``taubin`` or ``hyper``.
     robust : bool
-        Apply Huber weights with a bound of 1.5 standard deviations about the current circle.
+        Whether to apply Huber weights, with a bound of 1.5 standard deviations about the current
+        circle.
     limits : CircleLimits, optional
         Acceptance limits of `estimate`.
 
     Raises
     ------
     ValueError
-        Forgetting is outside (0, 1], the window is shorter than four frames, or both options are
+        `forgetting` is outside (0, 1], `window` is shorter than four frames, or both options are
         used.
     """
 
@@ -123,7 +124,7 @@ class RunningCircle:
         if self._window is not None:
             self._slide((x, y, weight))
         if self._robust and self.frames >= _SETTLED_FRAMES:
-            # The weight of the next frame follows from this circle and its noise.
+            # The weight of the next frame is computed from this circle and its noise.
             found = self.circle()
             if found is not None:
                 m = self.moments()
@@ -177,7 +178,7 @@ class RunningCircle:
             self._add(x, y, w)
 
     def _recenter(self, x: float, y: float) -> tuple[float, float]:
-        """Move the origin to the mean if the mean is far, since fourth powers would lose digits."""
+        """Move the origin to a mean that is far away, because fourth powers would lose digits."""
         weight = self._sums[9]
         if weight <= 0.0 or self._origin is None:
             return x, y
@@ -205,7 +206,7 @@ class RunningCircle:
 
         return CircleMoments(
             w,
-            w * w / self._squares if self._squares > 0.0 else 0.0,  # all weights decayed to 0
+            w * w / self._squares if self._squares > 0.0 else 0.0,  # 0 if all weights have decayed
             self._origin[0] + xb,
             self._origin[1] + yb,
             cxx,
@@ -221,7 +222,7 @@ class RunningCircle:
         )
 
     def circle(self) -> tuple[float, float, float] | None:
-        """Return center and radius, m, before `temper` and the limits; None without a circle."""
+        """Return center and radius, m, without `temper` and limits; None without a circle."""
         m = self.moments()
         z = m.xx + m.yy
         if m.effective <= 3.0 or m.xx * m.yy - m.xy * m.xy <= ROUNDING * z * z:
@@ -235,8 +236,8 @@ class RunningCircle:
     def estimate(self) -> CenterEstimate:
         """Return center, covariance, predicted error and acceptance from all frames.
 
-        This method never raises. Without a usable center, the estimate is refused with cause and
-        remedy.
+        This method never raises an error. Without a usable center, the estimate is refused with
+        cause and remedy.
         """
         return publish(
             self.moments(),

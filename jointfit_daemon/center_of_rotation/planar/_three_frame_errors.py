@@ -1,9 +1,9 @@
-r"""Error of a center computed from three frames, from the noise of each coordinate.
+r"""Error of a center that is computed from three frames, from the noise of each coordinate.
 
 The marker is at distance r from the center, at the angles θ₁, θ₂, θ₃. Source: Akbarifar et al.
-2021, section 2-2-2, with these misprints corrected: in equation 12 the denominator has a factor s
-and a sum instead of a difference of sines; in equation 13 the terms of second order have the wrong
-sign. The source calls the mean squares standard deviations.
+2021, section 2-2-2, with corrections of these misprints. In equation 12 the denominator has a
+factor s, and a sum instead of a difference of sines. In equation 13 the terms of second order have
+the wrong sign. The mean squares are called standard deviations.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 
 
 def three_frame_error(angles: ArrayLike, radius: ArrayLike, errors: ArrayLike) -> Array:
-    r"""Return the error of the center for given errors of the coordinates, exactly.
+    r"""Return the exact error of the center for given errors of the coordinates.
 
     .. math::
         \hat x = \frac{1}{2 \tilde D} \sum_i u_i (\tilde y_j - \tilde y_k), \qquad
         \hat y = -\frac{1}{2 \tilde D} \sum_i u_i (\tilde x_j - \tilde x_k), \qquad
         u_i = 2 r (ε_{xi} \cos θ_i + ε_{yi} \sin θ_i) + ε_{xi}^2 + ε_{yi}^2
 
-    with i, j, k cyclic, ε the errors, and :math:`\tilde D` twice the signed area of the measured
-    triangle. Source: equations 12 and 13, corrected, including the terms of second order that the
-    source omits.
+    where i, j, k are cyclic, ε are the errors, and :math:`\tilde D` is twice the signed area of the
+    measured triangle. Source: corrected equations 12 and 13, with the terms of second order that
+    the source omits.
 
     Parameters
     ----------
@@ -65,18 +65,18 @@ def three_frame_mean_squares(angles: ArrayLike, noise: ArrayLike) -> Array:
                       (\sin θ_j - \sin θ_k)^2, \qquad
         Q = \sin(θ_1 - θ_2) - \sin(θ_1 - θ_3) + \sin(θ_2 - θ_3)
 
-    with i, j, k cyclic and σ the standard deviations of the coordinates. The mean square along y
-    has cosines in the second factor. The prediction is of first order in the noise, and the radius
-    cancels. If all standard deviations are equal, the sum of the two mean squares is equation 14
-    with its last sign corrected.
+    where i, j, k are cyclic and σ are the standard deviations of the coordinates. The mean square
+    along y has cosines instead of sines in the second factor. The prediction is of first order in
+    the noise, and the radius cancels. If all standard deviations are equal, the sum of the two mean
+    squares is equation 14 with its last sign corrected.
 
     Parameters
     ----------
     angles : array_like, shape (..., 3)
         Directions of the marker from the center in the three frames, rad.
     noise : array_like, broadcast to (..., 3, 2)
-        Standard deviations of x and y in each frame, m: six values, shape (3, 2); one value per
-        frame, shape (3, 1); one value per axis, shape (2,); or one value for all coordinates.
+        Standard deviations of x and y in each frame, m. Use six values, shape (3, 2), one value per
+        frame, shape (3, 1), one value per axis, shape (2,), or one value for all coordinates.
 
     Returns
     -------
@@ -90,7 +90,8 @@ def three_frame_mean_squares(angles: ArrayLike, noise: ArrayLike) -> Array:
     side = (_next(spoke) - _next(_next(spoke)))[..., ::-1]
     above = (radial * side**2).sum(axis=-2)
 
-    # Q is twice the area of the triangle on the unit circle; an area near rounding counts as zero
+    # Q is twice the area of the triangle on the unit circle; areas near the rounding error count as
+    # zero
     double_area = (spoke[..., 0] * side[..., 0]).sum(axis=-1)[..., None]
     lost = np.abs(double_area) < 1e-15
     return np.where(lost, np.inf, above / np.where(lost, 1.0, double_area) ** 2)

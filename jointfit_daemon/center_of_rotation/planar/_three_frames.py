@@ -1,7 +1,7 @@
-"""Center of rotation from three frames: the circle through three points, in closed form.
+"""Center of rotation from three frames, as the circle through three points in closed form.
 
-Three points leave no residual. The error is predicted from the sides of the triangle, and a
-degenerate triangle is refused.
+A circle through three points has no residual. The error is therefore predicted from the sides of
+the triangle. A degenerate triangle is refused.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 FLAT = 1e-9
-"""Twice the area of a triangle over the square of its longest side, below which the three points
-count as a line."""
+"""Ratio of twice the area of a triangle to the square of its longest side. Below this ratio the
+three points count as a line.
+"""
 
 
 def three_frame_center(points: ArrayLike) -> Array:
@@ -35,19 +36,21 @@ def three_frame_center(points: ArrayLike) -> Array:
         y_c &= y_1 + \left[ s_3 (x_2-x_1) - s_2 (x_3-x_1) \right] / 2D,
         \qquad s_i = |p_i - p_1|^2
 
-    Source: Akbarifar et al. 2021, equations 7 and 8. Here coordinates are relative to the first
-    point, because squares of large coordinates lose digits.
+    Source: Akbarifar et al. 2021, equations 7 and 8. This implementation uses coordinates relative
+    to the first point, because squares of large coordinates lose digits.
 
     Parameters
     ----------
     points : array_like, shape (..., 3, 2)
-        One marker in three frames, in the parent's coordinates, m. The frames need not be
-        successive: the first, the middle and the last frame of an arc are best.
+        Positions of one marker in three frames, in the parent's coordinates, m. The frames need not
+        be successive. The first, the middle and the last frame of an arc result in the smallest
+        error.
 
     Returns
     -------
     ndarray, shape (..., 2)
-        Centers, m; inf where the points are on a line or repeat, NaN only where a point is NaN.
+        Centers, m. They are inf if the points are on a line or two are equal, and NaN only if a
+        point is NaN.
     """
     p = np.asarray(points, dtype=np.float64)
     u, v, size = _sides(p)
@@ -69,7 +72,7 @@ def _sides(p: Array) -> tuple[Array, Array, Array]:
 
 
 def _offset(u: Array, v: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the center from the first point, over the largest side, and a mask of failures."""
+    """Return the center from the first point, divided by the largest side, and a failure mask."""
     D = u[..., 0] * v[..., 1] - v[..., 0] * u[..., 1]
     s2, s3 = (u**2).sum(axis=-1), (v**2).sum(axis=-1)
     longest = np.maximum(np.maximum(s2, s3), ((u - v) ** 2).sum(axis=-1))
@@ -88,9 +91,9 @@ def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
     points : array_like, shape (3, 2)
         One marker in three frames, m.
     noise : array_like, broadcast to (3, 2)
-        Standard deviations of x and y in each frame, m, which three points do not determine. Six
-        values, shape (3, 2); one value per frame, shape (3, 1); one value per axis, shape (2,); or
-        one value for all coordinates.
+        Standard deviations of x and y in each frame, m, which three points do not determine. Use
+        six values, shape (3, 2), one value per frame, shape (3, 1), one value per axis, shape (2,),
+        or one value for all coordinates.
 
     Returns
     -------
@@ -112,9 +115,9 @@ def three_frame_estimate(points: ArrayLike, noise: ArrayLike) -> CenterEstimate:
         return _refusal(p, typical, reason)
 
     spokes = np.stack((-offset, u - offset, v - offset))
-    # radial noise e shifts the center by δ: u·δ = r (e₂ - e₁), v·δ = r (e₃ - e₁), so that
-    # C = r² A⁻¹ [[σ₁² + σ₂², σ₁²], [σ₁², σ₁² + σ₃²]] A⁻ᵀ with A = (u v)ᵀ and radial variances σ²;
-    # the unit of sides and radius cancels
+    # Radial noise e shifts the center by δ, with u·δ = r (e₂ - e₁) and v·δ = r (e₃ - e₁). Hence C =
+    # r² A⁻¹ [[σ₁² + σ₂², σ₁²], [σ₁², σ₁² + σ₃²]] A⁻ᵀ with A = (u v)ᵀ and the radial variances σ².
+    # The unit of the sides u, v and the radius r cancels.
     moves = float(np.hypot(*offset)) * np.linalg.inv(np.stack((u, v)))
     first, second, third = (variances * spokes**2).sum(axis=1) / (spokes**2).sum(axis=1)
     chords = np.array([[first + second, first], [first, first + third]])
@@ -146,10 +149,10 @@ def equal_step_error(step: ArrayLike, noise: ArrayLike) -> Array:
 
     .. math:: E^2 = \sigma^2 \frac{2 + \cos\alpha}{(1 - \cos\alpha)^2 (1 + \cos\alpha)}
 
-    with α the step and σ the noise. Source: Akbarifar et al. 2021, equation 15, of first order in
-    the noise. This is the Cramér-Rao bound of three points. The prediction holds while noise/radius
-    is below (1 - cos α)/6; above this ratio the error has no finite mean square. The minimum of E
-    is 1.155 σ at 120°.
+    where α is the step and σ the noise. Source: Akbarifar et al. 2021, equation 15, which is of
+    first order in the noise. E is the Cramér-Rao bound of three points. The prediction holds while
+    noise/radius is below (1 - cos α)/6; above this ratio the error has no finite mean square. The
+    minimum of E is 1.155 σ at 120°.
 
     Parameters
     ----------
@@ -167,7 +170,7 @@ def equal_step_error(step: ArrayLike, noise: ArrayLike) -> Array:
     one_less = 2.0 * np.sin(a / 2) ** 2
     one_more = 2.0 * np.cos(a / 2) ** 2
 
-    # π is not representable: at the nearest float, 1 + cos α is rounding
+    # at the floating-point number nearest to π, 1 + cos α is only a rounding error
     one_more = np.where(one_more < 1e-30, 0.0, one_more)
     error = np.asarray(noise) * np.sqrt(1.0 + one_more)
     below = one_less * np.sqrt(one_more)

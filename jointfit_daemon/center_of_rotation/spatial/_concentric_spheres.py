@@ -1,4 +1,4 @@
-r"""Common center of the spheres (in a plane: circles) of several markers, from sums over frames.
+r"""Common center of the spheres (or circles) of several markers, from sums over frames.
 
 Let x be the position of marker j relative to its mean, a the center, and R_j the radius. The
 algebraic residual F = |x|² - 2 a·x - mean|x|² is 2 R_j times the radial residual. Therefore the
@@ -7,11 +7,11 @@ condition
 .. math:: \min_a \sum_j \frac{n_j}{R_j^2 s_j} \left( \mathrm{var} F_j - \eta\, E_j(a) \right)
           = 0 \text{ at the smallest } \eta
 
-weights all markers as a geometric fit does. n_j is the number of frames of marker j and s_j its
-relative noise variance. The term E_j, the contribution of unit noise to var F_j, removes the bias
-of short arcs. For one marker in a plane the center equals the center of the Hyper fit (Al-Sharadqah
-and Chernov 2009; Kanatani and Rangarajan 2011). For spheres the center is the limit of the
-iteration of Halvorsen 2003.
+gives all markers the weights of a geometric fit. n_j is the number of frames of marker j and s_j
+its relative noise variance. The term E_j, the contribution of unit noise to var F_j, removes the
+bias of short arcs. For one marker in a plane the center equals the center of the Hyper fit
+(Al-Sharadqah and Chernov 2009; Kanatani and Rangarajan 2011). For spheres the center is the limit
+of the iteration of Halvorsen 2003.
 """
 
 from __future__ import annotations
@@ -35,23 +35,23 @@ _REACH_M = 1e3
 
 @dataclass(frozen=True, slots=True)
 class MarkerPaths:
-    """Central moments of k markers' paths in r directions."""
+    """Central moments of the paths of k markers in r directions."""
 
     n: Array
-    """Effective frames, shape (k,)."""
+    """Effective number of frames of each marker, shape (k,)."""
     mean: Array
     """Mean of each path, m, shape (k, r)."""
     C: Array
     """Covariance of the path, m², shape (k, r, r)."""
     c: Array
-    """Covariance of x with |x|², m³, shape (k, r)."""
+    """Covariance of the position x with |x|², m³, shape (k, r)."""
     Z: Array
     """Variance of |x|², m⁴, shape (k,)."""
     S: Array
-    """Contribution of unit noise to C, shape (k, r, r); the identity for isotropic noise."""
+    """Contribution of unit noise to `C`, shape (k, r, r); the identity for isotropic noise."""
 
     def seen_along(self, basis: Array) -> MarkerPaths:
-        """Return the paths projected onto directions, the columns of `basis`, shape (r, s)."""
+        """Return the paths projected onto the columns of `basis`, shape (r, s)."""
         B = basis
         return MarkerPaths(
             self.n, self.mean @ B, B.T @ self.C @ B, self.c @ B, self.Z, B.T @ self.S @ B
@@ -90,14 +90,15 @@ class ConcentricSpheres:
     """Squared radius of each marker, m², shape (k,)."""
     information: Array
     """Squared change of the marker directions, summed over frames and markers, minus the noise
-    contribution. The weight of a marker is the common noise variance over the marker's noise
-    variance. Shape (r, r)."""
+    contribution, shape (r, r). The weight of a marker is the ratio of the common noise variance to
+    its own noise variance.
+    """
     floor: Array
     """Contribution of noise to the sum in `information`, shape (r, r)."""
 
 
 def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
-    """Fit one center, each marker weighted by its noise; None if the paths have no curvature."""
+    """Fit one center, with markers weighted by their noise; None if the paths have no curvature."""
     k = len(paths.n)
     relative = np.ones(k)
     found = _smallest_root(paths, relative)
@@ -106,8 +107,8 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
         if found is None:
             return None
 
-        # Compute the relative noise variance of each marker; remove differences that are within
-        # chance.
+        # Compute the relative noise variance of each marker, without differences that are
+        # insignificant.
         ratio = found[2] / np.maximum(relative * found[1], _NOTHING_M2) * relative
         ratio = ratio / np.median(ratio) if np.median(ratio) > 0 else np.ones_like(ratio)
         ratio = np.clip(ratio, 0.0, 1e6)
@@ -129,7 +130,7 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
     noise2 = max(eta, _NOTHING_M2) * total / max(total - k - len(m), 1.0)
     w = paths.n / (R2 * relative)
 
-    # the path about its own mean contains 1 - 1/n of the noise of n frames
+    # relative to its own mean, a path of n frames contains the fraction 1 - 1/n of the noise
     left = (1.0 - 1.0 / np.maximum(paths.n, 1.0)) * noise2 * relative
     floor = np.einsum("j,jab->ab", w * left, paths.S)
     information = np.einsum("j,jab->ab", w, paths.C) - floor
@@ -137,7 +138,7 @@ def common_center(paths: MarkerPaths) -> ConcentricSpheres | None:
 
 
 def _smallest_root(paths: MarkerPaths, relative: Array) -> tuple[Array, float, Array, Array] | None:
-    """Return center, eta, and the radial variance and the squared radius of each marker.
+    """Return center, η, and the radial variance and the squared radius of each marker.
 
     G is the sum that vanishes at the root η, and B the normal matrix of the center at η. Newton's
     method on G(η) det B(η), which has no smaller root, converges from zero without overshoot.

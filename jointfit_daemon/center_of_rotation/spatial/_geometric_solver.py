@@ -1,7 +1,7 @@
 """Robust geometric fit of concentric spheres.
 
-The center keeps its start value along unobservable directions. `judge_sphere` decides on
-acceptance.
+The center keeps its start value along unobservable directions. `judge_sphere` checks whether a fit
+is accepted.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Mask = NDArray[np.bool_]
 
 HUBER = 1.5
 NOISE_FACTOR = 6.0
-"""Ratio of the rotation to the rotation caused by noise above which a direction is observed."""
+"""Ratio of the rotation to the noise of the rotation above which a direction is observed."""
 _PASSES = 30
 _ROUNDED = 1e-9
 _LONGEST_STEP_M = 0.2
@@ -41,20 +41,21 @@ class SphereOptions:
 
     huber: float = HUBER
     """Residual, in robust standard deviations, above which the weight of a point is reduced; inf
-    gives plain least squares."""
+    for plain least squares.
+    """
     smallest_scale: float = _ROUNDED
     """Smallest residual scale, m. With soft-tissue artefact use 0.1 mm, so that a few frames with
     small residuals do not dominate."""
     start: Array | None = None
     """Initial center, m, shape (3,). The estimate keeps this value along unobserved directions."""
     hold: float = 0.0
-    """Noise of the markers, m. Along directions in which this noise dominates, the initial estimate
-    stays at `start`."""
+    """Noise of the markers, m. Along directions in which this noise dominates, the initial center
+    of the iteration is `start`.
+    """
     min_direction: float = 0.0
-    """RMS rotation, rad, below which a direction counts as unobserved, however small the noise
-    is."""
+    """RMS rotation, rad, below which a direction counts as unobserved even with small noise."""
     keep_one: bool = False
-    """Fit the best direction even if it is not observable."""
+    """Whether to fit the best direction even if it is not observable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +65,14 @@ class SphereFit:
     center: Array
     """Position of the center, m, shape (3,)."""
     basis: Array
-    """Observed directions, the columns, shape (3, r)."""
+    """Observed directions as columns, shape (3, r)."""
     residuals: Array
     """Radial residuals, m, shape (n, k); zero where missing."""
     seen: Mask
     weights: Array
     """Huber weights of the points, shape (n, k); zero where a point is missing."""
     turning: Array
-    """Derivatives of the residuals by the center, shape (n, k, 3)."""
+    """Derivatives of the residuals with respect to the center, shape (n, k, 3)."""
     radii: Array
     """Mean distance of each marker, m, shape (k,)."""
     resultant: Array
@@ -85,7 +86,7 @@ class SphereFit:
 
     @property
     def unseen(self) -> Array:
-        """Return the unobserved directions, the rows, shape (3 - r, 3)."""
+        """Return the unobserved directions as rows, shape (3 - r, 3)."""
         return np.asarray(np.linalg.svd(self.basis)[0][:, self.basis.shape[1] :].T)
 
 
@@ -93,15 +94,15 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
     """Fit spheres about one center by Gauss-Newton with Huber weights; radii are eliminated.
 
     The center keeps its start value along unobserved directions. Otherwise noise would move the
-    center to the plane of the markers, with too small a covariance. Source: Halvorsen 2003; Chang
-    and Pollard 2007.
+    center to the plane of the markers, and its covariance would be too small. Source: Halvorsen
+    2003; Chang and Pollard 2007.
 
     Parameters
     ----------
     points : ndarray, shape (n, k, 3)
-        Marker positions, m; NaN where missing. Every marker is visible at least twice.
+        Marker positions, m; NaN where missing. Every marker must be visible at least twice.
     options : SphereOptions
-        Start value of the center, Huber's bound and the limits of observability.
+        Start value of the center, the Huber threshold and the limits of observability.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1))
     v = np.where(seen[..., None], points, 0.0)
@@ -151,7 +152,7 @@ def solve_sphere(points: Array, options: SphereOptions) -> SphereFit:
 
 
 def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
-    """Return Gamage and Lasenby's center, or `start` along directions where `hold` dominates."""
+    """Return the Gamage-Lasenby center, with `start` along directions where `hold` dominates."""
     total = np.maximum(w.sum(axis=0), 1e-12)
     d = v - start
     d = d - (w[..., None] * d).sum(axis=0) / total[:, None]
@@ -160,7 +161,7 @@ def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
     A = 2.0 * np.einsum("tj,tja,tjb->ab", w / total, d, d)
     b = np.einsum("tj,tja,tj->a", w / total, d, square)
 
-    # a millionth of the path avoids a singular matrix for motion in a plane
+    # a millionth of the path's moment avoids a singular matrix for motion in a plane
     least = max(options.hold**2, 1e-6 * float(np.trace(A)) / len(total))
     return np.asarray(start + np.linalg.solve(A + 2.0 * len(total) * least * np.eye(3), b))
 
@@ -168,9 +169,9 @@ def _begin(v: Array, w: Array, start: Array, options: SphereOptions) -> Array:
 def _observed(v: Array, w: Array, m: Array, scale: float, options: SphereOptions) -> Array:
     """Return an orthonormal basis (3, r) of the observed directions.
 
-    Noise changes the unit vector u from the center to a marker only normal to u. Therefore the
-    threshold along each axis b of the basis is multiplied by the mean of 1 - (b·u)² over all
-    markers.
+    Noise changes the unit vector u from the center to a marker only perpendicular to u. The
+    threshold along each axis b of the basis is therefore multiplied by the mean of 1 - (b·u)² over
+    all markers.
     """
     _, J = radial_residuals(v, m, w)
     total = w.sum()
@@ -202,11 +203,11 @@ def judge_sphere(
     .. math:: C = \frac{\sum ψ^2 / (N - k - r)}{p^2} \Big(\sum J J^T - \text{noise's part}
               \Big)^{-1} \frac{1+\rho}{1-\rho}
 
-    with ψ the residuals limited to Huber's bound, p the share of residuals that are not limited,
-    and ρ the correlation of the residuals from one frame to the next (Huber 1964). N is the number
-    of residuals, k the number of markers, r the number of observed directions, J the derivatives of
-    the residuals. The factor with ρ prevents an underestimate of the covariance for smooth
-    disturbances at a high frame rate.
+    where ψ are the residuals limited to the Huber threshold, p is the fraction of residuals that
+    are not limited, and ρ is the correlation of the residuals from one frame to the next (Huber
+    1964). N is the number of residuals, k the number of markers, r the number of observed
+    directions, J the derivatives of the residuals. The factor with ρ prevents an underestimate of
+    the covariance for smooth disturbances at a high frame rate.
     """
     n, k = int(fit.seen.sum()), fit.seen.shape[1]
     rank = fit.basis.shape[1]
@@ -232,7 +233,7 @@ def judge_sphere(
     conditioning = radius / float(np.sqrt(np.linalg.norm(shown, 2)))
     unseen = fit.unseen
 
-    # the marker that rotated most determines the arc, since markers near the axis rotate less
+    # the marker that rotated most determines the arc, because markers near the axis rotate less
     inside = np.linalg.norm(fit.resultant @ fit.basis, axis=1)
     off = np.linalg.norm(fit.resultant @ unseen.T, axis=1) if len(unseen) else 0.0 * inside
     arc = arc_of(float((inside / np.sqrt(np.maximum(1.0 - off**2, 1e-12))).min()))

@@ -1,10 +1,10 @@
 """Observable directions of a center, and its covariance along them.
 
-A direction is observable if the markers rotated along it by more than the noise, and if the
-standard deviation of the center along it is below a sixth of the radius. The covariance is
-increased for residuals that persist between frames and for noise shared between markers.
-Soft-tissue artefact repeats with posture, so all frames together count as one observation of the
-artefact.
+A direction is observable under two conditions. The markers rotated in this direction by more than
+the noise, and the standard deviation of the center in this direction is below a sixth of the
+radius. The covariance is increased for residuals that persist between frames and for noise that is
+common to markers. Soft-tissue artefact repeats with posture, so all frames together count as one
+observation of the artefact.
 """
 
 from __future__ import annotations
@@ -28,17 +28,21 @@ if TYPE_CHECKING:
 
 
 MIN_CONDITIONING = 6.0
-"""T, the radius over the standard deviation of the center, below which a direction is
-unobserved."""
+"""Smallest T of an observed direction, where T is the radius divided by the standard deviation of
+the center.
+"""
 MIN_SIGNIFICANCE = 7.0
-"""Standard deviations by which the rotation along a third direction must exceed the rotation that
-noise causes. Otherwise many frames of noise along a hinge's axis would appear as a well-conditioned
-center."""
+"""Standard deviations by which the rotation in a third direction must exceed the rotation that
+noise causes. Otherwise the noise of many frames along the axis of a hinge would appear as a
+well-conditioned center.
+"""
 FADED = 0.5 ** LAGS[1]
-"""Correlation over `LAGS[1]` frames of noise that halves from frame to frame; a larger correlation
-is attributed to soft-tissue artefact."""
+"""Correlation over `LAGS[1]` frames of noise whose correlation halves from frame to frame. A larger
+correlation is attributed to soft-tissue artefact.
+"""
 FILLED = 0.1
-"""Share of the variance of the path above which the radial residuals are not noise about an arc."""
+"""Fraction of the variance of the path above which the radial residuals are not noise about an arc.
+"""
 _STILL_M = 1e-6
 _PERSISTENT = 0.99
 _CHI2 = (3.841, 5.991, 7.815)  # 95 % quantiles of χ² for one, two, three degrees of freedom
@@ -49,10 +53,10 @@ class SphereLimits:
     """Acceptance limits of a center in space."""
 
     min_direction: float = 0.0
-    """RMS rotation of the markers along the third direction, rad, below which the joint counts as a
-    hinge, however small the noise is. Use 3° with soft-tissue artefact. The value must exceed the
-    rotation of the parent's frame due to noise, which cannot be distinguished from joint
-    rotation."""
+    """RMS rotation of the markers in the third direction, rad, below which the joint counts as a
+    hinge even with small noise. Use 3° with soft-tissue artefact. The value must exceed the
+    rotation of the parent's frame due to noise, which cannot be distinguished from joint rotation.
+    """
     min_arc: float = radians(8.0)
     reach: tuple[float, float] = (0.02, 1.0)
     """Least and largest distance of the markers from the center, m."""
@@ -70,7 +74,7 @@ class ResidualStatistics:
     persistence: float
     """Correlation of the residuals from one frame to the next, 0 to 0.99; 0 if not significant."""
     posture: float
-    """Share of the residual variance that repeats with posture."""
+    """Fraction of the residual variance that repeats with posture."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +82,11 @@ class ObservedCenter:
     """Part of a center along the directions that the movement makes observable."""
 
     basis: Array
-    """Directions of the fit, the columns, shape (d, r)."""
+    """Directions of the fit as columns, shape (d, r)."""
     shown: Array
-    """Directions that are observable despite soft-tissue artefact, in coordinates of the basis, as
-    columns; shape (r, s)."""
+    """Directions that are observable despite soft-tissue artefact, as columns in coordinates of the
+    basis, shape (r, s).
+    """
     paths: MarkerPaths
     """Fitted center and radii in coordinates of the basis, m."""
     found: ConcentricSpheres
@@ -107,8 +112,8 @@ def observe(
 ) -> ObservedCenter | None:
     """Fit the center, dropping the least observable direction until all others are observable.
 
-    Directions hidden by noise are left out of the fit. Directions that only soft-tissue artefact
-    excites remain in the fit, since the residuals would grow without these directions. The result
+    The fit omits directions that noise dominates. It includes directions that only soft-tissue
+    artefact excites, because the residuals would be larger without these directions. The result
     does not contain them.
     """
     while basis.shape[1] >= 2:
@@ -118,7 +123,7 @@ def observe(
             basis = basis @ np.linalg.eigh(np.einsum("j,jab->ab", flat.n, flat.C))[1][:, 1:]
             continue
 
-        # information, rad², that noise may contribute along the least observed direction
+        # largest plausible information from noise in the least observed direction, rad²
         spread, axes = np.linalg.eigh(found.information)
         radius2 = float(np.median(found.radii2))
         noise = max(MIN_CONDITIONING**2 * found.noise2 / radius2, 0.0)
@@ -129,8 +134,9 @@ def observe(
             noise = max(noise, chance, limits.min_direction**2 * total)
 
         if spread[0] > noise:
-            # Paths that fill an area as wide as it is long are a small movement on a sphere, viewed
-            # along its radius. The curvature is not measurable; a fitted circle is chance.
+            # If the paths fill an area that is as wide as it is long, they are a small movement on
+            # a sphere, in a projection along the radius. The curvature cannot be measured, and a
+            # fitted circle is meaningless.
             wide = np.linalg.eigvalsh(np.einsum("j,jab->ab", flat.n / flat.n.sum(), flat.C))[-1]
             if found.noise2 * float(np.median(found.relative)) > FILLED * wide:
                 return None
@@ -139,7 +145,8 @@ def observe(
             skin2 = found.noise2 + soft_tissue_variance(left, flat, found)
             shown = spread > MIN_CONDITIONING**2 * skin2 / radius2
 
-            # one direction alone determines no center; the predicted error is then large
+            # One direction alone does not determine a center. All directions are then used, and the
+            # predicted error is large.
             shown = shown if shown.sum() >= 2 else np.ones_like(shown)
             return _spread(sums, basis, flat, found, left=left, shown=axes[:, shown])
 
@@ -151,13 +158,13 @@ def observe(
 def soft_tissue_variance(
     left: ResidualStatistics, paths: MarkerPaths, found: ConcentricSpheres
 ) -> float:
-    r"""Return the variance of the soft-tissue artefact, m², to be divided by the information.
+    r"""Return the variance of the soft-tissue artefact, m²; the caller divides by information.
 
     .. math:: \mathrm{Cov}_{posture} = p^2 \left[ \overline{u u^T} - \bar u \bar u^T \right]^{-1}
 
-    p² is the persistent variance of the residuals, u the unit vectors from the center to the
-    markers. The part of the artefact that is linear in u moves the center and leaves no residual.
-    This part is assumed to be as large as the part that leaves residuals. The artefact repeats with
+    p² is the persistent variance of the residuals, and u are the unit vectors from the center to
+    the markers. The part of the artefact that is linear in u moves the center without residuals.
+    This part is assumed to be as large as the part that causes residuals. The artefact repeats with
     every cycle, and all markers share the soft tissue of their parent. Therefore neither more
     frames nor more markers reduce this variance.
     """
@@ -165,10 +172,10 @@ def soft_tissue_variance(
 
 
 def posture_share(lasting: float, frames: float) -> float:
-    """Return the share of the residual variance that repeats with posture.
+    """Return the fraction of the residual variance that repeats with posture.
 
-    The share is the correlation of the residuals over `LAGS[1]` frames if this correlation exceeds
-    the 99.7 % quantile of decayed noise, otherwise zero.
+    The fraction is the correlation of the residuals over `LAGS[1]` frames. It is zero if this
+    correlation is below the 99.7 % quantile of the correlation of noise.
     """
     # a correlation ρ per frame divides the effective frames by (1 + ρ²)/(1 - ρ²)
     chance = FADED + 3.0 * float(np.sqrt((5.0 / 3.0) / max(frames, 1.0)))
@@ -180,8 +187,8 @@ def within95(rank: int, freedom: float) -> float:
 
     .. math:: r F_{0.95}(r, \nu) \approx \chi^2 \left( 1 + \frac{\chi^2 - r + 2}{2 \nu} \right)
 
-    for r directions and noise estimated with ν degrees of freedom; χ² is the 95 % quantile for r
-    degrees of freedom.
+    for r directions and noise that is estimated with ν degrees of freedom. χ² is the 95 % quantile
+    for r degrees of freedom.
     """
     chi2 = _CHI2[rank - 1]
     return chi2 * (1.0 + (chi2 - rank + 2.0) / (2.0 * max(freedom, 2.0)))
@@ -196,16 +203,16 @@ def _spread(
     left: ResidualStatistics,
     shown: Array,
 ) -> ObservedCenter:
-    r"""Return the covariance by the sandwich formula with the observed covariance of the residuals.
+    r"""Return the covariance from the sandwich formula with the observed covariance of residuals.
 
     .. math:: \mathrm{Cov} = B^{-1} \Big[ \sum_{jl} \frac{n_{jl}\, \overline{e_j e_l}\;
               \overline{u_j u_l^T}}{s_j s_l} \Big] B^{-1} \cdot \frac{1+\rho\rho_u}{1-\rho\rho_u}
 
-    with e the radial residuals of markers j and l, u the unit vectors from the center to the
+    where e are the radial residuals of markers j and l, u the unit vectors from the center to the
     markers, s the relative noise, and B the information. n_jl is the number of frames in which both
-    markers are visible. ρ is the lag-one correlation of e and ρ_u the one of u: persistent noise
-    matters only if the movement persists, too. The function adds `soft_tissue_variance` divided by
-    the information.
+    markers are visible. ρ and ρ_u are the lag-one correlations of e and u. Persistent noise
+    increases the covariance only if the movement is persistent as well. The function adds
+    `soft_tissue_variance` divided by the information.
     """
     k, rank = paths.mean.shape
     total = float(paths.n.sum())
@@ -223,7 +230,7 @@ def _spread(
     bread = np.linalg.inv(found.information)
     dof = max(total * (1.0 - rho) / (1.0 + rho) - k - rank, 2.0)
 
-    # a fit absorbs more of persistent noise than of white noise
+    # a fit removes more of persistent noise than of white noise from the residuals
     own = total * (1.0 - both) / (1.0 + both)
     widened = total / max(own - k - rank, 1.0)
     bound2 = found.noise2 * float(np.trace(bread))
@@ -231,7 +238,7 @@ def _spread(
     spread = spread + soft_tissue_variance(left, paths, found) * bread
     path = np.einsum("j,jab->ab", paths.n / found.relative, paths.C)
 
-    # normal of a plane through the paths
+    # variance of the normal of a plane through the paths
     tilt = (found.noise2 + soft_tissue_variance(left, paths, found)) * np.linalg.inv(path)
     size = within95(shown.shape[1], dof)
     return ObservedCenter(basis, shown, paths, found, spread, tilt, bound2, left, size)
@@ -240,7 +247,7 @@ def _spread(
 def _no_better(spread: Array, white: Array) -> Array:
     """Return `spread`, raised in every direction to a quarter of the white-noise covariance.
 
-    In few frames, chance correlations between markers could cancel all noise.
+    With few frames, chance correlations between markers could cancel all noise.
     """
     L = np.linalg.cholesky((white + white.T) / 2.0)
     inner = np.linalg.solve(L, np.linalg.solve(L, spread).T)

@@ -1,8 +1,8 @@
 r"""Effect of the parent's marker noise on a point in the parent's coordinates.
 
-The parent's frame is itself a fit to noisy markers. A rotation error of this fit moves a point in
-proportion to its lever arm. Parent markers close to each other and long lever arms amplify this
-noise. The noise is common to all markers of the child.
+The parent's frame is fitted to noisy markers. A rotation error of this fit moves a point in
+proportion to its lever arm. The error is large if the parent's markers are close to each other or
+if the lever arm is long. It is common to all markers of the child.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
               \quad G = \sum_j \left(|d_j|^2 I - d_j d_j^T\right), \quad λ = x - \bar y,
               \quad d_j = y_j - \bar y
 
-    to first order in the noise, for a frame fitted by Kabsch's method with equal weights. σ is the
-    noise of the m parent markers y_j, ȳ their mean, and λ the lever arm of the point x.
+    to first order in the noise, for a frame that is fitted by the method of Kabsch with equal
+    weights. σ is the noise of the m parent markers y_j, ȳ their mean, and λ the lever arm of the
+    point x.
 
     Parameters
     ----------
@@ -44,7 +45,7 @@ def spatial_noise(points: Array, parent: Array, noise: float) -> Array:
     Raises
     ------
     ValueError
-        Fewer than three markers, or all on a line: the frame is undetermined.
+        The markers do not determine a frame: there are fewer than three, or all are on a line.
     """
     middle = parent.mean(axis=0)
     d = parent - middle
@@ -76,15 +77,16 @@ def turn_noise(parent: Array, noise: float) -> float:
 
 
 def relative(points: Array, parent: Array, center: Array) -> Array:
-    r"""Return each marker's relative noise covariance for `RunningSphere`; its radial part is 1.
+    r"""Return the relative noise covariance of each marker, whose radial part is 1.
 
     .. math:: S_j = Σ_c / \overline{\hat r_j^T Σ_c \hat r_j}, \qquad
               Σ_c = \left(1 + \tfrac1m\right) I + [λ_c]_× G^{-1} [λ_c]_×^T
 
-    with :math:`λ_c` the lever arm of the center, not of the marker, and :math:`\hat r_j` the unit
-    vector from the center to marker j; G as in `spatial_noise`. A rotation of the parent's frame
-    moves markers and center alike. Therefore only the displacement of the center changes the
-    distance between marker and center.
+    where :math:`λ_c` is the lever arm of the center, not of the marker, and :math:`\hat r_j` the
+    unit vector from the center to marker j. `spatial_noise` defines G. A rotation error of the
+    parent's frame rotates the markers and the true center together, and does not change their
+    distance. The distance from the estimated center changes only by the displacement of the true
+    center, whose lever arm is :math:`λ_c`.
 
     Parameters
     ----------
@@ -98,8 +100,8 @@ def relative(points: Array, parent: Array, center: Array) -> Array:
     Returns
     -------
     ndarray, shape (k, 3, 3)
-        Relative noise covariance of each marker. A marker that is never visible has the common
-        covariance.
+        Relative noise covariance of each marker, for `RunningSphere`. A marker that is never
+        visible has the common covariance.
     """
     seen = np.asarray(np.isfinite(points).all(axis=-1), dtype=np.float64)
     S = spatial_noise(center, parent, 1.0)

@@ -29,17 +29,21 @@ if TYPE_CHECKING:
 
 
 OUTLIER = 3.0
-"""Residual in standard deviations above which the weight of a marker is reduced. This threshold is
-larger than Huber's 1.5 because a frame is weighted only once, and the noise estimate must not
-shrink."""
+"""Residual in standard deviations above which the weight of a marker is reduced. The threshold is
+larger than the usual 1.5, because a frame is weighted only once, and the noise estimate must not
+decrease.
+"""
 OFF = 8.0
-"""Residual in standard deviations, and at least `OFF_M`, above which a marker is off its sphere."""
+"""Residual, in standard deviations, above which a marker is off its sphere; it must also exceed
+`OFF_M`.
+"""
 OFF_M = 0.01
 STAYED_OFF = 25
 """Consecutive frames off its sphere after which a marker is restarted at its new position."""
 _FAR_M = 2.0
-"""Largest distance of a marker from its fixed point, m; fourth powers of larger distances lose
-digits."""
+"""Largest distance of a marker from its fixed point, m, because fourth powers of larger distances
+lose digits.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +51,9 @@ class _ExpectedMarkers:
     """Marker positions expected from the last estimate."""
 
     f: Array
-    """Coefficients f of each marker, m, shape (k, e): the radial residual is f·φ. Zero for a marker
-    without estimate."""
+    """Coefficients f of the radial residual f·φ of each marker, m, shape (k, e); zero for a marker
+    without estimate.
+    """
     noise: Array
     """Standard deviation of a coordinate of each marker, m, shape (k,); inf where unknown."""
     mean: Array
@@ -66,27 +71,28 @@ class RunningSphere:
     markers : int
         Number of markers k in a frame.
     forgetting : float
-        Factor on the weight of all earlier frames at each new frame, in (0, 1]; 1 disables
-        forgetting.
+        Factor by which the weight of all earlier frames is multiplied at each new frame, in (0, 1];
+        1 disables forgetting.
     dimension : int
-        3, or 2 for points in a plane.
+        Dimension of the points: 3, or 2 in a plane.
     near : ndarray, shape (dimension,), optional
-        Position along unobserved directions, m.
+        Position of the center along unobserved directions, m.
     robust : bool
-        Reduce the weight of markers that leave their sphere (soft-tissue artefact, exchanged
-        labels), and restart a marker that remains off its sphere. The spheres are those of the last
-        call of `estimate`.
+        Whether to reduce the weight of markers that leave their sphere because of soft-tissue
+        artefact or exchanged labels. A marker that remains off its sphere is then restarted. The
+        last call of `estimate` determines the spheres.
     limits : SphereLimits, optional
         Acceptance limits. If None, persistent residuals are not counted as soft-tissue artefact,
         and the caller adds the variance of the artefact. Pass ``SphereLimits()`` to count the
         artefact here.
     shape : ndarray, shape (k, d, d), optional
-        Covariance of each marker's noise relative to the common variance, see ``relative``.
+        Covariance of each marker's noise relative to the common variance, as returned by
+        ``relative``.
 
     Raises
     ------
     ValueError
-        No markers, or forgetting outside (0, 1].
+        There are no markers, or `forgetting` is outside (0, 1].
     """
 
     def __init__(
@@ -167,9 +173,9 @@ class RunningSphere:
         return SphereSums(origin, M, self._L.copy(), self._squares.copy(), self._frames)
 
     def estimate(self) -> CenterEstimate:
-        """Return center, covariance and predicted error of all frames so far; never raises.
+        """Return center, covariance and predicted error of all frames; never raise an error.
 
-        This method takes longer than `feed`. Call it when a result is published, not for every
+        This method takes longer than `feed`. Call it when a result is published, not in every
         frame.
         """
         sums = self.sums()
@@ -190,7 +196,7 @@ class RunningSphere:
     def _weights(self, given: Array | None) -> Array | None:
         """Return the marker weights of the frame stored in `_phi`; None if all weights are one."""
         phi, expected = self._phi, self._expected
-        near = phi[:, 0] < _FAR_M**2  # the comparison is False for NaN
+        near = phi[:, 0] < _FAR_M**2  # False for NaN
         if expected is None:
             if given is None and near.all():
                 return None
@@ -206,7 +212,7 @@ class RunningSphere:
         w = np.where(near, 1.0 if given is None else given, 0.0)
         if fine.all():
             return self._restart(w, np.isfinite(phi[:, 0]) & ~near)
-        # the uncertainty of the center increases the tolerance at new positions of a marker
+        # at new positions of a marker the uncertainty of the center increases the tolerance
         way = np.where(near[:, None], phi[:, 1:-1] - expected.mean, 0.0)
         excused = np.einsum("ja,jab,jb->j", way, expected.unsure, way)
         scale = np.sqrt(expected.noise**2 + np.maximum(excused, 0.0))
@@ -278,10 +284,10 @@ def fit_running(
     points : ndarray, shape (n, k, d)
         Marker positions, m; NaN where a marker is not visible.
     weights : ndarray, shape (n, k), optional
-        Weights of the markers, non-negative; one if None. To model forgetting, pass the final
-        weights of the frames.
+        Weights of the markers, non-negative; one if None. For a result with forgetting, pass the
+        final weights of the frames.
     near, limits, shape
-        See `RunningSphere`.
+        Parameters of `RunningSphere`.
     """
     limits = limits or SphereLimits(posture=False)
     return center_of(sum_up(points, weights), near=near, shape=shape, limits=limits)[0]

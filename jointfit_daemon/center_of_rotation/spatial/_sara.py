@@ -1,7 +1,7 @@
 """Axis of a hinge from the poses of two bodies (SARA).
 
-The point on the axis is arbitrary; its variance along the axis is infinite. A movement about two
-axes is refused.
+The movement does not determine the position of the center along the axis. A movement about two axes
+is refused.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ def fit_axis(
     parent, child : BodyPoses
         Poses of both bodies in the same world coordinates.
     near : ndarray, shape (3,), optional
-        Position along the axis, in the parent's coordinates, m; None: nearest the parent's origin.
+        Point in the parent's coordinates, m, nearest to which the center is placed on the axis.
+        None is the parent's origin.
     toward : ndarray, shape (3,), optional
-        Direction that determines the sign of the axis: the axis has a positive component along it.
-        An example is the subject's right.
+        Direction along which the axis has a positive component, such as the subject's right.
     robust : bool
-        Apply Huber weights to the gap between the points of both bodies.
+        Whether to apply Huber weights to the gap between the points of both bodies.
     markers : tuple of ndarray, optional
-        Markers of parent and child, see `two_sided_estimate`.
+        Markers of parent and child, as in `two_sided_estimate`.
 
     Returns
     -------

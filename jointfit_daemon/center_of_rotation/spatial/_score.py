@@ -1,9 +1,9 @@
 """Center of rotation from the poses of two bodies (SCoRE), or the axis of a hinge.
 
 The method finds the point of the parent and the point of the child that coincide in every frame.
-Both poses may be noisy. The singular values of N = [R₁, -R₂], the rotations of both bodies in all
-frames, distinguish a point from an axis. If the markers of both bodies are known, the noise of the
-markers is separated from the movement (`fit_two_sides`).
+Both poses may be noisy. The matrix N = [R₁, -R₂] contains the rotations of both bodies in all
+frames. Its singular values distinguish a point from an axis. If the markers of both bodies are
+known, the noise of the markers is separated from the movement (`fit_two_sides`).
 """
 
 from __future__ import annotations
@@ -50,8 +50,9 @@ MIN_TURN_RAD = 0.02
 """RMS rotation about the second axis of the movement, rad, below which the movement counts as no
 rotation."""
 LEVER_M = 0.24
-"""Length that replaces the radius in the conditioning T, m, since poses do not contain marker
-positions. With this length T = 6 corresponds to a standard error of 40 mm."""
+"""Length that replaces the radius in the conditioning T, m, because poses do not contain marker
+positions. With this length T = 6 corresponds to a standard error of 40 mm.
+"""
 HIDDEN = (
     "noise of the markers rotates both bodies as much as the joint does: move the joint further, "
     "or put the markers of each body further apart"
@@ -69,9 +70,9 @@ def fit_score(
     markers: tuple[Array, Array] | None = None,
     posture: bool = True,
 ) -> CenterEstimate:
-    """Estimate a center by SCoRE; if only an axis was observed, return the estimate of a hinge.
+    """Estimate a center by SCoRE, or a hinge if only an axis was observed.
 
-    Source: Ehrig et al. 2006. The parameters are those of `two_sided_estimate`.
+    Source: Ehrig et al. 2006. The parameters have the same meaning as in `two_sided_estimate`.
     """
     return two_sided_estimate(
         "score", parent, child, near, hinge=False, robust=robust, markers=markers, posture=posture
@@ -93,8 +94,8 @@ def two_sided_estimate(
 
     .. math:: \min \sum_t \rho\left(|R_1 c_1 + t_1 - R_2 c_2 - t_2|\right)
 
-    R and t are rotation and translation of parent (1) and child (2), c the point in each body, ρ
-    Huber's loss. If `markers` are given, this point is the start value of `fit_two_sides`.
+    R and t are rotation and translation of parent (1) and child (2), c is the point in each body,
+    and ρ the Huber loss. If `markers` are given, this point is the start value of `fit_two_sides`.
 
     Parameters
     ----------
@@ -103,19 +104,19 @@ def two_sided_estimate(
     parent, child : BodyPoses
         Poses of both bodies in the same world coordinates; frames with NaN are ignored.
     near : ndarray, shape (3,), or None
-        Position along a hinge's axis, in the parent's coordinates, m; None: nearest the parent's
-        origin.
+        Point in the parent's coordinates, m, nearest to which the center is placed on the axis of a
+        hinge. None is the parent's origin.
     hinge : bool
-        Always solve for an axis, without the sixth singular value. If False, solve for an axis only
-        if the ratio of the last two singular values is below `HINGE_RATIO`.
+        Whether to solve for an axis in any case, without the sixth singular value. If False, the
+        result is an axis only if the ratio of the last two singular values is below `HINGE_RATIO`.
     robust : bool
-        Apply Huber weights to the gap between the points of both bodies. The weights reduce the
-        influence of exchanged markers.
+        Whether to apply Huber weights to the gap between the points of both bodies. The weights
+        reduce the influence of exchanged markers.
     markers : tuple of ndarray, shapes (m, 3) and (k, 3), or None
         Markers of parent and child to which the poses were fitted, each in the coordinates of its
         body, m. Each body needs at least three markers that are not on a line. If None, the noise
-        of the poses is unknown: for a small movement the center is biased and its predicted error
-        too small.
+        of the poses is unknown. The center of a small movement is then biased, and its predicted
+        error is too small.
     posture : bool
         Whether persistent residuals count as soft-tissue artefact. If False, the caller adds the
         variance of the artefact.
@@ -146,7 +147,7 @@ def two_sided_estimate(
     if hinge and ratio >= HINGE_RATIO:
         return refusal(name, 3, n, SEVERAL_AXES.format(ratio))
 
-    # for unit noise of the gap, score S and information M are equal: NᵀWN
+    # for unit noise of the gap, score S and information M are both NᵀWN
     squares = np.diag(s[:rank] ** 2)
     residual = sqrt(float((gaps**2).sum(axis=1).mean()))
     fit = TwoSidedFit(c, gaps, w, residual, squares, squares)
@@ -179,7 +180,7 @@ def _answer(
     inverse = Vt[:rank].T @ inner @ Vt[:rank]
     white, C, rho, repeated = _covariances(fit, inverse, rank, posture=posture)
 
-    # the direction along the axis is unobserved
+    # a hinge: the direction along the axis is unobserved
     axis = Vt[5, :3] / np.linalg.norm(Vt[5, :3]) if rank == 5 else None
     center = fit.point[:3]
     if axis is not None:
@@ -215,11 +216,11 @@ def _answer(
 def _covariances(
     fit: TwoSidedFit, inverse: Array, rank: int, *, posture: bool
 ) -> tuple[Array, Array, float, float]:
-    """Return the covariance of the parent's point for white noise and in total, m², shape (3, 3).
+    """Return the covariance of the parent's point for white noise, and the total covariance, m².
 
     The third value is the correlation of the gaps from one frame to the next. Persistent noise
     reduces the effective number of frames; with soft-tissue artefact this number is one. The fourth
-    value is the share of the gap variance that repeats with posture.
+    value is the fraction of the gap variance that repeats with posture.
     """
     gaps, w = fit.gaps, fit.weights
     n = len(gaps)
@@ -248,7 +249,7 @@ def _huber_weights(N: Array, rhs: Array, *, hinge: bool) -> Array:
 def _solve(
     N: Array, rhs: Array, w: Array, *, hinge: bool
 ) -> tuple[Array, Array, Array, Array, int]:
-    """Return both points (6,), gaps (n, 3), singular values, right vectors and the rank used."""
+    """Return both points (6,), gaps (n, 3), singular values, right vectors and rank."""
     root = np.sqrt(w)[:, None]
     U, s, Vt = np.linalg.svd((root[..., None] * N).reshape(-1, 6), full_matrices=False)
     rank = 5 if hinge or s[5] < HINGE_RATIO * s[4] else 6

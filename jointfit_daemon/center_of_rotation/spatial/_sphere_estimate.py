@@ -1,8 +1,8 @@
 """Center estimates from sums of marker positions: covariance, hinge axis and acceptance.
 
-A hinge movement determines the center in two directions, and the hinge axis. A straight path or a
-marker at rest is refused with a remedy. Along an unobserved direction the caller chooses the
-position of the center.
+The movement of a hinge determines the center in two directions, and the axis of the hinge. A
+straight path or a marker at rest is refused with a remedy. The caller determines the position of
+the center along an unobserved direction.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def center_of(
     shape: Array | None = None,
     limits: SphereLimits | None = None,
 ) -> tuple[CenterEstimate, ConcentricSpheres | None]:
-    """Estimate the center from sums over frames, and decide whether it may be used.
+    """Estimate the center from sums over frames, and check whether it may be used.
 
     Parameters
     ----------
@@ -67,10 +67,10 @@ def center_of(
     method : str
         Method name stored in the result.
     near : ndarray, shape (d,), optional
-        Position along unobserved directions, m; None: the mean of the markers.
+        Position of the center along unobserved directions, m; the mean of the markers if None.
     shape : ndarray, shape (k, d, d), optional
-        Noise covariance of each marker relative to the common variance, see ``relative`` for a
-        moving parent; None: isotropic noise.
+        Noise covariance of each marker relative to the common variance; isotropic noise if None.
+        ``relative`` returns it for a moving parent.
     limits : SphereLimits, optional
         Acceptance limits.
 
@@ -118,12 +118,12 @@ def _answer(
     stay = middle if near is None else np.asarray(near, dtype=np.float64)
     center, spread = shrink_center(seen, middle @ seen.basis)
     fitted = seen.basis @ center
-    hidden = unseen @ seen.basis @ seen.basis.T  # fitted, but not in the result
+    hidden = unseen @ seen.basis @ seen.basis.T  # not in the result
     lean = float(((unseen @ stay - hidden @ fitted - (unseen - hidden) @ middle) ** 2).sum())
     spread = seen.shown.T @ spread @ seen.shown
     C = basis @ (spread + lean * (seen.shown.T @ seen.tilt @ seen.shown)) @ basis.T
 
-    # radii and arc about the observable part of the center
+    # radii and arc are computed about the observable part of the center
     away = found.center - seen.paths.mean
     inside = away @ seen.shown
     aside2 = np.maximum((away**2).sum(axis=1) - (inside**2).sum(axis=1), 0.0)
@@ -164,10 +164,10 @@ def shrink_center(seen: ObservedCenter, middle: Array) -> tuple[Array, Array]:
 
     .. math:: S = (I + C/R^2)^{-1}, \qquad d' = S d, \qquad C' = S C S
 
-    for the vector d from the markers' mean to the center. The error of the estimated curvature is
-    nearly normal; its inverse, the distance, is therefore too large on average. The shrinkage,
-    Zellner's minimum expected loss estimator of an inverse (1978), removes this outward bias, as in
-    the plane. On long arcs S is the identity.
+    where d is the vector from the markers' mean to the center, with covariance C. The error of the
+    estimated curvature is nearly normal. The inverse of the curvature, the distance, is therefore
+    too large on average. The shrinkage is Zellner's minimum expected loss estimator of an inverse
+    (1978), and removes this outward bias, as in the plane. On long arcs S is nearly the identity.
     """
     R2 = float(np.median(seen.found.radii2))
     S = np.linalg.inv(np.eye(len(middle)) + seen.spread / R2)

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 OUTLIER = 3.0
 """Residual in standard deviations above which the weight of a point is reduced. Noise rarely
-exceeds this threshold, so that the noise variance is not underestimated."""
+exceeds this threshold, so the noise variance is not underestimated.
+"""
 STILL_M = 1e-6
 _HALVORSEN_STEPS = 20
 FLAT = (
@@ -42,8 +43,8 @@ def gamage_lasenby(points: Array, min_direction: float = 0.0) -> CenterEstimate:
     .. math:: 2 \sum_j \left(\overline{vv^T} - \bar v \bar v^T\right) m
               = \sum_j \left(\overline{v|v|^2} - \bar v\, \overline{|v|^2}\right)
 
-    with v the positions of marker j and m the center. On short arcs the center is biased towards
-    the markers, as in Kåsa's circle fit. Source: Gamage and Lasenby 2002.
+    where v are the positions of marker j and m is the center. On short arcs the center is biased
+    towards the markers, as in the circle fit of Kåsa. Source: Gamage and Lasenby 2002.
 
     Parameters
     ----------
@@ -61,8 +62,9 @@ def halvorsen(points: Array, min_direction: float = 0.0) -> CenterEstimate:
     .. math:: A m = b - 2 σ^2 \sum_j (\bar v_j - m), \qquad
               σ^2 = \frac{\sum (u - \bar u_j)^2}{nk - k - 3}, \quad u = |v - m|
 
-    with A and b the matrix and the right side of `gamage_lasenby`, n frames and k markers. Source:
-    Halvorsen 2003. The parameters are those of `gamage_lasenby`.
+    where A and b are the matrix and the right-hand side of `gamage_lasenby`, n is the number of
+    frames and k the number of markers. Source: Halvorsen 2003. The parameters have the same meaning
+    as in `gamage_lasenby`.
     """
     return _linear(points, "halvorsen", _HALVORSEN_STEPS, min_direction)
 
@@ -103,8 +105,8 @@ def fit_sphere(
     .. math:: \min_m \sum_{tj} \rho\left(|v_{tj} - m| - \bar u_j\right),
               \qquad \bar u_j = \mathrm{mean}_t |v_{tj} - m|
 
-    This fit determines the outliers, with ρ Huber's loss. Center and covariance are then computed
-    from the sums over the other points.
+    ρ is the Huber loss. This fit determines the weights of outliers. Center and covariance are then
+    computed from weighted sums over all points.
 
     Parameters
     ----------
@@ -115,8 +117,8 @@ def fit_sphere(
     limits : SphereLimits, optional
         Acceptance limits.
     parent : ndarray, shape (m, 3), optional
-        The parent's own markers in the parent's coordinates, m. Noise of the parent's markers is
-        common to all markers of the child, and is separated from the noise of the child's markers.
+        Markers of the parent in the parent's coordinates, m. Their noise is common to all markers
+        of the child, and is separated from the noise of the child's markers.
 
     Returns
     -------

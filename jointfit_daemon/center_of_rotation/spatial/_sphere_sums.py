@@ -1,15 +1,15 @@
-r"""Sums of fixed size over any number of frames, sufficient for a fit of spheres.
+r"""Sums over any number of frames that are sufficient for a fit of spheres; their size is fixed.
 
-For every marker, φ = (|p|², p, 1) with p the position of the marker relative to a fixed point near
-the marker. All estimates of spheres about one center are functions of
+Every marker has the vector φ = (|p|², p, 1), where p is the position of the marker relative to a
+fixed point near the marker. All estimates of spheres about one center are functions of
 
 .. math:: M_{jl} = \sum_t \sqrt{w_{tj} w_{tl}}\, φ_{tj} φ_{tl}^T, \qquad
           L_{gj} = \sum_t \sqrt{w_{tj} w_{t-g,j}}\, φ_{tj} φ_{t-g,j}^T, \quad g \in \{1, 4\}
 
-with w the weight of marker j or l in frame t. M determines the variances of the residuals and their
-covariance between markers (noise of the parent's frame). L determines the correlation of the
-residuals in time. Forgetting multiplies M and L by a factor. A marker that is not visible adds
-nothing to either sum.
+where w is the weight of marker j or l in frame t. M determines the variances of the residuals and
+their covariance between markers, which noise of the parent's frame causes. L determines the
+correlation of the residuals in time. Forgetting multiplies M and L by a factor. A marker that is
+not visible adds nothing to either sum.
 """
 
 from __future__ import annotations
@@ -25,15 +25,17 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 LAGS = (1, 4)
-"""Lags in frames: neighbours, and a lag after which noise that halves each frame has decayed."""
+"""Lags in frames. The second is large enough that noise whose correlation halves from frame to
+frame has decayed.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class SphereSums:
-    """Sums over frames of k markers in d dimensions, e = d + 2."""
+    """Sums over the frames of k markers in d dimensions; e is d + 2."""
 
     origin: Array
-    """The fixed point of each marker, m, shape (k, d)."""
+    """Fixed point of each marker, m, shape (k, d)."""
     M: Array
     """Sums of the products of φ of two markers, shape (k, e, k, e)."""
     L: Array
@@ -62,7 +64,7 @@ class SphereSums:
 
 
 def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
-    """Return the sums over all frames, computed at once.
+    """Return the sums over all frames.
 
     Parameters
     ----------
@@ -88,10 +90,10 @@ def sum_up(points: Array, weights: Array | None = None) -> SphereSums:
 
 
 def centered(sums: SphereSums) -> SphereSums:
-    r"""Return the sums about each marker's mean; sums of markers never visible are unchanged.
+    r"""Return the sums about the mean of each marker; markers without frames are unchanged.
 
-    If the reference point moves, φ is multiplied by a matrix T. The sums then are :math:`M' = T M
-    T^T` and :math:`L' = T L T^T`.
+    If the reference point moves, φ is multiplied by a matrix T. The sums are then
+    :math:`M' = T M T^T` and :math:`L' = T L T^T`.
     """
     k, d = sums.origin.shape
     by = np.einsum("jaj->ja", sums.M[:, 1:-1, :, -1])

@@ -1,10 +1,9 @@
 r"""Center of two bodies whose poses are fitted to noisy markers.
 
 Noise of the markers rotates the fitted bodies, and moves a point in proportion to its distance from
-the markers. Least squares on the gap between both bodies (SCoRE) therefore prefers points near the
-markers. The SCoRE center is biased by millimeters in small movements. The fit of this module
-estimates the errors of both rotations in every frame together with the center (errors in
-variables).
+the markers. A least-squares fit of the gap between both bodies (SCoRE) is therefore biased towards
+the markers. The bias is millimeters in small movements. The fit of this module estimates the errors
+of both rotations in every frame together with the center (errors in variables).
 """
 
 from __future__ import annotations
@@ -22,8 +21,9 @@ if TYPE_CHECKING:
 
 
 HUBER = 1.5
-"""Threshold of Huber's weight of a frame: length of the gap, in standard deviations of a
-coordinate."""
+"""Length of the gap, in standard deviations of a coordinate, above which the weight of a frame is
+reduced.
+"""
 MEDIAN_LENGTH = 1.538
 """Median length of a vector of three standard normal components."""
 _PASSES = 40
@@ -40,14 +40,14 @@ class ClusterNoise:
     .. math:: \mathrm{Cov}(\varphi) = G^{-1}, \quad \mathrm{Cov}(\bar y) = \tfrac1k I, \quad
               G = \sum_j \left(|d_j|^2 I - d_j d_j^T\right)
 
-    φ is the rotation error about the mean ȳ of the markers, d_j is the vector from this mean to
+    φ is the rotation error about the mean ȳ of the markers, and d_j the vector from this mean to
     marker j.
     """
 
     middle: Array
     """Mean of the markers in body coordinates, m, shape (3,)."""
     turning: Array
-    """G⁻¹, 1/m², shape (3, 3)."""
+    """Covariance G⁻¹ of the rotation error, 1/m², shape (3, 3)."""
     shift: float
     """Variance of the mean of the markers, 1/k."""
 
@@ -71,7 +71,7 @@ class TwoSidedFit:
     weights: Array
     """Weight of each frame, shape (n,)."""
     residual: float
-    """RMS distance between both sides, m."""
+    """RMS distance between the points of both bodies, m."""
     score: Array
     """Variance of the estimating equations for unit noise, along the basis, shape (r, r)."""
     information: Array
@@ -106,11 +106,11 @@ def fit_two_sides(
               R_1 e^{[\varphi_1]} \lambda_1 + p_1 + \rho_1 = R_2 e^{[\varphi_2]} \lambda_2 + p_2
               + \rho_2
 
-    with λ the point relative to the mean of a body's markers, p the measured mean, k the number of
-    markers, and φ, ρ the errors of the pose. G is defined in `ClusterNoise`. To first order this is
-    the maximum-likelihood estimate for isotropic marker noise of any variance. Rotation errors of a
-    distant cluster only cause gaps normal to the line to the cluster. Such gaps have less weight
-    than gaps along the line.
+    where λ is the point relative to the mean of a body's markers, p the measured mean, and k the
+    number of markers. φ and ρ are the errors of rotation and position of the pose. G is defined in
+    `ClusterNoise`. To first order this is the maximum-likelihood estimate for isotropic marker
+    noise of any variance. Rotation errors of a distant cluster cause only gaps perpendicular to the
+    line to the cluster. Such gaps have less weight than gaps along the line.
 
     Parameters
     ----------
@@ -123,7 +123,7 @@ def fit_two_sides(
     basis : ndarray, shape (6, r)
         Directions in which the point is fitted, orthonormal columns.
     robust : bool
-        Apply Huber weights to the gaps.
+        Whether to apply Huber weights to the gaps.
     """
     (parent, child), (above, below) = poses, noise
     R1 = rotation.to_matrix(parent.q)
@@ -200,7 +200,7 @@ def _linearize(
 
 
 def _step(frames: _LinearGaps, basis: Array, w: Array) -> tuple[Array, Array, Array]:
-    """Return the step of the point (r,), the gaps after it (n, 3), and AᵀVA (r, r)."""
+    """Return the step of the point (r,), the gaps after the step (n, 3), and AᵀVA (r, r)."""
     A = frames.A @ basis
     weighted = w[:, None, None] * np.swapaxes(A, 1, 2) @ frames.V
     S = (weighted @ A).sum(axis=0)
@@ -221,7 +221,7 @@ def _apply(matrices: Array, vectors: Array) -> Array:
 def _remaining_noise(
     frames: _LinearGaps, w: Array, noise: tuple[ClusterNoise, ClusterNoise]
 ) -> Array:
-    r"""Return the part of the score S due to errors of the corrected rotations, shape (6, 6).
+    r"""Return the part of the score S that errors of the corrected rotations cause, shape (6, 6).
 
     .. math:: \sum_t w_t\, E\left[ δA^T V δA \right], \qquad
               δA = (E_1 [δφ_1]_×, \; -E_2 [δφ_2]_×), \qquad

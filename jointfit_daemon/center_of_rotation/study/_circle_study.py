@@ -4,8 +4,9 @@ Invariant: one seeded generator supplies all random numbers. All runs of a cell 
 at once.
 
 A marker at distance r from the center is at the angles 0, α and 2α; each coordinate has independent
-noise of standard deviation σ. Two of (r, σ, α) vary over a map, the third is fixed. Every cell
-contains the RMS errors of the methods over many runs, and the error predicted for three frames,
+noise of standard deviation σ. In each map, two of the quantities r, σ and α vary, and the third is
+fixed. Every cell contains the RMS errors of the methods over many runs, and the predicted error for
+three frames,
 
 .. math:: F = \sigma \sqrt{\frac{2 + \cos\alpha}{(1 - \cos\alpha)^2 (1 + \cos\alpha)}}
 
@@ -38,11 +39,13 @@ if TYPE_CHECKING:
 
 
 CLIPS_M = (None, 0.05, 0.15, 0.3, 0.5)
-"""Upper limits that are applied to both maps before their correlation is computed, m; None: no
-limit."""
+"""Upper limits that are applied to two maps before their correlation is computed, m; None is no
+limit.
+"""
 PRINTED = {"α–σ": (0.99, 0.78), "r–σ": (0.99, 0.98), "r–α": (0.99, 0.94)}
-"""Correlations in table 1 of the source: analytic solution with prediction, analytic solution with
-grid."""
+"""Correlations in table 1 of the source. The first is between the analytic solution and the
+prediction, the second between the analytic solution and the grid search.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +55,7 @@ class StudySetup:
     radii: Array = field(default_factory=lambda: np.linspace(0.1, 0.6, 11))
     noises: Array = field(default_factory=lambda: 0.0005 * np.arange(11.0))
     steps: Array = field(default_factory=lambda: np.arange(5.0, 176.0, 5.0) * (np.pi / 180.0))
-    """α, the angle between successive frames; the poles 0 and π are excluded."""
+    """Angles α between successive frames; the poles 0 and π are excluded."""
     radius: float = 0.6
     """Radius r in the map with fixed r, m."""
     noise: float = 0.001
@@ -60,7 +63,7 @@ class StudySetup:
     repeats: int = 1000
     """Number of runs of the three-frame solution in each cell."""
     grid_repeats: int = 150
-    """Number of runs with grid searches: the first of the `repeats` runs."""
+    """Number of runs with grid searches, which are the first of the `repeats` runs."""
     box: float = 0.05
     """Half width of the grid about the true center, m."""
     node: float = 0.005
@@ -84,10 +87,12 @@ class PairMaps:
     """Values of the first quantity, SI."""
     columns: Array
     maps: Mapping[str, Array]
-    """RMS error, m, shape (len(rows), len(columns)), by method: ``predicted``, ``three frames``,
-    ``grid``, ``shifted grid`` for three frames; ``bound``, ``hyper``, ``oriented`` for all."""
+    """RMS error by method, m, shape (len(rows), len(columns)). ``predicted``, ``three frames``,
+    ``grid`` and ``shifted grid`` use three frames; ``bound``, ``hyper`` and ``oriented`` use all
+    frames.
+    """
     refused: Array
-    """Share of runs in which the Hyper fit is refused (T < 6)."""
+    """Fraction of the runs in which the Hyper fit is refused (T < 6)."""
 
 
 def correlation(a: Array, b: Array, clip: float | None = None) -> float:
@@ -107,7 +112,7 @@ def run_study(
     ----------
     setup : StudySetup
     on_progress : callable, optional
-        Function that is called with the completed share, 0 to 1, after every row of cells.
+        Function that is called after every row of cells with the completed fraction, 0 to 1.
 
     Returns
     -------
@@ -159,19 +164,19 @@ def uniform_arc_rms(arc: float, frames: int, noise: float, *, known_radius: bool
     .. math:: E^2 = \frac{\sigma^2}{n} \left[ \frac{2}{1-c} + \frac{2}{1+c-2s^2} \right],
               \quad s = \frac{\sin(\varphi/2)}{\varphi/2}, \quad c = \frac{\sin\varphi}{\varphi}
 
-    with φ the arc, n the number of frames and σ the noise. If the radius is known, the term 2s² is
-    zero. On short arcs E is about 26.8 σ/(√n φ²) for an unknown radius.
+    where φ is the arc, n the number of frames and σ the noise. If the radius is known, the term 2s²
+    is zero. On short arcs E is about 26.8 σ/(√n φ²) for an unknown radius.
 
     Parameters
     ----------
     arc : float
-        φ, rad, above zero.
+        Arc φ, rad, above zero.
     frames : int
         n.
     noise : float
         Standard deviation of each coordinate, m.
     known_radius : bool
-        The radius is known and not estimated.
+        Whether the radius is known and not estimated.
     """
     s = float(np.sinc(arc / (2.0 * np.pi)))
     c = float(np.sinc(arc / np.pi))

@@ -1,7 +1,7 @@
 """Tests of two claims about three-frame centers in the source of the study.
 
-The source (Akbarifar et al. 2021) recommends to repeat movements with small angles α and to average
-the results. It also states that the distance r of the marker has no effect unless the noise is
+The source (Akbarifar et al. 2021) recommends repeating movements with small angles α and averaging
+the results. It also states that the distance r of the marker has an effect only if the noise is
 large relative to r.
 """
 
@@ -25,22 +25,24 @@ STEPS_RAD = np.deg2rad([10.0, 20.0, 30.0, 45.0])
 RADII_M = np.array([0.03, 0.04, 0.06, 0.07, 0.08, 0.1, 0.2])
 """Distances r of the marker from the center, m."""
 LARGE_NOISE_M = 0.005
-"""Noise in the runs with varied radius, m: the largest noise in the source."""
+"""Noise in the runs with varied radius, m, which is the largest noise in the source."""
 _BLOCKS = 40
 _RUNS = 40_000
 
 
 class Repetition(NamedTuple):
-    """Median error over α of two ways to average repetitions, m, shape (len(STEPS_RAD),)."""
+    """Median error of two ways to average repetitions, by α, m, shape (len(STEPS_RAD),)."""
 
     mean_of_centers: Array
-    """The center is computed in every repetition, and the centers are averaged."""
+    """Error if the center is computed in every repetition, and the centers are averaged."""
     center_of_means: Array
-    """The marker positions are averaged over the repetitions, and the center is computed once."""
+    """Error if the marker positions are averaged over the repetitions, and the center is computed
+    once.
+    """
 
 
 def average_repetitions(setup: StudySetup) -> Repetition:
-    """Return the errors after averaging `setup.repeats` repetitions, medians of 40 simulations."""
+    """Return the median errors after averaging `setup.repeats` repetitions, in 40 simulations."""
     rng = np.random.default_rng(setup.seed)
     found = []
     for step in STEPS_RAD:
@@ -55,8 +57,8 @@ def average_repetitions(setup: StudySetup) -> Repetition:
 def effect_of_radius(setup: StudySetup) -> Array:
     """Return the error at each of `RADII_M`, divided by the error at the largest radius.
 
-    The error is its 95th percentile, because its mean square is not finite. The noise is
-    `LARGE_NOISE_M`, and the step is the fixed step of the setup.
+    The result uses the 95th percentile of the error, because the mean square is not finite. The
+    noise is `LARGE_NOISE_M`, and the step is the fixed step of the setup.
     """
     rng = np.random.default_rng(setup.seed)
     drawn = rng.normal(0.0, LARGE_NOISE_M, (_RUNS, 3, 2))

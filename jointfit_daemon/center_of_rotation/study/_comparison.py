@@ -1,4 +1,4 @@
-r"""Comparison of the three-frame solution with geometric methods at the same range of motion.
+r"""Comparison of the three-frame solution with geometric methods, for the same range of motion.
 
 Two markers of a rigid body rotate by 2α. Both are at the same distance from the center, `APART_RAD`
 apart. Methods that need two frames use the first and the last frame.
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 APART_RAD = np.pi / 3.0
 """Angle between the two markers about the center, rad."""
 _LEAST_TURN = 1e-12
-"""Rotation that counts as rounding, rad."""
+"""Rotation below which it counts as a rounding error, rad."""
 
 
 def bisector_center(points: ArrayLike) -> Array:
@@ -33,8 +33,9 @@ def bisector_center(points: ArrayLike) -> Array:
     .. math:: \min_c \sum_{k,a<b} \left[ (p_{kb} - p_{ka})^T c
               - \tfrac12 (|p_{kb}|^2 - |p_{ka}|^2) \right]^2
 
-    over markers k and pairs of frames a, b, with p the marker positions. Two markers in two frames
-    give Reuleaux's construction, and one marker in three frames gives `three_frame_center`.
+    The sum is over markers k and pairs of frames a, b, and p are the marker positions. For two
+    markers in two frames the result is Reuleaux's construction. For one marker in three frames it
+    is `three_frame_center`.
 
     Parameters
     ----------
@@ -67,8 +68,8 @@ def rotation_pole(first: ArrayLike, second: ArrayLike) -> Array:
 
     .. math:: c = (\bar b - R \bar a) (I - R)^{-1}
 
-    in complex numbers, with R the rotation of the least-squares rigid fit of the marker sets a and
-    b, and :math:`\bar a`, :math:`\bar b` their means.
+    in complex numbers, where R is the rotation of the least-squares rigid fit of the marker sets a
+    and b, and :math:`\bar a`, :math:`\bar b` are their means.
 
     Parameters
     ----------
@@ -92,8 +93,8 @@ def rotation_pole(first: ArrayLike, second: ArrayLike) -> Array:
 def compare_methods(setup: StudySetup) -> Mapping[str, Array]:
     """Return the median error of each method over α, m, shape (len(setup.steps),).
 
-    The result is a median because some errors have no finite mean square. Radius, noise, number of
-    runs and seed are those of the setup.
+    The result is a median because some errors have no finite mean square. The setup contains
+    radius, noise, number of runs and seed.
     """
     rng = np.random.default_rng(setup.seed)
     found: dict[str, list[float]] = {}

@@ -1,7 +1,8 @@
 """The orientation-aided fit for many runs at once, for the Monte Carlo study.
 
-Cost function, start and guard are those of `planar.oriented_estimate`. The arithmetic is arranged
-for thousands of short movements with equally many frames and evenly growing angles.
+Cost function, start and guard are the same as in `planar.oriented_estimate`. The computation is
+optimized for thousands of short movements with the same number of frames and evenly increasing
+angles.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _TOLD = AngleNoise()
 _STEPS = 12
 _LEAST_NOISE_M = 1e-6
 _STUCK = 1e3
-"""Damping above which the descent of a run ends."""
+"""Damping above which the iteration of a run ends."""
 
 
 class _Weights(NamedTuple):
@@ -63,7 +64,7 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     theta = np.broadcast_to(angles, points.shape[:-1]).reshape(-1, n)
     circles = fit_circles(points.reshape(-1, n, 2))
 
-    # start: least squares of z = c + w exp(iθ) as (x, y, |w|, arg w), shape (runs, 4)
+    # start at the least-squares solution of z = c + w exp(iθ), as (x, y, |w|, arg w), (runs, 4)
     turn = np.exp(1j * theta)
     away = turn - turn.mean(axis=-1, keepdims=True)
     w = (z * away.conj()).sum(axis=-1) / (np.abs(away) ** 2).sum(axis=-1)
@@ -76,12 +77,12 @@ def oriented_centers(points: Array, angles: Array, interval: float = 0.02) -> Ar
     noise = np.maximum(noise, _LEAST_NOISE_M)
     found, H = start, np.zeros((len(z), 4, 4))
 
-    # the scale error uses angles without noise, which grow evenly from frame to frame
+    # the scale error uses angles without noise, which increase evenly from frame to frame
     values, U = _wandering(n, interval)
     even = np.arange(n) - 0.5 * (n - 1)
     g = _TOLD.gain * np.outer(theta @ even, even) / (even @ even)
 
-    for _ in range(2):  # the angular noise is computed at a fixed radius; two passes suffice
+    for _ in range(2):  # the angular noise depends on the radius
         radius = np.maximum(found[:, 2], 0.01)
         d = 1.0 / (values + (noise / radius)[:, None] ** 2)
         h = ((g @ U) * d) @ U.T
@@ -101,7 +102,7 @@ def _wandering(n: int, interval: float) -> tuple[Array, Array]:
 
 
 class _Runs(NamedTuple):
-    """Data of the runs that are constant during the descent."""
+    """Data of the runs that are constant during the iteration."""
 
     z: Complex
     theta: Array
@@ -110,7 +111,7 @@ class _Runs(NamedTuple):
     diagonal: Array
     """Diagonal of M, shape (runs, n)."""
     rho0: Array
-    """Radius at which M is computed, shape (runs,)."""
+    """Radius with which M is computed, shape (runs,)."""
 
     def only(self, i: NDArray[np.intp]) -> _Runs:
         """Return the data of the selected runs."""
