@@ -28,9 +28,9 @@ async def run(gateway: Gateway) -> Outcome:
 
 SCENARIO = Scenario(
     title="network to the broker that loses 30 % of the segments",
-    reported="not a fault until poses are dropped: `dropped` of the link",
+    reported="not a fault until poses are dropped; then `dropped` of the link",
     continues="everything; poses arrive late",
-    counted="poses: `dropped` of the link",
+    counted="poses; counter `dropped` of the link",
     run=run,
     noticed_limit_s=1.0,
     recovered_limit_s=2.0,

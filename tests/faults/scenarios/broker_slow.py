@@ -33,10 +33,10 @@ async def run(gateway: Gateway) -> Outcome:
 
 
 SCENARIO = Scenario(
-    title="slow way to the broker",
+    title="slow connection to the broker",
     reported="`dropped` and `queued` of the link in `bridge/health`",
     continues="acquisition, fusion, recording; the newest poses; memory grows by less than 16 MB",
-    counted="poses: `dropped` of the link",
+    counted="poses; counter `dropped` of the link",
     run=run,
     noticed_limit_s=20.0,
     recovered_limit_s=2.0,

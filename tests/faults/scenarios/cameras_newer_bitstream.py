@@ -32,7 +32,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 
 SCENARIO = Scenario(
-    title="camera software with a bitstream newer than known",
+    title="camera software with a newer bitstream than the driver knows",
     reported="`bridge/event`, with the remedy",
     continues="poses from the sensors; frames as far as they can be decoded",
     counted="`corrupt` of the device",

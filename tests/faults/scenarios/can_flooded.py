@@ -37,10 +37,10 @@ async def run(gateway: Gateway) -> Outcome:
 
 
 SCENARIO = Scenario(
-    title="CAN bus at full load by strangers",
+    title="CAN bus at full load from other devices",
     reported="not a fault of the sensor",
     continues="poses from all sensors",
-    counted="the figure counts samples that were sent but not received",
+    counted="samples; the figure is the number of samples that were sent but not received",
     run=run,
     noticed_limit_s=1.0,
     recovered_limit_s=0.5,

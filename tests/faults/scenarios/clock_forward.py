@@ -39,9 +39,9 @@ def offset_s(gateway: Gateway) -> float:
 
 SCENARIO = Scenario(
     title="UNIX time set forward by an hour",
-    reported="noticed: times of poses follow",
+    reported="no report; *noticed* is the time until the stamps of poses follow",
     continues="everything",
-    counted="the figure counts `lost`, `late`, `dropped` and `restarts` of one sensor",
+    counted="nothing; the figure is `lost` + `late` + `dropped` + `restarts` of one sensor",
     run=run,
     noticed_limit_s=1.5,
     recovered_limit_s=1.5,

@@ -25,7 +25,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 SCENARIO = Scenario(
     title="daemon killed and started again",
-    reported="`bridge/state`, by the will of the connection",
+    reported="`bridge/state`, published by the broker (MQTT will)",
     continues="nothing",
     counted="at most a second of the recording, which is repaired",
     run=run,

@@ -30,7 +30,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 SCENARIO = Scenario(
     title="SIGTERM or SIGKILL at a random moment of the start",
-    reported="`bridge/state`; noticed: time to the exit",
+    reported="`bridge/state`; *noticed* is the time to the exit",
     continues="nothing",
     counted="nothing",
     run=run,

@@ -27,10 +27,10 @@ async def run(gateway: Gateway) -> Outcome:
 
 
 SCENARIO = Scenario(
-    title="sensor rebooted, its clock at zero",
+    title="sensor rebooted, with its clock at zero",
     reported="`bridge/event`",
     continues="poses from the other sensor",
-    counted="samples of the old clock that waited: `dropped` of the device",
+    counted="waiting samples of the old clock; counter `dropped` of the device",
     run=run,
     noticed_limit_s=1.5,
     recovered_limit_s=2.0,

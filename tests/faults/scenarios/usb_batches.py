@@ -28,9 +28,9 @@ async def run(gateway: Gateway) -> Outcome:
 
 SCENARIO = Scenario(
     title="USB adapter that delivers samples in pairs",
-    reported="not a fault: `jitter_us` of the device",
+    reported="not a fault; visible in `jitter_us` of the device",
     continues="poses from both sensors",
-    counted="late samples: `late` of the device",
+    counted="late samples; counter `late` of the device",
     run=run,
     noticed_limit_s=1.0,
     recovered_limit_s=1.0,

@@ -32,7 +32,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 
 SCENARIO = Scenario(
-    title="memory limit of the process of a fit",
+    title="process of a fit at its memory limit",
     reported="`calibration`, with the error",
     continues="poses with the calibration in force",
     counted="nothing: the phase can be repeated",

@@ -40,7 +40,7 @@ async def run(gateway: Gateway) -> Outcome:
 
 SCENARIO = Scenario(
     title="another device on the port",
-    reported="`bridge/event`, with what was found and the remedy",
+    reported="`bridge/event`, with the finding and the remedy",
     continues="poses from the other sensor",
     counted="nothing",
     run=run,
