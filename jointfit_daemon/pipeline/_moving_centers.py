@@ -25,36 +25,37 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, MocapFrame
 
 RATE_HZ = 20.0
-"""Number of camera frames used per second. Joints turn by a few degrees between two of these
+"""Number of camera frames used per second. Joints rotate by a few degrees between two of these
 frames."""
 PUBLISHED_HZ = 1.0
 MOVED_P = 1e-4
-"""Probability of a shift by chance below which a center is reported as moved.
+"""Probability of a shift by chance, below which a center is reported as moved.
 
-In an hour with a time constant of 20 s, 180 independent estimates are tested."""
+In one hour with a time constant of 20 s, 180 independent estimates are tested."""
 _UNSEEN_SD_M = 1.0
-"""Standard deviation along an unobserved direction, m: larger than any limb."""
+"""Standard deviation along an unobserved direction, m; it exceeds the size of any limb."""
 _SAME_DIRECTION = 0.3
-"""Singular value below which the unobserved directions of both centers are one direction."""
+"""Singular value below which the directions that the two centers did not observe are the same
+direction."""
 
 
 class MovingCenters:
     r"""Estimates the center of every joint from the last frames, and tests its shift.
 
-    Frames have the weight :math:`e^{-(t - t_k)/T}`. The shift δ between running and calibrated
-    center is tested with their covariances C,
+    A frame at time t_k has the weight :math:`e^{-(t - t_k)/T}`. The shift δ between running and
+    calibrated center is tested with the covariances C of both centers,
 
     .. math:: D^2 = \delta^T (C + C_{calibrated})^{-1} \delta \sim \chi^2_r,
 
-    over the r directions that both movements observed. Residuals that persist, such as residuals
-    from soft-tissue artefact, are counted once per posture in both covariances.
+    over the r directions that both movements observed. Some residuals persist, for example those
+    from soft-tissue artefact. They are counted once per posture in both covariances.
 
     Parameters
     ----------
     chain : Chain
         The limb.
     calibration : Calibration or None
-        The calibration in force; there are no estimates without one.
+        The calibration in force. Without a calibration, nothing is estimated.
     memory_s : float
         Time constant T, s; 0 disables the estimates.
     """
@@ -86,16 +87,17 @@ class MovingCenters:
         self._latest: list[tuple[RunningCenter, CenterEstimate | None]] = []
         self._before_ns: int | None = None
         self._seen: dict[str, tuple[int, int]] = {}
-        """Frames with both body parts of a joint, and the stamp of the last one, ns."""
+        """Number of frames that show both body parts of a joint, and stamp of the last such frame,
+        ns."""
 
     def serves(self, other: MovingCenters) -> bool:
-        """Return whether this object and a new one, `other`, have the same inputs."""
+        """Return whether this object has the same inputs as `other`, a new object."""
         return self._inputs == other._inputs
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[RunningCenters]:
         """Add one live mocap frame with its stamp; return the centers about once a second.
 
-        Each call estimates one joint at most, so that no frame of the limb waits for all joints.
+        Each call estimates at most one joint, so that no limb frame waits for all joints.
         """
         centers = self._centers
         if centers is None or not centers.joints or not self._frames.is_due(t_ns):
@@ -119,7 +121,7 @@ class MovingCenters:
     def _placed(
         centers: LiveJointCenters, found: RunningCenter, fit: CenterEstimate | None
     ) -> RunningCenter:
-        """Add the positions of the joint's markers in the newest frame."""
+        """Add the joint's position, which follows from the markers in the newest frame."""
         parts = centers.parts
         number = parts.names.index(found.segment)
         if fit is None or found.center is None or not parts.placed[number]:
@@ -145,7 +147,7 @@ class MovingCenters:
         if fit is None or fit.refused is not None:
             return found._replace(refused=live.refused or "the joint has hardly turned")
 
-        # Coordinates of the segment: origin at the mean of its markers, axes of the calibration.
+        # The origin of the segment is the mean of its markers, with the axes of the calibration.
         parts = centers.parts
         item = self._calibration.segment.get(segment)
         turn = np.eye(3) if item is None else rotation.to_matrix(np.array(item.q_static)).T
@@ -168,7 +170,7 @@ class MovingCenters:
 
 
 def _shift_test(fit: CenterEstimate, reference: CalibratedCenter) -> tuple[Array | None, float]:
-    """Return the shift in directions that both observed, m, and its probability by chance."""
+    """Return the shift along directions that both centers observed, m, and its probability."""
     unseen = np.concatenate((fit.unseen.reshape(-1, 3), np.reshape(reference.unseen, (-1, 3))))
     size, axes = np.linalg.svd(unseen, full_matrices=False)[1:]
     hidden = axes[size > _SAME_DIRECTION]

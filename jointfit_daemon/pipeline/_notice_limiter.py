@@ -1,11 +1,10 @@
 """Rate limit for notices about wires and clocks: one per minute, device and kind.
 
-A condition is reported when it begins, with its totals once a minute while it lasts, and when a
-minute passed without the condition. Lost samples are a warning above `MOST_LOST` of a minute's
-samples.
+A condition is reported when it begins. While it lasts, its totals are reported once a minute. Its
+end is reported after a minute without the condition. Lost samples are a warning if they exceed the
+share `MOST_LOST` of the samples in a minute.
 
-Invariant: the totals of all notices equal the totals of all events; no event is left out of the
-totals.
+Invariant: the sum of the totals in all notices equals the total number of events.
 """
 
 from __future__ import annotations
@@ -19,18 +18,18 @@ from jointfit_daemon.pipeline.events import Notice, NoticeKind, NoticeLevel
 from jointfit_daemon.pipeline.health import MOST_LOST
 
 QUIET_NS = 60_000_000_000
-"""Shortest time between two notices of one device and kind, ns. The counts in ``bridge/health``
-include all events."""
+"""Shortest time between two notices of the same device and kind, ns. The counts in
+``bridge/health`` include all events."""
 
 _NS_PER_S = 1_000_000_000
 
 STEP_NS = 2_000_000
-"""Smallest step of UNIX time that is reported, ns; the steps of NTP are smaller."""
+"""Smallest step of UNIX time that is reported, ns. The corrections by NTP are smaller."""
 
 _LEVELS = {"warning": NoticeLevel.WARNING, "error": NoticeLevel.ERROR}
-"""Level of the notice by kind of device event, if it is not ``info``."""
+"""Level of the notice for kinds of device events that are not ``info``."""
 _JUMPS = {"restart": NoticeKind.CLOCK, "clock": NoticeKind.CLOCK, "counter": NoticeKind.WIRE}
-"""Kind of the notice for device events whose notice contains their last text and their number."""
+"""Kind of the notice for device events that are summarized by their last text and their number."""
 _NO_DATA: Mapping[str, object] = MappingProxyType({})
 
 
@@ -43,21 +42,22 @@ class _Condition:
     amount: int = 0
     """Number of lost samples or discarded bytes."""
     lasting: bool = False
-    """Whether the condition was reported more than once, so that its end is reported, too."""
+    """Whether the condition was reported more than once. In this case its end is reported as
+    well."""
     text: str = ""
     data: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(slots=True)
 class NoticeLimiter:
-    """Collects corruption, gaps and clock jumps, and passes on all other events at once."""
+    """Collects corrupt bytes, gaps and clock jumps, and passes on all other events at once."""
 
     _conditions: dict[tuple[str, str], _Condition] = field(default_factory=dict)
 
     def add(
         self, now_ns: int, source: str, item: Corrupt | DeviceEvent, rate_hz: float
     ) -> list[Notice]:
-        """Add one event of a source with the sample rate `rate_hz`; return the notices due."""
+        """Add an event of a source with the sample rate `rate_hz`; return the due notices."""
         if isinstance(item, Corrupt):
             kind, amount, text, data = "corrupt", item.discarded, item.reason, _NO_DATA
         elif item.kind == "gap":
@@ -81,7 +81,7 @@ class NoticeLimiter:
         return [_notice(now_ns, key, condition)]
 
     def due(self, now_ns: int) -> list[Notice]:
-        """Return the collected notices whose quiet time has passed."""
+        """Return the collected notices whose waiting time has ended."""
         notices = []
         for key, condition in self._conditions.items():
             if now_ns - condition.reported_ns < QUIET_NS:
@@ -103,7 +103,7 @@ class NoticeLimiter:
 
 
 def _notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
-    """Return the notice of a condition, and begin its next quiet time."""
+    """Return the notice of a condition, and start the waiting time until its next notice."""
     source, kind = key
     level, elapsed_s = NoticeLevel.WARNING, (now_ns - condition.reported_ns) / _NS_PER_S
     if kind in _JUMPS:
@@ -118,8 +118,8 @@ def _notice(now_ns: int, key: tuple[str, str], condition: _Condition) -> Notice:
         if condition.lasting:
             text = f"{text}, in the last {elapsed_s:.0f} s"
         if kind == "gap":
-            # A first notice has no interval, so its samples are compared with the samples of a
-            # minute.
+            # There is no interval before the first notice, so lost samples are compared with one
+            # minute of data.
             interval_s = elapsed_s if condition.lasting else QUIET_NS / _NS_PER_S
             share = condition.amount / (condition.rate_hz * interval_s)
             text = f"{text} ({100 * share:.2f} %)" if condition.lasting else text

@@ -1,7 +1,7 @@
 """Comparison of the limb from the IMUs with the limb from the cameras, frame by frame.
 
-Invariant: every compared pair refers to one instant; limb states are interpolated to the exposure
-of the mocap frame.
+Invariant: both sides of a comparison refer to the same instant. Limb states are interpolated to the
+exposure of the mocap frame.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chain, LimbState, MocapFrame, Quaternion, Vector
 
 RMS_TIME_S = 10.0
-"""Time constant of the running RMS, s: a few gait cycles."""
+"""Time constant of the running RMS, s, equal to a few gait cycles."""
 MAX_GAP_NS = 50_000_000
-"""Longest time between two limb states for interpolation, ns: five frames at 100 Hz."""
+"""Longest time between two interpolated limb states, ns, equal to five frames at 100 Hz."""
 _WAITING = 64
-"""Largest number of mocap frames that wait for the next limb state: 0.25 s at 240 Hz."""
+"""Largest number of mocap frames that wait for the next limb state, equal to 0.25 s at 240 Hz."""
 _STATES = 64
-"""Number of limb states stored for mocap frames that arrive late: 0.6 s at 100 Hz."""
+"""Number of limb states stored for late mocap frames, equal to 0.6 s at 100 Hz."""
 
 
 class RunningRms:
@@ -73,9 +73,9 @@ class OpticalComparison:
     chain : Chain
         The limb.
     calibration : Calibration or None
-        The calibration in force; nothing is compared without one.
+        The calibration in force. Without a calibration, nothing is compared.
     rate_hz : float
-        Greatest number of compared mocap frames per second.
+        Largest number of compared mocap frames per second.
     """
 
     def __init__(self, chain: Chain, calibration: Calibration | None, rate_hz: float) -> None:
@@ -97,7 +97,7 @@ class OpticalComparison:
         self._waiting.append((t_ns, frame.number, synced, self._limb.read(frame)))
 
     def add_state(self, state: LimbState) -> list[OpticalState]:
-        """Add one limb state; return the comparisons that it completes."""
+        """Add one limb state; return the comparisons that this state makes possible."""
         if self._limb is None:
             return []
         self._states.append(state)
@@ -122,7 +122,7 @@ class OpticalComparison:
         return done
 
     def _states_around(self, t_ns: int) -> tuple[LimbState, LimbState] | None:
-        """Return the last state before and the first after an instant; None across a gap."""
+        """Return the limb states before and after an instant; None if they are too far apart."""
         after = None
         for state in reversed(self._states):
             if state.t_ns <= t_ns:
@@ -183,7 +183,7 @@ class OpticalComparison:
 
 
 def _segments_at(t_ns: int, before: LimbState, after: LimbState) -> list[Quaternion | None]:
-    """Return the segments between two states; None if one of them has no sensor data."""
+    """Return the segments interpolated between two states; None without sensor data in either."""
     share = _share(t_ns, before, after)
     return [
         interpolate_one(a.q_world_segment, b.q_world_segment, share)
@@ -194,9 +194,9 @@ def _segments_at(t_ns: int, before: LimbState, after: LimbState) -> list[Quatern
 
 
 def _position_at(t_ns: int, joint: int, pair: tuple[LimbState, LimbState] | None) -> Vector | None:
-    """Return a joint position between two states; None without the cameras' origin.
+    """Return a joint position interpolated between two states; None without the cameras' origin.
 
-    The first joint is the origin itself, so its position is not compared.
+    The cameras define the position of the first joint, so it is not compared.
     """
     if pair is None or joint == 0:
         return None

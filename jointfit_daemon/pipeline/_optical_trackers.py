@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def chain_tracker(
     rig: Rig, calibration: Calibration | None, before: ChainTracker | None
 ) -> ChainTracker | None:
-    """Return a tracker of the chain model with refined markers; `before` if that is equal."""
+    """Return a tracker of the chain model with refined markers; `before` if it is equivalent."""
     if rig.chain_model is None or rig.mqtt.chain_hz <= 0.0:
         return None
     stored = None if calibration is None else calibration.chain
@@ -36,7 +36,7 @@ def chain_tracker(
 
 
 def planar_tracker(rig: Rig, before: PlanarTracker | None) -> PlanarTracker | None:
-    """Return a tracker of a planar rig; `before` if that has equal settings."""
+    """Return a tracker of a planar rig; `before` if it has the same settings."""
     if not rig.chain.planar:
         return None
     rates = rig.mqtt.sticks_hz, rig.mqtt.sticks_memory_s
@@ -48,8 +48,8 @@ def planar_tracker(rig: Rig, before: PlanarTracker | None) -> PlanarTracker | No
 def label_monitor(
     rig: Rig, calibration: Calibration | None, before: LabelMonitor | None
 ) -> LabelMonitor | None:
-    """Return a monitor of the marker labels; `before` if that has equal settings."""
-    # the tracker of a chain model has its own monitor
+    """Return a monitor of the marker labels; `before` if it has the same settings."""
+    # The tracker of a chain model has its own monitor.
     if calibration is None or (rig.chain_model is not None and rig.mqtt.chain_hz > 0.0):
         return None
     if before is not None and before.serves(rig.chain, calibration):

@@ -1,7 +1,7 @@
 """Input events and outputs of the core, as frozen data.
 
-Invariant: only input events change the core. A log of the input events, fed to a new core, gives
-the same outputs.
+Invariant: only input events change the core. If a log of the input events is fed to a new core, the
+outputs are the same.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Configured:
-    """A configuration was loaded: the first event, and again at every reload."""
+    """A configuration was loaded. This is the first event, and it is repeated at every reload."""
 
     t_ns: int
     rig: Rig
@@ -45,7 +45,7 @@ class Configured:
 
 @dataclass(frozen=True, slots=True)
 class SourceOpened:
-    """A driver started; its chunks go to a new decoder."""
+    """A driver started. A new decoder processes its chunks."""
 
     t_ns: int
     source: str
@@ -55,7 +55,7 @@ class SourceOpened:
 class SourceClosed:
     """A driver ended because the device is lost, misconfigured, or removed by a reload.
 
-    Only a lost device is retried.
+    The driver is started again only if the device is lost.
     """
 
     t_ns: int
@@ -74,7 +74,7 @@ class ChunkArrived:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """Time passed without other events: a deadline of the core, or a heartbeat of the runner."""
+    """Time passed without other events: a deadline of the core, or the longest interval."""
 
     t_ns: int
 
@@ -83,7 +83,7 @@ class ReplyAddress(NamedTuple):
     """Topic and correlation data that a client requests for its reply (MQTT 5)."""
 
     topic: str | None = None
-    """Full topic name; None: ``bridge/response/COMMAND``."""
+    """Full name of the topic; None selects ``bridge/response/COMMAND``."""
     correlation: bytes | None = None
 
 
@@ -93,14 +93,14 @@ class Request:
 
     t_ns: int
     command: str
-    """Name of the request; the core processes ``calibrate``, ``static`` and ``mark``."""
+    """Name of the request. The core processes ``calibrate``, ``static`` and ``mark``."""
     transaction: str
     arguments: Mapping[str, object]
     reply_to: ReplyAddress = field(default_factory=ReplyAddress)
-    """Destination of the reply; not part of a recording."""
+    """Destination of the reply, which is not part of a recording."""
 
     def refusal(self, key: str, message: str) -> Reply:
-        """Return the reply that refuses this request because of one fault."""
+        """Return the reply that refuses this request because of a single fault."""
         return self.reply("error", {}, {"key": key, "message": message})
 
     def reply(
@@ -120,7 +120,7 @@ class CalibrationSelected:
     t_ns: int
     calibration: Calibration
     version: int
-    """Version from which it was loaded."""
+    """Version of the loaded calibration."""
     age_s: float
     """Time since the static pose of the calibration, s. The heading uncertainty grows with this
     time."""
@@ -129,7 +129,7 @@ class CalibrationSelected:
 
 @dataclass(frozen=True, slots=True)
 class JobFinished:
-    """The worker finished a job with a result, or failed with an error."""
+    """The worker finished a job with a result or an error."""
 
     t_ns: int
     job: int
@@ -138,7 +138,7 @@ class JobFinished:
 
     @property
     def failure(self) -> str | None:
-        """Reason why there is no usable result; None with a usable result."""
+        """Reason why there is no usable result; None if the result is usable."""
         if self.result is None:
             return self.error or "no result"
         return self.error or self.result.refused
@@ -146,7 +146,7 @@ class JobFinished:
 
 @dataclass(frozen=True, slots=True)
 class JobProgress:
-    """The worker reported the progress of a job; at most 5 a second."""
+    """The worker reported the progress of a job, at most five times a second."""
 
     t_ns: int
     job: int
@@ -167,9 +167,10 @@ class CalibrationStored:
 
 @dataclass(frozen=True, slots=True)
 class UnixOffset:
-    """UNIX time minus CLOCK_MONOTONIC: at the start, and whenever it changes.
+    """Offset of UNIX time from CLOCK_MONOTONIC, at the start and whenever the offset changes.
 
-    Both clocks have the same rate, so a change means that UNIX time was set or the host suspended.
+    Both clocks have the same rate. A change means that UNIX time was set, or that the host was
+    suspended.
     """
 
     t_ns: int
@@ -194,7 +195,7 @@ Event = (
 
 
 class NoticeKind(StrEnum):
-    """Subject of a notice."""
+    """Subject of a notice, which is its ``kind`` on ``bridge/event``."""
 
     DEVICE = "device"
     SENSOR = "sensor"
@@ -210,7 +211,7 @@ class NoticeKind(StrEnum):
     STATE = "state"
     """The state directory."""
     MARK = "mark"
-    """A label that a client set."""
+    """A label that a client set for an instant."""
 
 
 class NoticeLevel(StrEnum):
@@ -223,12 +224,12 @@ class NoticeLevel(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """A change worth reporting: published on ``bridge/event`` and logged."""
+    """A change to report, which is published on ``bridge/event`` and logged."""
 
     t_ns: int
     kind: NoticeKind
     id: str
-    """Name of the device, rig or phase."""
+    """Name of the device, rig or calibration phase."""
     text: str
     level: NoticeLevel = NoticeLevel.INFO
     data: Mapping[str, object] = field(default_factory=dict)
@@ -236,7 +237,7 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class DeviceStatus:
-    """Availability of one device; retained."""
+    """Availability of one device; published as a retained message."""
 
     id: str
     online: bool
@@ -244,7 +245,7 @@ class DeviceStatus:
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """Information that a device reported about itself; retained."""
+    """Information that a device reported about itself; published as a retained message."""
 
     id: str
     data: Mapping[str, object]
@@ -266,39 +267,40 @@ class CalibrationPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class CalibrationStatus:
-    """Phase and quality of the calibration; retained."""
+    """Phase and quality of the calibration; published as a retained message."""
 
     t_ns: int
     phase: CalibrationPhase
     text: str
     version: int | None = None
-    """Version of the calibration in force; None without a calibration or if it is not stored."""
+    """Version of the calibration in force; None if there is none, or if it is not stored."""
     quality: Mapping[str, object] = field(default_factory=dict)
-    """Quality of the phase that ended, or else of the calibration in force."""
+    """Quality of the result of the last phase; otherwise of the calibration in force."""
     kept: str | None = None
-    """Reason why a new result was rejected and the calibration in force remains in use."""
+    """Reason why a new result was rejected, so that the calibration in force stays in use."""
     refused: Mapping[str, object] = field(default_factory=dict)
     """Quality of the rejected result."""
     done: tuple[CalibrationPhase, ...] = ()
     """Recorded phases whose results the functional phase uses."""
     created_utc: str | None = None
-    """Date of the version in force, ISO 8601; None without a version or with an unknown date."""
+    """Date of the version in force, ISO 8601; None if there is no version or its date is
+    unknown."""
 
     @property
     def level(self) -> NoticeLevel:
-        """Level of the event: a rejected result or an aborted phase is a warning."""
+        """Level of the event: warning for a rejected result or an aborted phase."""
         aborted = self.phase == CalibrationPhase.ABORTED
         return NoticeLevel.WARNING if aborted or self.kept is not None else NoticeLevel.INFO
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationProgress:
-    """Progress of the running phase; at most 5 a second."""
+    """Progress of the running phase, at most five times a second."""
 
     t_ns: int
     phase: CalibrationPhase
     progress: float
-    """Share of the phase that is done, 0 to 1."""
+    """Completed share of the phase, 0 to 1."""
     text: str
     data: Mapping[str, object] = field(default_factory=dict)
 
@@ -308,29 +310,30 @@ class FitJob:
     """A job for the worker process."""
 
     job: int
-    """Number of the job, which is never reused."""
+    """Number of the job. Numbers are never reused."""
     work: CalibrationJob
 
 
 @dataclass(frozen=True, slots=True)
 class CancelJob:
-    """The result of this job is no longer needed: stop the worker."""
+    """The result of this job is no longer needed, so the worker must be stopped."""
 
     job: int
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationReady:
-    """A calibration to store; answered with ``CalibrationStored``."""
+    """A calibration that must be stored. The shell answers with ``CalibrationStored``."""
 
     calibration: Calibration
     keep_date: bool = False
-    """Whether ``created_utc`` is kept: the calibration is a copy of a stored one."""
+    """Whether ``created_utc`` is kept, because the calibration is a copy of a stored
+    calibration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """The reply to a request; every request has exactly one."""
+    """The reply to a request. Every request has exactly one reply."""
 
     command: str
     transaction: str

@@ -1,6 +1,6 @@
 """Health of the core at one instant: devices, clocks, lags, frames and online learning.
 
-Times are in nanoseconds; `jointfit_daemon.outputs.payloads` converts them for ``bridge/health``.
+Times are in nanoseconds. `jointfit_daemon.outputs.payloads` converts them for ``bridge/health``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ MOST_LOST = 0.01
 
 @dataclass(slots=True)
 class WireCounts:
-    """Counts since the daemon started; they continue when a reconnect replaces the decoder."""
+    """Counts since the daemon started. They continue if a reconnect replaces the decoder."""
 
     received: int = 0
     """Number of decoded samples."""
@@ -32,12 +32,12 @@ class WireCounts:
     """Number of runs of discarded bytes."""
     discarded_bytes: int = 0
     lost: int = 0
-    """Number of samples that the device counted but that did not arrive."""
+    """Number of missing samples, according to the sequence numbers of the device."""
     restarts: int = 0
-    """Number of restarts of the device, reported by the device or detected from its clock. A device
-    that was disconnected counts as restarted unless its clock continued."""
+    """Number of restarts of the device, reported by the device or detected from its clock. A
+    reconnected device counts as restarted unless its clock continued."""
     opened: int = 0
-    """Number of times the source was opened; all openings but the first are reconnects."""
+    """Number of times the source was opened. All openings after the first are reconnects."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,20 +48,20 @@ class ClockHealth:
     epoch: int
     """Number of restarts of the clock."""
     offset_ns: int | None
-    """Host minus device time."""
+    """Offset of host time from device time, ns."""
     skew_ppm: float | None
     sigma_ns: float | None
-    """Standard deviation of the last stamp."""
+    """Standard deviation of the last stamp, ns."""
     bound_ns: float | None
-    """Limit of the constant error; None without echoes."""
+    """Limit of the constant error of the stamps, ns; None if the device sends no echoes."""
     latency_ns: int
-    """Prior mean of the smallest delay from sample to arrival."""
+    """Prior mean of the smallest delay from sampling to arrival, ns."""
     latency_sd_ns: int
     jitter_ns: float | None
     delays: DelayPercentiles | None
-    """Quantiles of the delay from sampling instant to arrival in the last minute."""
+    """Quantiles of the delay from sampling to arrival in the last minute; None if unknown."""
     rate_hz: float | None
-    """Sample rate in the last minute."""
+    """Sample rate in the last minute, Hz; None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,15 +69,15 @@ class DeviceHealth:
     """Health of one device.
 
     Invariant: ``received = used + decimated + idle + late + duplicate + dropped + pending``.
-    Pending samples are counted elsewhere within a few sample periods.
+    Pending samples get another outcome within a few sample periods.
     """
 
     online: bool
     wire: WireCounts
     silent_ns: int | None
-    """Time since the last chunk; None before the first."""
+    """Time since the last chunk, ns; None before the first chunk."""
     samples: Mapping[str, int]
-    """Samples by outcome (CONVENTIONS.md), and ``pending``."""
+    """Number of samples by outcome (CONVENTIONS.md), and ``pending``."""
     clock: ClockHealth
     orientation_filter: object = None
     """Report of the orientation filter on the gateway; None without such a filter."""
@@ -100,13 +100,13 @@ class LagHealth:
     source: LagSource
     used_ns: float | None
     sigma_ns: float | None
-    """Standard deviation of the lag in use."""
+    """Standard deviation of the lag in use, ns; None if unknown."""
     found_by: str | None
-    """Method by which the calibration estimated the lag."""
+    """Method by which the calibration estimated the lag; None if it did not."""
     tracked: TrackedLag | None
     """Lag estimated during operation."""
     refused: str | None
-    """Reason why the last window gave no estimate of the lag."""
+    """Reason why the last window yielded no estimate of the lag; None if it yielded one."""
 
 
 class LearningState(StrEnum):
@@ -125,32 +125,32 @@ class LearningHealth:
     state: LearningState = LearningState.OFF
     reason: str | None = None
     stopped_ns: int | None = None
-    """Time since the last usable frame; None unless stopped."""
+    """Time since the last usable frame, ns; None unless learning is stopped."""
     kept: int = 0
     """Number of frames that wait for a refit."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameCounts:
-    """Frames since the daemon started."""
+    """Counts of frames since the daemon started."""
 
     sent: int = 0
     empty: int = 0
-    """Frames without any sensor."""
+    """Number of frames without any sensor."""
     skipped: int = 0
-    """Frames omitted after a stall of the process."""
+    """Number of frames omitted because the process was delayed."""
 
 
 @dataclass(frozen=True, slots=True)
 class CoreHealth:
-    """Health of the core; the default values are the health of a core without configuration."""
+    """Health of the core. The default values describe a core without configuration."""
 
     devices: Mapping[str, DeviceHealth] = field(default_factory=dict)
     phase: CalibrationPhase = CalibrationPhase.UNCALIBRATED
     version: int | None = None
     """Version of the calibration in force."""
     fusion: Mapping[str, object] = field(default_factory=dict)
-    """Report on the consistency of the sensors, in JSON form."""
+    """Report on the consistency of the sensors, as a JSON object."""
     lags: Mapping[str, LagHealth] = field(default_factory=dict)
     frames: FrameCounts = field(default_factory=FrameCounts)
     learning: LearningHealth = field(default_factory=LearningHealth)

@@ -1,7 +1,6 @@
-"""Interface with which a core reports that an event has passed a stage of processing.
+"""Interface through which a core reports that an event has passed a processing stage.
 
-Invariant: a core receives no data from its observer, so the outputs are the same as without an
-observer.
+Invariant: a core receives no data from its observer, so the observer does not affect the outputs.
 """
 
 from __future__ import annotations
@@ -10,10 +9,10 @@ from typing import Protocol
 
 
 class StageObserver(Protocol):
-    """Observer of the stages of a frame, for example with a clock, which a core does not have."""
+    """Observer of the processing stages of a frame. It may use a clock, which a core must not."""
 
     def mark_decoded(self, arrival_ns: int) -> None:
-        """Process the report that a chunk was decoded and its measurements were stamped.
+        """Record that a chunk was decoded and its measurements were stamped.
 
         Parameters
         ----------
@@ -22,14 +21,14 @@ class StageObserver(Protocol):
         """
 
     def mark_aligned(self) -> None:
-        """Process the report that the aligner released one or more frames."""
+        """Record that the aligner released one or more frames."""
 
     def mark_fused(self, deadline_ns: int | None) -> None:
-        """Process the report that the limb state of the next released frame was computed.
+        """Record that the limb state of the next released frame was computed.
 
         Parameters
         ----------
         deadline_ns
-            Deadline at which the frame was released, CLOCK_MONOTONIC ns; None if the chunk that was
-            decoded last completed it.
+            Deadline at which the frame was released, CLOCK_MONOTONIC ns. None means that the most
+            recently decoded chunk completed the frame.
         """

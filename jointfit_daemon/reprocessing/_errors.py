@@ -2,4 +2,4 @@
 
 
 class ReprocessingError(ValueError):
-    """A recording does not fit rig, calibration or request; the message gives the remedy."""
+    """The recording does not fit the rig, calibration or request; the message states the remedy."""

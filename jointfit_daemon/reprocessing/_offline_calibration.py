@@ -1,4 +1,4 @@
-"""Calibration from a recording: recorded requests start the same phases with new fits."""
+"""Calibration from a recording: the recorded requests start the same phases, with new fits."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class OfflineCalibration:
     """Result of the calibration phases of a recording."""
 
     rig: Rig
-    """The rig in force at the end."""
+    """The rig that was in force at the end."""
     calibration: Calibration | None
-    """Last new calibration, with the date of its result; None if no phase gave a calibration."""
+    """Last new calibration, with the date of its result; None if no phase yielded a calibration."""
     rejected: str | None
     """Reason why the last result was rejected; None if it was accepted."""
     quality: Mapping[str, object]
@@ -54,16 +54,16 @@ def calibrate_recording(
     Parameters
     ----------
     path
-        The recording; for a session in several parts, any part.
+        Path of the recording; any part of a session in several parts.
     rig
-        Rig instead of the recorded one, for example with other markers or another method.
+        Rig that replaces the recorded rig, for example with other markers or another method.
     report
-        Function called with the time since the beginning, s, and every status of the calibration.
+        Function that is called with the time since the beginning, s, and every calibration status.
 
     Raises
     ------
     ReprocessingError
-        The recording contains no calibration phase, or the rig does not fit it.
+        The recording contains no calibration phase, or does not fit the rig.
     ConfigError
         The recorded rig cannot be loaded, because a driver is not installed.
     ValueError, OSError
@@ -105,7 +105,7 @@ class _CalibrationRun:
     offset_ns: int | None = None
 
     def add_event(self, event: Event) -> None:
-        """Process an event before its outputs."""
+        """Process an event before its outputs are processed."""
         self.now_ns = event.chunk.t_ns if isinstance(event, ChunkArrived) else event.t_ns
         if isinstance(event, Configured):
             self.begin_ns = event.t_ns if self.rig is None else self.begin_ns
@@ -116,7 +116,7 @@ class _CalibrationRun:
             self.requests += 1
 
     def add_result(self, ready: CalibrationReady) -> None:
-        """Store a new calibration with the date of the session, as the daemon would."""
+        """Store a new calibration with the date of the session, as the daemon does."""
         self.calibration, self.rejected = ready.calibration, None
         if not ready.keep_date and self.offset_ns is not None:
             unix_s = (self.now_ns + self.offset_ns) / _NS_PER_S

@@ -1,8 +1,8 @@
-"""Processing of recorded events in a new core, optionally with changed rig, calibration or fits.
+"""Processing of recorded events in a new core, with optional changes of rig, calibration or fits.
 
-Invariant: without a change the core receives exactly the recorded events, so its outputs equal the
-outputs of the daemon, byte for byte. With a change, dependent results are computed again. Then no
-recorded fit, progress message or stored version reaches the core.
+Invariant: without changes, the core receives exactly the recorded events, so its outputs equal the
+outputs of the daemon, byte for byte. With changes, dependent results are computed again. In this
+case the core receives no recorded fit, progress message or stored version.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 
 _OF_A_SOURCE = (ChunkArrived, SourceOpened, SourceClosed)
 _FIT_EVENTS = (JobFinished, JobProgress, CalibrationStored)
-"""Events that contain results of fits."""
+"""Types of events that contain results of fits."""
 
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """Differences from the recorded run; by default none."""
+    """Changes relative to the recorded run; there are none by default."""
 
     rig: Rig | None = None
     """Rig that replaces the recorded rigs; None to use the recorded rigs."""
@@ -52,33 +52,33 @@ class Changes:
     """Calibration in force from the first to the last event; None to use the recorded
     calibrations."""
     compute_fits: bool = False
-    """Whether fits are computed again even without another difference."""
+    """Whether fits are computed again even if nothing else changes."""
 
     @property
     def any(self) -> bool:
-        """Whether the outputs may differ from the recorded ones."""
+        """Whether the outputs may differ from the recorded outputs."""
         return self.rig is not None or self.calibration is not None or self.compute_fits
 
 
 def process_events(
     events: Iterable[Event], changes: Changes | None = None, core: Core | None = None
 ) -> Iterator[tuple[Event, list[Output]]]:
-    """Yield every event that a core processes, and its outputs, in order.
+    """Yield each event that a core processes, together with its outputs, in order.
 
     Parameters
     ----------
     events
-        The events of a recording.
+        Events of a recording.
     changes
-        Differences from the recorded run.
+        Changes relative to the recorded run; None for no change.
     core
         A new core; None creates a core without observer.
 
     Raises
     ------
     ReprocessingError
-        The first event is not a configuration, or the rig or calibration of `changes` does not fit
-        the recording.
+        The first event is not a configuration, or `changes` contains a rig or calibration that does
+        not fit the recording.
     """
     core = core or Core()
     changed = None if changes is None or not changes.any else _ChangedRun(core, changes)
@@ -100,11 +100,11 @@ def process_events(
 
 
 class _ChangedRun:
-    """A core with substituted configurations and fits that are computed here.
+    """A core with replaced configurations, whose fits are computed in this process.
 
     With another rig, the result of a fit is delivered at the instant of its request. With the
-    recorded rig, the result is delivered at the recorded instant, so that all other inputs keep
-    their order.
+    recorded rig, it is delivered at the recorded instant, so that all other inputs keep their
+    order.
     """
 
     def __init__(self, core: Core, changes: Changes) -> None:
@@ -116,7 +116,7 @@ class _ChangedRun:
         self._now_ns = 0
 
     def feed(self, event: Event) -> Iterator[tuple[Event, list[Output]]]:
-        """Process one recorded event, or the event that replaces it."""
+        """Process one recorded event, or an event that replaces it."""
         if isinstance(event, _OF_A_SOURCE):
             if self._sources is not None and event.source in self._sources:
                 yield from self._pass_on(event)
@@ -128,20 +128,20 @@ class _ChangedRun:
             if isinstance(event, JobFinished) and waiting is not None and waiting.job == event.job:
                 yield from self._finish_job(waiting, event.t_ns)
         else:
-            # A given calibration remains in force, so requests for another calibration or for a fit
-            # are left out.
+            # A given calibration must stay in force. Requests for a fit or for another calibration
+            # are therefore omitted.
             requested = isinstance(event, Request) and event.command != "mark"
             other = requested or isinstance(event, CalibrationSelected)
             if self._changes.calibration is None or not other:
                 yield from self._pass_on(event)
 
     def finish(self) -> Iterator[tuple[Event, list[Output]]]:
-        """Deliver the result of a fit that the recorded run did not finish."""
+        """Deliver the result of a fit that was still running at the end of the recorded run."""
         if self._waiting is not None:
             yield from self._finish_job(self._waiting, self._now_ns)
 
     def _configuration(self, event: Configured) -> Configured | None:
-        """Return the configuration to use instead of a recorded one; None keeps the last."""
+        """Return the configuration that replaces a recorded one; None to keep the previous one."""
         changes, first = self._changes, self._sources is None
         rig = event.rig if changes.rig is None else changes.rig
         if not first and changes.rig is not None:
@@ -185,7 +185,7 @@ class _ChangedRun:
 
 
 def compute_fit(job: FitJob) -> FitResult:
-    """Run a fit in this process; the result passes through JSON like a worker's result."""
+    """Run a fit in this process. The result passes through JSON, as the result of a worker does."""
     from jointfit_daemon.calibration.phases import run_job  # noqa: PLC0415 - loads scipy
 
     text = orjson.dumps(run_job(job.work).to_dict(), option=orjson.OPT_SERIALIZE_NUMPY)
@@ -193,12 +193,12 @@ def compute_fit(job: FitJob) -> FitResult:
 
 
 def check_sources(recorded: Rig, wanted: Rig) -> None:
-    """Check that every source of `wanted` was recorded, with the same driver.
+    """Check that the recording contains every source of `wanted`, with the same driver.
 
     Raises
     ------
     ReprocessingError
-        A source is missing, or its bytes were recorded with another driver.
+        A source is missing, or its bytes were recorded with a different driver.
     """
     drivers = {source.id: source.driver for source in recorded.sources}
     known = ", ".join(f"{name} ({driver})" for name, driver in drivers.items())

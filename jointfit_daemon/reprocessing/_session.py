@@ -1,4 +1,4 @@
-"""Conversion of a recording to arrays, with the recorded or another configuration."""
+"""Conversion of a recording to arrays, with the recorded configuration or another one."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def load_session(
     Parameters
     ----------
     path
-        The recording; for a session in several parts, any part.
+        Path of the recording; any part of a session in several parts.
     rig
-        Rig that replaces the recorded rig; fits are computed again.
+        Rig that replaces the recorded rig. If it is given, fits are computed again.
     calibration
-        Calibration in force from the beginning, which replaces the recorded calibrations.
+        Calibration that replaces the recorded calibrations, from the beginning.
 
     Raises
     ------
@@ -96,7 +96,7 @@ def load_session(
 
 
 def _note_gaps(recording: Recording, collector: SessionCollector) -> Iterator[Event]:
-    """Yield the events of a recording; pass its gaps to the collector."""
+    """Yield the events of a recording, and pass its gaps to the collector."""
     for item in recording.messages():
         if isinstance(item, RecordingGap):
             collector.add_gap(item)
@@ -123,12 +123,12 @@ def recorded_rig(path: Path) -> Rig:
 
 
 def load_calibration(path: Path) -> Calibration:
-    """Return the calibration in a file: a stored version, or the output of `jointfit fuse fit`.
+    """Return the calibration of a file: a stored version, or the output of `jointfit fuse fit`.
 
     Raises
     ------
     ReprocessingError
-        The content cannot be used.
+        The content is not a usable calibration.
     OSError
         The file cannot be read.
     """

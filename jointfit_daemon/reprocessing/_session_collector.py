@@ -1,8 +1,9 @@
-"""Arrays of a session from the measurements and outputs of the core.
+"""Collection of the measurements and outputs of a core as arrays of a session.
 
-All series share the time axis of the cameras. The lag of each sensor, from the calibration in force
-at the end, is subtracted from its stamps. Rows whose instant is not after the previous row are left
-out, because a clock that settles or restarts may step back.
+All series share the time axis of the cameras. For this purpose, the lag of each sensor is
+subtracted from its stamps; the lags are those of the calibration in force at the end. Rows whose
+instant is not later than the previous row are omitted, because a clock that settles or restarts may
+step back.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _UNKNOWN_VECTOR = (nan,) * 3
 class _Rows:
     """Rows of numbers with increasing instants.
 
-    A number takes only eight bytes, because sessions last for hours.
+    Each number takes only eight bytes, because sessions may last for hours.
     """
 
     __slots__ = ("_t_ns", "_values", "_width")
@@ -52,7 +53,7 @@ class _Rows:
         self._width, self._t_ns, self._values = width, array("q"), array("d")
 
     def add(self, t_ns: int, *parts: Sequence[float]) -> None:
-        """Append a row of `parts` one after another, unless it is not after the last row."""
+        """Append `parts` as one row, unless its instant is not later than that of the last row."""
         if not self._t_ns or t_ns > self._t_ns[-1]:
             self._t_ns.append(t_ns)
             for part in parts:
@@ -64,12 +65,12 @@ class _Rows:
         return times
 
     def columns(self, first: int, count: int) -> Array:
-        """Return `count` columns, shape (n, count)."""
+        """Return `count` columns, from column `first` on, shape (n, count)."""
         table: Array = np.array(self._values).reshape(-1, self._width)[:, first : first + count]
         return table
 
     def known_columns(self, first: int, count: int) -> Array | None:
-        """Return `count` columns; None if all values are unknown."""
+        """Return `count` columns, from column `first` on; None if all values are unknown."""
         table = self.columns(first, count)
         return None if np.isnan(table).all() else table
 
@@ -153,7 +154,7 @@ class SessionCollector:
         self._events.append((gap.from_t_ns, event))
 
     def add_health(self, t_ns: int, rig: Rig, health: CoreHealth) -> None:
-        """Add clocks, sample counts and latency of the run as events at its end."""
+        """Add clocks, sample counts and latency of the run as events at the end of the session."""
         rates = {source.id: source.rate_hz for source in rig.sources}
         found = []
         for name, device in health.devices.items():
@@ -187,11 +188,11 @@ class SessionCollector:
         Parameters
         ----------
         rig
-            The last rig in force.
+            Rig in force at the end.
         lags_ns
             Lag of each sensor behind the cameras, ns.
         description
-            Origin of the data.
+            Description of the origin of the data.
         """
         begin_ns = self._begin_ns or 0
         timeline = sorted(self._events, key=lambda item: item[0])
@@ -271,7 +272,7 @@ def _joint_series(
 
 
 def _marker_series(frames: Sequence[tuple[int, MocapFrame]], begin_ns: int) -> MarkerSeries | None:
-    """Return the frames with all labels that occurred; a label missing in a frame is NaN."""
+    """Return the frames with all labels that occurred; labels missing in a frame are NaN."""
     layouts = dict.fromkeys(frame.layout for _, frame in frames)
     labels = tuple(dict.fromkeys(label for layout in layouts for label in layout.markers))
     if not labels:

@@ -1,8 +1,8 @@
 """Comparison of a replay with the recorded outputs, byte for byte.
 
-A recording that did not begin with the daemon starts with the configuration, but without the state
-of clocks and filters. Orientations of such a recording are compared with a tolerance after a
-warm-up instead, and the result contains this fact.
+If a recording did not begin with the start of the daemon, it contains the configuration, but not
+the state of clocks and filters. In this case, orientations are compared with a tolerance after a
+warm-up, and the result states this.
 """
 
 from __future__ import annotations
@@ -37,31 +37,32 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output
 
 WARM_UP_S = 20.0
-"""Time after which clocks and filters of a core that started later agree with the clocks and
-filters of the daemon, s."""
+"""Time after which the clocks and filters of the replay agree with those of the daemon, s, if the
+replay started later."""
 TOLERANCE_RAD = np.radians(1.0)
 """Largest difference of an orientation after the warm-up, rad."""
 TOLERATED_SHARE = 0.99
 """Share of the orientations that must be within the tolerance. Orientations near a lost frame may
-differ more."""
+differ by more."""
 _OUTPUT = "output/"
 _NS_PER_S = 1e9
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """The first output of a replay that differs from the recorded one."""
+    """The first output of a replay that differs from the recorded output."""
 
     t_s: float
     """Time since the beginning of the recording, s."""
     channel: str
     """Kind of output, such as ``output/state``."""
     key: str
-    """First key with another value, such as ``joints[1].angles[0]``; empty for the whole output."""
+    """First key whose value differs, such as ``joints[1].angles[0]``; empty for the whole
+    output."""
     recorded: str
     """Recorded value as JSON; ``none`` if the recording has no such output."""
     replayed: str
-    """Value of the replay; ``none`` if the replay has no such output."""
+    """Value in the replay as JSON; ``none`` if the replay has no such output."""
 
     def text(self) -> str:
         """Return the difference as a sentence."""
@@ -74,10 +75,10 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class TolerantComparison:
-    """Comparison of orientations for a replay that cannot be exact."""
+    """Comparison of orientations with a tolerance, for a replay that cannot be exact."""
 
     compared: int
-    """Number of orientations after the warm-up."""
+    """Number of compared orientations after the warm-up."""
     within: int
     """Number of orientations within the tolerance."""
     median_rad: float
@@ -96,20 +97,20 @@ class Verification:
     seconds: float
     """Duration of the recording, s."""
     compared: dict[str, int]
-    """Number of outputs that were equal, by their channel."""
+    """Number of equal outputs by channel."""
     difference: Difference | None = None
     gaps: tuple[str, ...] = ()
     """Missing parts of the recording, one sentence each."""
     until_s: float | None = None
-    """Time up to which outputs could be compared, s; None: to the end."""
+    """Time up to which outputs could be compared, s; None if all could be compared."""
     tolerant: TolerantComparison | None = None
-    """Comparison with a tolerance; None if bytes were compared."""
+    """Result of the comparison with a tolerance; None if bytes were compared."""
     program: str = PROGRAM
     """Name and version of the daemon that wrote the recording."""
 
     @property
     def passed(self) -> bool:
-        """Whether outputs could be compared, and all compared outputs agree."""
+        """Whether outputs could be compared and all of them agree."""
         if self.tolerant is not None:
             return self.tolerant.agrees
         return self.difference is None and sum(self.compared.values()) > 0
@@ -164,7 +165,7 @@ def verify_recording(path: Path) -> Verification:
     Parameters
     ----------
     path
-        The recording; for a session in several parts, any part.
+        Path of the recording; any part of a session in several parts.
 
     Raises
     ------
@@ -183,7 +184,7 @@ def verify_recording(path: Path) -> Verification:
 
 @dataclass(slots=True)
 class _ByteComparison:
-    """Outputs of the replay that are not compared yet, in order."""
+    """Outputs of the replay that are not yet compared, in order."""
 
     begin_ns: int | None = None
     now_ns: int = 0
@@ -191,7 +192,7 @@ class _ByteComparison:
     compared: dict[str, int] = field(default_factory=dict)
 
     def feed(self, core: Core, event: Event) -> Difference | None:
-        """Process an event; return a difference if earlier outputs are left."""
+        """Process an event; return a difference if outputs of earlier events are left over."""
         if self.expected:
             channel, data = self.expected[0]
             return Difference(self.seconds, channel, "", "none", data.decode("utf-8", "replace"))
@@ -203,7 +204,7 @@ class _ByteComparison:
         return None
 
     def compare(self, message: RecordedMessage) -> Difference | None:
-        """Compare a recorded output with the next one of the replay."""
+        """Compare a recorded output with the next output of the replay."""
         if not self.expected:
             recorded = message.data.decode("utf-8", "replace")
             return Difference(self.seconds, message.channel, "", recorded, "none")
@@ -279,27 +280,27 @@ def _first_difference(recorded: Any, replayed: Any, key: str) -> tuple[str, str,
 
 
 class _Orientations:
-    """Collects orientations of segments with their instants."""
+    """Collects the orientations of segments and their instants."""
 
     def __init__(self) -> None:
         self._rows: dict[str, tuple[list[int], list[Quaternion]]] = {}
 
     def add(self, name: str, t_ns: int, q: Quaternion | None) -> None:
-        """Append one orientation, unless it is unknown or not after the last one."""
+        """Append one orientation, unless it is unknown or not later than the last one."""
         stamps, rows = self._rows.setdefault(name, ([], []))
         if q is not None and (not stamps or t_ns > stamps[-1]):
             stamps.append(t_ns)
             rows.append(q)
 
     def add_replayed(self, outputs: Iterable[Output]) -> None:
-        """Append the limb states among the outputs of the replay."""
+        """Append the limb states that are among the outputs of the replay."""
         for output in outputs:
             if isinstance(output, LimbState):
                 for segment in output.segments:
                     self.add(segment.name, output.t_ns, segment.q_world_segment)
 
     def arrays(self, begin_ns: int) -> dict[str, tuple[Array, Array]]:
-        """Return instants, s, and orientations, shape (n, 4), by segment."""
+        """Return instants, s, shape (n,), and orientations, shape (n, 4), by segment."""
         return {
             name: ((np.array(stamps, dtype=np.int64) - begin_ns) / _NS_PER_S, np.array(rows))
             for name, (stamps, rows) in self._rows.items()
@@ -308,7 +309,7 @@ class _Orientations:
 
 
 def _verify_orientations(recording: Recording) -> Verification:
-    """Compare orientations after the warm-up; a gap restarts the warm-up."""
+    """Compare the orientations after the warm-up, which starts again after a gap."""
     core, begin_ns, now_ns, quiet_ns = Core(), None, 0, 0
     gaps: list[str] = []
     recorded, replayed = _Orientations(), _Orientations()
@@ -344,7 +345,7 @@ def _verify_orientations(recording: Recording) -> Verification:
 def _orientation_errors(
     recorded: dict[str, tuple[Array, Array]], replayed: dict[str, tuple[Array, Array]]
 ) -> Array:
-    """Return the angles between recorded and replayed orientations, rad; frames differ in phase."""
+    """Return the angles between recorded and interpolated replayed orientations, rad."""
     found = []
     for name, (t_s, q) in recorded.items():
         if name in replayed:

@@ -1,8 +1,8 @@
 """Stored calibrations of the running rig: loading, and writing in the background.
 
 Invariant: an unreadable calibration file does not stop the daemon. The core and a reload use the
-same calibration, even while a write is pending or has failed. A calibration that could not be
-written is written again.
+same calibration, even while a write is pending or after it failed. A failed write of a calibration
+is repeated.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event
 
 RETRY_S = 10.0
-"""Interval between attempts to write a calibration after a failure, s."""
+"""Interval between attempts to write a calibration after a failed attempt, s."""
 
 
 class LoadedCalibration(NamedTuple):
-    """The stored calibration of a rig."""
+    """Calibration of a rig, loaded from the store."""
 
     calibration: Calibration | None
     """Newest stored calibration; None if the store contains no usable calibration."""
     version: int | None
-    """Number of the calibration in the store."""
+    """Number of the calibration in the store; None without a calibration."""
     warnings: tuple[str, ...]
-    """Faults of the stored files, for the log and ``bridge/event``."""
+    """Descriptions of faults in the stored files, for the log and ``bridge/event``."""
 
 
 def store_of(rig: Rig) -> CalibrationStore:
@@ -55,7 +55,7 @@ def store_directory(rig: Rig) -> Path:
 
 
 def load_latest(rig: Rig) -> LoadedCalibration:
-    """Return the newest calibration for the chain and sensors of the rig; report its faults."""
+    """Return the newest calibration that fits the rig's chain and sensors; report faults."""
     try:
         latest = store_of(rig).latest()
     except (CalibrationFileError, OSError) as error:
@@ -74,7 +74,7 @@ def load_latest(rig: Rig) -> LoadedCalibration:
 
 
 def calibration_age_s(calibration: Calibration, now: datetime.datetime | None = None) -> float:
-    """Return the time since a calibration was stored, s; 0 if unknown or in the future."""
+    """Return the time since a calibration was stored, s; 0 for unknown and future dates."""
     try:
         then = datetime.datetime.fromisoformat(calibration.created_utc)
         elapsed = (now or datetime.datetime.now(datetime.UTC)) - then
@@ -84,12 +84,12 @@ def calibration_age_s(calibration: Calibration, now: datetime.datetime | None = 
 
 
 def save(rig: Rig, calibration: Calibration, *, keep_date: bool = False) -> int:
-    """Write a new version, by default with the present date, and return its number.
+    """Write a new version and return its number. By default, it gets the current date.
 
     Raises
     ------
     OSError
-        The medium is full, read-only or absent.
+        The storage medium is full, read-only or absent.
     """
     if keep_date:
         return store_of(rig).save(calibration)
@@ -102,16 +102,16 @@ def _with_present_date(calibration: Calibration) -> Calibration:
 
 
 class CalibrationWriter:
-    """Writes calibrations in a thread, one after another, and delivers `CalibrationStored`.
+    """Writes calibrations one after another in a thread, and feeds `CalibrationStored` to the core.
 
     Parameters
     ----------
     tasks : asyncio.TaskGroup
-        Owner of the task of every write.
+        Task group that owns the task of every write.
     deliver : callable
         Function that feeds one event to the core.
     report : callable
-        Function that reports a failed write; called once per reason.
+        Function that reports a failed write. It is called once for each reason.
     """
 
     def __init__(
@@ -130,12 +130,12 @@ class CalibrationWriter:
         """Reason why the calibration in force is not stored; None if it is stored."""
 
     def start(self, rig: Rig, calibration: Calibration, *, keep_date: bool = False) -> None:
-        """Write a new version to the store of the rig; `keep_date` as for `save`."""
+        """Write a new version to the store of the rig; `keep_date` is described at `save`."""
         self._unwritten, self._store = (rig, calibration, keep_date), rig.calibration_store
         self._begin(*self._unwritten)
 
     def retry(self) -> None:
-        """Write a calibration that could not be written before, if any, at once."""
+        """Write again, at once, a calibration whose write failed; do nothing if there is none."""
         if self._next_try is not None:
             self._next_try.cancel()
             self._next_try = None
@@ -149,7 +149,7 @@ class CalibrationWriter:
         task.add_done_callback(self._writing.discard)
 
     def stop(self) -> None:
-        """Cancel further attempts; a write in progress is completed."""
+        """Cancel further attempts. A write in progress is completed."""
         self._unwritten = None
         if self._next_try is not None:
             self._next_try.cancel()
@@ -174,8 +174,8 @@ class CalibrationWriter:
             if newest:
                 self._unwritten = self.fault = None
 
-        # If a newer calibration is in force or a reload selected another store, the number is not
-        # the version of the calibration in force.
+        # The number is not the version of the calibration in force if a newer calibration is in
+        # force, or if a reload selected another store.
         if newest and rig.calibration_store == self._store:
             self._deliver(CalibrationStored(time.monotonic_ns(), version, dated.created_utc))
 

@@ -1,7 +1,7 @@
-"""Feeds events and time to the core, and distributes its outputs to the sinks.
+"""Passes events and time to the core, and distributes the core's outputs to the sinks.
 
-Invariant: events are processed one at a time, in order of arrival, and each sink receives an event
-before the core. An exception of the core is a bug: it propagates and ends the daemon.
+Invariant: events are processed one at a time in the order of arrival, and each sink receives an
+event before the core. An exception of the core is a bug, which propagates and ends the daemon.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ if TYPE_CHECKING:
 LONGEST_TICK_INTERVAL_NS = 100_000_000
 """Longest time without an event for the core, ns."""
 _SHORTEST_WAIT_NS = 1_000_000
-"""Shortest wait for a deadline, ns: without it, a deadline that remains in the past would block the
-loop."""
+"""Shortest wait for a deadline, ns. Without it, a deadline that stays in the past would block the
+event loop."""
 _NS_PER_S = 1e9
 
 
 class CoreInterface(Protocol):
-    """Interface of the core: the methods that the shell uses."""
+    """Interface of the core, with the methods that the shell uses."""
 
     stages: StageObserver | None
-    """Observer of the stages of every frame."""
+    """Observer of the processing stages of every frame; None without observer."""
 
     @property
     def next_deadline_ns(self) -> int | None:
@@ -50,9 +50,9 @@ class CoreRunner:
     Parameters
     ----------
     core
-        The pure core.
+        The core, which has no clock and no I/O.
     clock
-        Source of the UNIX time offset that the core receives.
+        Clock that measures the UNIX time offset for the core.
     """
 
     def __init__(self, core: CoreInterface, clock: UnixClock) -> None:
@@ -75,7 +75,7 @@ class CoreRunner:
         self._sinks.remove(sink)
 
     def feed(self, event: Event) -> None:
-        """Pass one event to the sinks and to the core, and its outputs to the sinks."""
+        """Pass one event to the sinks and the core, then the core's outputs to the sinks."""
         for sink in self._sinks:
             sink.event(event)
 
@@ -88,8 +88,7 @@ class CoreRunner:
     def _arm(self) -> None:
         """Set the timer for the next tick.
 
-        A timer that is due earlier than necessary is not changed. When it ends, the deadline is
-        checked again.
+        A timer that is due too early is not changed. When it fires, the deadline is checked again.
         """
         due_ns = self._fed_ns + LONGEST_TICK_INTERVAL_NS
         deadline_ns = self.core.next_deadline_ns
@@ -118,14 +117,14 @@ class CoreRunner:
                 self._failed.set_exception(error)
 
     def _feed_unix_offset(self) -> None:
-        """Feed the offset of UNIX time at the start and after each change."""
+        """Pass the offset of UNIX time to the core, at the start and after each change."""
         offset_ns = self._unix_clock.offset_ns()
         if offset_ns != self._unix_offset_ns:
             self._unix_offset_ns = offset_ns
             self.feed(UnixOffset(time.monotonic_ns(), offset_ns))
 
     async def run(self) -> None:
-        """Feed ticks until cancelled; raise exceptions of the core."""
+        """Feed ticks to the core until cancelled, and raise exceptions of the core."""
         self._feed_unix_offset()
         self._arm()
         try:

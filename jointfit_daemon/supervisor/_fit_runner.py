@@ -1,7 +1,7 @@
-"""Runs fits in a worker process, so that a calibration fit does not delay acquisition.
+"""Runs calibration fits in a worker process, so that they do not delay acquisition.
 
-Invariant: one job runs at a time. The process of the job is killed when the job is cancelled or the
-daemon ends. Results pass through JSON, so a replay of a recording uses the same values.
+Invariant: one job runs at a time. The worker process is killed when its job is cancelled or the
+daemon ends. Results pass through JSON, so that a replay of a recording uses the same values.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 FIT_TIMEOUT_S = 300.0
-"""Longest duration of a fit, s. After this time the subject has probably removed the sensors."""
+"""Longest duration of a fit, s. Later the subject has probably removed the sensors."""
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-"""Environment of the worker, which numpy reads on import. More threads would use the CPU core that
-processes the sensors. They are also slower on small matrices: 11 s instead of 1 s."""
+"""Environment variables of the worker, which numpy reads on import. More threads would use the CPU
+core that processes the sensors. They are also slower on small matrices: 11 s instead of 1 s."""
 _LONGEST_LINE = 256 * 1024 * 1024
-"""Size of the longest result, bytes; a calibration of four sensors has about 1 MB."""
+"""Size of the largest result, bytes. A calibration of four sensors has about 1 MB."""
 _STDERR_TAIL = 4000
-"""Number of logged bytes of the worker's standard error."""
+"""Number of bytes of the worker's standard error that are logged."""
 
 
 class FitRunner:
@@ -45,7 +45,7 @@ class FitRunner:
     Parameters
     ----------
     tasks
-        Owner of the task of every job.
+        Task group that owns the task of every job.
     deliver
         Function that feeds one event to the core.
     """
@@ -55,12 +55,12 @@ class FitRunner:
         self._running: asyncio.Task[None] | None = None
 
     def start(self, job: FitJob) -> None:
-        """Start a job; a running job is cancelled."""
+        """Start a job, and cancel the running job if there is one."""
         self.cancel()
         self._running = self._tasks.create_task(self._run(job), name=f"fit {job.work.name}")
 
     def cancel(self) -> None:
-        """Kill the running job, if any; no result is delivered for it."""
+        """Kill the running job without delivering a result; do nothing if no job is running."""
         if self._running is not None:
             self._running.cancel()
             self._running = None
@@ -85,7 +85,7 @@ class FitRunner:
 
 
 async def _in_worker(job: FitJob, report: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
-    # Pickling minutes of samples takes tens of milliseconds, so it runs in a thread.
+    # Pickling minutes of samples takes tens of milliseconds, so it is done in a thread.
     data = await asyncio.to_thread(pickle.dumps, job.work)
     command = [sys.executable, "-m", "jointfit_daemon.supervisor.worker"]
     pipe = asyncio.subprocess.PIPE
@@ -101,8 +101,8 @@ async def _in_worker(job: FitJob, report: Callable[[dict[str, Any]], None]) -> d
         async with asyncio.TaskGroup() as pipes:
             answer = pipes.create_task(_answer(worker.stdout, report), name="fit result")
             printed = pipes.create_task(_read(worker.stderr), name="fit output")
-            # The pipe remains open, because the worker exits when the pipe closes. If the worker
-            # ended early, the missing answer is reported.
+            # The pipe must stay open, because the worker exits when it is closed. A worker that
+            # ended early causes a missing answer, which is reported.
             with contextlib.suppress(BrokenPipeError, ConnectionResetError):
                 if worker.stdin is not None:
                     worker.stdin.write(HEADER.pack(len(data)) + data)
@@ -123,7 +123,7 @@ async def _in_worker(job: FitJob, report: Callable[[dict[str, Any]], None]) -> d
 async def _answer(
     pipe: asyncio.StreamReader | None, report: Callable[[dict[str, Any]], None]
 ) -> dict[str, Any]:
-    """Return the worker's last line, and report earlier lines as progress; empty if none."""
+    """Report each line of the worker except the last as progress; return the last; {} if none."""
     found: dict[str, Any] = {}
     while pipe is not None and (line := await pipe.readline()):
         content = orjson.loads(line)

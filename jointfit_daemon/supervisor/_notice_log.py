@@ -1,4 +1,4 @@
-"""Log lines of the core's notices on sources, sensors and calibrations."""
+"""Log lines for the core's notices about sources, sensors and calibrations."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CLOSED_S = 1.0
-"""Longest time from the end of the permitted silence of a source to the report of its closing,
+"""Longest time between the end of a source's permitted silence and the report that it was closed,
 s."""
 LEVELS = {
     NoticeLevel.INFO: logging.INFO,
     NoticeLevel.WARNING: logging.WARNING,
     NoticeLevel.ERROR: logging.ERROR,
 }
-"""Level of the log line of a notice."""
+"""Log level for each level of a notice."""
 
 
 class NoticeLog:
@@ -45,7 +45,7 @@ class NoticeLog:
     Attributes
     ----------
     online
-        Ids of the connected sources.
+        Ids of the sources that are connected.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -55,12 +55,12 @@ class NoticeLog:
         self.online: set[str] = set()
 
     def configure(self, rig: Rig) -> None:
-        """Use another rig; sources that are not in this rig are no longer online."""
+        """Use another rig. Sources that it does not contain no longer count as online."""
         self._rig = rig
         self.online &= {source.id for source in rig.sources}
 
     def event(self, event: Event) -> None:
-        """Ignore the inputs of the core."""
+        """Do nothing, because inputs of the core are not logged."""
 
     def output(self, output: Output) -> None:
         """Write the log lines of one output."""
@@ -76,14 +76,14 @@ class NoticeLog:
                 (self.online.add if online else self.online.discard)(name)
 
     def write_due(self, now_s: float, *, stalled: bool) -> None:
-        """Write the delayed lines that are due at `now_s`; `stalled` postpones them."""
+        """Write the delayed lines that are due at `now_s`. `stalled` delays them further."""
         if stalled:
             self._outages.postpone(now_s)
         for notice in self._outages.due(now_s):
             _write(notice)
 
     def _write_status(self, status: CalibrationStatus) -> None:
-        """Write the line of a change of the calibration, with the file in which it is stored."""
+        """Log a change of the calibration, with the file in which it is stored."""
         phase, text, version = status.phase, status.text, status.version
         if phase == CalibrationPhase.FITTING:
             text = text.partition("; ")[0]  # the remarks are notices with their own lines
@@ -98,7 +98,7 @@ class NoticeLog:
         log.log(LEVELS[status.level], "%s: %s", title, text, extra=fields)
 
     def _closes_within(self, name: str) -> float | None:
-        """Return the time after which a silent source is closed, s; None if it is closed."""
+        """Return the time after which a silent source will be closed, s; None if it is closed."""
         if name not in self.online:
             return None
         settings = [source.settings for source in self._rig.sources if source.id == name]

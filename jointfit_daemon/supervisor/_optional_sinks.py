@@ -1,6 +1,6 @@
 """Sinks that rig.toml or a request enables: recording, metrics, Lab Streaming Layer (LSL).
 
-Invariant: a sink that cannot start is reported, and the daemon runs without this sink.
+Invariant: a sink that cannot start is reported, and the daemon runs without it.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ log = logging.getLogger(__name__)
 
 
 class Report(Protocol):
-    """Interface of the function that reports a state of the daemon."""
+    """Interface of the function that reports a state of the shell."""
 
     def __call__(self, kind: NoticeKind, text: str, level: NoticeLevel) -> None:
         """Publish and log the state."""
 
 
 def create_recorder(rig: Rig, core: CoreRunner, tasks: TaskGroup, report: Report) -> Recorder:
-    """Return the recorder; it records from now on if rig.toml asks for it, otherwise on request."""
+    """Return the recorder. It starts recording at once if rig.toml requests this."""
     settings = rig.recording or RecordingSettings(autostart=False)
     folder = state_directory() / settings.directory
     limits = RecordingLimits(
@@ -57,7 +57,7 @@ def create_recorder(rig: Rig, core: CoreRunner, tasks: TaskGroup, report: Report
 
 
 def create_spool(rig: Rig, link: Callable[[], MqttPublisher]) -> Spool | None:
-    """Return the spool of `rig`, if rig.toml has the table ``[mqtt.spool]``."""
+    """Return the spool of `rig` if rig.toml has the table ``[mqtt.spool]``; None otherwise."""
     settings = rig.mqtt.spool
     if settings is None:
         return None
@@ -66,7 +66,7 @@ def create_spool(rig: Rig, link: Callable[[], MqttPublisher]) -> Spool | None:
 
 
 def report_changes(before: Rig, rig: Rig, report: Report) -> None:
-    """Report the sinks whose changed settings need a restart of the daemon."""
+    """Report changed settings of sinks that take effect only after a restart of the daemon."""
     for key in ("recording", "metrics", "lsl", "mqtt.spool"):
         if attrgetter(key)(before) != attrgetter(key)(rig):
             text = f"a change of [{key}] requires a restart"
@@ -80,7 +80,7 @@ def start_metrics(
     tasks: TaskGroup,
     report: Report,
 ) -> None:
-    """Start the server of the metrics, if rig.toml names its address."""
+    """Start the server of the metrics if rig.toml configures its address."""
     if rig.metrics is None:
         return
     from jointfit_daemon.outputs.metrics import (  # noqa: PLC0415 - modules of an HTTP server
@@ -102,7 +102,7 @@ def start_metrics(
 
 
 def start_lsl(rig: Rig, core: CoreRunner, report: Report) -> None:
-    """Create streams of the Lab Streaming Layer, if rig.toml has the table ``[lsl]``."""
+    """Create the streams of the Lab Streaming Layer if rig.toml has the table ``[lsl]``."""
     if rig.lsl is None:
         return
     from jointfit_daemon.outputs.lsl import LslError, LslOutlet  # noqa: PLC0415 - rarely used

@@ -1,7 +1,7 @@
-"""Detects that the daemon has less processor time or bandwidth than its outputs need.
+"""Detection that the daemon has less processor time or bandwidth than its outputs need.
 
-Invariant: one cause has one warning. Messages that are dropped because the event loop was delayed
-cause no second warning.
+Invariant: each cause has one warning. If messages are dropped because the event loop was delayed,
+there is no second warning.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.outputs.mqtt import LinkHealth
 
 STALL_S = 0.5
-"""Delay of the event loop, s, above which sensors appear to have no data."""
+"""Delay of the event loop above which sensors appear to send no data, s."""
 STALL_REPEAT_S = 60.0
-"""Shortest interval between two warnings of stalls, s."""
+"""Shortest interval between two warnings about stalls, s."""
 DROPPED_SHARE = 0.2
 """Share of dropped MQTT messages in one health interval above which the daemon is overloaded."""
 FEWEST = 20
-"""Number of messages in one health interval below which the share is not evaluated."""
+"""Smallest number of messages in one health interval for which the share is evaluated."""
 REPEAT_S = 300.0
-"""Shortest interval between two warnings of dropped messages, s."""
+"""Shortest interval between two warnings about dropped messages, s."""
 _LIGHTEN = "lower output_rate_hz, sensors_hz or chain_hz, "
 
 
@@ -35,7 +35,7 @@ class OverloadMonitor:
         self._counts = (0, 0, 0)  # connections, sent and dropped messages at the last report
 
     def stall_warning(self, delay_s: float, now_s: float) -> str | None:
-        """Return the warning about an event loop delayed by `delay_s`, or None."""
+        """Return the warning for an event loop delayed by `delay_s`; None if no warning is due."""
         if delay_s <= STALL_S:
             return None
         self._stalled = True
@@ -57,10 +57,10 @@ class OverloadMonitor:
         return text
 
     def drop_warning(self, link: LinkHealth, now_s: float) -> str | None:
-        """Return the warning about dropped messages, or None; call once for each health report.
+        """Return the warning about dropped messages, or None. Call it once per health report.
 
-        An interval with a stall, or in which the connection to the broker was lost, is not
-        evaluated.
+        An interval is not evaluated if it contains a stall or a loss of the connection to the
+        broker.
         """
         stalled, self._stalled = self._stalled, False
         before, self._counts = self._counts, (link.connects, link.sent, link.dropped)

@@ -1,7 +1,7 @@
-"""The request `physical-test`: the guided test of one sensor, during its normal operation.
+"""The request `physical-test`: a guided test of one sensor during normal operation.
 
-Invariant: a test ends by itself if it is not completed, or if no client requests its state. Its
-chunks therefore do not accumulate.
+Invariant: a test ends by itself if it is not completed, or if no client requests its state. The
+chunks that it stores are therefore limited.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Event, Output, Reply, Request
 
 ABANDONED_S = 30.0
-"""Time without a request after which a test ends, s. A page requests the state every second."""
+"""Time without a request after which a test ends, s. A web page requests the state every second."""
 LONGEST_S = 300.0
-"""Longest duration of a test, s. A page may remain open during a test."""
+"""Longest duration of a test, s. The web page may stay open during a test."""
 OPEN_S = 20.0
-"""Longest time from opening to the first orientation, s; a search at other speeds is included."""
+"""Longest time from opening to the first orientation, s, including a search for the speed."""
 RUNNING_PHASES = ("align", "static", "functional", "fitting")
-"""Calibration phases that a restart of a device would spoil."""
+"""Calibration phases that the restart of a device would invalidate."""
 
 
 class TestedDaemon(Protocol):
-    """The operations of the daemon that a test uses."""
+    """Operations of the daemon that a test uses."""
 
     @property
     def rig(self) -> Rig:
         """The rig in force."""
 
     def health(self) -> BridgeHealth:
-        """Return counters and clocks of this instant."""
+        """Return the counters and clocks of this instant."""
 
     def subscribe(self, sink: Sink) -> None:
         """Pass all further events of the core to `sink`."""
@@ -49,11 +49,11 @@ class TestedDaemon(Protocol):
         """End the subscription of `sink`."""
 
     async def restart_device(self, name: str) -> None:
-        """Close the port of one device, and open the port again."""
+        """Close and reopen the port of one device."""
 
 
 class RunningPhysicalTest:
-    """One test in operation; a `Sink` of the core for the chunks of its sensor."""
+    """One running test; a `Sink` of the core that receives the chunks of its sensor."""
 
     def __init__(self, source: Source) -> None:
         self.test = PhysicalTest(source)
@@ -62,7 +62,7 @@ class RunningPhysicalTest:
         self._began_ns: int | None = None
 
     def event(self, event: Event) -> None:
-        """Store the chunks of the sensor; the loss of the sensor ends the test."""
+        """Store the chunks of the sensor; end the test if the sensor is lost."""
         name = self.test.source.id
         if isinstance(event, ChunkArrived) and event.source == name and self.failure is None:
             if self._began_ns is None:
@@ -78,16 +78,16 @@ class RunningPhysicalTest:
             self.failure = self.failure or event.text
 
     def _end_incomplete(self) -> None:
-        """End a test that exceeds its time limit, and discard its chunks."""
+        """End a test that exceeds its time limit, and delete its chunks."""
         if len(self.test.rests) < len(STEPS):
             self.failure = f"not completed within {LONGEST_S / 60:g} minutes: start the test again"
             self.test = PhysicalTest(self.test.source)
 
     def output(self, output: Output) -> None:
-        """Ignore the outputs of the core."""
+        """Do nothing, because a test does not use the outputs of the core."""
 
     async def state(self) -> dict[str, object]:
-        """Return the data of an answer; a complete test is evaluated in a thread."""
+        """Return the data of an answer. A complete test is evaluated in a thread."""
         test, step = self.test, len(self.test.rests)
         if step == len(STEPS) and self.result is None:
             result = await asyncio.to_thread(test.result)
@@ -115,7 +115,7 @@ def _state(
 
 
 class PhysicalTestHandler:
-    """Executes the request; at most one test runs.
+    """Executes the request. At most one test runs at a time.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ class PhysicalTestHandler:
         return request.reply("ok", await running.state())
 
     async def _start(self, source: Source) -> None:
-        """Open the sensor again, so that the test receives the sensor's replies to the driver."""
+        """Reopen the sensor, so that the test receives its replies to the driver."""
         self._stop()
         await self._daemon.restart_device(source.id)
         self._stop()  # events of a start at the same time

@@ -1,6 +1,7 @@
 """CPU share, memory and event loop delay of this process.
 
-Only ``/proc/self`` is read: systemd's ProcSubset=pid hides the other files of ``/proc``.
+The module reads only ``/proc/self``, because the systemd option ProcSubset=pid hides the other
+files in ``/proc``.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ from jointfit_daemon.outputs.payloads import ProcessHealth
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 _STATM = Path("/proc/self/statm")
 _DELAYS = 600
-"""Number of loop delays for the percentile: one minute at ten per second."""
+"""Number of stored loop delays for the percentile, equal to one minute at ten per second."""
 
 
 class ProcessStatistics:
-    """Statistics of this process since the last call of `health`."""
+    """Statistics of this process since the previous call of `health`."""
 
     def __init__(self) -> None:
         self._wall_s, self._cpu_s = time.monotonic(), time.process_time()

@@ -1,7 +1,7 @@
-"""Progress of the core, the condition for the watchdog of systemd.
+"""Progress of the core, on which the signal to the watchdog of systemd depends.
 
-Invariant: the watchdog signal stops only if samples that should produce limb states do not produce
-any. Missing or stuck devices do not trip the watchdog, since a restart would not help.
+Invariant: the signal stops only if samples that should produce limb states do not produce any.
+Missing or stuck devices do not trip the watchdog, because a restart would not help.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.health import CoreHealth
 
 _OUTCOMES_WITHOUT_STATE = ("late", "duplicate", "dropped", "idle")
-"""Outcomes of samples that do not contribute to a limb state."""
+"""Outcomes of samples that contribute to no limb state."""
 
 
 class ProgressMonitor:

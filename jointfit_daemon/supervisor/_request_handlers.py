@@ -1,6 +1,6 @@
-"""Handlers of the requests that the daemon executes itself, not the core.
+"""Handlers of the requests that the daemon executes itself instead of the core.
 
-Invariant: a handler that refuses a request has changed nothing.
+Invariant: a handler that refuses a request changes nothing.
 """
 
 from __future__ import annotations
@@ -34,34 +34,34 @@ if TYPE_CHECKING:
 
 
 class DaemonInterface(TestedDaemon, Protocol):
-    """Interface of the daemon: the operations that the handlers use."""
+    """Operations of the daemon that the handlers use."""
 
     def feed(self, event: Event) -> None:
         """Pass one event to the core."""
 
     @property
     def recorder(self) -> Recorder:
-        """The recorder."""
+        """The recorder of the daemon."""
 
     async def reload(self, before_move: Callable[[Rig], None] | None = None) -> Rig | None:
-        """Load rig.toml again and apply it; raise `ConfigError` for a faulty file."""
+        """Load rig.toml again and apply it. Raise `ConfigError` if the file is faulty."""
 
     async def set_output_rate(self, rate_hz: float) -> None:
-        """Apply the rig in force with another output rate."""
+        """Apply the rig in force with a different output rate."""
 
     async def settle_store(self) -> None:
         """Wait until no calibration is being written."""
 
 
 class RequestHandlers:
-    """The handlers of one daemon.
+    """Request handlers of one daemon.
 
     Parameters
     ----------
     daemon
         Daemon that executes the changes.
     publish
-        Function that publishes an answer before its handler ends.
+        Function that publishes an answer before its handler has ended.
     """
 
     def __init__(self, daemon: DaemonInterface, publish: Callable[[Reply], None]) -> None:
@@ -83,10 +83,10 @@ class RequestHandlers:
         }
 
     async def reload(self, request: Request) -> Reply | None:
-        """Load rig.toml again; the error of a faulty file lists its faults.
+        """Load rig.toml again. If the file is faulty, the error lists all its faults.
 
-        If the file moves the daemon to another broker or base topic, the answer is published before
-        the move, as ``accepted``.
+        If the file selects another broker or base topic, the answer ``accepted`` is published
+        before the daemon changes the connection.
         """
 
         def data(rig: Rig) -> dict[str, object]:
@@ -102,7 +102,7 @@ class RequestHandlers:
         return None if rig is None else request.reply("ok", data(rig))
 
     async def restart_device(self, request: Request) -> Reply:
-        """Close and open the port of one device; the topic ``availability`` reports the result."""
+        """Close and open the port of one device. The topic ``availability`` shows the result."""
         name = str(request.arguments["device"])
         known = [source.id for source in self._daemon.rig.sources]
         if name not in known:
@@ -113,7 +113,7 @@ class RequestHandlers:
         return request.reply("accepted", {"device": name})
 
     async def rate(self, request: Request) -> Reply:
-        """Change the output rate; refuse a rate above the rates of all sensors."""
+        """Change the output rate. A rate above the rates of all sensors is refused."""
         rig, rate_hz = self._daemon.rig, float(str(request.arguments["hz"]))
         fastest_hz = max(s.rate_hz for s in rig.sources if s.kind == "imu")
         fault = None
@@ -144,10 +144,10 @@ class RequestHandlers:
         return request.reply("ok", {"in_force": in_force, **found})
 
     async def use_calibration(self, request: Request) -> Reply | None:
-        """Load a stored version and pass it to the core, which answers."""
-        # Until the file of the calibration in force is written, this calibration has no number. A
-        # revert would find this file as the newest stored version, and would select the calibration
-        # that it should replace.
+        """Load a stored version and pass it to the core, which sends the answer."""
+        # The calibration in force has no version number until its file is written. A revert in the
+        # meantime would find this file as the newest version, and would select the calibration that
+        # it should replace.
         await self._daemon.settle_store()
         rig, in_force = self._daemon.rig, self._daemon.health().core.version
         version = request.arguments.get("version")
@@ -169,7 +169,7 @@ class RequestHandlers:
         return None
 
     async def record(self, request: Request) -> Reply:
-        """Start or stop the recording, or return its state; repeated requests change nothing."""
+        """Start or stop the recording, or return its state. Repeated requests have no effect."""
         recorder, action = self._daemon.recorder, request.arguments["action"]
         try:
             if action == "start":
@@ -187,7 +187,7 @@ class RequestHandlers:
         return request.reply("ok", {"directory": str(recorder.directory.absolute()), **found})
 
     async def selftest(self, request: Request) -> Reply:
-        """Check devices, clocks, store, broker and host."""
+        """Check devices, clocks, calibration store, broker and host."""
         rig = self._daemon.rig
         host = await asyncio.to_thread(read_host, store_directory(rig))
         return request.reply("ok", result_of(self_test(rig, self._daemon.health(), host)))

@@ -1,6 +1,7 @@
 """The checks of the request ``selftest``: devices, clocks, calibration, broker and host.
 
-Invariant: every check has one line in the result, and every line that is not ``ok`` has a remedy.
+Invariant: every check has one line in the result, and every line whose level is not ``ok`` contains
+a remedy.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
 LEAST_RATE = 0.95
 """Share of the configured sample rate below which a device is reported."""
 MOST_DROPPED = 0.05
-"""Ratio of dropped to sent messages above which the link is reported. At every start, poses are
-dropped before the connection is made."""
+"""Ratio of dropped to sent messages above which the connection is reported. At every start, some
+poses are dropped before the connection exists."""
 CLOCK_SIGMA_NS = 2e6
 """Standard deviation of a stamp above which a clock is reported, ns."""
 LOOP_DELAY_MS = 20.0
@@ -42,17 +43,17 @@ _THERMAL = Path("/sys/class/thermal")
 
 @dataclass(frozen=True, slots=True)
 class HostState:
-    """State of the host."""
+    """State of the host: disk, state directory and temperature."""
 
     store_fault: str | None
-    """Reason why the state directory cannot be written."""
+    """Reason why the daemon cannot write to the state directory; None if it can."""
     free_bytes: int | None
     temperature_c: float | None
     """Highest temperature of the processor, °C; None if unknown."""
 
 
 def read_host(folder: Path) -> HostState:
-    """Return the state of the host; `folder` contains the calibrations. Call it in a thread."""
+    """Return the state of the host. `folder` contains the calibrations. Call it in a thread."""
     fault, free = write_fault(folder), None
     for place in (folder, *folder.absolute().parents):
         if place.is_dir():
@@ -78,7 +79,7 @@ def self_test(rig: Rig, health: BridgeHealth, host: HostState) -> list[Finding]:
     health
         Counters and clocks of this instant.
     host
-        Disk, store and temperature.
+        State of disk, store and processor temperature.
     """
     return [
         *_devices(rig, health),
@@ -226,7 +227,7 @@ def _process(health: BridgeHealth, host: HostState) -> Iterator[Finding]:
 
 
 def result_of(checks: list[Finding]) -> dict[str, Any]:
-    """Return the data of the answer: the worst level, and one line for each check."""
+    """Return the data of the answer: the most severe level, and one line for each check."""
     levels = {check.level for check in checks}
     worst = next((level for level in ("error", "warning") if level in levels), "ok")
     return {

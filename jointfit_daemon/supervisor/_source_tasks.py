@@ -1,8 +1,9 @@
-"""One task per source: retries a lost device, pauses a misconfigured one, propagates bugs.
+"""One task per source, which retries a lost device and pauses a misconfigured one.
 
 Invariant: a source is opened in the core with its first chunk and closed when its driver ends. No
-source stops permanently: a misconfigured source is retried when its port has another device, after
-at most one minute, or at a reload. Any other exception of a driver is a bug and ends the daemon.
+source stops permanently. A misconfigured source is retried when another device appears on its port,
+at a reload, and after one minute at the latest. Any other exception of a driver is a bug and ends
+the daemon.
 """
 
 from __future__ import annotations
@@ -32,27 +33,29 @@ if TYPE_CHECKING:
 FIRST_RETRY_S = 0.1
 """Wait before the first retry, s. A device that was plugged in again is available at once."""
 LAST_RETRY_S = 1.0
-"""Longest wait before a retry, s: operation resumes within two seconds of plugging in."""
+"""Longest wait before a retry, s. Operation resumes within two seconds after a device is plugged
+in."""
 SERVER_RETRY_S = 0.25
-"""Longest wait before a retry of a source without a port, s. No file shows that the server is
-available again, and an attempt costs only a few datagrams."""
+"""Longest wait before a retry of a source without a port, s. No device file shows that the server
+is available again, and an attempt costs only a few datagrams."""
 WORKED_S = 1.0
-"""Duration of data after which the waits and pauses of a source start at their first values, s."""
+"""Duration of data after which waits and pauses of a source start at their first values again,
+s."""
 PAUSE_S = 60.0
-"""Longest pause of a misconfigured source, s: a device may be reconfigured without being unplugged.
-"""
+"""Longest pause of a misconfigured source, s. A device may be reconfigured without being
+unplugged."""
 PLUGGED_S = 0.05
-"""Interval between checks whether an absent port exists again before the next retry, s."""
+"""Interval between checks whether an absent port exists again, before the next retry is due, s."""
 SERVER_PAUSE_S = 5.0
-"""First pause of a misconfigured source without a port, s. No file shows that the configuration of
-the server was changed. Each further pause is twice as long, up to `PAUSE_S`, until the source has
-worked."""
+"""First pause of a misconfigured source without a port, s. No device file shows that the server's
+configuration was changed. Each further pause is twice as long, up to `PAUSE_S`, until the source
+has sent data."""
 CHECK_S = 0.5
-"""Interval between checks of the port of a paused source, s; each check is one call of stat(2)."""
+"""Interval between checks of the port of a paused source, s. Each check is one call of stat(2)."""
 
 
 class _SourceReporter:
-    """Reports the state of one source to the core: opened with its first chunk, closed once."""
+    """Reports the state of one source to the core: open at its first chunk, closed at its end."""
 
     def __init__(self, source: str, deliver: Callable[[Event], None], known: asyncio.Event) -> None:
         self._source, self._deliver, self._known = source, deliver, known
@@ -62,7 +65,7 @@ class _SourceReporter:
 
     @property
     def worked(self) -> bool:
-        """Whether the source has been open for `WORKED_S`."""
+        """Whether the source has sent data for `WORKED_S`."""
         return self._open and asyncio.get_running_loop().time() - self._opened_s > WORKED_S
 
     def emit(self, chunk: Chunk) -> None:
@@ -77,9 +80,9 @@ class _SourceReporter:
     def closed(
         self, reason: Literal["lost", "misconfigured"], text: str, *, absent: bool = False
     ) -> None:
-        """Report the end of the source; do not repeat the last report.
+        """Report the end of the source, unless it is the same as the last report.
 
-        The first report of an `absent` device remains true for all of its next attempts.
+        After the first report of an `absent` device, its further failed attempts are not reported.
         """
         self._known.set()
         repeated = text == self._reported or (absent and self._absent)
@@ -96,12 +99,12 @@ class _SourceReporter:
 
 
 class _RunningSource:
-    """State of one source, with its task.
+    """State of one source, including its task.
 
     Attributes
     ----------
     known
-        Set once the source has sent a chunk or was reported absent.
+        Event that is set when the source has sent a chunk or was reported absent.
     paused
         Whether the source is misconfigured and waits for another device.
     """
@@ -121,7 +124,7 @@ async def run_source(
     Parameters
     ----------
     source
-        The source.
+        Source to run.
     deliver
         Function that feeds one event to the core.
     state
@@ -129,7 +132,7 @@ async def run_source(
     """
     state = state or _RunningSource(source)
     reporter = _SourceReporter(source.id, deliver, state.known)
-    # one object for all attempts: it may store findings of failed attempts
+    # All attempts share one driver object, because it may store findings of failed attempts.
     driver = source.driver_class(source.settings)
     path = device_path(source.settings)
     longest_s, first_pause_s = LAST_RETRY_S, PAUSE_S
@@ -155,7 +158,7 @@ async def run_source(
         if reporter.worked:
             delay_s, pause_s = FIRST_RETRY_S, first_pause_s
         # The core logs the fault. The text does not contain the duration of the pause, so that a
-        # repetition is recognized.
+        # repeated fault has the same text.
         reporter.closed("misconfigured" if misconfigured else "lost", text, absent=absent)
         if misconfigured:
             state.paused = True
@@ -163,13 +166,14 @@ async def run_source(
             state.paused, delay_s = False, FIRST_RETRY_S
             pause_s = min(2 * pause_s, PAUSE_S)
 
-        # Full jitter prevents sources that are lost together from retrying together.
+        # A random wait (full jitter) prevents sources that are lost together from retrying
+        # together.
         await _wait_for_retry(path, random.uniform(0, delay_s))  # noqa: S311 - not security-relevant
         delay_s = min(2 * delay_s, longest_s)
 
 
 async def _wait_for_retry(path: str | None, delay_s: float) -> None:
-    """Wait for `delay_s`, or until a device appears at `path` if there is none."""
+    """Wait for `delay_s`. If no device exists at `path`, wait only until one appears."""
     absent = path is not None and _device_identity(path) is None
     loop = asyncio.get_running_loop()
     until_s = loop.time() + delay_s
@@ -180,7 +184,7 @@ async def _wait_for_retry(path: str | None, delay_s: float) -> None:
 
 
 async def _wait_for_change(path: str | None, device: object, pause_s: float) -> None:
-    """Wait until another device is at `path` than `device`; at most `pause_s`."""
+    """Wait until the device at `path` is no longer `device`; at most `pause_s`."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(pause_s):
             while _device_identity(path) == device:  # noqa: ASYNC110 - a file system has no event
@@ -188,9 +192,10 @@ async def _wait_for_change(path: str | None, device: object, pause_s: float) -> 
 
 
 def _device_identity(path: str | None) -> object:
-    """Return a value that differs between devices plugged in one after another.
+    """Return a value that differs between devices that are plugged in one after another.
 
-    The value is None without a device. A name without a slash is a network interface (``can0``).
+    The value is None if there is no device. A name without a slash is a network interface
+    (``can0``).
     """
     if path is None:
         return None
@@ -202,12 +207,12 @@ def _device_identity(path: str | None) -> object:
 
 
 class SourceTasks:
-    """The running sources of the rig in force.
+    """Tasks of the sources of the rig in force.
 
     Parameters
     ----------
     tasks : asyncio.TaskGroup
-        The root group. A bug in a driver ends this group.
+        Root task group, which a bug in a driver ends.
     deliver : callable
         Function that feeds one event to the core.
     """
@@ -217,9 +222,10 @@ class SourceTasks:
         self._running: dict[str, _RunningSource] = {}
 
     async def retire(self, sources: Iterable[Source]) -> None:
-        """Stop the sources that are not among `sources`; unchanged sources continue.
+        """Stop the sources that are not among `sources`. Unchanged sources continue.
 
-        Paused sources are stopped, too: the cause may have been removed outside rig.toml.
+        Paused sources are stopped as well, because their fault may have been corrected outside
+        rig.toml.
         """
         wanted = {source.id: source for source in sources}
         removed = [
@@ -244,12 +250,12 @@ class SourceTasks:
         )
 
     async def restart(self, name: str) -> None:
-        """Close the port of a running source, and open the port again with a new driver.
+        """Close the port of a running source, and open it again with a new driver.
 
         Raises
         ------
         KeyError
-            No source of this name is running.
+            No source with this name is running.
         """
         removed = self._running.pop(name)
         if removed.task is not None:
@@ -270,7 +276,7 @@ class SourceTasks:
 
 
 async def stop(tasks: Iterable[asyncio.Task[None]]) -> None:
-    """Cancel tasks and wait for their end; exceptions propagate to their task group."""
+    """Cancel tasks and wait until they end. Exceptions propagate to the task group of the tasks."""
     ending = list(tasks)
     for task in ending:
         task.cancel()

@@ -1,4 +1,4 @@
-"""The status line of the service in ``systemctl status``."""
+"""The status line of the service that ``systemctl status`` displays."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import Source
 
 _PLAIN_PHASES = (CalibrationPhase.CALIBRATED, CalibrationPhase.UNCALIBRATED)
-"""Phases whose names are displayed without the word calibration."""
+"""Phases that are displayed without the word "calibration"."""
 
 
 class FrameRateCounter:
-    """Rate of limb states between two calls."""
+    """Measures the rate of limb states between two calls."""
 
     def __init__(self) -> None:
         self._states, self._at_s = 0, float("nan")
@@ -37,7 +37,7 @@ def status_line(
     *,
     connected: bool,
 ) -> str:
-    """Return the state of the rig in one line: counts, and the names of missing sensors.
+    """Return the state of the rig in one line, with counts and the names of missing sensors.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def status_line(
     rate_hz
         Limb states per second; NaN if unknown.
     connected
-        Whether the broker is connected.
+        Whether the daemon is connected to the broker.
     """
     imus = [source.id for source in sources if source.kind == "imu"]
     missing = [name for name in imus if name not in online]

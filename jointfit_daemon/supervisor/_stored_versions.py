@@ -1,7 +1,7 @@
-"""Summaries of the stored calibrations, for the request ``calibrations``.
+"""Summaries of the stored calibrations for the request ``calibrations``.
 
-A summary reads the file without the checks that precede the use of a calibration, so that a list
-costs only milliseconds.
+A summary reads the file without the checks that are necessary before a calibration is used. A list
+therefore costs only milliseconds.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.limb_model import Calibration
 
 _ONLINE = ("rounds", "from_version", "before_deg", "after_deg")
-"""Names of the figures of the last refit by online learning."""
+"""Keys of the last refit by online learning in a summary."""
 _UNREADABLE = (OSError, ValueError, LookupError, TypeError, AttributeError, MalformedFileError)
 
 
@@ -35,32 +35,32 @@ class VersionSummary:
     method: str | None = None
     procedure: str | None = None
     restored_from: int | None = None
-    """Version of which this version is a copy."""
+    """Version from which this version was copied; None if it is not a copy."""
     online: dict[str, Any] | None = None
-    """Last refit by online learning in the models of this version, None without a refit. The keys
-    are number of refits since the functional phase, previous version, and errors before and
+    """Last refit of this version's models by online learning; None without a refit. The keys are
+    the number of refits since the functional phase, the previous version, and the errors before and
     after."""
     functional: bool | None = None
-    """Whether the calibration was determined from a movement in view of the cameras."""
+    """Whether the calibration includes a functional phase with the cameras; None if unknown."""
     usable: bool = False
-    """Whether the calibration belongs to the limb and the sensors of the rig."""
+    """Whether the calibration fits the limb and the sensors of the rig."""
     segments_deg: dict[str, float | None] = field(default_factory=dict)
     """RMS orientation error of each segment on held-out movement, by the method in use."""
     flexion_deg: dict[str, float | None] = field(default_factory=dict)
     """RMS flexion error of each joint on held-out movement, by the method in use."""
     fault: str | None = None
-    """Reason why the file cannot be read."""
+    """Reason why the file cannot be read; None if it can."""
 
 
 class StoredVersions:
-    """Lists and loads the stored calibrations of a rig; call the methods in a thread."""
+    """Lists and loads the stored calibrations of a rig. Call its methods in a thread."""
 
     def __init__(self) -> None:
         self._seen: dict[tuple[str, int], tuple[dict[str, Any], bytes]] = {}
-        """Summary and layout of files that were read: a stored version never changes."""
+        """Cache of summaries and limb layouts of files, because a stored version never changes."""
 
     def list(self, rig: Rig, count: int) -> dict[str, Any]:
-        """Return the newest `count` versions, the newest first, and the number of older ones."""
+        """Return the newest `count` versions, newest first, and the number of older versions."""
         store = store_of(rig)
         numbers = store.versions()[::-1]
         found = [asdict(self._summary(rig, number)) for number in numbers[:count]]
@@ -76,7 +76,7 @@ class StoredVersions:
         Raises
         ------
         CalibrationFileError
-            There is no such version, or its file cannot be used; the message has the remedy.
+            The version does not exist, or its file cannot be used; the message states the remedy.
         """
         try:
             return store_of(rig).load(version)
@@ -113,7 +113,7 @@ class StoredVersions:
 
 
 def _figures(content: dict[str, Any]) -> dict[str, Any]:
-    """Return the figures of one file that do not depend on the rig."""
+    """Return the values of a summary that do not depend on the rig."""
     quality, method = quality_payload(content["quality"]), content["method"]
     holdout, learned = quality.get("holdout") or {}, quality.get("online")
     return {

@@ -1,9 +1,9 @@
-"""Notification of systemd: readiness, reload, stop, watchdog and status line.
+"""Notification of systemd about readiness, reload, stop, watchdog and status line.
 
-Invariant: no method raises, and without systemd the methods have no effect.
+Invariant: no method raises an exception. Without systemd, the methods have no effect.
 
-Source: sd_notify(3): datagrams of ``KEY=VALUE`` lines to $NOTIFY_SOCKET; a leading ``@`` denotes an
-abstract socket.
+Source: sd_notify(3). A notification is a datagram of ``KEY=VALUE`` lines to $NOTIFY_SOCKET. A
+leading ``@`` denotes an abstract socket.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ TIMEOUT_S = 0.1
 
 
 class SystemdNotifier:
-    """Sends the state of the service to systemd, if it was started by systemd."""
+    """Sends the state of the service to systemd if systemd started the process."""
 
     def __init__(self) -> None:
         address = os.environ.get("NOTIFY_SOCKET", "")
@@ -38,7 +38,7 @@ class SystemdNotifier:
         self._send("READY=1")
 
     def reloading(self) -> None:
-        """Report that a reload begins; `ready` ends it."""
+        """Report that a reload begins. Call `ready` when it is complete."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
@@ -50,7 +50,7 @@ class SystemdNotifier:
         self._send("WATCHDOG=1")
 
     def status(self, text: str) -> None:
-        """Set the status line if it changed."""
+        """Set the status line if it has changed."""
         if text != self._status:
             self._status = text
             self._send(f"STATUS={text}")

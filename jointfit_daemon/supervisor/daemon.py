@@ -1,6 +1,6 @@
 """The daemon: one TaskGroup that passes events to the core and its outputs to the sinks.
 
-Invariant: the daemon ends by cancellation or by a bug only.
+Invariant: the daemon ends only by cancellation or because of a bug.
 
     task             purpose                                           end
     core time        feeds ticks to the core                           never
@@ -103,29 +103,29 @@ log = logging.getLogger(__name__)
 CHECK_S = 0.1
 """Interval between checks of the event loop's delay and of due health messages, s."""
 HEALTH_SOON_S = 0.5
-"""Delay of the health message after a device was lost or found or a recording began, s."""
+"""Delay of the health message after a device was lost or found, or a recording began, s."""
 KNOWN_S = 2.0
-"""Time after the start for which a silent source is awaited, s."""
+"""Longest wait after the start for the first data of a silent source, s."""
 FAREWELL_S = 0.5
-"""Longest wait for the broker to accept the last messages, s."""
+"""Longest wait until the broker accepts the last messages, s."""
 _STORING = ("calibrate", "static", "use-calibration")
-"""Names of requests whose results are stored. For these requests the state directory is checked at
-once."""
+"""Names of requests whose results are stored. They cause an immediate check of the state
+directory."""
 STOP_S = 4.8
-"""Longest duration of a stop, s; the documentation promises five seconds."""
+"""Longest duration of a stop, s. The documentation promises five seconds."""
 
 
 class Daemon:
-    """One rig in operation; a `Sink` of the core for jobs, calibrations and log lines.
+    """One running rig; a `Sink` of the core for jobs, calibrations and log lines.
 
     Parameters
     ----------
     config
-        Path of rig.toml, read again at every reload.
+        Path of rig.toml, which is read again at every reload.
     rig
-        Present content of rig.toml.
+        Current content of rig.toml.
     core
-        The pure core.
+        The core, which has no clock and no I/O.
     """
 
     def __init__(self, config: Path, rig: Rig, core: CoreInterface) -> None:
@@ -148,7 +148,7 @@ class Daemon:
         self._health_due_s = 0.0
         self._reload_requested = asyncio.Event()
         self._changes = asyncio.Lock()
-        """Lock that a change of the configuration or of a source holds: one at a time."""
+        """Lock that permits one change of the configuration or of a source at a time."""
         self._tasks: asyncio.TaskGroup
         self._sources: SourceTasks
         self._requests: RequestDispatcher
@@ -187,7 +187,7 @@ class Daemon:
     # --- start and stop ----------------------------------------------------------------------
 
     async def run(self) -> None:
-        """Run until cancelled; any other exception is a bug."""
+        """Run until cancelled. Any exception other than a cancellation is a bug."""
         loop = asyncio.get_running_loop()
         loop.set_exception_handler(self._loop_errors)
         loop.add_signal_handler(signal.SIGHUP, self._reload_requested.set)
@@ -241,9 +241,10 @@ class Daemon:
         self._systemd.ready()
 
     async def _check_state(self, *, asked: bool = True) -> None:
-        """Report a state directory without write access before a calibration needs it.
+        """Report a state directory without write access, before a calibration must be stored.
 
-        If neither a request nor a reload `asked` for the check, only changes are reported.
+        `asked` states that a request or a reload caused the check. Otherwise only changes are
+        reported.
         """
         folder = store_directory(self._rig)
         before, fault = self._state_fault, await asyncio.to_thread(write_fault, folder)
@@ -270,11 +271,11 @@ class Daemon:
             self._topics.output(replace(self._calibration, t_ns=now_ns, text=text))
 
     def _publish_log_line(self, level: str, name: str, text: str, suppressed: int) -> None:
-        # topics change with the broker
+        # The topics change with the broker, so they are looked up at each call.
         self._topics.publish_log_line(level, name, text, suppressed)
 
     def _report(self, kind: NoticeKind, text: str, level: NoticeLevel = NoticeLevel.INFO) -> None:
-        """Report a state of the shell in the log and on ``bridge/event``."""
+        """Report a state of the shell, in the log and on ``bridge/event``."""
         log.log(LEVELS[level], "%s: %s", kind, text, extra=journal_fields(kind, self._rig.name))
         notice = Notice(time.monotonic_ns(), kind, self._rig.name, text, level)
         self._topics.publish_notice(notice)
@@ -286,10 +287,10 @@ class Daemon:
     # --- outputs of the core -----------------------------------------------------------------
 
     def event(self, event: Event) -> None:
-        """Ignore the inputs of the core."""
+        """Do nothing, because the daemon does not use the inputs of the core."""
 
     def output(self, output: Output) -> None:
-        """Execute jobs of the core, and store its calibrations."""
+        """Execute the jobs of the core, and store its calibrations."""
         match output:
             case FitJob():
                 self._fits.start(output)
@@ -307,7 +308,7 @@ class Daemon:
     # --- requests ----------------------------------------------------------------------------
 
     def _receive_request(self, message: Incoming) -> None:
-        """Pass one request to the core, or publish the reply that refuses it."""
+        """Pass one request to the core or a handler, or publish the reply that refuses it."""
         request = parse_request(message, self._authenticator)
         if request is None:
             return
@@ -348,18 +349,18 @@ class Daemon:
         await self._calibrations.settle()
 
     async def set_output_rate(self, rate_hz: float) -> None:
-        """Apply the rig in force with another output rate, until the next reload."""
+        """Apply the rig in force with a different output rate, until the next reload."""
         async with self._changes:
             await self._change_to(replace(self._rig, output_rate_hz=rate_hz))
 
     @property
     def recorder(self) -> Recorder:
-        """The recorder."""
+        """The recorder of the daemon."""
         assert self._recorder is not None  # noqa: S101 - it exists before the first request
         return self._recorder
 
     async def restart_device(self, name: str) -> None:
-        """Close the port of one device, and open the port again."""
+        """Close and reopen the port of one device."""
         async with self._changes:
             if name in {source.id for source in self._rig.sources}:  # a reload may have removed it
                 await self._sources.restart(name)
@@ -393,7 +394,10 @@ class Daemon:
                     self._state_check = self._tasks.create_task(check, name="state check")
 
     def health(self) -> BridgeHealth:
-        """Return the health of this instant; process and latency as in the last health message."""
+        """Return the current health.
+
+        Process and latency values are those of the last health message.
+        """
         core = self._core.core.health(time.monotonic_ns())
         link = self._link.health(self._loop_errors.dropped)
         state = StateHealth(self._state_fault, self._calibrations.fault)
@@ -445,18 +449,18 @@ class Daemon:
         Parameters
         ----------
         before_move
-            Called with the new rig if it has another broker or base topic, before the connection
-            to the present broker ends.
+            Function that is called with the new rig if this rig has another broker or base topic.
+            It is called before the current connection ends.
 
         Returns
         -------
         Rig or None
-            The new rig; None if `before_move` was called.
+            The new rig; None if `before_move` was called, because the answer is already published.
 
         Raises
         ------
         ConfigError
-            The file is faulty; the running configuration remains in force.
+            The file is faulty. The running configuration stays in force.
         """
         async with self._changes:
             self._systemd.reloading()
@@ -486,7 +490,7 @@ class Daemon:
             raise ConfigError(str(self._config), [Fault("rig.toml", text)]) from error
 
     async def _change_to(self, rig: Rig) -> None:
-        """Apply `rig`; sources and connections without changes continue."""
+        """Apply `rig`. Sources and connections that do not change continue to run."""
         before, self._rig = self._rig, rig
         sinks.report_changes(before, rig, self._report)
         await self._sources.retire(rig.sources)
@@ -515,9 +519,9 @@ async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreInterface] =
     Parameters
     ----------
     config
-        Path of rig.toml, read again on SIGHUP.
+        Path of rig.toml, which is read again on SIGHUP.
     rig
-        Present content of rig.toml.
+        Current content of rig.toml.
     core
         Function that creates the core.
     """
@@ -534,8 +538,8 @@ async def run_daemon(config: Path, rig: Rig, core: Callable[[], CoreInterface] =
 
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop_once)
-        # If the event loop hangs, it calls no handler. This handler runs in any state, and the loop
-        # still receives the signal by its wake-up descriptor.
+        # If the event loop hangs, it calls no signal handler. This handler always runs, and the
+        # loop still receives the signal through its wake-up descriptor.
         signal.signal(number, lambda *_: limit.start())
     try:
         await Daemon(config, rig, core()).run()

@@ -12,15 +12,15 @@ from queue import SimpleQueue
 log = logging.getLogger(__name__)
 
 _REPORT_S = 0.15
-"""Longest time for the log line and the tracebacks of a forced end, s."""
+"""Longest time for the log line and the tracebacks before a forced end, s."""
 
 
 class ExitLimit:
     """Ends the process with an exit code if it still runs `seconds` after `start`.
 
-    A thread that resolves a host name, or a driver that does not return, cannot be interrupted. The
-    time limit runs in its own thread, since the event loop may be the part that hangs. This thread
-    is started first, because no thread can be started safely in a signal handler.
+    Some work cannot be interrupted: a thread that resolves a host name, or a driver that does not
+    return. The time limit has its own thread, because the event loop may hang. This thread is
+    started when the object is created, because no thread can be started safely in a signal handler.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class ExitLimit:
     code
         Exit code.
     activity
-        Name of the activity with the time limit, for the log.
+        Description of the activity with the time limit, for the log.
     """
 
     def __init__(self, seconds: float, code: int, activity: str) -> None:
@@ -38,18 +38,21 @@ class ExitLimit:
         threading.Thread(target=self._run, name=f"limit of {activity}", daemon=True).start()
 
     def start(self) -> None:
-        """Start the time limit; safe in a signal handler, and without effect when repeated."""
+        """Start the time limit.
+
+        It is safe in a signal handler, and a repeated call has no effect.
+        """
         self._started.put(True)
 
     def cancel(self) -> None:
-        """End the thread of the time limit, unless the limit was started."""
+        """End the thread of the time limit, unless the time limit is running."""
         self._started.put(False)
 
     def _run(self) -> None:
         if not self._started.get():
             return
         time.sleep(self._seconds)
-        # Standard error may be a pipe that no process reads, and its lock may be held permanently.
+        # Standard error may be a pipe that no process reads, so that its lock is never released.
         report = threading.Thread(target=self._report, daemon=True)
         report.start()
         report.join(_REPORT_S)

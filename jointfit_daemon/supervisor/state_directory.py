@@ -1,6 +1,6 @@
 """The state directory: exclusive lock, private permissions, and a check for write access.
 
-Invariant: the kernel holds the lock and releases it when the process ends, so no lock is stale.
+Invariant: the kernel owns the lock and releases it when the process ends, so no lock is stale.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 LOCK = "lock"
-"""Name of the lock file; it contains the process id of the daemon."""
+"""Name of the lock file, which contains the process id of the daemon."""
 PRIVATE_UMASK = 0o077
-"""Umask of the daemon: calibrations and recordings are personal data."""
+"""Umask of the daemon, because calibrations and recordings are personal data."""
 _DIRECTORY_MODE, _FILE_MODE = 0o700, 0o600
 _OWNED = ("calibrations", "recordings")
-"""Folders written by the daemon; other folders in the state directory may belong to other
+"""Folders that the daemon writes. Other folders in the state directory may belong to other
 programs."""
 WRITE_REMEDY = "check mount, permissions and free space, or set STATE_DIRECTORY"
 """Remedy for a directory that cannot be written."""
@@ -31,19 +31,20 @@ _HELD = (errno.EWOULDBLOCK, errno.EACCES)
 
 
 class StateDirectoryInUseError(Exception):
-    """Another daemon holds the lock; the message names its process."""
+    """Another daemon owns the lock; the message contains its process id."""
 
 
 def state_directory() -> Path:
-    """Return the folder of persistent data: $STATE_DIRECTORY (systemd), by default ./state."""
+    """Return the folder of persistent data: $STATE_DIRECTORY (set by systemd), or ./state."""
     return Path(os.environ.get("STATE_DIRECTORY", "state").split(":")[0])
 
 
 def lock_state(directory: Path) -> int | None:
-    """Lock `directory` for this process and return the descriptor that holds the lock.
+    """Lock `directory` for this process, and return the descriptor that owns the lock.
 
-    Returns None if no lock file can be created, because a directory without write access has no
-    state to protect. Some network file systems have no locks.
+    Return None if no lock file can be created, because a directory without write access contains no
+    state to protect. Also return None if the file system has no locks, as some network file systems
+    do.
 
     Raises
     ------
@@ -76,9 +77,10 @@ def lock_state(directory: Path) -> int | None:
 
 
 def lock_again(directory: Path) -> int | None:
-    """Lock `directory` as `lock_state` does, unless this process holds its lock (None).
+    """Lock `directory` as `lock_state` does; return None if this process already owns the lock.
 
-    The function is for a directory that was not writable at the start and therefore was not locked.
+    The function is used for a directory that was not writable at the start, and was therefore not
+    locked.
     """
     try:
         holder = (directory / LOCK).read_text(encoding="ascii", errors="replace").strip()
@@ -88,9 +90,9 @@ def lock_again(directory: Path) -> int | None:
 
 
 def make_private(directory: Path) -> None:
-    """Remove the permissions of group and others from the files of earlier daemons.
+    """Remove the permissions of group and others from files that earlier daemons created.
 
-    Only files of this user in the folders of the daemon are changed.
+    Only files of this user in the daemon's folders are changed.
     """
     for path in _written(directory):
         try:
@@ -103,7 +105,7 @@ def make_private(directory: Path) -> None:
 
 
 def _written(directory: Path) -> Iterator[Path]:
-    """Yield the files and folders of daemons, without links, and the directory itself."""
+    """Yield the directory, and the files and folders in it that daemons wrote, without links."""
     for name in _OWNED:
         for folder, _, files in os.walk(directory / name):
             yield Path(folder)
@@ -113,7 +115,7 @@ def _written(directory: Path) -> Iterator[Path]:
 
 
 def write_fault(directory: Path) -> str | None:
-    """Return the reason why no file can be written to `directory`; None if writing succeeds."""
+    """Return the reason why no file can be written to `directory`; None if it can be written."""
     probe = directory / f".probe-{os.getpid()}"
     try:
         directory.mkdir(mode=_DIRECTORY_MODE, parents=True, exist_ok=True)
@@ -127,5 +129,5 @@ def write_fault(directory: Path) -> str | None:
 
 
 def describe_write_error(error: OSError, directory: Path) -> str:
-    """Return a text with the directory and the reason why it cannot be written."""
+    """Return a text that names the directory and the reason why it cannot be written."""
     return f"{directory.absolute()}: {error.strerror or error}"

@@ -1,9 +1,9 @@
-"""The worker process: one fit, started as ``python -m jointfit_daemon.supervisor.worker``.
+"""The worker process, which runs one fit: ``python -m jointfit_daemon.supervisor.worker``.
 
-The worker reads a pickled job from standard input and writes JSON objects, one per line: any number
-of ``{"progress": …, "text": …}``, at most five a second, then ``{"result": …}`` or ``{"error":
-text}``. Everything else that a fit prints is redirected to standard error. The parent process
-leaves the input open; the worker exits when the input is closed.
+The worker reads a pickled job from standard input and writes JSON objects, one per line. It writes
+any number of ``{"progress": …, "text": …}``, at most five a second, and then ``{"result": …}`` or
+``{"error": text}``. Everything else that a fit prints is redirected to standard error. The parent
+process leaves the input open, and the worker exits when the input is closed.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.calibration import JobControl
 
 HEADER = struct.Struct("<Q")
-"""Format of the length of the pickled job, bytes."""
+"""Format of the length of the pickled job, in bytes."""
 _REPORT_S = 0.2
 """Shortest time between two reports of progress, s."""
 _NICE = 10
-"""Decrease of the priority, because acquisition has precedence."""
+"""Increase of the nice value, because acquisition has precedence."""
 
 
 def main() -> int:
-    """Run the one job that the parent sends."""
+    """Run the job that the parent process sends."""
     with contextlib.suppress(OSError):  # a system-call filter may refuse this
         os.nice(_NICE)
     answer_fd = os.dup(sys.stdout.fileno())
@@ -58,7 +58,7 @@ def main() -> int:
 
 
 def _control(answer_fd: int) -> JobControl:
-    """Return the time since now, and reports on a descriptor."""
+    """Return an object that measures the duration from now on and reports to a descriptor."""
     from jointfit_daemon.calibration import JobControl  # noqa: PLC0415 - as above
 
     began = reported = time.monotonic()

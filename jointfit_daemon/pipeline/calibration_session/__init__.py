@@ -1,4 +1,4 @@
-"""Calibration session: state machine, recording of the phases, stillness of a static pose."""
+"""Calibration session: state machine, recording of the phases, stillness in the static pose."""
 
 from jointfit_daemon.pipeline.calibration_session._session import CalibrationSession
 

@@ -1,6 +1,6 @@
-"""Recording of one calibration phase: trial, progress and instructions for the subject.
+"""Recording of one calibration phase: measurements, progress and instructions for the subject.
 
-The session decides when a phase starts, ends or is aborted.
+The calibration session decides when a phase starts, ends or is aborted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _NS = 1_000_000_000
 PROGRESS_NS = 200_000_000
-"""Interval of progress reports, ns. Five reports per second suffice for a progress bar."""
+"""Interval between progress reports, ns. Five reports per second suffice for a progress bar."""
 STATIC_TIMEOUT_S = 120.0
 """Time after which a static phase without stillness is aborted, s."""
 MOCAP = "the mocap system"
@@ -36,10 +36,11 @@ class PhaseRecording:
     Parameters
     ----------
     phase : CalibrationPhase
-        ``static`` ends after `wanted_s` of stillness, ``align`` after `wanted_s`, ``functional``
-        when all conditions of the guide hold, after `wanted_s` at the latest.
+        Phase to record. ``static`` ends after `wanted_s` of stillness, and ``align`` after
+        `wanted_s`. ``functional`` ends when all conditions of the guide hold, but after `wanted_s`
+        at the latest.
     chain : Chain
-        Sensors that take part.
+        Limb whose sensors take part.
     start_ns : int
         Host time of the start.
     wanted_s : float
@@ -74,7 +75,7 @@ class PhaseRecording:
             self._last_ns[MOCAP] = start_ns
 
     def add_sample(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> bool:
-        """Add one orientation; return whether it ended a period of stillness."""
+        """Add one orientation; return whether it ended a period of stillness of all sensors."""
         self._recorder.add_sample(sensor, t_ns, q_world_sensor)
         self._latest[sensor] = q_world_sensor
         self._last_ns[sensor] = t_ns
@@ -89,14 +90,14 @@ class PhaseRecording:
             self._last_ns[MOCAP] = t_ns
 
     def progress_due(self, now_ns: int) -> bool:
-        """Return whether the interval of progress reports has passed, and start the next one."""
+        """Return whether a progress report is due; if so, start the next interval."""
         if now_ns < self._progress_ns + PROGRESS_NS:
             return False
         self._progress_ns = now_ns
         return True
 
     def progress(self, now_ns: int) -> tuple[float, str, dict[str, object]]:
-        """Return the progress, 0 to 1, the instruction for the subject, and data."""
+        """Return the progress (0 to 1), the instruction for the subject, and further data."""
         if self._gate is not None:
             still_s = self._gate.still_s(now_ns)
             text = self._gate.text(now_ns)
@@ -119,7 +120,7 @@ class PhaseRecording:
     def _guided_progress(
         self, guide: MovementGuide, elapsed_s: float, silent: list[str]
     ) -> tuple[float, str, dict[str, object]]:
-        """Return the progress of a movement: 1 when all conditions hold."""
+        """Return the progress of a functional phase, which is 1 when all conditions hold."""
         latest = {name: q for name, q in self._latest.items() if name not in silent}
         look = self._look = guide.look(latest, elapsed_s)
         data: dict[str, object] = {
@@ -137,21 +138,21 @@ class PhaseRecording:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Movements that are still missing, each with its remedy."""
+        """Movements that the subject must still perform, each with its instruction."""
         return () if self._look is None else self._look.missing
 
     def timed_out(self, now_ns: int) -> bool:
-        """Return whether a static phase has waited for stillness too long."""
+        """Return whether a static phase has waited too long for stillness."""
         timeout_ns = round(STATIC_TIMEOUT_S * _NS)
         return self._gate is not None and now_ns - self._start_ns > timeout_ns
 
     @property
     def overflowed(self) -> int:
-        """Number of measurements that exceeded the size of the recording."""
+        """Number of measurements that were not recorded, because the recording was full."""
         return self._recorder.overflowed
 
     def trial(self, now_ns: int) -> CalibrationTrial:
-        """Return the recording; for a static phase only the still period at its end."""
+        """Return the recording; for a static phase, only the still period at its end."""
         if self._gate is None:
             return self._recorder.trial()
         return self._recorder.trial(self._gate.still_since_ns, now_ns)

@@ -1,8 +1,9 @@
 """Calibration session: the phases align, static and functional, and the fits that follow them.
 
 The session records the measurements of a phase, requests a fit from the worker process, and
-publishes status and progress. Its phases and transitions are a table
-(:mod:`jointfit_daemon.pipeline.calibration_session._state_machine`).
+publishes status and progress. The module
+:mod:`jointfit_daemon.pipeline.calibration_session._state_machine` contains the table of phases and
+transitions.
 
 Invariant: the session never computes a fit itself, so it never blocks acquisition.
 """
@@ -68,7 +69,7 @@ PLANAR = (
     "a planar rig has no sensors and needs no calibration: its joints are on the topic "
     "optical/sticks"
 )
-"""Reason for which a planar rig starts no phase."""
+"""Reason why a planar rig starts no calibration phase."""
 
 
 class CalibrationSession:
@@ -81,11 +82,11 @@ class CalibrationSession:
     settings : CalibrationSettings
         Durations, markers and method from rig.toml.
     mocap : bool
-        Whether the rig has a mocap source; without it only a static calibration is possible.
+        Whether the rig has a mocap source. Without mocap, only a static calibration is possible.
     calibration : Calibration or None
-        The calibration in force.
+        The calibration in force; None if there is none.
     version : int or None
-        Version of `calibration` in the store.
+        Version of `calibration` in the store; None if it is not stored.
     """
 
     def __init__(
@@ -102,22 +103,22 @@ class CalibrationSession:
         self.version = version
         """Version of the calibration in force; None while it is not stored."""
         self._created_utc = "" if calibration is None else calibration.created_utc
-        """Date of `version`."""
+        """Date of the calibration with the number `version`."""
         self.lags: LagMonitor | None = None
-        """Configured lags, and lags estimated during operation."""
+        """Lags from the configuration, and lags estimated during operation."""
         self._state = self._resting_phase
         self._recording: PhaseRecording | None = None
         self._fit: FitJob | None = None
         self._alignment: Mapping[str, Any] | None = None
         self._static: CalibrationTrial | None = None
         self._static_s = settings.static_s
-        """Requested length of the static pose, s; this length may differ from rig.toml."""
+        """Requested length of the static pose, s, which may differ from rig.toml."""
         self._jobs = 0
         self._force = False
         self.refits = OnlineRefits()
 
     def resume(self, before: CalibrationSession, *, same_rig: bool) -> None:
-        """Continue from the session before a reload; keep alignment and pose if `same_rig`."""
+        """Continue the session from before a reload; keep alignment and pose if `same_rig`."""
         self._jobs = before._jobs  # job numbers are never reused
         if same_rig:
             self._alignment, self._static = before._alignment, before._static
@@ -137,7 +138,7 @@ class CalibrationSession:
 
     @property
     def phase(self) -> CalibrationPhase:
-        """The running phase; otherwise whether a calibration is in force."""
+        """The running phase; if none is running, whether a calibration is in force."""
         return self._resting_phase if self._state in RESTING else self._state
 
     @property
@@ -148,7 +149,7 @@ class CalibrationSession:
 
     @property
     def _done(self) -> tuple[CalibrationPhase, ...]:
-        """Recorded phases whose results the functional phase uses, without the running one."""
+        """Recorded phases whose results the functional phase uses, except the running phase."""
         running = None if self._fit is None else self._fit.work.name
         if self._recording is not None:
             running = self._recording.phase
@@ -163,7 +164,7 @@ class CalibrationSession:
     # --- measurements ------------------------------------------------------------------------
 
     def add_sample(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> list[Output]:
-        """Add one orientation; call only while ``collecting``."""
+        """Add one orientation. Call it only while ``collecting``."""
         recording = self._recording
         if recording is not None and recording.add_sample(sensor, t_ns, q_world_sensor):
             text = "moved: stillness is timed from the start again"
@@ -171,12 +172,12 @@ class CalibrationSession:
         return []
 
     def add_mocap(self, t_ns: int, frame: MocapFrame) -> None:
-        """Add one mocap frame; call only while ``collecting``."""
+        """Add one mocap frame. Call it only while ``collecting``."""
         if self._recording is not None:
             self._recording.add_mocap(t_ns, frame)
 
     def advance(self, now_ns: int) -> list[Output]:
-        """Publish progress at most five times a second, and end the phase when it is complete."""
+        """Publish progress at most five times a second; end the phase when it is complete."""
         recording = self._recording
         if recording is None or not recording.progress_due(now_ns):
             return []
@@ -195,7 +196,7 @@ class CalibrationSession:
         return outputs
 
     def restart_sensor(self, t_ns: int, sensor: str) -> list[Output]:
-        """Discard the static pose: the heading of a restarted sensor may have changed."""
+        """Discard the static pose, because a restart may change the heading of the sensor."""
         recording, fit = self._recording, self._fit
         moving = recording is not None and recording.phase != CalibrationPhase.STATIC
         # The result of a functional phase remains valid; the notice requests a new static pose.
@@ -216,7 +217,7 @@ class CalibrationSession:
     # --- requests ----------------------------------------------------------------------------
 
     def request(self, request: Request) -> list[Output]:
-        """Start or abort a phase, or revert online learning; the first output is the reply."""
+        """Start or abort a phase, or revert online learning. The first output is the reply."""
         wanted = str(request.arguments.get("phase", ""))
         if request.command == "static":
             wanted = "static"
@@ -241,7 +242,7 @@ class CalibrationSession:
         ]
 
     def _revert_refits(self, request: Request) -> list[Output]:
-        """Restore the models from before online learning; pause it until a functional phase."""
+        """Restore the models from before online learning, and pause it until a functional phase."""
         now, running = self.calibration, self._state not in RESTING
         before = None if now is None or running else self.refits.revert(now)
         if before is None:
@@ -257,9 +258,10 @@ class CalibrationSession:
         ]
 
     def select(self, event: CalibrationSelected) -> list[Output]:
-        """Use a stored calibration, and pause online learning until the next movement.
+        """Use a stored calibration, and pause online learning until the next functional phase.
 
-        The calibration is stored again as a new version, because the newest version is in force.
+        The calibration is stored again as a new version, because the newest version is the one in
+        force.
         """
         request, chosen = event.request, event.calibration
         if self._state not in RESTING:
@@ -289,7 +291,7 @@ class CalibrationSession:
         )
 
     def request_refit(self, fresh: OnlineFrames) -> list[Output]:
-        """Request a refit of the models to new frames; call only while ``may_learn``."""
+        """Request a refit of the models to new frames. Call it only while ``may_learn``."""
         if self.calibration is None:
             return []
         self._jobs += 1
@@ -297,7 +299,7 @@ class CalibrationSession:
         return [FitJob(self._jobs, RefitJob(self._chain, self.calibration, fresh))]
 
     def _refusal(self, wanted: str) -> str | None:
-        """Return the reason why a phase cannot start, or None."""
+        """Return the reason why a phase cannot start; None if it can."""
         settings = self._settings
         if wanted not in COLLECTING:
             return f"expected one of {', '.join(COLLECTING)}, abort; got {wanted!r}"
@@ -316,7 +318,7 @@ class CalibrationSession:
         )
 
     def _functional_refusal(self) -> str | None:
-        """Return the reason why the functional phase has no markers or no static pose, or None."""
+        """Return why the functional phase lacks markers or a static pose; None if it lacks none."""
         named = {*self._settings.markers, *self._settings.rigid_bodies}
         bare = [segment for segment in self._chain.segments if segment not in named]
         if bare:
@@ -378,7 +380,7 @@ class CalibrationSession:
         return [*outputs, self.status(now_ns, text, CalibrationPhase.FITTING), self._fit]
 
     def _job(self, phase: CalibrationPhase, trial: CalibrationTrial) -> CalibrationJob:
-        """Return the fit that follows the phase that ended."""
+        """Return the fit that must follow the phase that ended."""
         chain, settings = self._chain, replace(self._settings, static_s=self._static_s)
         lag_ns = None if self.lags is None else self.lags.known_ns()
         if phase == CalibrationPhase.ALIGN:
@@ -393,14 +395,14 @@ class CalibrationSession:
         )
 
     def report_job(self, event: JobProgress) -> list[Output]:
-        """Publish the progress of the running fit; progress of cancelled jobs is ignored."""
+        """Publish the progress of the running fit. The progress of cancelled jobs is ignored."""
         if self._fit is None or event.job != self._fit.job:
             return []
         fitting = CalibrationPhase.FITTING
         return [CalibrationProgress(event.t_ns, fitting, round(event.progress, 3), event.text)]
 
     def finish_job(self, event: JobFinished) -> list[Output]:
-        """Use the result of the worker. Results of cancelled jobs are ignored."""
+        """Use the result of a fit from the worker. Results of cancelled jobs are ignored."""
         fit = self._fit
         if event.job == self.refits.job and self.calibration is not None:
             found, notice = self.refits.finish(event, self.calibration, self.version)
@@ -468,7 +470,10 @@ class CalibrationSession:
         phase: CalibrationPhase | None = None,
         quality: Mapping[str, object] | None = None,
     ) -> CalibrationStatus:
-        """Return a status, by default of the present phase and the calibration in force."""
+        """Return a status.
+
+        By default, it describes the current phase and the calibration in force.
+        """
         if quality is None:
             quality = {} if self.calibration is None else self.calibration.quality
         created_utc = None if self.version is None else self._created_utc or None
@@ -483,7 +488,7 @@ class CalibrationSession:
         )
 
     def abort(self, t_ns: int, reason: str) -> list[Output]:
-        """Abort the running phase or fit, if any."""
+        """Abort the running phase or fit; do nothing if none is running."""
         if self._state in RESTING:
             return []
         outputs: list[Output] = []
@@ -495,7 +500,7 @@ class CalibrationSession:
 
 
 def _seconds(value: object) -> float | None:
-    """Return a requested number of seconds; NaN if it is not a number."""
+    """Return a requested number of seconds; NaN if the value is not a number."""
     if value is None:
         return None
     usable = isinstance(value, int | float) and not isinstance(value, bool)

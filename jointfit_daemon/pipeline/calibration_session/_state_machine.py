@@ -2,7 +2,7 @@
 
 The diagram in docs/calibration.md is generated from :data:`TRANSITIONS`.
 
-Invariant: a transition that is not in the table raises; no event is ignored silently.
+Invariant: a transition that is not in the table raises an error, so no event is ignored silently.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from enum import StrEnum
 from jointfit_daemon.pipeline.events import CalibrationPhase
 
 COLLECTING = (CalibrationPhase.ALIGN, CalibrationPhase.STATIC, CalibrationPhase.FUNCTIONAL)
-"""Phases that record a trial; a request starts them."""
+"""Phases that record a trial. Each of them starts with a request."""
 RESTING = (
     CalibrationPhase.UNCALIBRATED,
     CalibrationPhase.ALIGNED,
@@ -20,7 +20,7 @@ RESTING = (
     CalibrationPhase.CALIBRATED,
     CalibrationPhase.ABORTED,
 )
-"""Phases in which neither a recording nor a fit runs and a request is accepted."""
+"""Phases in which a request is accepted, because neither a recording nor a fit is running."""
 
 
 class SessionEvent(StrEnum):
@@ -42,7 +42,7 @@ START = {
     CalibrationPhase.STATIC: SessionEvent.START_STATIC,
     CalibrationPhase.FUNCTIONAL: SessionEvent.START_FUNCTIONAL,
 }
-"""Event by requested phase."""
+"""Event that starts each phase."""
 
 TRANSITIONS: dict[tuple[CalibrationPhase, SessionEvent], CalibrationPhase] = {
     **{(phase, START[wanted]): wanted for phase in RESTING for wanted in COLLECTING},
@@ -54,4 +54,4 @@ TRANSITIONS: dict[tuple[CalibrationPhase, SessionEvent], CalibrationPhase] = {
     (CalibrationPhase.FITTING, SessionEvent.RESULT_WORSE): CalibrationPhase.CALIBRATED,
     (CalibrationPhase.FITTING, SessionEvent.FAILED): CalibrationPhase.ABORTED,
 }
-"""Next phase by phase and event."""
+"""Next phase, by current phase and event."""

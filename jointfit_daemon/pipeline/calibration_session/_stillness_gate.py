@@ -1,7 +1,7 @@
-"""Stillness of all sensors of a rig during a static pose.
+"""Detection that all sensors of a rig are still during a static pose.
 
 Every sensor has a causal stillness monitor (`calibration.registration.StillnessMonitor`). The pose
-is still while every sensor is still; a sensor without data is not still.
+is still while every sensor is still. A sensor without data does not count as still.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 _NS = 1_000_000_000
 SILENT_NS = 500_000_000
-"""Time without data after which a sensor is silent, ns."""
+"""Time without data after which a sensor counts as silent, ns."""
 REPORTED_NS = 500_000_000
 """Shortest period of stillness whose end is reported, ns. A slow movement ends several short
-periods in a row."""
+periods one after another."""
 
 
 class StillnessGate:
@@ -37,7 +37,7 @@ class StillnessGate:
         self._still = dict.fromkeys(sensors, False)
         self._last_ns: dict[str, int] = {}
         self.still_since_ns: int | None = None
-        """Instant from which all sensors are still; None while they are not."""
+        """Instant since which all sensors are still; None while they are not still."""
 
     def feed(self, sensor: str, t_ns: int, q_world_sensor: Quaternion) -> bool:
         """Add one orientation; return whether it ended a stillness of at least `REPORTED_NS`."""
@@ -56,14 +56,14 @@ class StillnessGate:
         return ended and t_ns - (before or 0) >= REPORTED_NS
 
     def still_s(self, now_ns: int) -> float:
-        """Return the time for which all sensors have been still, s; a silent sensor ends it."""
+        """Return for how long all sensors have been still, s; 0 if a sensor is silent."""
         if self.silent(now_ns):
             self.still_since_ns = None
         since_ns = self.still_since_ns
         return 0.0 if since_ns is None else max(0, now_ns - since_ns) / _NS
 
     def silent(self, now_ns: int) -> list[str]:
-        """Return the sensors without data."""
+        """Return the sensors that send no data."""
         last = self._last_ns
         return [s for s in self._monitors if s not in last or now_ns - last[s] > SILENT_NS]
 

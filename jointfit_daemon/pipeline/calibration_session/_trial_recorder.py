@@ -1,4 +1,4 @@
-"""Recorder of one calibration phase: samples and mocap frames on the host clock, bounded."""
+"""Recorder of one calibration phase: samples and mocap frames on the host clock, up to a limit."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import MocapFrame, Quaternion
 
 MAX_PHASE_S = 600
-"""Longest phase, s: 240 000 samples of a sensor at 400 Hz, about 40 MB."""
+"""Longest phase, s. One sensor at 400 Hz then has 240 000 samples, which take about 40 MB."""
 
 _MAX_SAMPLES = MAX_PHASE_S * 400
 
 
 @dataclass(slots=True)
 class TrialRecorder:
-    """Records samples and mocap frames from construction on.
+    """Records samples and mocap frames, starting with its creation.
 
-    Invariant: the tracks of a trial are strictly increasing in time.
+    Invariant: the times of each track in a trial increase strictly.
     """
 
     _samples: dict[str, list[tuple[int, Quaternion]]] = field(default_factory=dict)
@@ -46,7 +46,7 @@ class TrialRecorder:
             self.overflowed += 1
 
     def trial(self, start_ns: int | None = None, end_ns: int | None = None) -> CalibrationTrial:
-        """Return the recording between two instants, both included."""
+        """Return the recording between two instants, inclusive."""
         low = -(2**62) if start_ns is None else start_ns
         high = 2**62 if end_ns is None else end_ns
         sensors = {}
@@ -62,13 +62,13 @@ class TrialRecorder:
 
 
 def _increasing(t_ns: np.ndarray) -> np.ndarray:
-    """Return the indices of a strictly increasing subsequence; a restarted clock may step back."""
+    """Return the indices of rows with strictly increasing time; a restarted clock may step back."""
     before = np.concatenate(([np.iinfo(np.int64).min], np.maximum.accumulate(t_ns)))[:-1]
     return np.flatnonzero(t_ns > before)
 
 
 def _optical_track(frames: list[tuple[int, MocapFrame]]) -> OpticalTrack:
-    """Merge frames of one or more layouts by name; names that a layout lacks are NaN."""
+    """Merge frames of one or more layouts by name; NaN for names that a layout does not contain."""
     layouts = dict.fromkeys(frame.layout for _, frame in frames)
     markers = tuple(dict.fromkeys(name for layout in layouts for name in layout.markers))
     bodies = tuple(dict.fromkeys(name for layout in layouts for name in layout.bodies))

@@ -1,6 +1,6 @@
 """Inverse kinematics of a chain model from single mocap frames, at a limited rate.
 
-Invariant: nothing here depends on an IMU or on a calibration of the limb.
+Invariant: the result depends neither on an IMU nor on a calibration of the limb.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 RECENT_NS = 10_000_000_000
-"""Time over which recent errors are computed, ns: a few gait cycles."""
+"""Time over which recent errors are computed, ns, equal to a few gait cycles."""
 FARTHEST_M = 1000.0
 """Distance from the origin beyond which a marker counts as missing, m. No camera has this range,
-and the squares of larger distances would spoil the solution."""
+and the squares of larger distances would make the solution inaccurate."""
 FEWEST_MARKERS = 3
-"""Smallest number of markers of a frame with a solution. Fewer markers do not determine the
-position of the first segment."""
+"""Smallest number of markers in a frame for a solution. Fewer markers do not determine the position
+of the first segment."""
 _FEW_EVALUATIONS = 8
-"""Largest number of evaluations of the marker errors after which the same frame may also search
-labels."""
+"""Largest number of evaluations of the marker errors for which the search of labels may run in the
+same frame."""
 OPTIONS = LiveOptions(steps=6, huber_m=0.02, restart_interval=5)
-"""The solver takes up to six steps, because frames are 100 ms apart. The Huber threshold bounds the
-influence of an exchanged marker until it is excluded. A restart takes longer than a frame, so
-restarts that do not help become rare."""
+"""Options of the solver. It takes up to six steps per frame, because frames are 100 ms apart. The
+Huber threshold limits the influence of an exchanged marker until it is excluded. A restart takes
+longer than a frame, so unsuccessful restarts become less frequent."""
 
 
 class _FrameErrors(NamedTuple):
@@ -65,7 +65,7 @@ class ChainTracker:
     loaded : LoadedModel
         The chain model and the names of its coordinates.
     rate_hz : float
-        Greatest number of fitted frames per second; above 0.
+        Largest number of fitted frames per second; above 0.
     refined : bool
         Whether the marker positions come from a calibration.
     """
@@ -89,19 +89,19 @@ class ChainTracker:
         self._recent: deque[_FrameErrors] = deque()
 
     def serves(self, loaded: LoadedModel, rate_hz: float, *, refined: bool) -> bool:
-        """Return whether a new tracker with these arguments would be equal to this one."""
+        """Return whether a new tracker with these arguments would be equivalent to this tracker."""
         names = [joint.names for joint in loaded.coordinates]
         same_names = names == [joint.names for joint in self.loaded.coordinates]
         same_settings = (self._rate_hz, self._refined) == (rate_hz, refined)
         return same_settings and same_names and self._model == loaded.chain
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
-        """Return the state of the model in a live frame, if one is due, and notices."""
+        """Return the state of the model if a state is due for this live frame, and notices."""
         if not self._rate.is_due(t_ns):
             self._monitor.search_labels(t_ns)
             return []
 
-        # Find the markers of the model in a frame, m, shape (M, 3); NaN where missing.
+        # Collect the markers of the model in a frame, m, shape (M, 3); NaN where missing.
         if frame.layout is not self._layout:
             self._layout = frame.layout
             column = {name: k for k, name in enumerate(frame.layout.markers)}
@@ -120,8 +120,7 @@ class ChainTracker:
             return [state, *_notices(t_ns, reports)]
 
         pose = self._solver.feed(np.where(used[:, None], measured, np.nan))
-        # Labels are not searched in the frame of a restart, because a restart takes as long as a
-        # search.
+        # Labels are not searched in the same frame as a restart, because both take equally long.
         if pose.evaluations <= _FEW_EVALUATIONS:
             self._monitor.search_labels(t_ns)
         distances, faults = self._monitor.compare(t_ns, measured, pose.rotations, pose.origins)

@@ -3,9 +3,10 @@
 Faulty markers are excluded from inverse kinematics. They are still compared with the model, so that
 their recovery is detected.
 
-Invariant: markers are excluded only while the others fit: at most a third of the visible markers is
-far from its place, and the median distance is small. Otherwise the model itself does not fit. The
-monitor then reports the misfit and excludes no marker.
+Invariant: markers are excluded only while the other markers fit the model. This requires that at
+most a third of the visible markers is far from the model positions, and that the median distance is
+small. Otherwise the model itself does not fit. The monitor then reports the misfit and excludes no
+marker.
 """
 
 from __future__ import annotations
@@ -29,36 +30,37 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel
 
 FAR_M = 0.06
-"""Distance from its place above which a marker is misplaced, m. Soft-tissue artefact is smaller,
-and 0.04 m is accepted."""
+"""Distance from the model position above which a marker is misplaced, m. Soft-tissue artefact is
+smaller, and 0.04 m is accepted."""
 NEAR_M = 0.03
-"""Distance below which a faulty marker recovers, m."""
+"""Distance from the model position below which a faulty marker can recover, m."""
 FAULT_NS = 1_000_000_000
-"""Time for which a marker is misplaced, exchanged or hidden before it is flagged, ns."""
+"""Time for which a marker must be misplaced, exchanged or hidden before it is flagged, ns."""
 RECOVERY_NS = 2_000_000_000
-"""Time for which a faulty marker is near its place before it is used again, ns."""
+"""Time for which a faulty marker must be near its model position before it is used again, ns."""
 LOST_REPORT_NS = 10_000_000_000
-"""Time for which a marker is hidden before a notice, ns: occlusions of seconds are frequent."""
+"""Time for which a marker must be hidden before a notice, ns. Occlusions of seconds are
+frequent."""
 _MOST_EXCLUDED = 1 / 3
 _MEMORY = 0.02
-"""Weight of a new frame in the mean position of a misplaced marker: 5 s at 10 Hz."""
+"""Weight of a new frame in the mean position of a misplaced marker, equal to 5 s at 10 Hz."""
 _OBSERVED = 50
 """Number of frames after which the movement of a misplaced marker is compared with the segments."""
 _RIGID_M = 0.012
-"""Standard deviation of a marker in the axes of a segment below which it is fixed to this segment,
-m."""
+"""Standard deviation of a marker in the axes of a segment, m, below which it is attached to this
+segment."""
 _MOVING_M = 0.025
-"""Standard deviation of a marker in the axes of its own segment above which it is not fixed to this
-segment, m."""
+"""Standard deviation of a marker in the axes of its own segment, m, above which it is not attached
+to this segment."""
 
 
 class MarkerReport(NamedTuple):
-    """A change worth a notice."""
+    """A change of a marker or model that requires a notice."""
 
     id: str
-    """Name of the marker or model."""
+    """Name of the marker or of the model."""
     state: str
-    """`MarkerFlag`, or ``ok``."""
+    """New state: a `MarkerFlag`, or ``ok``."""
     text: str
     data: Mapping[str, object]
 
@@ -80,26 +82,26 @@ class MarkerMonitor:
     Parameters
     ----------
     model
-        The chain.
+        The chain model.
     """
 
     model: ChainModel
     excluded: NDArray[np.bool_] = field(init=False)
-    """Markers that inverse kinematics must not use, shape (M,)."""
+    """Mask of the markers that inverse kinematics must not use, shape (M,)."""
     misfit: bool = False
     """Whether the model as a whole does not fit."""
     _seen_ns: list[int | None] = field(init=False)
     """Instant at which each marker was visible for the last time."""
     _reported_lost: set[str] = field(default_factory=set)
     _since_ns: dict[str, dict[str, int]] = field(default_factory=dict)
-    """Beginning of each condition, by kind of condition and flag."""
+    """Start of each condition, by kind of condition and flag."""
     _faults: dict[str, tuple[int, ...]] = field(default_factory=dict)
-    """Markers of each flag in force."""
+    """Markers concerned by each flag in force."""
     _observed: dict[int, _Observation] = field(default_factory=dict)
     _began_ns: int | None = None
     _labels: SegmentLabels = field(init=False)
     _by_shape: set[str] = field(default_factory=set)
-    """Flags of exchanges in force that were found from the shapes of the segments."""
+    """Flags in force of exchanged markers that were found from the shapes of the segments."""
 
     def __post_init__(self) -> None:
         self._labels = SegmentLabels(self.model)
@@ -123,11 +125,11 @@ class MarkerMonitor:
         return t_ns if self._began_ns is None else self._began_ns
 
     def search_labels(self, t_ns: int) -> None:
-        """Continue the search of exchanged labels in a frame of the cameras."""
+        """Continue the search for exchanged labels during a camera frame."""
         self._labels.advance(t_ns)
 
     def see(self, t_ns: int, seen: NDArray[np.bool_]) -> list[MarkerReport]:
-        """Record the visible markers of a frame, shape (M,)."""
+        """Store which markers are visible in a frame, shape (M,)."""
         self._began_ns = t_ns if self._began_ns is None else self._began_ns
         reports = []
         for m, marker in enumerate(self.model.markers):
@@ -159,17 +161,16 @@ class MarkerMonitor:
         t_ns
             Instant of the frame.
         measured
-            World, m, shape (M, 3); NaN where hidden.
+            Marker positions in the world, m, shape (M, 3); NaN where hidden.
         rotations, origins
-            Segments in the world, shapes (S, 3, 3) and (S, 3), m.
+            Poses of the segments in the world, shapes (S, 3, 3) and (S, 3), m.
 
         Returns
         -------
         distances
-            Distances of the markers from their places in the model, m, shape (M,); NaN where
-            hidden.
+            Distances of the markers from their model positions, m, shape (M,); NaN where hidden.
         reports
-            Faults that were found or ended.
+            Faults that began or ended.
         """
         segments = self.model.marker_segments
         places = (rotations[segments] @ self.model.positions[:, :, None])[..., 0]
@@ -179,8 +180,8 @@ class MarkerMonitor:
         far = distances > FAR_M  # the comparison is False where NaN
         exchanged: list[tuple[int, ...]] = []
         if far.any() or self._by_shape:
-            # First by the shapes of the segments, because exchanged markers turn a fitted segment;
-            # then by the places of the markers.
+            # Exchanged markers rotate a fitted segment, so the shapes of the segments are checked
+            # first. The positions of the markers are checked second.
             self._labels.begin(t_ns, measured)
             exchanged = [*self._labels.faults]
             turned = {segments[m] for group in exchanged for m in group}
@@ -202,7 +203,7 @@ class MarkerMonitor:
         return f"{kind}:{'~'.join(self.model.markers[m].name for m in markers)}"
 
     def _lasting(self, t_ns: int, condition: str, flags: Iterable[str], least_ns: int) -> set[str]:
-        """Return the flags whose condition has lasted `least_ns`; discard other flags."""
+        """Return the flags whose condition has lasted for `least_ns`; forget all other flags."""
         before = self._since_ns.get(condition, {})
         now = self._since_ns[condition] = {flag: before.get(flag, t_ns) for flag in flags}
         return {flag for flag, since_ns in now.items() if t_ns - since_ns >= least_ns}
@@ -210,7 +211,7 @@ class MarkerMonitor:
     def _exclude(
         self, t_ns: int, suspects: Mapping[str, tuple[int, ...]], distances: Array
     ) -> list[MarkerReport]:
-        """Exclude lasting suspects, unless the model as a whole does not fit."""
+        """Exclude markers whose suspicion lasts, unless the model as a whole does not fit."""
         lasting = self._lasting(t_ns, "far", suspects, FAULT_NS)
         if not lasting and not self.misfit:
             return []
@@ -265,9 +266,9 @@ class MarkerMonitor:
         return MarkerReport(names[0], MarkerFlag.MISPLACED, text, {"segment": segment})
 
     def _recover(self, t_ns: int, distances: Array) -> list[MarkerReport]:
-        """Use faulty markers again if they are near their places."""
-        # Without the excluded markers, a segment may have no pose. The shape of the segment then
-        # decides.
+        """Use faulty markers again if they are near their model positions."""
+        # Without the excluded markers, a segment may have no pose. In this case the shape of the
+        # segment is checked instead.
         near = [
             flag
             for flag, m in self._faults.items()
@@ -290,14 +291,14 @@ class MarkerMonitor:
     def _observe(
         self, measured: Array, rotations: Array, origins: Array, distances: Array
     ) -> list[MarkerReport]:
-        """Compare the movement of misplaced markers with that of every segment."""
+        """Compare the movement of misplaced markers with the movement of every segment."""
         single = {markers[0] for markers in self._faults.values() if len(markers) == 1}
         self._observed = {m: seen for m, seen in self._observed.items() if m in single}
         reports = []
         for m in single:
             if not np.isfinite(distances[m]):
                 continue
-            # in the axes of each segment, m, shape (S, 3)
+            # Position of the marker in the axes of each segment, m, shape (S, 3).
             x = np.einsum("sji,sj->si", rotations, measured[m] - origins)
             seen = self._observed.setdefault(m, _Observation(x, np.zeros(len(x))))
             off = x - seen.mean

@@ -1,10 +1,12 @@
-"""Search of exchanged labels by the shapes of the segments of a chain model.
+"""Search for exchanged labels by the shapes of the segments of a chain model.
 
-Inverse kinematics turns a segment at the end of a chain to where its exchanged markers fit best.
-The exchanged markers are then near the places of other markers, or only some are far from their own
-places. The shape of the segment's marker cluster does not change.
+Inverse kinematics rotates the last segment of a chain until its exchanged markers fit best. The
+exchanged markers are then near the model positions of other markers, or only some markers are far
+from their own model positions. The shape of the segment's marker cluster is not affected, so
+exchanged labels can be found from it.
 
-Invariant: a frame takes a bounded part of a search. The last result holds until the next one.
+Invariant: the computation per frame is limited, so a search takes several frames. The last result
+is valid until the next result.
 """
 
 from __future__ import annotations
@@ -32,16 +34,16 @@ if TYPE_CHECKING:
 _FITS_M = 0.02
 """Largest RMS residual of a segment with correct labels, m."""
 SEARCH_HZ = 5.0
-"""Maximum number of searches per second."""
+"""Largest number of searches per second."""
 
 
 class SegmentLabels:
-    """Searches exchanged labels of the markers of a chain model.
+    """Searches for exchanged labels among the markers of a chain model.
 
     Parameters
     ----------
     model : ChainModel
-        The chain.
+        The chain model.
     """
 
     def __init__(self, model: ChainModel) -> None:
@@ -57,7 +59,7 @@ class SegmentLabels:
             origin, q = points.mean(axis=0), rotation.IDENTITY.copy()
             clusters.append(MarkerCluster(name, names, None, points - origin, origin, q))
 
-        # A joint without translation keeps its center in both segments.
+        # The center of a joint without translation is fixed in both adjacent segments.
         centers = {}
         for segment, parent in zip(model.segments, model.parents.tolist(), strict=True):
             if segment.parent is not None and segment.joint.kind != "free":
@@ -73,14 +75,14 @@ class SegmentLabels:
         self.forget()
 
     def forget(self) -> None:
-        """Discard the last result and end the search, because no marker is suspect."""
+        """Discard the last result and end the search, because no marker is suspected."""
         self._examination = None
         self.faults: tuple[tuple[int, ...], ...] = ()
         """Exchanged markers in the last examined frame, as `find_exchanged_labels` returns them."""
         self._rms: Array = np.full(len(self._names), np.nan)
 
     def begin(self, t_ns: int, measured: Array) -> None:
-        """Search the labels of a frame, if a search is due and no search is running.
+        """Start a search in the labels of a frame, if it is due and no search is running.
 
         Parameters
         ----------
@@ -93,7 +95,7 @@ class SegmentLabels:
             self._examination = LabelExamination(self._search, t_ns, measured[self._rows])
 
     def advance(self, t_ns: int) -> None:
-        """Continue the search in a frame of the cameras."""
+        """Continue the search during a camera frame."""
         finding = None if self._examination is None else self._examination.advance(t_ns)
         if finding is None:
             return
@@ -106,7 +108,7 @@ class SegmentLabels:
         )
 
     def fit(self, markers: Iterable[int]) -> bool:
-        """Return whether the segments of some markers fit in the last examined frame."""
+        """Return whether the segments of the given markers fitted in the last examined frame."""
         parts = {self._segments[m] for m in markers}
         rms = [self._rms[self._names.index(part)] for part in parts if part in self._names]
         exchanged = {m for fault in self.faults for m in fault}

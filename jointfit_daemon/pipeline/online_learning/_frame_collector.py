@@ -1,10 +1,11 @@
 """Collection of training frames for online learning: pairs of sensor and mocap frames.
 
-Ten frames a second are examined. A frame is retained if all sensors and markers are present, the
-clocks are synchronized, and no sensor fault is flagged. While the subject holds a posture, one
-frame a second is retained.
+Ten frames per second are examined. A frame is retained if all sensors and markers are present, the
+clocks are synchronized, and no sensor fault is flagged. While the subject does not change the
+posture, one frame per second is retained.
 
-Invariant: the collection is bounded, and no frames are paired across a restart of a clock.
+Invariant: the size of the collection is limited, and no frames are paired across a restart of a
+clock.
 """
 
 from __future__ import annotations
@@ -30,20 +31,20 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.alignment import AlignedFrame
 
 INTERVAL_NS = 100_000_000
-"""Time between frames that are examined, ns."""
+"""Time between examined frames, ns."""
 POSTURE_NS = 1_000_000_000
 """Time between retained frames of the same posture, ns."""
 POSTURE_COSINE = 0.99985
-"""Cosine of half of 2°. If every segment has rotated by less than 2° since the last retained frame,
-the subject holds a posture."""
+"""Cosine of half of 2°. If no segment has rotated by 2° since the last retained frame, the posture
+is the same."""
 MAX_GAP_NS = 60_000_000
-"""Longest time between two sensor frames that is interpolated, ns."""
+"""Longest time between two sensor frames for interpolation, ns."""
 MAX_FRAMES = 3000
-"""Largest number of retained frames; the newest are retained."""
+"""Largest number of retained frames. The oldest frames are dropped."""
 MIN_FRAMES = 600
-"""Number of frames that trigger a refit: one minute of movement."""
+"""Number of frames required for a refit, equal to one minute of movement."""
 REFIT_NS = 180_000_000_000
-"""Time between two refits, and from enough frames to the first refit, ns."""
+"""Shortest time between two refits, and from enough frames to the first refit, ns."""
 _FAULTS = {
     FrameFlag.STUCK: "sensor repeats its value",
     FrameFlag.SLIPPED: "sensor slipped",
@@ -53,15 +54,16 @@ _FAULTS = {
     FrameFlag.HELD: "no data of the sensors",
     FrameFlag.LOST: "no data of the sensors",
 }
-"""Flags of a frame that is not used for training, and their texts."""
+"""Flags that exclude a frame from training, and the texts that explain them."""
 _RECENT, _WAITING = 64, 16
 
 
 class _TrainingFrame(NamedTuple):
     sensors: list[Quaternion]
-    """Segment orientation q_optical_segment from each sensor, in the order of the chain."""
+    """Segment orientation q_optical_segment computed from each sensor, in the order of the
+    chain."""
     mocap: list[Array]
-    """Markers, shape (k, 3), or orientation of the rigid body, shape (4,), of each segment."""
+    """Markers, shape (k, 3), or rigid-body orientation, shape (4,), of each segment."""
 
 
 class OnlineFrameCollector:
@@ -72,10 +74,10 @@ class OnlineFrameCollector:
     chain : Chain
         The limb.
     calibration : Calibration or None
-        The calibration in force. No frame is collected without a calibration, or if it contains no
-        movement data or lacks the marker clusters of a segment.
+        The calibration in force. No frame is collected if there is no calibration, if it contains
+        no movement data, or if it lacks the marker clusters of a segment.
     wanted : bool
-        ``learn_online`` of rig.toml.
+        Value of ``learn_online`` in rig.toml.
     """
 
     def __init__(self, chain: Chain, calibration: Calibration | None, *, wanted: bool) -> None:
@@ -106,7 +108,10 @@ class OnlineFrameCollector:
         self._last_ns: int | None = None
 
     def notices(self, now_ns: int) -> list[Notice]:
-        """Return the notices about obstacles to learning that are due, each once."""
+        """Return the notices about obstacles to learning that are due.
+
+        Each notice is returned once.
+        """
         return self._monitor.notices(now_ns)
 
     def health(self, now_ns: int) -> LearningHealth:
@@ -122,7 +127,7 @@ class OnlineFrameCollector:
         if frame.layout is not self._layout:
             self._layout = frame.layout
 
-            # Find the markers or the rigid body of every cluster in the new layout.
+            # Find the columns of each cluster's markers or rigid body in the new layout.
             columns, missing = [], []
             for markers, body in self._clusters:
                 known, names = (
@@ -148,7 +153,7 @@ class OnlineFrameCollector:
             for columns, (_, body) in zip(self._columns, self._clusters, strict=True)
         ]
 
-        # Find the markers and bodies that are not visible; usually there are none.
+        # Find the markers and bodies that are not visible. Usually all are visible.
         invisible = []
         for x, (markers, body) in zip(mocap, self._clusters, strict=True):
             if np.isfinite(x).all():
@@ -166,7 +171,7 @@ class OnlineFrameCollector:
         self._monitor.add_obstacle(t_ns, not_visible(invisible), in_view=in_view)
 
     def add_frame(self, frame: AlignedFrame, flags: Collection[str]) -> None:
-        """Add one frame of the sensors and the flags of its limb state."""
+        """Add one sensor frame, and the flags of its limb state."""
         if not self.active:
             return
         if self._last_ns is not None and frame.t_ns < self._last_ns:
@@ -189,7 +194,7 @@ class OnlineFrameCollector:
                 self._monitor.add_obstacle(t_ns, "; ".join(listed))
 
     def take_due(self, now_ns: int) -> OnlineFrames | None:
-        """Return and remove the collected frames if a refit is due; otherwise None."""
+        """Return and remove the collected frames if a refit is due; return None otherwise."""
         if len(self._kept) < MIN_FRAMES:
             return None
         if self._waiting_since_ns is None or now_ns - self._waiting_since_ns < REFIT_NS:
@@ -216,7 +221,7 @@ class OnlineFrameCollector:
     # --- pairs -------------------------------------------------------------------------------
 
     def _pair(self, t_ns: int, mocap: list[Array]) -> None:
-        """Retain the sensors at the instant of a mocap frame, if they are complete and moved."""
+        """Retain the sensors at the instant of a mocap frame, if all are known and have moved."""
         after = None
         for before in reversed(self._frames):
             if before.t_ns <= t_ns:
@@ -252,7 +257,7 @@ class OnlineFrameCollector:
     def _sensors_at(
         self, t_ns: int, before: AlignedFrame, after: AlignedFrame
     ) -> list[Quaternion] | None:
-        """Return the sensors between two frames, or None if data is missing or not synced."""
+        """Return the sensors between two frames; None if data or synchronization is missing."""
         width = after.t_ns - before.t_ns
         if width > MAX_GAP_NS or not (before.synced and after.synced):
             return None
@@ -272,7 +277,7 @@ def _abs_dot(p: Quaternion, q: Quaternion) -> float:
 
 
 def _excluded(chain: Chain, calibration: Calibration | None, *, wanted: bool) -> str | None:
-    """Return the reason why online learning is impossible with this configuration, or None."""
+    """Return the reason why this configuration excludes online learning; None if it does not."""
     if not wanted:
         return "learn_online is off in rig.toml"
     if calibration is None or not calibration.fits(chain):

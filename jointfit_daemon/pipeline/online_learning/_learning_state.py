@@ -1,7 +1,7 @@
-"""State of online learning: whether it can proceed, and the reason and duration of an obstacle.
+"""State of online learning: whether it is possible, and reason and duration of an obstacle.
 
-A lasting obstacle is reported once, and so is its end. A subject outside the view of the cameras is
-no obstacle.
+A lasting obstacle is reported once when it begins and once when it ends. If the subject is outside
+the view of the cameras, this is not an obstacle.
 """
 
 from __future__ import annotations
@@ -19,26 +19,25 @@ _NS = 1_000_000_000
 REPORT_NS = 60 * _NS
 """Duration after which an obstacle is reported, ns. Most occlusions are shorter."""
 MOCAP_SILENT_NS = 2 * _NS
-"""Time without frames after which the mocap system is regarded as off, ns."""
+"""Time without frames after which the mocap system counts as switched off, ns."""
 MAX_NAMES = 4
-"""Maximum number of markers that a text lists by name."""
+"""Largest number of markers that a text lists by name."""
 
 
 class LearningMonitor:
-    """Follows the state of one frame collector.
+    """Monitors the state of one frame collector.
 
     Parameters
     ----------
     off : str or None
-        Reason why the configuration or calibration excludes online learning; None if learning is
-        possible.
+        Reason why the configuration or calibration excludes online learning; None if it does not.
     """
 
     def __init__(self, off: str | None = None) -> None:
         self._off = off
         self._mocap_ns: int | None = None
         self._usable_ns: int | None = None
-        """Instant of the last usable frame, or of the first frame."""
+        """Instant of the last usable frame; before it, instant of the first frame."""
         self._obstacle: str | None = None
         self._in_view = False
         self._reported = False
@@ -49,13 +48,13 @@ class LearningMonitor:
         self._obstacle, self._in_view = None, True
 
     def add_obstacle(self, now_ns: int, reason: str, *, in_view: bool = True) -> None:
-        """Add a frame that cannot be used; `in_view`: whether any marker is visible."""
+        """Add a frame that cannot be used. `in_view` states whether any marker is visible."""
         self._mocap_ns, self._obstacle, self._in_view = now_ns, reason, in_view
         if self._usable_ns is None or not in_view:  # an absent subject is no obstacle
             self._usable_ns = now_ns
 
     def notices(self, now_ns: int) -> list[Notice]:
-        """Return the notices that are due at `now_ns`, each once."""
+        """Return the notices that are due at `now_ns`. Each notice is returned once."""
         if self._usable_ns is None:
             return []
         if self._reported:
@@ -77,7 +76,7 @@ class LearningMonitor:
         return self._mocap_ns is not None and now_ns - self._mocap_ns <= MOCAP_SILENT_NS
 
     def health(self, now_ns: int, kept: int) -> LearningHealth:
-        """Return the state; `kept` is the number of frames that wait for a refit."""
+        """Return the state of learning. `kept` is the number of frames that wait for a refit."""
         if self._off is not None:
             return LearningHealth(LearningState.OFF, self._off, kept=kept)
         if not self._mocap_present(now_ns):
@@ -92,5 +91,5 @@ class LearningMonitor:
 
 
 def not_visible(markers: Sequence[str]) -> str:
-    """Return the text that names the markers that are not visible."""
+    """Return a text that lists the markers that are not visible."""
     return f"not visible to the cameras: {list_names(markers, MAX_NAMES)}"

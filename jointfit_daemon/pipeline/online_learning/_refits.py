@@ -1,4 +1,4 @@
-"""Refits of the models during operation: request, result and reversal."""
+"""Refits of the models during operation: request, result and reversion."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 
 class RefitOutcome(NamedTuple):
-    """Outcome of a refit."""
+    """Result of a refit."""
 
     calibration: Calibration | None
-    """Calibration with the new models; None if the new models are rejected."""
+    """Calibration with the new models; None if they are rejected."""
     notice: Notice
 
 
@@ -30,9 +30,10 @@ class OnlineRefits:
     job: int | None = None
     """Number of the running refit."""
     original: Calibration | None = None
-    """Calibration before the first accepted refit; a reversal restores this calibration."""
+    """Calibration before the first accepted refit. A reversion restores this calibration."""
     paused: bool = False
-    """Whether online learning waits for the next functional calibration, after a reversal."""
+    """Whether online learning is paused until the next functional calibration, after a
+    reversion."""
 
     def finish(self, event: JobFinished, before: Calibration, version: int | None) -> RefitOutcome:
         """Return the outcome of the running refit."""
@@ -42,7 +43,7 @@ class OnlineRefits:
             text = f"models unchanged: {event.failure}"
             return RefitOutcome(None, Notice(event.t_ns, kind, "online", text, NoticeLevel.WARNING))
 
-        # The notice contains errors in degrees, with four digits.
+        # The notice states errors in degrees with four digits.
         quality = result.quality.get("online", {})
         data: dict[str, object] = {
             key: quality[key] for key in ("frames", "judged") if key in quality

@@ -1,4 +1,4 @@
-"""The plane of a movement, from the positions of all markers.
+"""The plane of a movement, estimated from the positions of all markers.
 
 Each marker of a planar movement moves in its own plane, and these planes are parallel. The pooled
 scatter of the markers about their own means therefore has its smallest eigenvalue along the common
@@ -16,19 +16,20 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 FEWEST_FRAMES = 40
-"""Number of frames before a plane is estimated: 2 s at 20 Hz."""
+"""Smallest number of frames for the estimate of a plane, equal to 2 s at 20 Hz."""
 LEAST_MOVEMENT_M = 0.01
-"""RMS movement along the smaller principal direction in the plane, m, below which the plane is not
-determined."""
+"""RMS movement along the smaller principal direction in the plane, m. Below this value, the plane
+is not determined."""
 MOST_OFF_M = 0.02
-"""RMS distance of the markers from their planes, m, above which the movement is not planar."""
+"""RMS distance of the markers from their planes, m. Above this value, the movement is not
+planar."""
 MOST_RATIO = 0.5
-"""Ratio of the movement out of the plane to the smaller principal movement in the plane, above
-which the movement is not planar."""
+"""Ratio of the movement out of the plane to the smaller principal movement in the plane. Above this
+value, the movement is not planar."""
 
 
 class MovementPlane(NamedTuple):
-    """Plane of a movement."""
+    """Estimated plane of a movement."""
 
     normal: Array | None
     """Unit normal in the world, shape (3,); None if there is no plane."""
@@ -39,10 +40,10 @@ class MovementPlane(NamedTuple):
 
 
 class PlaneEstimator:
-    r"""Estimates the plane of a stream of frames.
+    r"""Estimates the plane of movement from a sequence of frames.
 
-    The position of marker m in frame t is x_tm, its weighted mean x̄_m. The weight w_t of a frame
-    decreases with age. The scatter is
+    x_tm is the position of marker m in frame t, and x̄_m is its weighted mean. The weight w_t of a
+    frame decreases with age. The scatter is
 
     .. math:: S = \sum_m \sum_t w_t (x_{tm} - \bar x_m)(x_{tm} - \bar x_m)^T
 
@@ -53,7 +54,7 @@ class PlaneEstimator:
     count : int
         Number of markers.
     forgetting : float
-        Remaining share of a frame's weight one frame later, in (0, 1].
+        Factor by which the weight of a frame decreases per frame, in (0, 1].
     """
 
     def __init__(self, count: int, forgetting: float) -> None:
@@ -64,7 +65,7 @@ class PlaneEstimator:
         self.frames = 0
 
     def feed(self, markers: Array) -> None:
-        """Process one frame, m, shape (count, 3); NaN where a marker is missing."""
+        """Process the marker positions of one frame, m, shape (count, 3); NaN where missing."""
         seen = np.isfinite(markers).all(axis=1)
         self._weights *= self._forgetting
         self._scatter *= self._forgetting
@@ -72,7 +73,7 @@ class PlaneEstimator:
             return
         self._weights[seen] += 1.0
 
-        # incremental mean and scatter of every marker
+        # Update mean and scatter of every marker incrementally.
         away = markers[seen] - self._means[seen]
         share = 1.0 / self._weights[seen]
         self._means[seen] += share[:, None] * away
@@ -80,7 +81,7 @@ class PlaneEstimator:
         self.frames += 1
 
     def estimate(self) -> MovementPlane:
-        """Return the plane of the frames so far."""
+        """Return the plane estimated from all frames so far."""
         if self.frames < FEWEST_FRAMES:
             return MovementPlane(None, None, "plane not known yet: move the joints")
         values, vectors = np.linalg.eigh(self._scatter / self._weights.sum())

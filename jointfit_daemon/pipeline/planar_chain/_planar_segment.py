@@ -1,7 +1,8 @@
 """Pose of one segment in the plane of movement, from two or more markers.
 
-The template of the markers is the first frame with all of them. The origin of the segment is the
-template's mean. Complex numbers are points of the plane: x + iy in the coordinates of its basis.
+The template of the markers is the first frame that shows all of them. The origin of the segment is
+the mean of the template. Complex numbers x + iy represent points of the plane in the coordinates of
+its basis.
 """
 
 from __future__ import annotations
@@ -17,48 +18,50 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LOOSE_M = 0.012
-"""RMS residual above which markers are not at their mutual places, m. Two markers reach it if their
-distance changes by 24 mm, which exceeds soft-tissue artefact."""
+"""RMS residual of the template above which the markers are displaced relative to each other, m. Two
+markers reach it if their distance changes by 24 mm, which exceeds soft-tissue artefact."""
 LEAST_MARKERS = 2
 """Number of markers that define a pose in a plane."""
 _EXCHANGE_RAD = 2.5
-"""Rotation between two frames, rad, above which the labels must have been exchanged."""
+"""Rotation between two frames above which the labels must have been exchanged, rad."""
 _EXCHANGE_NS = 200_000_000
-"""Longest time between two frames that are checked for exchanged labels, ns."""
+"""Longest time between two frames for the check of exchanged labels, ns."""
 _MEMORY = 0.02
-"""Weight of a new frame in the mean square of the residuals and in the share of loose frames."""
+"""Weight of a new frame in two running means: the squared residual and the share of loose
+frames."""
 _MOST_LOOSE = 0.1
-"""Share of frames with displaced markers above which a segment has no pose."""
+"""Share of frames with displaced markers above which the segment has no pose."""
 
 
 class PlanarPose(NamedTuple):
-    """Pose of a segment in the plane: a point z of the segment is at turn · z + origin."""
+    """Pose of a segment in the plane. A point z of the segment is at turn · z + origin."""
 
     turn: complex
-    """Rotation, of absolute value 1."""
+    """Rotation as a complex number of absolute value 1."""
     origin: complex
     """Position of the segment's origin, m."""
 
 
 class MissingPose(NamedTuple):
-    """Reason why a segment has no pose in a frame."""
+    """Reason why a segment has no pose in one frame."""
 
     reason: str
     faulty: bool = False
-    """Whether the visible markers are wrong, so that no joint may be estimated from them."""
+    """Whether the visible markers are faulty, so that no joint may be estimated from them."""
 
 
 @dataclass(slots=True)
 class PlanarSegment:
-    """Tracks the pose of one segment in the plane."""
+    """Estimates the pose of one segment in the plane."""
 
     markers: tuple[str, ...]
     template: NDArray[np.complex128] | None = None
-    """Markers in the coordinates of the segment, m; None before the first complete frame."""
+    """Markers in the coordinates of the segment, m; None before the first frame with all
+    markers."""
     _square: float = 0.0
-    """Mean square residual of the template, m²."""
+    """Mean squared residual of the template fit, m²."""
     _loose: float = 0.0
-    """Recent share of frames in which the markers are not at their mutual places."""
+    """Share of recent frames in which the markers are displaced relative to each other."""
     _angle: float | None = None
     _angle_ns: int = 0
 
@@ -69,24 +72,24 @@ class PlanarSegment:
 
     @property
     def flat_template(self) -> NDArray[np.float64]:
-        """Template with real coordinates, m, shape (m, 2)."""
+        """Template in real coordinates, m, shape (m, 2)."""
         template = np.zeros(0) if self.template is None else self.template
         return np.column_stack((template.real, template.imag))
 
     def clear(self) -> None:
-        """Discard the template: the basis of the plane has changed."""
+        """Discard the template, because the basis of the plane has changed."""
         self.template, self._angle = None, None
         self._square = self._loose = 0.0
 
     def pose(self, t_ns: int, z: NDArray[np.complex128]) -> PlanarPose | MissingPose:
-        """Return the pose in one frame, or the reason why there is none.
+        """Return the pose in one frame, or the reason why there is no pose.
 
         Parameters
         ----------
         t_ns
             Instant of the frame.
         z
-            Markers in the plane, m, shape (m,); NaN where missing.
+            Marker positions in the plane, m, shape (m,); NaN where missing.
         """
         seen = np.isfinite(z)
         if self.template is None and seen.all():
@@ -113,7 +116,7 @@ class PlanarSegment:
         return PlanarPose(turn, origin)
 
     def _exchanged(self, t_ns: int, angle: float) -> bool:
-        """Return whether exchanged labels have turned the segment since the last frame."""
+        """Return whether exchanged labels have rotated the segment since the last frame."""
         before, self._angle = self._angle, angle
         recent = t_ns - self._angle_ns < _EXCHANGE_NS
         self._angle_ns = t_ns

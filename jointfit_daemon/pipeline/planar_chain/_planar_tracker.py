@@ -1,11 +1,12 @@
 """Joint positions and stick figure of a planar chain in operation.
 
-Every joint lies between two body parts. In the coordinates of a part with two markers, each marker
-of the neighboring part moves on a circle about the joint. A running fit with forgetting gives the
-center and its predicted error. One marker suffices on a part at an end of the chain. Source:
-Akbarifar et al., Iranian Journal of Biomedical Engineering 15 (2021), 1-11.
+A joint connects two body parts. If a part has two markers, its coordinates are known. In these
+coordinates, each marker of the adjacent part moves on a circle about the joint. A running circle
+fit, in which older frames lose weight, estimates the center and predicts its error. A part at the
+end of the chain needs only one marker. Source: Akbarifar et al., Iranian Journal of Biomedical
+Engineering 15 (2021), 1-11.
 
-Invariant: nothing here depends on an IMU or on a calibration.
+Invariant: the result depends neither on an IMU nor on a calibration.
 """
 
 from __future__ import annotations
@@ -48,29 +49,29 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Output
 
 LEARNED_HZ = 20.0
-"""Frames per second of the running fits. Joints turn by a few degrees between two of these
-frames."""
+"""Number of frames per second in the running fits. Joints rotate by a few degrees between two of
+these frames."""
 FITTED_HZ = 2.0
-"""Number of estimates of the centers per second."""
+"""Number of center estimates per second."""
 OTHER_PLANE_COS = 0.9962
-"""Cosine of 5°, the angle between two planes above which the centers are estimated again. In a
-plane that is 5° off, the circles are compressed by 0.4 %."""
+"""Cosine of 5°. If the angle between two planes is larger, the centers are estimated again. In a
+plane with an error of 5°, the circles are compressed by 0.4 %."""
 FARTHEST_M = 1000.0
 """Distance from the origin beyond which a marker counts as missing, m."""
 
 
 @dataclass(slots=True)
 class _Side:
-    """Estimator of the center of a joint in the coordinates of one of its body parts."""
+    """Estimator of a joint center in the coordinates of one of the two body parts."""
 
     parent: str
     child: str
     circles: list[RunningCircle]
-    """One circle fit for each marker of the child."""
+    """One circle fit for each marker of the other body part."""
     estimate: CenterEstimate | None = None
 
     def feed(self, pose: PlanarPose | None, child: NDArray[np.complex128]) -> None:
-        """Process one frame; `child` are its markers in the plane, m, as complex numbers."""
+        """Process one frame. `child` are the markers of the other part in the plane, m."""
         if pose is None:
             local = np.full(len(child), complex(np.nan, np.nan))
         else:
@@ -79,7 +80,7 @@ class _Side:
             circle.feed(float(z.real), float(z.imag))
 
     def fit(self) -> None:
-        """Estimate the center from the frames so far."""
+        """Estimate the center from all frames so far."""
         each = [circle.estimate() for circle in self.circles]
         found = each[0] if len(each) == 1 else fuse_centers(each)
         if found.refused is None and MAX_FIT_RMS_M < found.residual < inf:
@@ -99,16 +100,16 @@ class _Joint:
 
 
 class PlanarTracker:
-    """Follows the joints between body parts with one or two markers.
+    """Estimates the joints between body parts with one or two markers.
 
     Parameters
     ----------
     chain : Chain
-        The limb: joints between neighboring parts with markers are followed.
+        The limb. Joints between adjacent parts with markers are estimated.
     markers : mapping of str to tuple of str
-        Markers of every body part.
+        Names of the markers of every body part.
     rate_hz : float
-        Greatest number of stick figures per second; above 0.
+        Largest number of stick figures per second; above 0.
     memory_s : float
         Time constant with which older frames lose weight, s.
     """
@@ -139,12 +140,12 @@ class PlanarTracker:
         return self._given == (chain, rate_hz, memory_s)
 
     def add_frame(self, t_ns: int, frame: MocapFrame) -> list[Output]:
-        """Return the stick figure of a live frame, if one is due, and notices."""
+        """Return the stick figure if it is due for this live frame, and notices."""
         learned, shown = self._learned.is_due(t_ns), self._shown.is_due(t_ns)
         if not (learned or shown):
             return []
 
-        # Find the markers of every part, m, shape (m, 3); NaN where missing.
+        # Collect the markers of every part, m, shape (m, 3); NaN where missing.
         if frame.layout is not self._layout:
             self._layout = frame.layout
             column = {name: k for k, name in enumerate(frame.layout.markers)}
@@ -163,7 +164,7 @@ class PlanarTracker:
         if fitted:
             notices = self._update_plane(t_ns)
 
-        # Estimate the pose of every part with two markers, or find the reason why there is none.
+        # Estimate the pose of every part with two markers, or find the reason why it has no pose.
         poses: dict[str, PlanarPose | MissingPose] = {}
         if self._basis is not None:
             poses = {
@@ -176,7 +177,7 @@ class PlanarTracker:
         return [*notices, self._figure(t_ns, frame, measured, poses)] if shown else notices
 
     def _update_plane(self, t_ns: int) -> list[Output]:
-        """Use the first plane; use a new plane if the plane of the movement has changed."""
+        """Use the first estimated plane, or a new plane if the movement has changed its plane."""
         self._plane = plane = self._estimator.estimate()
         if plane.normal is None:
             return []

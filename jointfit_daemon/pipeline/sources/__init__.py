@@ -1,4 +1,4 @@
-"""Sources: decoding and time stamping, latency priors, sync lines and lag monitoring."""
+"""Sources: decoding, time stamping, latency priors, sync lines and monitoring of the lag."""
 
 from jointfit_daemon.pipeline.sources._lag_monitor import LagMonitor, known_lags
 from jointfit_daemon.pipeline.sources._source_state import SourceState, StampedMeasurement

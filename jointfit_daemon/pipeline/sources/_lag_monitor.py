@@ -1,9 +1,9 @@
-"""Lag of every sensor behind the mocap system during operation, and notices of its changes.
+"""Lag of every sensor behind the mocap system during operation, and notices of changes.
 
 The monitor receives stamped samples and mocap frames, and retains the last window of both. It
-estimates the lag of one window at a time in small steps, so acquisition never waits for a whole
-fit. A replay takes the same steps. The monitor changes no lag: the lags in use come from
-calibration or ``rig.toml``.
+estimates the lag in one window at a time. The computation is split into small steps, so acquisition
+never waits for a complete fit, and a replay takes the same steps. The monitor does not change the
+lags in use, which come from the calibration or from ``rig.toml``.
 """
 
 from __future__ import annotations
@@ -36,41 +36,41 @@ if TYPE_CHECKING:
     from jointfit_daemon.timing.lag import Rates, TrackedLag
 
 WINDOW_NS = 10_000_000_000
-"""Length of the window of one estimate, ns."""
+"""Length of the time window of one estimate, ns."""
 HOP_NS = 2_500_000_000
-"""Time from one window to the next, ns."""
+"""Time between the starts of successive windows, ns."""
 MARGIN_NS = 300_000_000
-"""Samples of a sensor before and after the window, ns: for the lag and the ends of the filter."""
+"""Duration of samples before and after the window, ns, for the lag and the ends of the filter."""
 DRIFT_FAULT = 2e-6
-"""Drift of the lag between two synchronized clocks, ns/ns, above which a clock fit must be
+"""Drift of the lag between two synchronized clocks, ns/ns. A larger drift means that a clock fit is
 wrong."""
 STEP_FAULT_NS = 1_000_000.0
-"""Step of the lag above which the calibration is no longer valid, ns."""
+"""Change of the lag above which the calibration is no longer valid, ns."""
 CONTRADICTION_SIGMA = 4.0
-"""Difference between configured and estimated lag, in standard deviations, at which one of the two
-lags is wrong."""
+"""Difference between configured and estimated lag, in standard deviations. A larger difference
+means that one of the two lags is wrong."""
 RESTART_SD_NS = 1_000_000.0
-"""Standard deviation of the change of the lag when a clock restarts, ns."""
+"""Standard deviation by which the lag may change when a clock restarts, ns."""
 MAX_SAMPLES = 6_000
-"""Number of retained samples per sensor and of retained mocap frames: a window at 500 Hz."""
+"""Largest number of retained samples per sensor, and of mocap frames: a window at 500 Hz."""
 _FRAMES_PER_STEP = 150
 _MIN_FRAMES = 100
 
 
 _LOW_R2 = "no lag from this movement; normal on soft tissue, the lag in force stays"
-"""Cause of a low coefficient of determination R² during tracking. The sensor moves on the skin,
-which is no fault."""
+"""Text for a low coefficient of determination R² during tracking. The cause is motion of the sensor
+on the skin, which is not a fault."""
 
 
 class KnownLag(NamedTuple):
-    """A lag that needs no estimate: ``lag_ms`` of rig.toml, from a sync line or a measurement."""
+    """Lag that is not estimated: ``lag_ms`` in rig.toml, from a sync line or a measurement."""
 
     lag_ns: float
     sigma_ns: float
 
 
 def known_lags(rig: Rig) -> dict[str, KnownLag]:
-    """Return the lags that the sensor tables of a rig configure."""
+    """Return the lags that the sensor tables of a rig define."""
     settings_of = {source.id: source.settings for source in rig.sources if source.kind == "imu"}
     return {
         name: KnownLag(1e6 * settings.lag_ms, 1e6 * settings.lag_sd_ms)
@@ -80,7 +80,7 @@ def known_lags(rig: Rig) -> dict[str, KnownLag]:
 
 
 class _Window(NamedTuple):
-    """A window whose lag is being estimated."""
+    """A time window in which the lag is being estimated."""
 
     sensor: str
     center_ns: int
@@ -88,14 +88,14 @@ class _Window(NamedTuple):
 
 
 class _SegmentTrack(NamedTuple):
-    """Orientations of a segment from its markers in one window, shared by its sensors."""
+    """Orientations of a segment in one window, computed from its markers for all its sensors."""
 
     end_ns: int
-    """End of the window."""
+    """End of the window, ns."""
     t_ns: NDArray[np.int64]
     q: NDArray[np.float64]
     rates: Rates | None = None
-    """Angular rates, computed for the first sensor."""
+    """Angular rates, which are computed when the first sensor needs them."""
 
 
 class _SensorLag:
@@ -118,13 +118,14 @@ class LagMonitor:
     Parameters
     ----------
     chain : Chain
-        Sensors by segment.
+        Limb, with the sensors of each segment.
     calibration : Calibration or None
-        Marker clusters of the segments, and the lags in use. Without it nothing is estimated.
+        Calibration with the marker clusters of the segments and the lags in use. If it is None,
+        nothing is estimated.
     before : LagMonitor, optional
-        Monitor whose estimates are continued: a new calibration does not change the clocks.
+        Monitor whose estimates are continued, because a new calibration does not change the clocks.
     known : mapping, optional
-        Lags from rig.toml. They are used, and the estimates only check them.
+        Lags from rig.toml, which are used. The estimates only check them.
     """
 
     def __init__(
@@ -156,7 +157,7 @@ class LagMonitor:
         self._next_ns: int | None = None
         self._mocap_epoch: int | None = None
         self._tracks: dict[str, _SegmentTrack] = {}
-        """Track of the last window by segment; the next window continues it."""
+        """Track of the last window, by segment. The next window continues it."""
         for name, old in ({} if before is None else before.sensors).items():
             lag = self.sensors.get(name)
             if lag is not None:
@@ -165,7 +166,7 @@ class LagMonitor:
     # --- input -------------------------------------------------------------------------------
 
     def add_sample(self, sensor: str, t_ns: int, q: Quaternion, epoch: int = 0) -> None:
-        """Add one orientation; a new epoch of its clock discards the samples so far."""
+        """Add one orientation. A new epoch of the sensor's clock discards all earlier samples."""
         lag = self.sensors.get(sensor)
         if lag is None or not self._clusters or self._next_ns is None:
             return
@@ -212,7 +213,7 @@ class LagMonitor:
     # --- estimation --------------------------------------------------------------------------
 
     def step(self, now_ns: int) -> list[Notice]:
-        """Compute for a few milliseconds at most, and return the resulting notices."""
+        """Compute for at most a few milliseconds, and return the resulting notices."""
         window = self._window
         if window is None:
             if self._waiting:
@@ -236,7 +237,7 @@ class LagMonitor:
                 f"the calibration has no markers on {segment}: calibrate with motion capture"
             )
 
-        # Compute the orientations of the segment, which all its sensors share.
+        # Compute the orientations of the segment, which all of its sensors share.
         track = self._tracks.get(segment)
         if track is None or track.end_ns != end_ns:
             rows = [row for row in self._frames if start_ns <= row[0] <= end_ns]
@@ -246,7 +247,7 @@ class LagMonitor:
             track = _SegmentTrack(end_ns, t_ref, q_ref)
             self._tracks[segment] = track
 
-        # Select the samples of the sensor, with a margin for the lag.
+        # Select the sensor's samples, with a margin for the lag.
         low, high = start_ns - MARGIN_NS, end_ns + MARGIN_NS
         samples = [row for row in self.sensors[sensor].samples if low <= row[0] <= high]
         if len(samples) < _MIN_FRAMES:
@@ -268,7 +269,7 @@ class LagMonitor:
         if tracked is None or estimate.refused is not None:
             return []
 
-        # A step invalidates the calibration if it is large.
+        # A large change of the lag invalidates the calibration.
         notices, warning = [], NoticeLevel.WARNING
         if (step_ns := tracked.step_ns) is not None:
             kind, level = NoticeKind.CLOCK, NoticeLevel.INFO
@@ -279,7 +280,7 @@ class LagMonitor:
             data = {"step_ms": round(step_ns * 1e-6, 3)}
             notices.append(Notice(now_ns, kind, name, text, level, data))
 
-        # Drift between synchronized clocks is reported once.
+        # Drift between synchronized clocks is reported only once.
         excess = abs(tracked.drift) - DRIFT_FAULT
         drifts = excess > 2.0 * tracked.drift_sigma
         if drifts and not lag.drifted:
@@ -292,7 +293,7 @@ class LagMonitor:
             notices.append(Notice(now_ns, NoticeKind.CLOCK, name, text, warning, data))
         lag.drifted = drifts or (lag.drifted and excess > 0.0)
 
-        # A contradiction between configured and estimated lag is reported once.
+        # A contradiction between configured and estimated lag is reported only once.
         if (known := self._known.get(name)) is None:
             return notices
         difference = tracked.lag_ns - known.lag_ns
@@ -323,7 +324,7 @@ class LagMonitor:
         }
 
     def health(self) -> dict[str, LagHealth]:
-        """Return used and estimated lag of every sensor."""
+        """Return the lag in use and the estimated lag of every sensor."""
         found = {}
         for sensor, lag in self.sensors.items():
             if (known := self._known.get(sensor)) is not None:
@@ -341,9 +342,9 @@ class LagMonitor:
 def _orientations(
     cluster: MarkerCluster, rows: list[tuple[int, MocapFrame]], before: _SegmentTrack | None
 ) -> Generator[None, None, tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Return the orientations of a segment from its markers, in steps of a few frames.
+    """Return the orientations of a segment from its markers; yield after every few frames.
 
-    Windows overlap: frames of the window `before` are not fitted again.
+    Windows overlap, so frames that the window `before` contains are not fitted again.
     """
     t_ns = np.array([t for t, _ in rows], dtype=np.int64)
     layout = rows[0][1].layout

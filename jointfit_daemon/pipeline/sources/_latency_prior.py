@@ -1,7 +1,7 @@
 """Prior knowledge of the smallest delay from a sample to its arrival.
 
-A constant delay is not observable from arrival times. The mean of the prior is therefore subtracted
-from the stamps, and its standard deviation is published with them.
+A constant delay cannot be observed from arrival times. The prior mean is therefore subtracted from
+the stamps, and the prior standard deviation is published with them.
 """
 
 from __future__ import annotations
@@ -13,28 +13,29 @@ if TYPE_CHECKING:
 
 _NS_PER_MS = 1e6
 CAN_MS = (0.1, 0.1)
-"""Mean and standard deviation on a CAN bus, ms: one CAN frame at 1 Mbit/s."""
+"""Mean and standard deviation of the delay on a CAN bus, ms, equal to one CAN frame at 1 Mbit/s."""
 UART_MS = (0.2, 0.2)
-"""Mean and standard deviation on a UART, ms."""
+"""Mean and standard deviation of the delay on a UART, ms."""
 USB_MS = (1.0, 0.7)
-"""Mean and standard deviation on USB, ms: the host polls once a millisecond."""
+"""Mean and standard deviation of the delay on USB, ms; the host polls once per millisecond."""
 DATAGRAM_MS = (0.5, 0.5)
-"""Mean and standard deviation for datagrams on a local network, ms."""
+"""Mean and standard deviation of the delay of datagrams on a local network, ms."""
 _USB_NAMES = ("usb", "acm")
 
 
 class LatencyPrior(NamedTuple):
-    """Smallest delay from the sampling instant to arrival, ns."""
+    """Prior of the smallest delay from sampling to arrival, ns."""
 
     mean_ns: int
     sd_ns: int
 
 
 def latency_prior(source: Source) -> LatencyPrior:
-    """Return the prior of a source from its configuration, its driver, or else its transport.
+    """Return the prior of a source from its configuration, its driver, or its transport.
 
-    A driver declares a class attribute ``least_delay_ms``, or its settings a property
-    ``usual_delay_ms`` if the delay depends on them: mean and standard deviation, ms.
+    A driver declares mean and standard deviation, ms, in the class attribute ``least_delay_ms``. If
+    the delay depends on settings, the driver's settings have the property ``usual_delay_ms``
+    instead.
     """
     settings = source.settings
     configured = getattr(settings, "least_delay_ms", None) or getattr(

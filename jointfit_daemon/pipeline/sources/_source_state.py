@@ -1,7 +1,7 @@
 """State of one source in the core: decoder, clock and counters.
 
-The state converts chunks to stamped samples and counts losses and errors. The state is independent
-of frames, calibration and other sources.
+The state converts chunks to stamped samples, and counts losses and errors. It does not depend on
+frames, calibration or other sources.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ WITHHELD = ("unpublished", "duplicates", "late")
 
 
 KEPT_SAMPLES = 1000
-"""Number of samples and events after a reopening for which the time base of the previous decoder is
-used."""
+"""Number of samples and events after a reopening for which the time base of the previous decoder
+may be used."""
 
 
 class StampedMeasurement(NamedTuple):
-    """A measurement and its instant on the host clock."""
+    """A measurement, and its instant on the host clock."""
 
     measurement: ImuSample | MocapFrame
     stamp: Stamp
@@ -49,22 +49,22 @@ class SourceState:
     source: Source
     clock: DeviceClock
     lines: SyncLines = field(default_factory=SyncLines)
-    """Sync lines of the rig, shared by its sources."""
+    """Sync lines of the rig, which all of its sources share."""
     online: bool = False
     open: bool = False
     last_arrival_ns: int | None = None
     counts: WireCounts = field(default_factory=WireCounts)
     info: Mapping[str, object] = field(default_factory=dict)
     closed_text: str = ""
-    """Reason of the last closing."""
+    """Reason why the source was closed the last time."""
     _withheld: dict[str, int] = field(default_factory=lambda: dict.fromkeys(WITHHELD, 0))
     _decoder: Decoder | None = None
     _tick_clock: TickClock | None = None
-    """Time base of the previous decoder. It is used until the present decoder has determined a time
-    base, for at most `KEPT_SAMPLES` samples. A restart also ends the use, because the device may
-    have been exchanged."""
+    """Time base of the previous decoder, used until the current decoder has determined a time base,
+    for at most `KEPT_SAMPLES` samples. A restart also ends its use, because the device may have
+    been exchanged."""
     _kept: int = 0
-    """Number of further samples for which `_tick_clock` is used."""
+    """Number of further samples for which `_tick_clock` may be used."""
 
     @classmethod
     def create(
@@ -75,8 +75,8 @@ class SourceState:
     ) -> SourceState:
         """Return the state of a source that is not open yet.
 
-        The counts of `before`, the state of the same id before a reload, are continued: the counts
-        of its samples in the frame grid continue as well, and both must agree.
+        If `before` is the state of the same id before a reload, its counts are continued. The frame
+        grid also continues the counts of the samples, and both must agree.
         """
         mean_ns, sd_ns = latency_prior(source)
         period_ns = round(_NS / source.rate_hz)
@@ -90,10 +90,10 @@ class SourceState:
         return state
 
     def start(self) -> None:
-        """Start with a new decoder when the source was opened.
+        """Start with a new decoder after the source was opened.
 
-        The next sample of an IMU determines whether its clock restarted meanwhile. The clock of a
-        mocap server settles within a second, so its old fit is discarded.
+        The next sample of an IMU shows whether the IMU's clock restarted in the meantime. The clock
+        fit of a mocap server converges within a second, so its old fit is discarded.
         """
         if self.counts.opened and self.source.kind == "mocap":
             self.clock.feed_restart()
@@ -106,7 +106,7 @@ class SourceState:
         self.counts.opened += 1
 
     def stop(self) -> list[StampedMeasurement | Corrupt | DeviceEvent]:
-        """Return the remaining output of the decoder, and discard the decoder."""
+        """Return the remaining output of the decoder, and remove the decoder."""
         decoder, self._decoder = self._decoder, None
         self.open = self.online = False
         if decoder is None:
@@ -119,7 +119,7 @@ class SourceState:
         return items
 
     def withheld(self) -> dict[str, int]:
-        """Return the numbers of decoded frames that were not returned, by reason."""
+        """Return the number of decoded frames that were not returned, by reason."""
         return {
             name: count + getattr(self._decoder, name, 0) for name, count in self._withheld.items()
         }
@@ -127,12 +127,15 @@ class SourceState:
     def health(
         self, now_ns: int, samples: Mapping[str, int], sensors: SensorMonitor
     ) -> DeviceHealth:
-        """Return the health of the device; `samples` are the counts of the frame grid or router."""
+        """Return the health of the device.
+
+        `samples` are the counts of the frame grid or mocap router.
+        """
         sensor = None
         if self.source.kind == "imu":
             sensor = sensors.state(self.source.id)
         else:
-            # Add the frames that the decoder withheld.
+            # Add the number of frames that the decoder withheld.
             withheld = self.withheld()
             samples = {
                 **samples,
@@ -168,7 +171,7 @@ class SourceState:
         )
 
     def feed(self, chunk: Chunk) -> list[StampedMeasurement | Corrupt | DeviceEvent]:
-        """Return the stamped samples and events that `chunk` completes; none while closed."""
+        """Return the stamped samples and events that `chunk` completes; empty while closed."""
         decoder = self._decoder
         if decoder is None:
             return []
@@ -180,7 +183,8 @@ class SourceState:
     ) -> list[StampedMeasurement | Corrupt | DeviceEvent]:
         items: list[StampedMeasurement | Corrupt | DeviceEvent] = []
         # A new decoder may need seconds to determine the unit of device time. If samples were
-        # numbered by their counter meanwhile, the change would look like a restart of the clock.
+        # stamped by their counter in this time, the later change of clock would look like a
+        # restart.
         clock, tick_clock = self.clock, decoder.tick_clock
         if tick_clock is None and self._kept > 0:
             tick_clock = self._tick_clock
@@ -230,7 +234,7 @@ class SourceState:
         return StampedMeasurement(item, stamp)
 
     def _clock_events(self) -> list[DeviceEvent]:
-        """Return the events of the clock, and count clock restarts."""
+        """Return the events of the clock, and count its restarts."""
         events = [DeviceEvent(news.kind, news.text, dict(news.data)) for news in self.clock.news]
         self.clock.news.clear()
         restarts = sum(event.kind == "restart" for event in events)
@@ -240,7 +244,7 @@ class SourceState:
         return events
 
     def _identity_events(self, item: Corrupt | DeviceEvent) -> list[DeviceEvent]:
-        """Return a warning if a device reports another serial number than the calibrated one."""
+        """Return a warning if the device's serial number is not that of the calibrated sensor."""
         if not isinstance(item, DeviceEvent) or item.kind != "info" or "serial" not in item.data:
             return []
         text = exchanged_sensor(self.source.settings, item.data["serial"])

@@ -1,10 +1,10 @@
-"""Sync lines of a rig: assignment of the edges of different sources to common instants.
+"""Sync lines of a rig: edges from different sources are assigned to common instants.
 
-The reference of a line is the mocap source whose table names the line (``sync_line``: one edge per
-exposure), or else the first source whose edge arrived. The clocks of all other sources on the line
-are synchronized to the clock of the reference.
+The reference of a line is the mocap source whose table names the line (``sync_line``), because it
+sends one edge per exposure. Without such a source, the reference is the first source whose edge
+arrives. The clocks of all other sources on the line are synchronized to the clock of the reference.
 
-Invariant: the result depends only on the edges and clocks, in order of arrival.
+Invariant: the result depends only on the edges, the clocks, and their order of arrival.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ class SyncLines:
         self._mocap_lines: set[int] = set()
 
     def add_exposure(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
-        """Add a mocap frame whose exposure made an edge on line `number`."""
+        """Add a mocap frame whose exposure generated an edge on line `number`."""
         self._mocap_lines.add(number)
         self._add_reference_edge(number, source, clock, edge)
 
     def add_edge(self, number: int, source: str, clock: DeviceClock, edge: Edge) -> None:
-        """Add an edge on line `number` with a time stamp of `source`."""
+        """Add an edge on line `number` that `source` stamped."""
         line = self._lines.setdefault(number, _Line())
         silent = edge.t_ns - line.last_ns > SYNC_STALE_NS
         if line.reference is None or (silent and number not in self._mocap_lines):

@@ -1,4 +1,4 @@
-"""Requests of MQTT clients: table, validation, authentication, and single execution."""
+"""Requests of MQTT clients: definition, validation, authentication, and single execution."""
 
 from jointfit_daemon.supervisor.requests._arguments import REQUESTS, RequestArguments, RequestKind
 from jointfit_daemon.supervisor.requests._authentication import RequestAuthenticator

@@ -1,6 +1,6 @@
-"""The requests that the daemon accepts: name, arguments and effect of each.
+"""The requests that the daemon accepts, with name, arguments and effect.
 
-Invariant: `REQUESTS` equals the table of requests in docs/mqtt.md.
+Invariant: `REQUESTS` corresponds to the table of requests in docs/mqtt.md.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ LONGEST_MARK = 200
 LEAST_RATE_HZ, GREATEST_RATE_HZ = 1.0, 1000.0
 """Limits of a requested output rate, Hz."""
 MOST_VERSIONS = 50
-"""Largest number of stored calibrations in one answer; each takes about 500 bytes."""
+"""Largest number of stored calibrations in one answer. Each takes about 500 bytes."""
 LAST_VERSION = 999_999_999
 """Largest version number in a calibration store."""
 
@@ -134,7 +134,7 @@ class RequestKind(NamedTuple):
     model: type[RequestArguments]
     """Model of the arguments."""
     effect: str
-    """Effect of the request, in one sentence."""
+    """Effect of the request, described in one sentence."""
 
 
 REQUESTS: dict[str, RequestKind] = {
@@ -162,4 +162,4 @@ REQUESTS: dict[str, RequestKind] = {
         PhysicalTestArguments, "Test world, axes and direction of a sensor by three rotations."
     ),
 }
-"""Every request by its name, the last level of its topic."""
+"""All requests by name. The name is the last level of the topic."""

@@ -1,8 +1,8 @@
 """Authentication of requests by signature and nonce.
 
-Invariant: without a usable key every request is refused, each signed request passes once, and the
-memory of nonces is limited. Without ``[mqtt] request_key_file`` all requests pass; the access list
-of the broker then decides.
+Invariant: if no key can be used, every request is refused. Each signed request is accepted once,
+and the number of stored nonces is limited. Without ``[mqtt] request_key_file``, all requests are
+accepted; only the broker's access list can then restrict them.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ if TYPE_CHECKING:
     from jointfit_daemon.config import MqttSettings
 
 NONCE_CAPACITY = 4096
-"""Largest number of signed requests per minute; only owners of the key can reach this number."""
+"""Largest number of signed requests per minute. Only owners of the key can reach this number."""
 _NONCE_LIFETIME_NS = 2 * SIGNATURE_LIFETIME_US * 1000
-"""Time for which a nonce is stored, ns. A signature is valid for at most this time."""
+"""Time for which a nonce is stored, ns. No signature is valid for longer."""
 
 
 class RequestAuthenticator:
     """Verifies the signature of requests, and accepts each request once.
 
-    Requests signed before the authenticator was created are refused: an earlier process, whose
-    nonces are lost, may have accepted them.
+    Requests that were signed before this object was created are refused. An earlier process may
+    have accepted them, and its nonces are lost.
 
     Parameters
     ----------
     settings
-        ``[mqtt]``; the key is read once, at creation.
+        Table ``[mqtt]``. The key is read once, when the object is created.
     """
 
     def __init__(self, settings: MqttSettings) -> None:
         self._key: bytes | None = None
         self.fault = ""
-        """Reason why every request is refused; empty if requests are accepted."""
+        """Reason why all requests are refused; empty if requests are accepted."""
         try:
             self._key = request_key_of(settings)
         except RequestKeyError as missing:
@@ -56,7 +56,7 @@ class RequestAuthenticator:
         self._used: OrderedDict[str, int] = OrderedDict()
 
     def check(self, topic: str, request: Mapping[str, Any]) -> dict[str, Any]:
-        """Return `request` without the keys of its signature.
+        """Check the signature of `request`; return the request without the signature's keys.
 
         Raises
         ------
@@ -74,7 +74,7 @@ class RequestAuthenticator:
                     "t_us: from before the daemon started: sign the request again"
                 )
 
-            # Each nonce is accepted once.
+            # Each nonce is accepted only once.
             now_ns = time.monotonic_ns()
             while self._used and now_ns - next(iter(self._used.values())) > _NONCE_LIFETIME_NS:
                 self._used.popitem(last=False)

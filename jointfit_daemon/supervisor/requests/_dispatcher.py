@@ -1,7 +1,7 @@
-"""Runs each request once, and answers its repetitions with the first answer.
+"""Executes each request once, and answers its repetitions with the first answer.
 
-Invariant: every request that is received gets one answer. A request with the transaction of an
-earlier one never runs, and the memory of transactions is limited in number and time.
+Invariant: every received request gets one answer. A request with the same transaction as an earlier
+request is not executed. The number of stored transactions and their storage time are limited.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from jointfit_daemon.pipeline.events import Reply, ReplyAddress, Request
 
 Handler: TypeAlias = "Callable[[Request], Awaitable[Reply | None]]"
-"""Function that executes one request; it returns None if the core answers the request."""
+"""Function that executes one request. It returns None if the core answers the request."""
 
 log = logging.getLogger(__name__)
 
 MEMORY_NS = 60_000_000_000
-"""Time for which an answer is stored, ns. A broker repeats a message within seconds."""
+"""Time for which an answer is stored, ns. A broker repeats messages within seconds."""
 MEMORY_CAPACITY = 256
-"""Largest number of stored answers; a new answer replaces the oldest answer."""
+"""Largest number of stored answers. A new answer replaces the oldest."""
 MOST_RUNNING = 16
-"""Largest number of requests that wait for their answer."""
+"""Largest number of requests that wait for their answers."""
 
 
 @dataclass(slots=True)
@@ -39,29 +39,29 @@ class _Transaction:
 
     request: Request
     reply: Reply | None = None
-    """Answer to the request; None until it is answered."""
+    """Answer to the request; None until the request is answered."""
     repeated: list[ReplyAddress] = field(default_factory=list)
-    """Addresses of repetitions that wait for the answer."""
+    """Reply addresses of repetitions that wait for the answer."""
 
 
 class RequestDispatcher:
-    """Passes requests to the core or to their handlers.
+    """Passes requests to the core or to the daemon's handlers.
 
     Parameters
     ----------
     tasks : asyncio.TaskGroup
-        Owner of the task of every handler.
+        Task group that owns the task of every handler.
     feed
-        Function that passes a request to the core, which answers at once through its outputs.
+        Function that passes a request to the core. The core answers at once by one of its outputs.
     publish
         Function that publishes one answer.
     handlers
-        Handler by name; the core processes all other requests of `REQUESTS`.
+        Handlers by the name of the request. The core processes all other requests of `REQUESTS`.
 
     Raises
     ------
     ValueError
-        A handler has a name without a request.
+        A handler has a name that is not a request.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class RequestDispatcher:
         self._known: OrderedDict[str, _Transaction] = OrderedDict()
 
     def receive(self, request: Request) -> None:
-        """Execute a request, or answer its repetition."""
+        """Execute a request; if it is a repetition, answer it with the stored answer."""
         if request.transaction and self._is_repeated(request):
             return
         handler = self._handlers.get(request.command)
@@ -96,7 +96,7 @@ class RequestDispatcher:
             self._tasks.create_task(self._run(handler, request), name=name)
 
     def note_reply(self, reply: Reply) -> None:
-        """Store a published answer, and publish it for waiting repetitions of the request."""
+        """Store a published answer, and publish it also for the repetitions that wait for it."""
         known = self._known.get(reply.transaction)
         if known is None or known.reply is not None or known.request.command != reply.command:
             return
@@ -105,7 +105,7 @@ class RequestDispatcher:
             self._publish(replace(reply, reply_to=address))
 
     def _is_repeated(self, request: Request) -> bool:
-        """Answer a request with a known transaction; else store the transaction."""
+        """Answer a request with a known transaction and return True; else store the transaction."""
         now_ns = time.monotonic_ns()
         while self._known and (
             len(self._known) >= MEMORY_CAPACITY

@@ -1,7 +1,8 @@
 """Validation of MQTT requests.
 
-Invariant: no payload, topic or property raises an exception or costs more than linear time. Size
-and nesting are checked before the payload is parsed, and replies have a limited size.
+Invariant: no payload, topic or property raises an exception, and the cost is at most proportional
+to the size. Size and nesting are checked before the payload is parsed, and replies have a limited
+size.
 """
 
 from __future__ import annotations
@@ -26,24 +27,24 @@ if TYPE_CHECKING:
     from jointfit_daemon.supervisor.requests._authentication import RequestAuthenticator
 
 LONGEST_BYTES = 4096
-"""Largest payload, bytes; a signed request with a long transaction takes a quarter of it."""
+"""Largest payload, bytes. A signed request with a long transaction needs a quarter of it."""
 MOST_KEYS = 16
-"""Largest number of keys; `calibrate` has seven keys, including the keys of the signature."""
+"""Largest number of keys. `calibrate` has seven keys, including the keys of the signature."""
 LONGEST_TEXT = 256
 """Longest `transaction` and response topic, characters."""
 LONGEST_CORRELATION_BYTES = 256
 """Longest correlation data, bytes."""
 _MOST_BRACKETS = 64
-"""Largest number of opening brackets. A request is flat, and has one bracket outside of its
+"""Largest number of opening brackets. A request is flat, so it has one bracket outside its
 texts."""
 _MOST_FAULTS = 8
-"""Number of faults that a reply lists; further faults are counted."""
+"""Number of faults that a reply lists. Further faults are only counted."""
 _LONGEST_KEY, _LONGEST_MESSAGE = 80, 400
-"""Lengths of the longest texts in a reply, characters."""
+"""Longest key and longest message in a reply, characters."""
 _COMMAND = re.compile(r"[A-Za-z0-9_-]{1,32}")
-"""Permitted command names: other names are not repeated on a topic."""
+"""Pattern of command names. Names that do not match are not repeated on a topic."""
 _RESPONSE_LEVELS = re.compile(r"[\w.:~-]{1,64}(/[\w.:~-]{1,64}){0,3}", re.ASCII)
-"""Levels below ``bridge/response/`` that a client may request."""
+"""Pattern of the topic levels below ``bridge/response/`` that a client may request."""
 
 
 def parse_request(
@@ -56,12 +57,14 @@ def parse_request(
     message
         The received message.
     authenticator
-        Object that checks the signature before the arguments are read. None accepts all requests.
+        Object that checks the signature before the arguments are read. If it is None, all requests
+        are accepted.
 
     Returns
     -------
     Request, Reply or None
-        None if no reply is due: the last level of the topic cannot be a command.
+        The request, or a reply with its faults. None means that no reply is sent, because the last
+        level of the topic cannot be a command.
     """
     command = message.topic.rpartition("/")[2]
     if not _COMMAND.fullmatch(command):
@@ -96,7 +99,7 @@ def parse_request(
 
 
 def _parse_table(payload: bytes) -> tuple[dict[str, Any], Fault | None]:
-    """Return the flat JSON object in `payload`, or an empty object and the fault."""
+    """Return the JSON object in `payload` and no fault, or an empty object and the fault."""
     if len(payload) > LONGEST_BYTES:
         text = f"has {len(payload)} bytes, expected at most {LONGEST_BYTES}"
         return {}, Fault("payload", text)
@@ -117,7 +120,7 @@ def _parse_table(payload: bytes) -> tuple[dict[str, Any], Fault | None]:
 
 
 def _property_fault(message: Incoming) -> Fault | None:
-    """Return the fault of the response topic or of the correlation data."""
+    """Return the fault of the response topic or of the correlation data; None without a fault."""
     address = _reply_address(message)
     if message.response_topic is not None and address.topic is None:
         text = (
@@ -135,9 +138,9 @@ def _property_fault(message: Incoming) -> Fault | None:
 
 
 def _reply_address(message: Incoming) -> ReplyAddress:
-    """Return requested topic and correlation data, with None for values that are not permitted.
+    """Return requested topic and correlation data; values that are not permitted become None.
 
-    Only topics below ``bridge/response/`` are permitted: otherwise a client could write to `pose`.
+    Only topics below ``bridge/response/`` are permitted. Otherwise a client could write to `pose`.
     """
     topic = message.response_topic
     if topic is not None:
@@ -160,12 +163,12 @@ def _response_root(message: Incoming) -> str:
 
 
 def _refusal(command: str, transaction: str, faults: list[Fault], reply_to: ReplyAddress) -> Reply:
-    """Return a reply of limited size that lists `faults`."""
+    """Return a reply of limited size that contains `faults`."""
     return Reply(command, transaction, "error", {}, error_of(faults), reply_to)
 
 
 def error_of(faults: Sequence[Fault]) -> dict[str, Any]:
-    """Return the ``error`` of an answer: the first faults, and the number of further faults."""
+    """Return the key ``error`` of an answer: the first faults, and the number of further faults."""
     lines = [
         {"key": _cut(fault.key, _LONGEST_KEY), "message": _cut(fault.text(), _LONGEST_MESSAGE)}
         for fault in faults[:_MOST_FAULTS]
