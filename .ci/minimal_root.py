@@ -1,14 +1,14 @@
-"""Run the tests and the demo on a fresh minimal Debian, as a stranger would, without root.
+"""Run the tests and the demo on a new minimal Debian system, as a new user without root access.
 
     .ci/minimal_root.py [--suite NAME] [--out DIR] [-- SHELL COMMAND]
 
-The system is mmdebstrap's minbase with `PACKAGES`: no broker, no name localhost.
-It is entered as an ordinary user, in namespaces of its own, on a clone of this checkout's last
-commit, with an uptime of one minute where the kernel has time namespaces. Only setting it up needs
-root (or sudo). The configuration of pip, the files that it names, and the network are those of the
-host. DIR gets the JUnit reports (default: ``build/minimal``).
+The system is mmdebstrap's minbase with `PACKAGES`. It has no broker and no host name localhost. The
+tests run as an ordinary user in separate namespaces, on a clone of the last commit. If the kernel
+has time namespaces, the uptime is one minute. Only the set-up needs root (or sudo). The
+configuration of pip, the files that it names, and the network are those of the host. The JUnit
+reports are written to DIR (default: ``build/minimal``).
 
-Exit status: that of the command; 2 if the system cannot be set up.
+The exit status is that of the command, or 2 if the system cannot be set up.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 PACKAGES = ("python3", "python3-venv", "make", "git", "ca-certificates")
 DEMO = "make demo ARGS='--headless --seconds 20'"
 COMMAND = f"make test && {{ {DEMO} || {{ echo 'the demo failed: once more'; {DEMO}; }}; }}"
-"""The demo is judged in real time, which another guest of the machine can disturb once."""
+"""Command to run. The demo runs in real time, and another guest of the machine can disturb it once,
+so it has two attempts."""
 UPTIME_S = 60
 HOME = Path("/home/stranger")
 PIP_CONFIGURATIONS = (
@@ -38,11 +39,11 @@ PIP_CONFIGURATIONS = (
     (Path.home() / ".pip/pip.conf", HOME / ".pip/pip.conf"),
     (Path.home() / ".config/pip/pip.conf", HOME / ".config/pip/pip.conf"),
 )
-"""Where pip looks on the host, and where it looks inside."""
+"""Paths of pip's configuration files on the host and in the new system."""
 PASSED = re.compile(
     r"PIP_(?!CACHE_DIR)\w+|(https?|no)_proxy|SSL_CERT_FILE|REQUESTS_CA_BUNDLE", re.IGNORECASE
 )
-"""Environment variables that pip needs inside."""
+"""Names of the environment variables that pip needs in the new system."""
 ABSOLUTE = re.compile(r"(file://)?(/[^\s,;\"']+)")
 
 SET_UP = """\
@@ -92,7 +93,7 @@ exit $status
 
 
 def main() -> int:
-    """Set the system up and run the command in it; return the exit status."""
+    """Set up the system, and run the command in it; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=CHECKOUT / "build" / "minimal", metavar="DIR")
     parser.add_argument("--suite", default=SUITE, help="release of Debian (default: %(default)s)")
@@ -126,7 +127,7 @@ def main() -> int:
 
 
 def _namespaces(root: list[str]) -> list[str]:
-    """Return the command that enters new namespaces; nothing inside outlives it."""
+    """Return the command that enters new namespaces, in which no process outlives the command."""
     enter = ["unshare", "--mount", "--propagation=private", "--pid", "--fork", "--kill-child"]
     monotonic = UPTIME_S - int(time.clock_gettime(time.CLOCK_MONOTONIC))
     boottime = UPTIME_S - int(time.clock_gettime(time.CLOCK_BOOTTIME))
@@ -169,11 +170,11 @@ def _read_configurations() -> list[str]:
 
 
 def _shared(texts: list[str]) -> list[Path]:
-    """Return the existing files and folders that settings of pip name, in order of depth."""
+    """Return the existing files and folders that pip's settings name, in order of depth."""
     found = set()
     for scheme, name in (match.groups() for text in texts for match in ABSOLUTE.finditer(text)):
         path = Path(name)
-        if scheme and path.parent != Path("/"):  # an index links to files that lie beside it
+        if scheme and path.parent != Path("/"):  # an index links to files in its own folder
             path = path.parent
         if path.exists() and not path.samefile(os.devnull):
             found.add(path)

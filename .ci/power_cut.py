@@ -3,15 +3,15 @@
 
     .ci/power_cut.py [--cuts N] [--seed N] [--time-limit S]
 
-The light virtual machine records four sensors of 400 Hz to a disk of its own. At N random moments
-it is stopped for an instant, and its disk is copied; at the last one it is killed. The disk
-contains the data that the guest had written, without the pages that were still in its memory. A
-second machine mounts these disks, which replays their journals, and copies the recordings to the
+The light virtual machine records four sensors of 400 Hz to its own disk. At N random times, the
+machine is stopped for a short time and its disk is copied. At the last time, the machine is killed.
+A copied disk contains the data that the guest had written, without the pages in its memory. A
+second machine mounts these disks, which replays their journals. It copies the recordings to the
 host.
 
-Invariant: every recording opens, lacks at most its last second, and nothing before it.
+Invariant: every recording opens. It lacks at most the last second, and nothing before.
 
-Exit status: 0; 1 if a recording lacks more; otherwise as of ``light_vm.py``.
+The exit status is 0, or 1 if a recording lacks more. Other values are those of ``light_vm.py``.
 """
 
 from __future__ import annotations
@@ -41,13 +41,14 @@ from jointfit_daemon.outputs.recording import RecordedMessage, open_recording
 DISK_MIB = 16
 DISKS = "/dev/shm"  # noqa: S108 - memory: a busy disk of the host would delay the guest
 LONGEST_LOSS_S = 1.0
-"""Longest loss of a machine that has a processor for itself, s."""
+"""Longest accepted loss on a machine with its own processor, s."""
 STAMP_S = 0.1
-"""Interval of the printed stamps, s; a longer one is the load of this machine."""
+"""Time between two printed stamps, s. A longer time is caused by the load of this machine."""
 FILE_S = 2.0
-"""Duration of one file, s: long enough to lose too much of it, and some cuts hit its beginning."""
+"""Duration of one file, s. A file is long enough that a large loss is possible. Some cuts occur at
+the beginning of a file."""
 RECORDED_S = 6.0
-"""Time in which the power is cut, s."""
+"""Period in which the power cuts occur, s."""
 RECORD = """\
 mkdir /tmp/disk && mount -t ext4 /dev/ubda /tmp/disk && exec {python} -m \\
     bench.rigs.recording_process /tmp/disk/recordings --file-seconds {file_s} --stamps
@@ -68,7 +69,7 @@ class RecordingMachine:
 
     def __init__(self, work: Path, disk: Path) -> None:
         self.stamps_ns: list[int] = []
-        """Arrivals of some chunks in the guest, CLOCK_MONOTONIC ns of the guest."""
+        """Arrival times of some chunks in the guest, CLOCK_MONOTONIC of the guest, ns."""
         self.console: list[str] = []
         self._disk = disk
         with self._disk.open("wb") as file:
@@ -97,7 +98,7 @@ class RecordingMachine:
         return bool(self.stamps_ns)
 
     def copy_disk(self, target: Path) -> list[int]:
-        """Copy the disk as a power cut would leave it now; return the stamps of the guest."""
+        """Copy the disk in the state after a power cut; return the stamps of the guest."""
         stopped = [one for one in uml.members(self._machine.pid) if not is_traced(one)]
         for process in stopped:
             os.kill(process, signal.SIGSTOP)
@@ -111,7 +112,7 @@ class RecordingMachine:
         return stamps_ns
 
     def kill(self) -> Path:
-        """End the machine without any warning; return its disk."""
+        """Kill the machine; return the path of its disk."""
         with suppress(ProcessLookupError):
             os.killpg(self._machine.pid, signal.SIGKILL)
         uml.stop(self._machine)
@@ -119,13 +120,13 @@ class RecordingMachine:
 
 
 def is_traced(process: int) -> bool:
-    """Return whether a process belongs to the guest, whose kernel traces it."""
+    """Return whether the guest kernel traces a process, which then belongs to the guest."""
     status = Path(f"/proc/{process}/status").read_text(encoding="ascii")
     return "\nTracerPid:\t0\n" not in status
 
 
 def process_state(process: int) -> str:
-    """Return the letter of the state of a process; ``T`` is stopped."""
+    """Return the state letter of a process; ``T`` means stopped."""
     return Path(f"/proc/{process}/stat").read_text(encoding="ascii").rpartition(") ")[2][0]
 
 
@@ -168,11 +169,11 @@ class CutDisk(NamedTuple):
 
     disk: Path
     stamps_ns: list[int]
-    """Known arrivals of chunks before the cut, CLOCK_MONOTONIC ns of the guest."""
+    """Known arrival times of chunks before the cut, CLOCK_MONOTONIC of the guest, ns."""
 
 
 def cut_power(work: Path, memory: Path, moments_s: list[float], limit_s: float) -> list[CutDisk]:
-    """Record on a machine, and return its disk at each moment; none if it does not record."""
+    """Record on a machine; return its disk at each time, or none if it does not record."""
     machine = RecordingMachine(work, memory / "disk")
     try:
         if not machine.wait_for_recording(limit_s):
@@ -190,7 +191,7 @@ def cut_power(work: Path, memory: Path, moments_s: list[float], limit_s: float) 
 
 
 def hand_over(work: Path, disks: list[Path], limit_s: float) -> int:
-    """Mount the disks in a second machine, which copies the recordings to the host."""
+    """Copy the recordings to the host by means of a second machine that mounts the disks."""
     letters = ascii_lowercase[: len(disks)]
     light_vm.write_init(work / "init", work / "out", HAND_OVER, disks=" ".join(letters))
     attached = [f"ubd{number}={disk}" for number, disk in enumerate(disks)]
@@ -198,7 +199,7 @@ def hand_over(work: Path, disks: list[Path], limit_s: float) -> int:
 
 
 def judge(folder: Path, cut: CutDisk) -> bool:
-    """Print the extent of a recording; return whether it is complete up to its last second."""
+    """Print the time range of a recording; return whether only its last second is missing."""
     recording = open_recording(folder)
     messages = list(recording.messages())
     found = [one for one in messages if isinstance(one, RecordedMessage)]

@@ -1,8 +1,8 @@
-"""A Linux kernel as an ordinary process: Debian's user-mode-linux, started and ended cleanly.
+"""A Linux kernel as an ordinary process (Debian's user-mode-linux, UML), with clean start and end.
 
-Invariant: nothing of a machine outlives the script that booted it; a result is believed only if the
-guest wrote it. Used by ``light_vm.py`` (the host's own files) and ``full_vm.py`` (an image with
-systemd).
+Invariant: no process of a machine outlives the script that booted it. A result counts only if the
+guest wrote it. ``light_vm.py`` (with the host's own files) and ``full_vm.py`` (an image with
+systemd) use this module.
 """
 
 from __future__ import annotations
@@ -36,16 +36,17 @@ NO_AVX = {
     "OPENBLAS_CORETYPE": "Nehalem",
     "NPY_DISABLE_CPU_FEATURES": "X86_V3,X86_V4,AVX512_ICL,AVX512_SPR",
 }
-"""For every program of a guest that keeps SSE registers only (see ``hide_xstate``)."""
+"""Environment variables for every program of a guest that saves SSE registers only (see
+``hide_xstate``)."""
 
 
 def say(text: str) -> None:
-    """Print one line, flushed because it mixes with the guest's console."""
+    """Print one line and flush it, because the guest's console uses the same output."""
     print(f"{Path(sys.argv[0]).stem}: {text}", flush=True)
 
 
 def search_path() -> str:
-    """Return PATH with the folders of administration tools, which users often lack."""
+    """Return PATH extended by the folders of administration tools, which users often lack."""
     return os.environ.get("PATH", "") + ":/usr/sbin:/sbin"
 
 
@@ -55,9 +56,9 @@ def missing(*tools: str) -> list[str]:
 
 
 def boot(command: list[str], limit_s: float, console: IO[bytes] | None = None) -> int:
-    """Run a machine to its end or the limit; nothing of it is left in any case.
+    """Run a machine to its end or to the time limit; stop all its processes.
 
-    Returns the guest's exit status, 128 + a signal's number, or `TIMED_OUT`.
+    Return the guest's exit status, 128 + the number of a signal, or `TIMED_OUT`.
     """
     machine = start(command, console)
     say(f"booted as process {machine.pid}, at most {limit_s:g} s")
@@ -89,7 +90,7 @@ def start(command: list[str], console: IO[bytes] | int | None = None) -> subproc
 
 
 def prepare(parent: int) -> None:
-    """In the child: one CPU (three times faster), and no life beyond this script's."""
+    """Prepare the child process: use one CPU (three times faster), and end with this script."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != parent:
@@ -99,17 +100,18 @@ def prepare(parent: int) -> None:
 
 
 def has_amx() -> bool:
-    """Whether the processor's extended state (11 KB) is larger than UML's room for it (2.7 KB)."""
+    """Return whether the processor's extended state (11 KB) exceeds UML's buffer (2.7 KB)."""
     return " amx_tile " in Path("/proc/cpuinfo").read_text().replace("\n", " ")
 
 
 def hide_xstate() -> None:
-    """Have ``ptrace(PTRACE_GETREGSET)`` fail, so that UML saves registers the older way.
+    """Make ``ptrace(PTRACE_GETREGSET)`` fail, so UML saves registers the older way.
 
-    UML 6.1 tries that call at boot to see whether it can save the extended state. On a processor
-    with AMX the try succeeds and every later PTRACE_SETREGSET fails, for its buffer is too short:
-    the guest dies at once ("ptrace set fp regs failed, errno = 14"). Refused, it falls back to
-    PTRACE_GETFPREGS: x87 and SSE only, which is why threads of the guest must do without AVX.
+    At boot, UML 6.1 tests with this call whether it can save the extended state. On a processor
+    with AMX, the test succeeds. Every later PTRACE_SETREGSET then fails because its buffer is too
+    short, and the guest dies at once ("ptrace set fp regs failed, errno = 14"). If the call fails,
+    UML uses PTRACE_GETFPREGS, which saves x87 and SSE registers only. Threads of the guest must
+    therefore not use AVX.
     """
     load, equal, ret = 0x20, 0x15, 0x06
     program = struct.pack(
@@ -118,8 +120,8 @@ def hide_xstate() -> None:
         equal, 0, 3, 101,  # ptrace
         load, 0, 0, 16,  # its first argument
         equal, 0, 1, 0x4204,  # PTRACE_GETREGSET
-        ret, 0, 0, 0x00050000 | errno.EINVAL,  # fails
-        ret, 0, 0, 0x7FFF0000,  # all else is allowed
+        ret, 0, 0, 0x00050000 | errno.EINVAL,  # the call fails
+        ret, 0, 0, 0x7FFF0000,  # all other calls are allowed
     )  # fmt: skip
     room = ctypes.create_string_buffer(program)
     header = struct.pack("HxxxxxxP", 6, ctypes.addressof(room))
@@ -130,7 +132,7 @@ def hide_xstate() -> None:
 
 
 def stop(machine: subprocess.Popen[bytes]) -> int:
-    """End the machine: ask, then kill its process group, which is its own. Return 0."""
+    """Terminate the machine, then kill its process group. Return 0."""
     if machine.poll() is None:
         machine.terminate()
         try:
@@ -138,7 +140,7 @@ def stop(machine: subprocess.Popen[bytes]) -> int:
         except subprocess.TimeoutExpired:
             machine.kill()
             machine.wait()
-    for _ in range(100):  # it calls setsid: whatever is left is in its group
+    for _ in range(100):  # the machine calls setsid, so all its processes are in its group
         try:
             os.killpg(machine.pid, signal.SIGKILL)
         except (ProcessLookupError, PermissionError):
@@ -150,12 +152,12 @@ def stop(machine: subprocess.Popen[bytes]) -> int:
 
 
 def members(group: int) -> list[int]:
-    """Return the processes of a process group that are not yet gone (zombies are)."""
+    """Return the processes of a process group that have not ended; zombies have ended."""
     found = []
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
             state, _, of_group = path.read_text().rpartition(")")[2].split()[:3]
-        except (OSError, ValueError):  # it went away just now
+        except (OSError, ValueError):  # the process has just ended
             continue
         if int(of_group) == group and state != "Z":
             found.append(int(path.parent.name))
@@ -163,16 +165,16 @@ def members(group: int) -> list[int]:
 
 
 def exit_status(code: int) -> int:
-    """Return a signal's death as shells do."""
+    """Return the exit status in the convention of shells: 128 + N after a signal N."""
     return code if code >= 0 else 128 - code
 
 
 NOT_OF_THIS_WIRE = ("this wire", "bytes of this wire")
-"""First words of the reasons with which the conformance suite leaves out parts."""
+"""First words of the reasons with which the conformance suite skips tests."""
 
 
 def judge(code: int, report: Path) -> int:
-    """Return the exit status: pytest's, or 1 if the report lacks or skipped a test."""
+    """Return pytest's exit status, or 1 if a test was skipped or is missing from the report."""
     if code == TIMED_OUT:
         return code
     if not report.is_file():
@@ -185,7 +187,7 @@ def judge(code: int, report: Path) -> int:
     }
     say(", ".join(f"{key} {value}" for key, value in counts.items()))
 
-    # Only what a protocol rules out may be skipped here.
+    # Only tests that the protocol excludes may be skipped here.
     reasons = [
         found.get("message") or "no reason given"
         for suite in suites

@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 """Compile the modules of the frame's path with mypyc: `python packaging/compiled.py [--out DIR]`.
 
-The command writes the packages as a wheel would install them, sources and extension modules, into
-DIR (default: build/compiled). As the build hook of the wheel it adds the extension modules to the
-wheel; it is active with ``JOINTFIT_COMPILED=1``, otherwise wheels and editable installations are
-pure. Modules are listed in pyproject.toml. They are compiled again only if a source, the list, the
-compiler or mypy has changed.
+The command writes the packages as a wheel would install them, with sources and extension modules,
+into DIR (default: build/compiled). The module is also the build hook of the wheel. With
+``JOINTFIT_COMPILED=1`` the hook adds the extension modules to the wheel. Otherwise, wheels and
+editable installations are pure Python. The modules are listed in pyproject.toml. They are compiled
+again only if a source, the list, the compiler or mypy has changed.
 
-Invariant: the sources are compiled as they are; a wheel contains them beside their compiled form.
+Invariant: the sources are compiled without changes. A wheel contains the sources and the compiled
+modules.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ PACKAGES = (
 VARIANT = "jointfit_variant.py"
 STAMP = ".digest"
 REQUIREMENTS = ["mypy[mypyc]>=2.4,<3", "setuptools>=65", "numpy>=1.26", "typing-extensions>=4.4"]
-"""Packages for the compilation; numpy for its types."""
+"""Packages that the compilation needs. numpy provides types."""
 MYPY = """\
 [mypy]
 explicit_package_bases = true
@@ -67,13 +68,14 @@ for extension in extensions:
 arguments = ["--quiet", "build_ext", "--inplace", "--build-temp", "objects"]
 setup(name="jointfit", packages=[], ext_modules=extensions, script_args=arguments)
 """
-"""Program that compiles; one C file a module, because one for all needs a gigabyte of memory."""
+"""Program that compiles the modules. Each module has its own C file, because a single C file for
+all modules would need a gigabyte of memory."""
 LEVEL = "2"
 """Optimization level of the C compiler."""
 
 
 def compiler() -> str | None:
-    """Return the C compiler; None if it or the headers of Python are missing."""
+    """Return the path of the C compiler; None if the compiler or Python's headers are missing."""
     words = os.environ.get("CC", "cc").split() or ["cc"]
     found = shutil.which(words[0])
     headers = Path(sysconfig.get_path("include"), "Python.h")
@@ -81,7 +83,7 @@ def compiler() -> str | None:
 
 
 def module_list(root: Path = ROOT) -> dict[str, list[str]]:
-    """Return the patterns of the modules to compile by group, from pyproject.toml."""
+    """Return the file patterns of the modules to compile, by group, from pyproject.toml."""
     project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
     target = project["tool"]["hatch"]["build"]["targets"]["wheel"]
     groups: dict[str, list[str]] = target["hooks"]["custom"]["modules"]
@@ -89,19 +91,19 @@ def module_list(root: Path = ROOT) -> dict[str, list[str]]:
 
 
 def is_current(out: Path, groups: dict[str, list[str]] | None = None, level: str = LEVEL) -> bool:
-    """Return whether `out` contains the extension modules of the present sources."""
+    """Return whether `out` contains extension modules of the current sources."""
     stamp = out / STAMP
     digest = _digest(groups or module_list(), level)
     return stamp.is_file() and stamp.read_text(encoding="utf-8") == digest
 
 
 def compile_modules(out: Path, groups: dict[str, list[str]], level: str = LEVEL) -> Path:
-    """Write the packages with extension modules to `out`, unless they are there and current.
+    """Write the packages with extension modules to `out`, unless they are current.
 
     Raises
     ------
     RuntimeError
-        No C compiler, no headers of Python, or a module that cannot be compiled.
+        The C compiler or Python's headers are missing, or a module cannot be compiled.
     """
     if compiler() is None:
         raise RuntimeError(
@@ -111,7 +113,7 @@ def compile_modules(out: Path, groups: dict[str, list[str]], level: str = LEVEL)
     if is_current(out, groups, level):
         return out
 
-    digest = _digest(groups, level)  # a source may change meanwhile
+    digest = _digest(groups, level)  # before a source changes during compilation
     work = out.with_name(f"{out.name}.new")
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
@@ -126,7 +128,7 @@ def compile_modules(out: Path, groups: dict[str, list[str]], level: str = LEVEL)
     done = subprocess.run(  # noqa: S603 - our own program
         [sys.executable, "setup.py", level, *modules],
         cwd=work, text=True, capture_output=True, check=False,
-        env=os.environ | {"PYTHONHASHSEED": "0"},  # the C files follow the order of sets
+        env=os.environ | {"PYTHONHASHSEED": "0"},  # the order of sets affects the C files
     )  # fmt: skip
     if done.returncode:
         raise RuntimeError(f"{done.stdout}{done.stderr}compiling ended with {done.returncode}")
@@ -152,7 +154,7 @@ def _modules(tree: Path, groups: dict[str, list[str]]) -> list[str]:
 
 
 def _digest(groups: dict[str, list[str]], level: str) -> str:
-    """Return the hash of everything on which the extension modules depend."""
+    """Return a hash of all inputs of the extension modules."""
     version = subprocess.run(  # noqa: S603 - the compiler
         [compiler() or "cc", "--version"], capture_output=True, text=True, check=False
     ).stdout
@@ -188,7 +190,7 @@ class CompiledBuildHook(BuildHookInterface):  # type: ignore[type-arg]
 
 
 def main() -> int:
-    """Compile into a folder and print how to use it."""
+    """Compile the modules into a folder, and print how to use it."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, default=OUT, metavar="DIR")
     parser.add_argument("--level", default=LEVEL, help="optimization of the C compiler, 0 to 3")

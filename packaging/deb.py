@@ -1,13 +1,15 @@
 #!/usr/bin/env python3
 """Build the Debian package: `python packaging/deb.py [--arch amd64|arm64] [--out DIR]`.
 
-Invariant: the content depends on ``requirements.lock``, the commit and the C compiler only; the
-same commit gives the same bytes (SOURCE_DATE_EPOCH, default: of the commit). Wheels are only
-unpacked, so a package for another architecture can be built here, too. Only a package for this
-architecture contains compiled modules (packaging/compiled.py), if there is a C compiler.
+Invariant: the content depends only on ``requirements.lock``, the commit and the C compiler. The
+same commit yields identical bytes (SOURCE_DATE_EPOCH; the default is the time of the commit).
+Wheels are only unpacked, so a package for another architecture can also be built. Only a package
+for the architecture of this machine contains compiled modules (packaging/compiled.py), if a C
+compiler exists.
 
-The package carries its own site-packages behind /usr/lib/jointfitd/bin/python3, a link to Debian's
-Python: nothing of it is seen by other programs, and nothing of theirs by it.
+The package contains its own site-packages. Its interpreter /usr/lib/jointfitd/bin/python3 is a link
+to Debian's Python. Other programs cannot import packages of jointfitd, and jointfitd cannot import
+theirs.
 """
 
 from __future__ import annotations
@@ -45,7 +47,8 @@ COMMANDS = {
 }
 MAINTAINER = "The jointfitd authors <jointfitd@users.noreply.github.com>"
 EXTRAS = "demo,c3d,metrics"
-"""Pure Python, or with wheels for both architectures."""
+"""Extras in the package. Their dependencies are pure Python or have wheels for both architectures.
+"""
 LAUNCHER = """\
 #!/usr/lib/jointfitd/bin/python3 -I
 import sys
@@ -56,7 +59,8 @@ if __name__ == "__main__":
     sys.exit(main())
 """
 LOCAL_DRIVERS = "/usr/local/lib/jointfitd"
-"""Where `pip install --target` puts drivers of third parties; root's, as /usr/local is."""
+"""Folder for third-party drivers from `pip install --target`. It belongs to root, as /usr/local
+does."""
 SYSTEM_FILES = {
     "systemd/jointfitd.service": "usr/lib/systemd/system",
     "systemd/jointfitd@.service": "usr/lib/systemd/system",
@@ -72,7 +76,7 @@ SYSTEM_FILES = {
 
 
 def main() -> int:
-    """Build one package and print its path."""
+    """Build one package, and print its path."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--arch", choices=sorted(PLATFORMS), default="amd64")
     parser.add_argument("--out", type=Path, default=ROOT / "build" / "packages", metavar="DIR")
@@ -117,11 +121,11 @@ def _commit_time() -> str:
         )  # fmt: skip
         if done.returncode == 0 and done.stdout.strip():
             return done.stdout.strip()
-    return str(int((ROOT / "pyproject.toml").stat().st_mtime))  # an unpacked source archive
+    return str(int((ROOT / "pyproject.toml").stat().st_mtime))  # source archive, no commit
 
 
 def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) -> None:
-    """Unpack our wheel and its dependencies where Debian's Python will find them."""
+    """Unpack the wheel of this project and its dependencies into the package's site-packages."""
     site = tree / HOME / "lib" / f"python{PYTHON}" / "site-packages"
     pip: list[str | Path] = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
     is_compiled = architecture == THIS_ARCHITECTURE and compiler() is not None
@@ -135,7 +139,7 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
     )  # fmt: skip
     wheel = next(scratch.glob("jointfitd-*.whl"))
     names = list(PLATFORMS[architecture])
-    if is_compiled:  # for this machine: such a wheel names no manylinux
+    if is_compiled:  # a compiled wheel has the platform tag of this machine
         names.append(f"linux_{platform.machine()}")
     platforms = [word for name in names for word in ("--platform", name)]
     _run(
@@ -146,9 +150,9 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
         ],
         epoch,
     )  # fmt: skip
-    for leftover in ("bin", "share", "lib", "include"):  # scripts and data of wheels
+    for leftover in ("bin", "share", "lib", "include"):  # remove scripts and data of wheels
         shutil.rmtree(site / leftover, ignore_errors=True)
-    for record in site.glob("*.dist-info/direct_url.json"):  # the path on this machine
+    for record in site.glob("*.dist-info/direct_url.json"):  # contains a path of this machine
         record.unlink()
     _drop_tests(site)
     (site / "local-drivers.pth").write_text(f"{LOCAL_DRIVERS}\n")
@@ -158,7 +162,8 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
     (tree / HOME / "pyvenv.cfg").write_text(
         "home = /usr/bin\ninclude-system-site-packages = false\n"
     )
-    # Python does not compare them with their sources: only the package manager changes both.
+    # Python does not compare these files with their sources, because only the package manager
+    # changes both.
     mode = py_compile.PycInvalidationMode.UNCHECKED_HASH
     compileall.compile_dir(
         site, quiet=2, stripdir=str(tree), prependdir="/", invalidation_mode=mode, workers=1
@@ -166,7 +171,7 @@ def _install_python(tree: Path, scratch: Path, architecture: str, epoch: str) ->
 
 
 def _drop_tests(site: Path) -> None:
-    """Leave out the libraries' own tests: half of the files, and never run."""
+    """Remove the tests of the libraries, which are half of the files and never run."""
     for folder in sorted(site.glob("*/**/tests")):
         if folder.is_dir():
             shutil.rmtree(folder, ignore_errors=True)
@@ -186,7 +191,7 @@ def _install_files(tree: Path) -> None:
 
 
 def _install_documents(tree: Path, version: str, epoch: int) -> None:
-    """Install manual pages, licence and changelogs where Debian's policy wants them."""
+    """Install manual pages, licence and changelogs at the paths that Debian's policy requires."""
     documents, manuals = tree / "usr/share/doc/jointfitd", tree / "usr/share/man/man1"
     manuals.mkdir(parents=True)
     for page in sorted((DEBIAN.parent / "man").glob("*.1")):
@@ -226,7 +231,7 @@ def _write_control(tree: Path, version: str, architecture: str) -> None:
 
 
 def _md5sums(tree: Path) -> str:
-    """Return the checksums with which `dpkg --verify` compares the installed files."""
+    """Return the checksums that `dpkg --verify` compares with the installed files."""
     files = [path for path in sorted(tree.rglob("*")) if path.is_file() and not path.is_symlink()]
     return "".join(
         f"{hashlib.md5(path.read_bytes()).hexdigest()}  {name}\n"  # noqa: S324 - dpkg's format
@@ -236,7 +241,7 @@ def _md5sums(tree: Path) -> str:
 
 
 def _settle(tree: Path, epoch: int) -> None:
-    """Set rights and date of every file as in a package."""
+    """Set the permissions and the date of every file."""
     for path in sorted(tree.rglob("*"), reverse=True):
         if not path.is_symlink():
             executable = path.is_dir() or path.stat().st_mode & 0o100

@@ -3,9 +3,9 @@ r"""Baseline: a linear soft-tissue correction of the weighted mean, without kern
 
 .. math:: \hat q = f_0 \otimes \exp(\eta\, \mathrm{clip}(C^T \varphi))
 
-:math:`f_0` is the weighted mean of the sensors of a segment, :math:`\varphi` the relative rotations
-of `features`, and C a robust ridge fit of :math:`\rho = \log(f_0^* \otimes q_{ref})`. Outside the
-training range the correction fades (:math:`\eta`).
+Here :math:`f_0` is the weighted mean of the sensors of a segment, and :math:`\varphi` are the
+relative rotations from `features`. C is a robust ridge fit of :math:`\rho = \log(f_0^* \otimes
+q_{ref})`. Outside the training range, the correction fades (:math:`\eta`).
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion
 
 PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
-"""Ridge penalties compared on held-out blocks."""
+"""Ridge penalties that are compared on held-out blocks."""
 LARGEST = 0.4
 """Largest component of a correction, rad."""
 HULL = 10.0
-"""The correction fades above this multiple of the 0.995 quantile of the training leverage."""
+"""Multiple of the 0.995 quantile of the training leverage above which the correction fades."""
 OUTSIDE = 3.0
-"""Above this multiple of the quantile the frame is flagged as extrapolating."""
+"""Multiple of this quantile above which the frame has the flag ``extrapolating``."""
 
 
 @dataclass(frozen=True)
@@ -53,28 +53,30 @@ class LinearCorrection(SegmentModel):
     kind: ClassVar[str] = "linear"
 
     weights: tuple[float, ...]
-    """One weight a sensor, sum 1."""
+    """One weight per sensor; the sum is 1."""
     coefficients: tuple[tuple[float, ...], ...]
-    """C^T: three rows, rad per unit of each feature."""
+    """Matrix C^T with three rows, rad per unit of each feature."""
     leverage: tuple[tuple[float, ...], ...]
-    """Square matrix L: the leverage ``phi @ L @ phi`` is the distance of a frame from the training
+    """Square matrix L. The leverage ``phi @ L @ phi`` is the distance of a frame from the training
     range."""
     scales: tuple[float, ...]
-    """RMS of each feature in training, the scale of a recursive fit."""
+    """RMS of each feature in training. It is the scale of a recursive fit."""
     hull_leverage: float
     """0.995 quantile of the leverage in training."""
     mean_leverage: float
     ratio_offset: float
-    """Mean of leverage ratio + 3 over held-out frames: makes the mean predicted variance unbiased.
+    """Mean of the leverage ratio + 3 over held-out frames. It makes the mean predicted variance
+    unbiased.
     """
     covariance: tuple[tuple[float, ...], ...]
     """Mean outer product of held-out residuals, rad^2, 3x3, segment axes."""
     residual_sd: float
     mean_sd: float
-    """RMS error of the uncorrected mean in training, rad per axis, used without a neighbour."""
+    """RMS error of the uncorrected mean in training, rad per axis. It applies without a
+    neighbouring segment."""
     penalty: float
     movements: int
-    """Movements in training."""
+    """Number of movements in training."""
     _arrays: tuple[Array, Array] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -119,18 +121,18 @@ class LinearCorrection(SegmentModel):
 
     @override
     def to_dict(self) -> dict[str, Any]:
-        """Not supported: a baseline is never stored."""
+        """Raise an error, because a baseline is never stored."""
         raise NotImplementedError
 
     @classmethod
     @override
     def read(cls, data: Mapping[str, Any]) -> LinearCorrection:
-        """Not supported: a baseline is never stored."""
+        """Raise an error, because a baseline is never stored."""
         raise NotImplementedError
 
 
 def fit_linear_correction(training: SegmentTraining) -> LinearCorrection:
-    """Fit the correction; choose penalty and predicted variance on held-out blocks.
+    """Fit the correction; determine penalty and predicted variance on held-out blocks.
 
     Raises
     ------
@@ -176,8 +178,9 @@ def features(sensors: Sequence[Array], q_other: Array) -> Array:
 
     .. math:: \varphi = [k,\ d_2 \dots d_m,\ |k| \circ k,\ k_1 k_2,\ k_1 k_3,\ k_2 k_3,\ \sin 2k]
 
-    with :math:`k = \log(x^* \otimes o)` the joint rotation measured by the first sensor and
-    :math:`d_j = \log(x^* \otimes y_j)` its deviation from each further sensor, all in rad.
+    Here :math:`k = \log(x^* \otimes o)` is the joint rotation that the first sensor measures.
+    :math:`d_j = \log(x^* \otimes y_j)` is the deviation of the first sensor from each further
+    sensor. All values are in rad.
 
     Parameters
     ----------
@@ -212,18 +215,19 @@ class CrossValidated:
     residuals: Array
     """rho minus prediction, rad, shape (n, 3)."""
     leverage_ratios: Array
-    """Leverage of each held-out row over the mean of its own training rows, shape (n,)."""
+    """Leverage of each held-out row divided by the mean leverage of its training rows, shape (n,).
+    """
 
     @property
     def score(self) -> float:
-        """Summed squared residual."""
+        """Sum of the squared residuals."""
         return float(np.sum(self.residuals**2))
 
 
 def cross_validate(
     phi: Array, rho: Array, penalty: float, folds: Iterable[NDArray[np.bool_]]
 ) -> CrossValidated:
-    """Fit without each fold in turn; evaluate on that fold."""
+    """Leave out each fold in turn, fit the rest, and evaluate on the fold."""
     residuals, ratios = [], []
     for held in folds:
         fit = fit_ridge(phi[~held], rho[~held], penalty)

@@ -1,21 +1,21 @@
-"""Pages of docs generated from templates and stored results: ``python -m bench.framework.pages``.
+"""Generates pages of the documentation from templates: ``python -m bench.framework.pages``.
 
 A template in ``bench/pages`` is Markdown with fields in double braces:
 
 ``{{value: ID | RESULT}}``
-    A value with its unit, two or three significant digits.
+    A value with its unit, with two or three significant digits.
 ``{{value: ID | RESULT | N}}``
-    The same with N decimals.
+    A value with its unit, with N decimals.
 ``{{range: ID ... | ENDING}}``
-    Smallest and largest value of the results of several experiments whose names end so.
+    Smallest and largest value among the results of several experiments whose names end with ENDING.
 ``{{experiment: ID ...}}``
     Title, subjects, reference, command and table of each experiment.
 ``{{speed: ID ...}}``
-    One table of times with targets for all experiments.
+    One table of times and targets for all experiments.
 ``{{missed}}``
-    A table of all thresholds and targets that are missed, with the reasons.
+    A table of all missed thresholds and targets, with reasons.
 ``{{machine}}``
-    The machine of the times.
+    The machine on which the times were measured.
 
 Invariant: a page contains no measured value that does not come from ``bench/results``.
 """
@@ -43,9 +43,9 @@ ROOT = Path(__file__).resolve().parents[2]
 TEMPLATES = ROOT / "bench" / "pages"
 FIELD = re.compile(r"\{\{(\w+)(?:: *(.*?))?\}\}", re.DOTALL)
 UNITS = {"deg": "°", "us": " µs", "": ""}
-"""Units as printed after a value in text; others follow a space."""
+"""Units that are printed differently after a value in text. Other units follow a space."""
 PIVOT_ROWS = 2
-"""Results named ``A: B`` become a table with a row for each A if there are so many."""
+"""Minimum number of rows at which results named ``A: B`` become a table with one row for each A."""
 
 
 class TemplateError(ValueError):
@@ -53,7 +53,7 @@ class TemplateError(ValueError):
 
 
 def write(docs: Path = ROOT / "docs") -> list[Path]:
-    """Generate all pages below `docs`; return those that changed."""
+    """Generate all pages below `docs`; return the paths of changed pages."""
     changed = []
     for name, text in render_all().items():
         path = docs / name
@@ -65,7 +65,7 @@ def write(docs: Path = ROOT / "docs") -> list[Path]:
 
 
 def render_all() -> dict[str, str]:
-    """Return the generated pages and drawings by their path below docs."""
+    """Return the generated pages and drawings, by their path below docs."""
     stored.cache_clear()
     written = {
         path.relative_to(TEMPLATES).as_posix(): render(path.read_text(encoding="utf-8"))
@@ -82,7 +82,7 @@ def render(template: str) -> str:
 def _field(kind: str, argument: str) -> str:
     match kind:
         case "value":
-            # inside a Markdown table the separator is escaped
+            # In a Markdown table, the separator is escaped.
             return _value(*(part.strip() for part in argument.replace("\\|", "|").split("|")))
         case "range":
             return _range(*(part.strip() for part in argument.split("|")))
@@ -149,7 +149,7 @@ def _experiment(name: str) -> str:
 
 
 def table_of(results: Sequence[Result]) -> str:
-    """Return the results as a matrix if their names are ``row: column``, otherwise as a list."""
+    """Return the results as a matrix if their names are ``row: column``, or else as a list."""
     split = [result.name.rpartition(": ") for result in results]
     rows = list(dict.fromkeys(row for row, _, _ in split))
     columns = list(dict.fromkeys(column for _, _, column in split))

@@ -1,4 +1,4 @@
-"""Plots of one run as PNG: clocks, delays, alignment, lags."""
+"""Plots of one run as PNG files: clocks, delays, alignment and lags."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 NS, NS_PER_MS, NS_PER_US = 1e9, 1e6, 1e3
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-"""Palette of Okabe and Ito, distinguishable with color blindness."""
+"""Palette of Okabe and Ito, whose colors are distinguishable with color blindness."""
 GAP_PERIODS = 1.5
 _DPI = 110
 
 
 def run(directory: Path, recorded: Path | None) -> list[Path]:
-    """Plot a recorded run, or a simulated one; return the files written.
+    """Plot a recorded or a simulated run; return the written files.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def run(directory: Path, recorded: Path | None) -> list[Path]:
 def _figure(
     title: str, panels: Sequence[str], about: SimulatedRun, *, height: float = 2.0
 ) -> Figure:
-    """Return a figure with panels one below the other and a common time axis."""
+    """Return a figure with panels below each other and a common time axis."""
     figure = Figure(figsize=(11, 1.1 + height * len(panels)), layout="constrained")
     figure.suptitle(f"{title}\n{about.title}", fontsize=11, x=0.01, ha="left")
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
@@ -134,13 +134,13 @@ def _of(looks: Sequence[Look], what: str) -> Floats:
 def _from_first(
     values: Floats,
 ) -> Floats:
-    """Subtract the first known value, again after every jump of more than 10 ms (a restart)."""
+    """Subtract the first known value; repeat this after each jump above 10 ms (a restart)."""
     known = np.flatnonzero(np.isfinite(values))
     found = values.copy()
     for part in np.split(known, np.flatnonzero(np.abs(np.diff(values[known])) > 1e7) + 1):
         if part.size:
             found[part] -= values[part[0]]
-            found[part[0]] = np.nan  # the line is interrupted where a new epoch begins
+            found[part[0]] = np.nan  # interrupts the line at a new epoch
     return found
 
 
@@ -151,7 +151,7 @@ def _rate_and_gaps(trace: Trace, name: str, color: str, rate: Axes, gaps: Axes) 
     counts, _ = np.histogram(t_s, edges)
     rate.step(edges[:-1], counts, where="post", color=color, lw=1.1)
     steps = np.diff(t_ns)
-    # the median step instead of the configured rate: cameras have their own rate
+    # The median step replaces the configured rate, because cameras have their own rate.
     periods = steps / np.median(steps)
     row = sorted(trace.looks).index(name)
     for i in np.flatnonzero(periods > GAP_PERIODS):
@@ -161,14 +161,17 @@ def _rate_and_gaps(trace: Trace, name: str, color: str, rate: Axes, gaps: Axes) 
 
 
 def delays(trace: Trace, about: SimulatedRun) -> Figure:
-    """Arrival minus stamp: the delay beyond the minimum delay (beyond exposure, with echoes)."""
+    """Arrival time minus stamp: the delay in excess of the minimum delay.
+
+    With echoes, it is the delay since the exposure.
+    """
     names = sorted(trace.stamps)
     figure = Figure(figsize=(11, 1.1 + 1.5 * len(names)), layout="constrained")
     title = f"Delay beyond the fastest sample\n{about.title}"
     figure.suptitle(title, fontsize=11, x=0.01, ha="left")
     axes = figure.subplots(
         len(names), 2, squeeze=False, sharey="row", width_ratios=(4, 1)
-    )  # one scale per panel: camera delays are milliseconds, UART delays microseconds
+    )  # own scales: camera delays are ms, UART delays are µs
     for (over_time, spread), name in zip(axes, names, strict=True):
         color = _colors(names)[name]
         rows = trace.stamps[name]
@@ -192,7 +195,7 @@ def delays(trace: Trace, about: SimulatedRun) -> Figure:
 
 
 def alignment(trace: Trace, about: SimulatedRun) -> Figure:
-    """Error of the stamps where truth is known; waiting time of the frames."""
+    """Error of the stamps if the truth is known, and waiting time of the frames."""
     errors = true_errors(trace, about.taken_ns, about.unseen_ns) if about.taken_ns else {}
     panels = [f"{name}: error, ms" for name in sorted(errors)]
     note = " (error less the smallest delay, which only the lag tells)" if errors else ""
@@ -235,7 +238,7 @@ def _latency(axis: Axes, trace: Trace) -> None:
 
 
 def lags(trace: Trace, about: SimulatedRun) -> Figure:
-    """Lag windows of every sensor with their sigmas; rejected windows are crosses at the bottom."""
+    """Lag windows of every sensor with their sigmas; crosses are rejected windows."""
     names = sorted(trace.lags)
     figure = _figure("IMU later than cameras, windows of 10 s, ± 2 sigma",
                      [f"{name}, ms" for name in names] or ["no optical bodies"], about)  # fmt: skip

@@ -1,4 +1,4 @@
-"""Trace of the clocks of a run: every stamp, every frame, every clock once a second, every lag.
+"""Trace of a run: every stamp, every frame, every clock once per second, and every lag.
 
 Invariant: the events pass through the core of the daemon, which is only observed.
 """
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 NS = 1_000_000_000
 LOOK_NS = NS // 2
-"""Interval at which the clocks are recorded."""
+"""Time between two records of the clocks, ns."""
 WINDOW_S, HOP_S = 10.0, 2.5
 
 
@@ -48,7 +48,7 @@ class Stamping(NamedTuple):
 
 
 class Look(NamedTuple):
-    """One clock at one instant; None is unknown."""
+    """One clock at one time; None for unknown values."""
 
     at_ns: int
     offset_ns: float | None
@@ -68,7 +68,7 @@ class Frame(NamedTuple):
 
 
 class LagWindow(NamedTuple):
-    """One lag window of a sensor and the body to which it is attached."""
+    """One lag window of a sensor, and the rigid body that carries the sensor."""
 
     at_ns: int
     body: str
@@ -81,12 +81,12 @@ class Trace:
 
     begin_ns: int = 0
     latency_ns: dict[str, int] = field(default_factory=dict)
-    """Least delay of each transport that the clock assumes and subtracts."""
+    """Minimum delay of each transport that the clock assumes and subtracts, ns."""
     stamps: dict[str, list[Stamping]] = field(default_factory=dict)
     looks: dict[str, list[Look]] = field(default_factory=dict)
     frames: list[Frame] = field(default_factory=list)
     turns: dict[str, list[tuple[int, Floats]]] = field(default_factory=dict)
-    """Orientations by sensor, and by optical body as ``mocap/NAME``; stamps increase."""
+    """Orientations by sensor, or by optical body with the key ``mocap/NAME``; stamps increase."""
     lags: dict[str, list[LagWindow]] = field(default_factory=dict)
 
 
@@ -157,7 +157,7 @@ def _look(at_ns: int, clock: DeviceClock) -> Look:
 
 
 def traced(events: Iterable[Event]) -> Trace:
-    """Feed `events` to a new core and return the trace.
+    """Process `events` in a new core, and return the trace.
 
     Raises
     ------
@@ -180,7 +180,7 @@ def traced(events: Iterable[Event]) -> Trace:
 
 
 def _lags(trace: Trace) -> dict[str, list[LagWindow]]:
-    """Return the lag windows of every sensor and the body with the best fit."""
+    """Return the lag windows of every sensor with the best-fitting body."""
     tracks = {name: _track(turns) for name, turns in trace.turns.items()}
     bodies = {name: track for name, track in tracks.items() if "/" in name}
     found: dict[str, list[LagWindow]] = {}
@@ -226,12 +226,12 @@ def _cut(
 def true_errors(
     trace: Trace, taken_ns: Mapping[tuple[str, int], int], unseen_ns: Mapping[str, int]
 ) -> dict[str, tuple[Floats, Floats, NDArray[np.bool_]]]:
-    """Return by stream: time since the beginning (s), error of the stamp (ms), and synced."""
+    """Return by stream: time since the start (s), error of the stamp (ms), and synced flag."""
     errors = {}
     for name, rows in trace.stamps.items():
         known = [row for row in rows if (name, row.ticks) in taken_ns and row.ticks is not None]
         unseen = unseen_ns.get(name, 0)
-        if unseen:  # the assumed part of the delay is already subtracted from the stamps
+        if unseen:  # stamps already lack the assumed delay
             unseen -= trace.latency_ns[name]
         t_s = np.array([(row.arrival_ns - trace.begin_ns) / NS for row in known])
         error = [(row.t_ns - unseen - taken_ns[name, row.ticks or 0]) / 1e6 for row in known]

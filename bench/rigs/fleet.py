@@ -1,7 +1,7 @@
-"""A fleet of simulated gateways at one broker, measured at the broker and at one station.
+"""A fleet of simulated gateways with one broker, measured at the broker and at one station.
 
-Invariant: the messages are those of a real daemon, recorded at a broker for some seconds. Broker,
-gateways and station are processes of their own; the station is this one.
+Invariant: the messages were recorded from a real daemon for some seconds. Broker, gateways and
+station are separate processes. The station is this process.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ FORWARDED = (
     "pose/ui", "joint/*", "bridge/state", "bridge/info", "bridge/health", "bridge/event",
     "bridge/response/*", "calibration", "device/*",
 )  # fmt: skip
-"""Topics that the broker of a gateway forwards: those of examples/fleet/gateway-bridge.conf."""
+"""Topics that the broker of a gateway forwards, as in examples/fleet/gateway-bridge.conf."""
 ALL = ("*",)
 WARM_S, LIMIT_S = 2.0, 60.0
 _DUE = re.compile(re.escape(DUE_KEY) + rb"(\d{16})")
@@ -43,7 +43,7 @@ class Traffic:
     """Messages of one gateway."""
 
     path: Path
-    """Recording for `bench.rigs.fleet_gateways`."""
+    """File with recorded messages for `bench.rigs.fleet_gateways`."""
     messages_s: float
     bytes_s: float
     retained: int
@@ -69,7 +69,7 @@ class Station:
                 if kind >> 4 == 3:
                     size = int.from_bytes(content[:2])
                     self._receive(content[2 : 2 + size], content[2 + size :])
-                    self.messages += not kind & 1  # retained ones were sent before it subscribed
+                    self.messages += not kind & 1  # omit retained messages
         finally:
             writer.close()
 
@@ -82,7 +82,7 @@ class Station:
 
 
 async def _length(reader: asyncio.StreamReader) -> int:
-    """Return the length of a packet, which has 7 bits a byte, the lowest first."""
+    """Return the length of a packet, which is encoded with 7 bits per byte, lowest first."""
     length = shift = 0
     while True:
         byte = (await reader.readexactly(1))[0]
@@ -99,17 +99,17 @@ class FleetFigures:
     messages_s: float
     latencies_ms: list[float]
     lost: int
-    """Messages that the gateways sent and the station did not receive."""
+    """Number of messages that the gateways sent and the station did not receive."""
     broker_pct: float
     broker_mb: float
     back_s: float
-    """Time from the start of a broker without memory until all gateways are online again."""
+    """Time from the restart of the broker without stored state until all gateways are online, s."""
 
 
 async def record_traffic(
     folder: Path, port: int, seconds: float, selections: dict[str, tuple[str, ...]]
 ) -> dict[str, Traffic]:
-    """Record the messages of one daemon; write a file for each selection of its topics."""
+    """Record the messages of one daemon; write one file for each selection of topics."""
     messages: list[tuple[float, str, bytes, bool]] = []
     async with running_gateway(folder, port, Load(100.0)) as gateway:
         reader, writer = await asyncio.open_connection(HOST, port, limit=1 << 20)
@@ -142,7 +142,7 @@ async def record_traffic(
 async def measure_fleet(
     broker: MosquittoBroker, traffic: Traffic, count: int, seconds: float
 ) -> FleetFigures:
-    """Run `count` gateways and one station for `seconds`; then restart the broker."""
+    """Run `count` gateways and one station for `seconds`, then restart the broker."""
     station = Station()
     listening = asyncio.create_task(station.listen(broker.port))
     async with _gateways(broker.port, traffic.path, count) as process:
@@ -165,7 +165,7 @@ async def measure_fleet(
 
 
 async def _restart(broker: MosquittoBroker, traffic: Traffic, count: int) -> float:
-    """Return the time after which all gateways are online at a restarted broker."""
+    """Restart the broker; return the time until all gateways are online, s."""
     async with _gateways(broker.port, traffic.path, count):
         broker.stop()
         broker.start()
@@ -183,7 +183,7 @@ async def _restart(broker: MosquittoBroker, traffic: Traffic, count: int) -> flo
 async def _gateways(
     port: int, traffic: Path, count: int
 ) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run simulated gateways in a process of their own for the duration of the block."""
+    """Run simulated gateways in another process during the ``async with`` block."""
     words = ("-m", "bench.rigs.fleet_gateways", str(port), str(traffic), str(count))
     process = await asyncio.create_subprocess_exec(
         sys.executable, *words, cwd=ROOT,

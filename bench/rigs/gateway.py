@@ -1,8 +1,9 @@
-"""The daemon between simulated devices and a broker, timed at a subscriber.
+"""The daemon between simulated devices and a broker, with latencies measured at a subscriber.
 
-Invariant: four processes exchange only bytes: ``jointfit-sim`` (two IMUs on ptys, two on an SLCAN
-adapter on a pty, a NatNet server), jointfitd, a broker, and this process, which only subscribes.
-The daemon uses a stored calibration of the simulated wearer.
+Invariant: four processes exchange only bytes. The processes are ``jointfit-sim``, jointfitd, a
+broker, and this process, which only subscribes. ``jointfit-sim`` simulates two IMUs on
+pseudo-terminals, two on an SLCAN adapter on a pseudo-terminal, and a NatNet server. The daemon uses
+a stored calibration of the simulated subject.
 """
 
 from __future__ import annotations
@@ -34,10 +35,10 @@ if TYPE_CHECKING:
     from jointfit_daemon.tools.child_processes import Simulator
 
 SETTLE_S = 4.0
-"""Time in which the clocks settle, not measured, s."""
+"""Time in which the clocks converge, s. It is not part of the measurement."""
 CONNECT_S, END_S = 40.0, 20.0
 FLOOD_START_S = 0.5
-"""Time in which the flooding process imports and connects, not measured, s."""
+"""Time in which the flooding process starts and connects, s. It is not part of the measurement."""
 ROOT = Path(__file__).resolve().parents[2]
 OUTCOMES = ("used", "decimated", "idle", "late", "duplicate", "dropped", "pending")
 TOPICS = ("pose", "bridge/health", "bridge/state", "device/+/availability")
@@ -68,7 +69,8 @@ class ReceivedMessages:
     pose: dict[str, Any] = field(default_factory=dict)
     first_pose_s: float | None = None
     running_s: float | None = None
-    """Monotonic times of ``online`` on ``bridge/state`` and of the first pose."""
+    """Monotonic time of the message ``online`` on ``bridge/state``, s. `first_pose_s` is the time
+    of the first pose."""
 
     async def listen(self, client: MqttClient) -> None:
         async for topic, payload in client.messages():
@@ -91,49 +93,53 @@ class Figures:
     """Results of one run."""
 
     latencies_ms: list[float]
-    """Receipt minus arrival of the sample that completed the frame, of every frame."""
+    """Latency of every frame: receipt of the frame minus arrival of the sample that completed it.
+    """
     seconds: float
     cpu_s: float
-    """CPU time of the daemon in these seconds."""
+    """CPU time of the daemon during the measurement, s."""
     loop_s: float
-    """CPU time of the fixed loop during the run."""
+    """CPU time of a fixed loop during the run, s."""
     waited_s: float
-    """Time in which the daemon was runnable without a core, caused by the load of the machine."""
+    """Time in which the daemon was ready to run but had no processor core, because the machine was
+    loaded, s."""
     rss_mb: float
     unaccounted: int
-    """Samples sent and not received, without an outcome, or dropped."""
+    """Number of samples that were sent but not received, had no outcome, or were dropped."""
     received: int
     running_s: float
     first_pose_s: float
-    """Time from exec to ``online`` at the broker, and to the first pose."""
+    """Time from the start of the process to the first pose, s. Another value is the time to
+    ``online`` at the broker."""
 
 
 @cache
 def calibration() -> Calibration:
-    """Return the calibration of the simulated wearer (seed 1)."""
+    """Return the calibration of the simulated subject (seed 1)."""
     return fitted(bench_rig())
 
 
 @dataclass(frozen=True, slots=True)
 class FloodFigures:
-    """Latencies of every frame of one run, before and during a flood of requests."""
+    """Latencies of all frames of one run, before and during a flood of requests."""
 
     quiet_ms: list[float]
     flooded_ms: list[float]
     quiet_cpu_s: float
     flooded_cpu_s: float
-    """CPU time of the daemon in each part."""
+    """CPU time of the daemon during the flood, s. `quiet_cpu_s` is its CPU time before the flood.
+    """
     seconds: float
-    """Length of each part."""
+    """Duration of each part, s."""
     requests: int
-    """Requests sent in that time."""
+    """Number of requests that were sent during the flood."""
     ignored: int
-    """Requests that the daemon counted as ignored."""
+    """Number of requests that the daemon counted as ignored."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gateway:
-    """Running devices and daemon, and their subscriber."""
+    """Running devices, daemon and subscriber."""
 
     hardware: Simulator
     pid: int
@@ -145,7 +151,7 @@ class Gateway:
 
 
 async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
-    """Start everything, settle, measure for `seconds`, stop the devices, count all samples."""
+    """Start all processes, wait, measure for `seconds`, stop the devices, and count all samples."""
     async with running_gateway(folder, port, load) as gateway:
         heard = gateway.heard
         measured = await _measure(gateway.pid, heard, seconds)
@@ -161,7 +167,7 @@ async def run(folder: Path, port: int, load: Load, seconds: float) -> Figures:
 
 
 async def run_flooded(folder: Path, port: int, load: Load) -> FloodFigures:
-    """Start everything, settle, measure without requests and then under a flood of requests."""
+    """Start all processes, wait, and measure without requests, then under a flood of requests."""
     async with running_gateway(folder, port, load) as gateway:
         heard, pid = gateway.heard, gateway.pid
         quiet_ms, _, quiet_cpu, *_ = await _measure(pid, heard, SECONDS)
@@ -180,7 +186,7 @@ async def run_flooded(folder: Path, port: int, load: Load) -> FloodFigures:
 
 @asynccontextmanager
 async def flooder(port: int, base: str, seconds: float) -> AsyncIterator[asyncio.Task[int]]:
-    """Run a process that floods the daemon; yield a task that returns its number of requests."""
+    """Run a process that floods the daemon; yield a task with its number of requests."""
     words = ("-m", "bench.rigs.request_flood", str(port), base, "--seconds", str(seconds))
     process = await asyncio.create_subprocess_exec(
         sys.executable, *words, cwd=ROOT, stdout=asyncio.subprocess.PIPE
@@ -204,7 +210,7 @@ async def flooder(port: int, base: str, seconds: float) -> AsyncIterator[asyncio
 
 @asynccontextmanager
 async def running_gateway(folder: Path, port: int, load: Load) -> AsyncIterator[Gateway]:
-    """Start devices, subscriber and daemon; ready when all sources are online and settled."""
+    """Start devices, subscriber and daemon; wait until all sources are online."""
     base = f"jointfit/{folder.name}"
     CalibrationStore(folder / "state" / "calibrations", "demo").save(calibration())
     async with simulator(folder, port, base, load.options) as hardware:
@@ -226,7 +232,7 @@ async def running_gateway(folder: Path, port: int, load: Load) -> AsyncIterator[
 
 @asynccontextmanager
 async def subscriber(settings: MqttSettings) -> AsyncIterator[ReceivedMessages]:
-    """Collect the messages of the daemon until the block ends; yield them."""
+    """Collect the messages of the daemon during the block; yield them."""
     heard = ReceivedMessages()
     async with MqttClient(settings) as client:
         await client.subscribe(*TOPICS)
@@ -242,7 +248,7 @@ async def _measure(
     pid: int, heard: ReceivedMessages, seconds: float
 ) -> tuple[list[float], float, float, float, float, float]:
     gc.collect()
-    gc.freeze()  # garbage collection here would be measured as latency of the daemon
+    gc.freeze()  # garbage collection would add latency
     heard.latencies_ms.clear()
     began_s, began_cpu, began_wait = time.monotonic(), cpu_s(pid), waited_s(pid)
     await asyncio.sleep(seconds)
@@ -254,7 +260,7 @@ async def _measure(
 
 
 async def _last_health(heard: ReceivedMessages) -> dict[str, Any]:
-    """Wait for a health message with all sources offline: no sample is in transit then."""
+    """Wait for a health message with all sources offline, when no sample is in transit."""
     async with asyncio.timeout(END_S):
         while any(  # noqa: ASYNC110 - it hangs on what a message says, not on its coming
             device["online"] for device in heard.health["devices"].values()
@@ -280,10 +286,10 @@ def cpu_s(pid: int) -> float:
 
 
 def waited_s(pid: int) -> float:
-    """Return the time in which the main thread of a process was runnable without a core, s."""
+    """Return the time in which a process's main thread waited for a processor core, s."""
     try:
         return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="utf-8").split()[1]) / 1e9
-    except OSError:  # the kernel lacks it
+    except OSError:  # this kernel has no such file
         return float("nan")
 
 

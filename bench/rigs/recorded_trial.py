@@ -1,10 +1,11 @@
-"""Recorded trial replayed as bytes through the daemon, evaluated from its MQTT messages.
+"""Replays a recorded trial as bytes through the daemon, and evaluates the MQTT messages.
 
 Invariant: three processes exchange only bytes: `jointfit-sim play --trial`, the daemon, and a
-broker. The `pose` messages are compared with the simulator's ground truth at the instants of the
-poses, and with the states of the same session offline. The daemon calibrates itself on a static
-pose and the first 60 % of the squats; the last 40 % are evaluated. The regressions of the patent
-run in its procedure: they get the whole trial, fit the first 60 % and verify on the rest.
+broker. The `pose` messages are compared with the simulator's ground truth at the times of the
+poses, and with the limb states of an offline run of the same session. The daemon is calibrated on a
+static pose and the first 60 % of the squats. The last 40 % are evaluated. The regressions of the
+patent run in the procedure of the patent: they receive the whole trial, fit the first 60 %, and
+verify on the rest.
 """
 
 from __future__ import annotations
@@ -43,16 +44,19 @@ if TYPE_CHECKING:
 SOURCES = {"S1", "S2", "S3", "S4", "mocap"}
 SETTLE_S, STATIC_S = 3.0, 3.5
 BLEND_S = 1.0
-"""Interpolation from standing to the first frame of the trial, without optical bodies, s."""
+"""Duration of the interpolation from standing to the first frame of the trial, s. It has no optical
+bodies."""
 POLL_S = 0.05
 SPARE_S = 1.0
-"""Time by which a phase is longer than its motion, for late bytes; the cameras see no bodies, s."""
+"""Time by which a phase is longer than its motion, s. Late bytes arrive in this time, and the
+cameras track no bodies."""
 SQUATS_HZ, WALKING_HZ = 50.0, 100.0
 SEGMENTS = ("thigh", "shank")
 FRAME_NS, MATCH_NS = 10_000_000, 1_000_000
-"""Truth and poses refer to multiples of 10 ms of one clock; the rest is rounding."""
+"""Interval between frames, ns, and tolerance of their times, ns. Truth and poses have times at
+multiples of 10 ms of the same clock, apart from rounding."""
 PLAYS, IN_TIME = 3, 0.9
-"""Largest number of plays, and share of frames in time with which a play counts."""
+"""Maximum number of plays, and minimum share of frames in time for a valid play."""
 FADE_NS = 250_000_000
 """Time for which the output fades after a sensor was missing, ns."""
 CONNECT_S, PATIENCE_S = 80.0, 300.0
@@ -63,7 +67,7 @@ ENDS = {"static": "posed", "functional": "calibrated"}
 
 
 class MachineTooSlowError(Exception):
-    """Every frame of a play was affected by samples that this machine delivered too late."""
+    """Late samples, which this machine delayed, affected every frame of a play."""
 
 
 @dataclass(slots=True)
@@ -77,9 +81,10 @@ class Gateway:
     online: set[str] = field(default_factory=set)
     health: dict[str, Any] = field(default_factory=dict)
     sensors: dict[int, dict[str, Any]] = field(default_factory=dict)
-    """Sensors of `sensors/pose` by frame number."""
+    """Sensors in the message `sensors/pose`, by frame number."""
     regression: dict[str, Any] = field(default_factory=dict)
-    """Coefficients of `calibration` by segment; empty if the method is not a regression."""
+    """Coefficients in the message `calibration`, by segment; empty if the method is not a
+    regression."""
     _phases: asyncio.Queue[dict[str, Any]] = field(default_factory=asyncio.Queue)
 
     async def listen(self) -> None:
@@ -116,7 +121,7 @@ class Gateway:
                     raise RuntimeError(f"{name}: {status['text']}")
 
     async def play(self, motion: str) -> None:
-        """Start a motion; return in its interpolation, in which the cameras see no bodies."""
+        """Start a motion; return during its interpolation, when the cameras track no bodies."""
         await self.sim.say(f"play {motion}")
         async with asyncio.timeout(PATIENCE_S):
             while True:
@@ -126,12 +131,12 @@ class Gateway:
                 await asyncio.sleep(POLL_S)
 
     async def live(self, motion: str, seconds: float) -> None:
-        """Play a motion of `seconds`."""
+        """Play a motion for `seconds`."""
         await self.play(motion)
         await asyncio.sleep(BLEND_S + seconds + SPARE_S)
 
     def calibration(self) -> Calibration:
-        """Return the calibration stored by the daemon."""
+        """Return the calibration that the daemon has stored."""
         stored = CalibrationStore(self.folder / "state" / "calibrations", "demo").latest()
         if stored is None:
             raise RuntimeError("no calibration was stored")
@@ -166,7 +171,7 @@ async def gateway(folder: Path, port: int, options: Sequence[str]) -> AsyncItera
 
 
 def _options(files: Sequence[Path], rate_hz: float, method: Method) -> list[str]:
-    """Return the options of a scene whose only errors are those of the recording."""
+    """Return the options of a scene without errors other than the recorded errors."""
     knobs = {
         "mocap_hz": rate_hz,
         "transition_s": BLEND_S,
@@ -185,15 +190,15 @@ def _options(files: Sequence[Path], rate_hz: float, method: Method) -> list[str]
 
 
 async def squats(data: Path, folder: Path, port: int, method: Method) -> Played:
-    """Calibrate on the first 60 % of the squats, evaluate the rest live.
+    """Calibrate on the first 60 % of the squats, and evaluate the rest live.
 
-    The daemon holds out the last 40 % of its trial itself for the regressions of the patent.
+    For the regressions of the patent, the daemon itself holds out the last 40 % of the trial.
     """
     files = _files(data, "squats1")
     whole = load(data, "squats1")
     cut, last = training_frames(whole), len(whole) - 1
     end = last if method in REGRESSIONS else cut - 1
-    shutil.rmtree(folder / "state", ignore_errors=True)  # of a play that was repeated
+    shutil.rmtree(folder / "state", ignore_errors=True)  # remains of an earlier play
     async with gateway(folder, port, _options(files, SQUATS_HZ, method)) as running:
         await running.connected()
         await running.phase("static", STATIC_S)
@@ -204,10 +209,10 @@ async def squats(data: Path, folder: Path, port: int, method: Method) -> Played:
 
 
 async def walking(data: Path, folder: Path, port: int, method: Method) -> Played:
-    """Restart with the calibration of the squats in `folder`; walk live."""
+    """Restart with the squat calibration in `folder`, and evaluate walking live."""
     files = _files(data, "walking1")
     async with gateway(folder, port, _options(files, WALKING_HZ, method)) as running:
-        await running.connected(2 * SETTLE_S)  # 1 ms corresponds to half a degree at this speed
+        await running.connected(2 * SETTLE_S)  # at this speed, 1 ms is half a degree
         await running.live("trial", 1.3)
     return _judged(running, data, files, method)
 
@@ -230,34 +235,35 @@ class Played:
     frames: int
     """Number of evaluated poses."""
     recorded: int
-    """Number of frames with all sensors offline."""
+    """Number of frames of the offline run that use all sensors."""
     errors: tuple[float, float, float]
     """RMS errors of thigh, shank and knee flexion, deg."""
     offline: tuple[float, float, float]
-    """The same of the offline session, at the same instants."""
+    """RMS errors of the offline run at the same times, deg."""
     calibration: Calibration
     health: dict[str, Any]
-    """Devices of the daemon's last health message."""
+    """Devices in the daemon's last health message."""
     repeated_deg: float | None
-    """Largest angle between a segment of `pose` and the regression of the patent, evaluated from
-    `sensors/pose` and the coefficients of `calibration`; None without a regression."""
+    """Largest angle between a segment in `pose` and the regression of the patent, deg. The
+    regression is evaluated from the messages `sensors/pose` and `calibration`. None without a
+    regression."""
 
 
 def _judged(running: Gateway, data: Path, files: Sequence[Path], method: Method) -> Played:
-    """Evaluate poses at instants of recorded truth, and the same session offline."""
+    """Evaluate the poses and the offline run at the times of the recorded truth."""
     log = running.folder / "truth.jsonl"
     truth, poses = _recorded_truth(log), _calibrated_poses(running.poses)
     whole = load(data, "squats1")
     training = training_frames(whole)
 
-    # The daemon's frames, offline; those that were not received as messages included.
+    # Times of the daemon's frames for the offline run, including frames without a received message.
     instants = sorted(poses)
     period_ns = min(b - a for a, b in pairwise(instants))
     grid = range(instants[0], instants[-1] + 1, period_ns)
     fit = calibrate(_files(data, "squats1"), training, method, _procedure(method))
     offline = fuse_session(files, log, grid, fit, BLEND_S)
 
-    # Frames with all sensors, live as offline.
+    # Frames with all sensors, both live and offline.
     complete = [t for t in grid if t in truth and _is_complete(*_used(offline[t]))]
     late = {t for t in poses if _used_live(poses[t])[1] < _used(offline[t])[1]}
     chosen = [
@@ -273,7 +279,7 @@ def _judged(running: Gateway, data: Path, files: Sequence[Path], method: Method)
     femur, tibia = (np.array([truth[t][i] for t in chosen]) for i in range(2))
     judge = Judge.of(whole.part(slice(0, training)))
     bones = KneeTrial((femur,) * 4, femur, tibia)
-    # the rotation from bone frames to those of the calibration is constant and is removed here
+    # The rotation from bone frames to calibration frames is constant and is removed here.
     live = _in_bone_frames(
         [[poses[t]["segments"][name]["q"] for t in chosen] for name in SEGMENTS], calibration
     )
@@ -292,7 +298,7 @@ def _judged(running: Gateway, data: Path, files: Sequence[Path], method: Method)
 
 
 def _calibrated_poses(poses: Iterable[Mapping[str, Any]]) -> dict[int, Mapping[str, Any]]:
-    """Return the poses since the calibration by instant, host time in ns."""
+    """Return the poses since the calibration, by host time in ns."""
     unix_ns = time.time_ns() - time.monotonic_ns()
     found = {}
     for pose in poses:
@@ -313,7 +319,7 @@ def _used_live(pose: Mapping[str, Any]) -> tuple[Sequence[str], int]:
 
 
 def _is_complete(flags: Sequence[str], sensors: int) -> bool:
-    """Return whether all sensors were measured at an instant, none extrapolated."""
+    """Return whether all sensors have a measurement in a frame, without extrapolation."""
     return "extrapolating" not in flags and sensors == len(SOURCES) - 1
 
 
@@ -349,8 +355,10 @@ def _repeated_deg(running: Gateway) -> float | None:
 
 
 def _recorded_truth(path: Path) -> dict[int, list[list[float]]]:
-    """Return thigh and shank by instant, ns; interpolated instants have no positions and are
-    omitted."""
+    """Return the orientations of thigh and shank by time, ns.
+
+    Interpolated times have no positions and are omitted.
+    """
     found = {}
     for line in path.read_text(encoding="utf-8").splitlines()[1:]:
         row = json.loads(line)
@@ -369,8 +377,10 @@ async def _undelayed(
     port: int,
     method: Method,
 ) -> Played:
-    """Play until this machine delivers enough samples in time, a few times at most; return the
-    play with the largest share."""
+    """Repeat the play until enough samples are in time, at most `PLAYS` times.
+
+    Return the play with the largest share of samples in time.
+    """
     best: Played | None = None
     for _ in range(PLAYS):
         with suppress(MachineTooSlowError):
@@ -405,10 +415,10 @@ async def _everything(
 def run(
     data: Path, methods: Sequence[Method], walkers: Sequence[Method] = ()
 ) -> dict[tuple[str, Method], Played]:
-    """Play the squats with one method after the other; `walkers` then walk.
+    """Play the squats with one method after another; the methods in `walkers` then walk.
 
-    A method takes about 35 s, and 10 s more for walking, because trials run in real time. Methods
-    in parallel would delay each other, and late samples enter the training.
+    A method needs about 35 s, and 10 s more for walking, because trials run in real time. Parallel
+    runs would delay each other, and late samples would enter the training.
     """
     with tempfile.TemporaryDirectory() as folder:
         return asyncio.run(_everything(data, Path(folder), methods, walkers))

@@ -1,14 +1,14 @@
-"""Errors of the daemon's stamps, compared with the instants at which samples were taken.
+"""Errors of the daemon's stamps relative to the true sampling times.
 
-Invariant: the recording replays to every stamp of the live run, and the simulator's sample log
-contains the instant of each sample. Their difference is the error, except for a constant that
-arrival times cannot reveal: where a stamp is based on arrivals, the true least delay of the
-transport replaces the assumed one. With a lag in use or with edges of a sync line, nothing is
+Invariant: the replay of the recording yields every stamp of the live run, and the simulator's
+sample log contains the true time of each sample. Their difference is the error, except for a
+constant that arrival times cannot reveal. If a stamp is based on arrivals, the true minimum delay
+of the transport replaces the assumed delay. With an active lag correction or sync edges, nothing is
 replaced.
 
-On a loaded machine samples arrive later, and without a fast sample no clock can estimate the delay.
-The part of an error that this explains is reported separately (`excused_ns`): the additional delay
-of the fastest sample since the clock started, slewed like the stamps.
+On a loaded machine, samples arrive later. Without a fast sample, no clock can estimate the delay.
+The part of an error with this cause is reported separately (`excused_ns`). It is the additional
+delay of the fastest sample since the clock started, slewed like the stamps.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _NS_PER_MS = 1e6
 OPTICAL = "mocap"
 MOST_NS = 2_000_000_000
-"""Upper limit of the transport delay of a sample."""
+"""Upper limit of the transport delay of a sample, ns."""
 
 
 class ObservedSample(NamedTuple):
@@ -48,14 +48,14 @@ class ObservedSample(NamedTuple):
     source: str
     arrival_ns: int
     t_ns: int
-    """Stamp used in frames: the clock's stamp less the lag in use."""
+    """Stamp that the frames use, ns: the stamp of the clock minus the active lag."""
     synced: bool
     method: str
-    """Clock method: `passive`, `echo`, `direct` …"""
+    """Clock method, such as `passive`, `echo` or `direct`."""
     error_ns: int | None
-    """None: the simulator has no such sample."""
+    """Error of the stamp, ns; None if the simulator has no such sample."""
     excused_ns: int
-    """Smallest delay of the samples of this clock so far, beyond the least delay."""
+    """Smallest delay of this clock's samples so far, in excess of the minimum delay, ns."""
 
 
 class JudgedFrame(NamedTuple):
@@ -65,14 +65,15 @@ class JudgedFrame(NamedTuple):
     completed_ns: int
     synced: bool
     worst_ns: float
-    """Largest error among the samples used for it, over all sensors; 0 if none is known."""
+    """Largest error among the samples of the frame, over all sensors, ns; 0 if no error is known.
+    """
     sensors: int
     unexcused_ns: float = 0.0
-    """The same without the excused part."""
+    """Largest error without the excused part, ns."""
 
 
 class Truth:
-    """True instants by device and sample number.
+    """True sampling times, by device and sample number.
 
     Parameters
     ----------
@@ -88,7 +89,7 @@ class Truth:
                 self._taken[sample["id"], sample["number"]].append(sample["host_ns"])
 
     def taken_ns(self, source: str, number: int, arrival_ns: int) -> int | None:
-        """Return the true instant of the sample with this number that arrived at `arrival_ns`."""
+        """Return the true time of the sample with this number that arrived at `arrival_ns`."""
         instants = self._taken.get((source, number), [])
         at = bisect_right(instants, arrival_ns)
         if at == 0 or arrival_ns - instants[at - 1] > MOST_NS:
@@ -105,7 +106,7 @@ class _Recent:
     excused_ns: list[int] = field(default_factory=list)
     epoch: int = -1
     least_ns: int = 0
-    """Delay of the fastest sample of this epoch beyond the least delay."""
+    """Delay of the fastest sample of this epoch in excess of the minimum delay, ns."""
 
     def excuse(self, late_ns: int | None, stamp: Stamp) -> int:
         """Add the delay of a sample; return the part of its error that the delays explain."""
@@ -120,14 +121,14 @@ class _Recent:
 
 
 class ObservedCore(Core):
-    """Core whose stamps and frames are recorded.
+    """Core that records its stamps and frames.
 
     Parameters
     ----------
     truth
-        Instants at which samples were taken.
+        True sampling times.
     delay_ns
-        Least delay of the transport by source; 0 if missing.
+        Minimum delay of the transport, ns, by source; the default is 0.
     """
 
     def __init__(self, truth: Truth, delay_ns: Mapping[str, int]) -> None:
@@ -183,8 +184,10 @@ class ObservedCore(Core):
         return super()._fuse(frame)
 
     def _error_at(self, source: str, t_ns: int) -> tuple[float, float]:
-        """Return the larger error of the two samples around `t_ns`, complete and without the
-        excused part."""
+        """Return the larger error of the two samples around `t_ns`.
+
+        The first value is the complete error, and the second value lacks the excused part.
+        """
         recent = self._recent[source]
         begin = max(0, len(recent.t_ns) - 512)
         after = bisect_left(recent.t_ns, t_ns, lo=begin)
@@ -198,7 +201,7 @@ class ObservedCore(Core):
 
 
 def unexcused(error_ns: int, excused_ns: int) -> int:
-    """Return the magnitude of an error without its excused part; only late stamps are excused."""
+    """Return the absolute error without its excused part; only a late stamp has such a part."""
     return max(-error_ns, error_ns - excused_ns, 0)
 
 

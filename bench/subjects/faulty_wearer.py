@@ -1,6 +1,6 @@
-"""Simulated subjects with faulty sensors, and the fused result.
+"""Simulated subjects with faulty sensors, and their fused results.
 
-Invariant: the bones are known; the calibration is that of the daemon, made before the fault.
+Invariant: the bones are known. The calibration is made by the code of the daemon before the fault.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState
 
 BEGIN_S = 100.0
-"""Errors and soft-tissue artefact change with time: the live part is later than the calibration."""
+"""Start of the live part, s. Errors and soft-tissue artefact change with time, so the live part is
+later than the calibration."""
 MOVES = ("walk", "squat", "sit_to_stand", "stand")
 MOVE_S = 15.0
 SEGMENTS = ("thigh", "shank")
 PULL_S, STAY_S = 5.0, 30.0
-"""Rise and fall time of a magnetic disturbance, and its duration, s."""
+"""Rise and fall time of a magnetic disturbance, and its duration between them, s."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +44,14 @@ class Worn:
     t_s: Array
     """Time from 0, shape (n,), s."""
     said: Mapping[str, Array]
-    """q_world_sensor by sensor, shape (n, 4); NaN: no sample."""
+    """Orientations q_world_sensor by sensor, shape (n, 4); NaN without a sample."""
     bones: Mapping[str, Array]
-    """q_optical_segment, shape (n, 4)."""
+    """Orientations q_optical_segment by segment, shape (n, 4)."""
     flexion: Array
     """Knee flexion, rad."""
 
     def spoilt(self, name: str, q: Array) -> Worn:
-        """Return the same with the samples of one sensor replaced."""
+        """Return a copy in which `q` replaces the samples of one sensor."""
         return Worn(self.t_s, {**self.said, name: q}, self.bones, self.flexion)
 
 
@@ -116,9 +117,10 @@ def drifting(person: Worn, names: Sequence[str], rate_rad_s: float) -> Worn:
 
 
 def pulled(person: Worn, names: Sequence[str], at_s: float, angle_rad: float) -> Worn:
-    """Return the subject under a magnetic disturbance: headings deviate for 30 s and return.
+    """Return the subject with a magnetic disturbance: headings deviate for 30 s and return.
 
-    The deviation rises and falls in :data:`PULL_S`, like a filter with a time constant of seconds.
+    The deviation rises and falls within :data:`PULL_S`, as in a filter with a time constant of
+    seconds.
     """
     begin, end = (person.t_s - at_s) / PULL_S, (person.t_s - at_s - PULL_S - STAY_S) / PULL_S
     turn = rotation.heading(angle_rad * (_smooth(begin) - _smooth(end)))
@@ -141,14 +143,14 @@ def play(
     states, told = [], []
     for k, t_s in enumerate(person.t_s.tolist()):
         t_ns = round((BEGIN_S + t_s) * NS)
-        heard = {name: q[k] for name, q in rows.items() if q[k][0] == q[k][0]}  # NaN: no sample
+        heard = {name: q[k] for name, q in rows.items() if q[k][0] == q[k][0]}  # NaN is no sample
         states.append(fuser.fuse(t_ns, t_ns, k, heard))
         told += [(t_s, news) for news in fuser.pop_reports(t_ns)]
     return states, told
 
 
 def oriented(states: Sequence[LimbState], segment: int) -> Array:
-    """Return q_world_segment, shape (n, 4)."""
+    """Return the orientations q_world_segment, shape (n, 4)."""
     return np.array([state.segments[segment].q_world_segment for state in states])
 
 

@@ -1,9 +1,9 @@
-"""Rigs of any number of sensors, segments and markers, with a calibration and a stream of bytes.
+"""Rigs with any number of sensors, segments and markers, with a calibration and device bytes.
 
-Sensors are Xbus devices at 100 Hz on a chain of equal segments, which swing in a plane. All sensors
-of a segment have its orientation. The calibration repeats that of the simulated wearer where a
-segment has two sensors; other segments use the mean of their sensors. With markers, a NatNet server
-sends a frame for each frame of the sensors.
+The sensors are Xbus devices at 100 Hz on a chain of equal segments, which swing in a plane. All
+sensors of a segment have its orientation. A segment with two sensors has the calibration of the
+simulated subject; other segments use the mean of their sensors. With markers, a NatNet server sends
+a frame for each frame of the sensors.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ BEGIN_NS = 1_000 * NS
 STAGGER_NS = 200_000
 """Time between the arrivals of two sensors in one frame, ns."""
 CAMERA_DELAY_NS = 9_000_000
-"""Arrival of the camera frame after its exposure, ns."""
+"""Time from the exposure of a camera frame to its arrival, ns."""
 SWING, SWING_HZ = 0.6, 0.8
-"""Amplitude, rad, and frequency of every segment."""
+"""Amplitude, rad, and frequency, Hz, of every segment's swing."""
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 _SERVER = ServerInfo("Motive", (2, 3, 0, 0), (*BITSTREAM, 0, 0), 10_000_000)
 
@@ -61,9 +61,9 @@ class GrowingRig:
 
     segments: int
     sensors: int
-    """Sensors of each segment."""
+    """Number of sensors of each segment."""
     markers: int = 0
-    """Markers of the first segment; 0 is without cameras."""
+    """Number of markers of the first segment; 0 for a rig without cameras."""
 
     @property
     def segment_names(self) -> list[str]:
@@ -74,7 +74,7 @@ class GrowingRig:
         return [f"M{i}" for i in range(1, self.markers + 1)]
 
     def sensor_names(self, segment: int) -> list[str]:
-        """Return the sensors of a segment, counted from 0."""
+        """Return the sensor names of a segment; segments are numbered from 0."""
         first = segment * self.sensors + 1
         return [f"S{number}" for number in range(first, first + self.sensors)]
 
@@ -134,7 +134,7 @@ class GrowingRig:
         )
 
     def opening(self) -> list[ChunkArrived]:
-        """Return the messages of a motion-capture server before its first frame."""
+        """Return the messages that a motion-capture server sends before its first frame."""
         if not self.markers:
             return []
         words = encode(_SERVER), encode(model_definition(self._bodies(), BITSTREAM), BITSTREAM)
@@ -167,26 +167,26 @@ class GrowingRig:
 
 
 def swing(segment: int, number: int) -> Quaternion:
-    """Return the orientation of a segment: about x, with a little noise of the sensor."""
+    """Return the orientation of a segment, which rotates about x, with small sensor noise."""
     t_s = number * PERIOD_NS / NS
     half = 0.5 * SWING * sin(2.0 * pi * SWING_HZ * t_s + segment) + 1e-5 * (number * 7919 % 97)
     return cos(half), sin(half), 0.0, 0.0
 
 
 def _template(marker: int) -> Vector:
-    """Return a marker on a helix about the segment, m: no two markers are close to each other."""
+    """Return a marker position on a helix about the segment, m, distant from all others."""
     angle = 2.4 * marker
     return 0.06 * cos(angle), 0.06 * sin(angle), 0.3 * (marker * 0.618 % 1.0) - 0.15
 
 
 @cache
 def _wearer() -> Calibration:
-    """Return the calibration of two segments with two sensors each."""
+    """Return the calibration of a subject with two sensors on each of two segments."""
     return fitted(bench_rig())
 
 
 def _models(chain: Chain, segment: int) -> dict[str, Any]:
-    """Return the models of the wearer's thigh for the sensors of a segment and its neighbour."""
+    """Return the subject's thigh models for the sensors of a segment and its neighbour."""
     names = dict(zip(("S1", "S2"), chain.sensors[segment], strict=True))
     names |= dict(zip(("S3", "S4"), neighbor(chain, segment), strict=True))
     return {
@@ -199,7 +199,7 @@ def _models(chain: Chain, segment: int) -> dict[str, Any]:
 
 
 def _links(chain: Chain) -> list[SensorLink]:
-    """Return the links of the wearer for each segment and the one below it."""
+    """Return the subject's sensor links for each segment and the next distal segment."""
     found: dict[tuple[str, str], SensorLink] = {}
     for segment in range(len(chain.segments) - 1):
         names = dict(

@@ -1,8 +1,8 @@
 """Inverse kinematics of OpenSim, the reference for refined marker sets.
 
-Invariant: the model is unchanged: joints, scaling and weights are those of its file; only marker
-positions on their bodies are replaced. Forces are removed, since inverse kinematics does not use
-them and they take time.
+Invariant: joints, scaling and weights of the model are those of its file. Only the marker positions
+on their bodies are replaced. Forces are removed, because inverse kinematics does not use them and
+they need time.
 """
 
 from __future__ import annotations
@@ -30,31 +30,32 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel
 
 _ACCURACY = 1e-5
-"""Default of InverseKinematicsTool."""
+"""Default accuracy of InverseKinematicsTool."""
 CONVERGED = 1e-7
-"""Accuracy at which errors no longer depend on it: within 2 micrometres of those at 1e-9."""
+"""Accuracy at which the errors have converged. They differ by less than 2 micrometres from the
+errors at 1e-9."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Errors of a model that follows a trial."""
+    """Errors of a model after inverse kinematics of a trial."""
 
     frame_rms: NDArray[np.float64]
-    """RMS over the markers visible in every frame, m."""
+    """RMS error over the visible markers of each frame, m."""
     rms: float
-    """RMS over all frames, m."""
+    """RMS error over all frames, m."""
     coordinates: NDArray[np.float64]
-    """Joint angles of every frame, rad (translations, m), shape (frames, coordinates)."""
+    """Coordinates of every frame, rad (translations in m), shape (frames, coordinates)."""
     seconds: float
 
     @property
     def variance(self) -> float:
-        """Variance of the RMS of the frames over time, m²."""
+        """Variance of the frames' RMS errors over time, m²."""
         return float(np.var(self.frame_rms))
 
 
 def trial_frames(path: Path, names: Sequence[str], every: int = 1) -> MarkerTrajectories:
-    """Return some markers and some frames of a TRC, in its own axes."""
+    """Return some markers and frames of a TRC file, in the axes of the file."""
     trial = read_trc(path)
     at = [trial.names.index(name) for name in names]
     return MarkerTrajectories(
@@ -82,14 +83,14 @@ def judge(
     refined: ChainModel | None = None,
     accuracy: float = _ACCURACY,
 ) -> Verdict:
-    """Run InverseKinematicsTool, unit weights, on the markers of a trial.
+    """Run InverseKinematicsTool with unit weights on the markers of a trial.
 
     Parameters
     ----------
     model
         An .osim file, which is not changed.
     refined
-        Marker positions on their bodies; those of the model if None.
+        Model with refined marker positions; the default is the positions in `model`.
     accuracy
         Accuracy at which the tool stops.
     """
@@ -146,7 +147,7 @@ def without_forces(model: Path) -> Any:
 def place(
     model: Any, places: Mapping[str, NDArray[np.float64]], bodies: Sequence[str] | None = None
 ) -> None:
-    """Move markers of a loaded model on their bodies, or to other bodies."""
+    """Move markers of a loaded model on their bodies or to other bodies."""
     import opensim  # noqa: PLC0415 - optional, and slow to import
 
     markers = model.updMarkerSet()
@@ -160,7 +161,7 @@ def place(
 class OpenSimFollower:
     """OpenSim model that follows a trial repeatedly with different marker positions.
 
-    Positions and poses are in our axes: z up, bodies rotated alike.
+    Positions and poses are in the axes of this project (z up). Bodies are rotated accordingly.
     """
 
     def __init__(self, model: Path, trial: MarkerTrajectories, segments: Sequence[str]) -> None:
@@ -181,7 +182,7 @@ class OpenSimFollower:
         """Return the poses of the marker bodies in every frame."""
         poses, _ = self._run(positions)
         at = [sorted(set(self._segments)).index(s) for s in self._segments]
-        turned = poses[:, at][:, :, [2, 0, 1]]  # y up to z up, rows and columns
+        turned = poses[:, at][:, :, [2, 0, 1]]  # y up to z up
         return Carriers(turned[..., [2, 0, 1]], turned[..., 3])
 
     def tracking_error(self, positions: NDArray[np.float64]) -> float:

@@ -1,6 +1,7 @@
-"""Simulated run as events of the core: five clocks, a walk without soft tissue, two incidents.
+"""Simulated run as events of the core: five clocks, a walk with rigid markers, two incidents.
 
-Invariant: deterministic, without processes, ports or waiting. Ground truth accompanies the events.
+Invariant: the run is deterministic and uses no processes, ports or waits. Ground truth accompanies
+the events.
 """
 
 from __future__ import annotations
@@ -47,9 +48,9 @@ TICK_NS = 100_000
 SERVER_HZ = 10_000_000
 VERSION = (3, 1)
 PATH_NS = 400_000
-"""Least transit time of a datagram."""
+"""Minimum transit time of a datagram, ns."""
 BAUD = 115_200
-"""Speed of the serial lines, as configured by `bench_rig`."""
+"""Speed of the serial lines in the configuration of `bench_rig`, bit/s."""
 ON_UART = ("S1", "S3")
 REBOOTED, INTERRUPTED = "S3", "S2"
 DOWN_NS = 1_500_000_000
@@ -57,23 +58,24 @@ DOWN_NS = 1_500_000_000
 
 @dataclass(frozen=True)
 class SimulatedRun:
-    """Input of a plot."""
+    """Events and ground truth of one run, the input of a plot."""
 
     events: Sequence[Event]
     taken_ns: Mapping[tuple[str, int], int] = field(default_factory=dict)
-    """Truth: the instant of the sample of a source with these ticks."""
+    """True sampling time, ns, by source and device ticks of the sample."""
     unseen_ns: Mapping[str, int] = field(default_factory=dict)
-    """Least delay of each transport, which no clock can estimate; none where echoes answer."""
+    """Minimum delay of each transport, ns, which no clock can estimate. A transport with echoes has
+    no entry."""
     lag_ns: Mapping[str, int] = field(default_factory=dict)
-    """Remaining part between a sensor and the cameras."""
+    """Remaining lag between a sensor and the cameras, ns, by sensor."""
     incidents: Mapping[str, float] = field(default_factory=dict)
-    """Incidents and their times, s after the beginning."""
+    """Times of the incidents after the start of the run, s, by name."""
     title: str = ""
 
 
 @dataclass
 class _Made:
-    """Events and truth while the run is generated."""
+    """Events and ground truth during the generation of the run."""
 
     chunks: list[tuple[int, str, bytes]] = field(default_factory=list)
     taken_ns: dict[tuple[str, int], int] = field(default_factory=dict)
@@ -120,7 +122,8 @@ def simulated(seconds: float = 90.0, seed: int = 1) -> SimulatedRun:
         events,
         made.taken_ns,
         unseen_ns,
-        # devices truncate their stamps to whole ticks: half a tick early on average
+        # Devices truncate their stamps to whole ticks, so the stamps are half a tick early on
+        # average.
         {name: unseen - TICK_NS // 2 for name, unseen in unseen_ns.items()},
         {f"{REBOOTED} reboots": 0.45 * seconds, f"{INTERRUPTED} silent": 0.7 * seconds},
         f"simulated, {seconds:g} s, a walk, clocks within ±50 ppm",
@@ -136,7 +139,7 @@ def _rig() -> Rig:
 
 
 Track = tuple["NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.int64]", "NDArray[np.bool_]"]
-"""True instants, device stamps, instants on the wire, and samples that are not sent."""
+"""True sampling times, device stamps, transmission times, and whether each sample is not sent."""
 
 
 def _latency_ms(knobs: Knobs, name: str) -> float:
@@ -186,7 +189,7 @@ def _sensor(
     for number, ((host, device, due, dropped), q) in enumerate(
         zip(_rows(track), orientations, strict=True)
     ):
-        ticks = max(0, device // TICK_NS)  # jitter after a boot must not lead below 0
+        ticks = max(0, device // TICK_NS)  # after a boot, jitter must not yield a negative value
         if dropped or hush[0] <= host < hush[1]:
             continue
         made.taken_ns[name, ticks] = host
@@ -207,7 +210,7 @@ def xbus_chunk(
             ]
         ),
     )
-    return due_ns + len(data) * 10 * NS // BAUD, data  # read when its last byte has arrived
+    return due_ns + len(data) * 10 * NS // BAUD, data  # read with the last byte
 
 
 def xcdi_chunk(name: str, number: int, ticks: int, due_ns: int, q: Quaternion) -> tuple[int, bytes]:

@@ -1,7 +1,7 @@
-"""Fusion on both legs: sit-to-stand, movements left out, coverage, and the static pose.
+"""Fusion on both legs: sit-to-stand, left-out movements, coverage, and the static pose.
 
-The trials of `skin_marker_knees` show the subject of the recorded knee with poses of our own
-inverse kinematics. They add the left leg and sit-to-stand.
+The trials of `skin_marker_knees` show the subject of the recorded knee. Their poses are from the
+inverse kinematics of this project. They add the left leg and sit-to-stand.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ DEEP_DEG = 40.0
 def sit_to_stand(data: Path) -> list[Result]:
     """Train on 60 % of the squats, walking and the jump; evaluate on sit-to-stand.
 
-    The default may not be worse than the mean of two or patent12 in any result.
+    No result of the default method may be worse than the mean of two sensors or patent12.
     """
     figures = []
     for side, trials in _both(data).items():
@@ -56,9 +56,9 @@ def sit_to_stand(data: Path) -> list[Result]:
 
 
 def exchanged(data: Path) -> list[Result]:
-    """The same with the filter errors exchanged between the sensors, RMS of five assignments.
+    """Errors of `sit_to_stand` with exchanged filter errors, RMS of five assignments.
 
-    The recordings assign one filter error to each sensor, arbitrarily.
+    The recordings assign one filter error to each sensor. This assignment is arbitrary.
     """
     figures = []
     for side in SIDES:
@@ -83,7 +83,7 @@ def exchanged(data: Path) -> list[Result]:
 
 
 def left_out(data: Path) -> list[Result]:
-    """Train on three of four movements; evaluate on the fourth."""
+    """Train on three of four movements, and evaluate on the fourth movement."""
     figures = []
     for side, trials in _both(data).items():
         squats = trials["squats1"]
@@ -101,8 +101,8 @@ def left_out(data: Path) -> list[Result]:
 def coverage(data: Path) -> list[Result]:
     """Coverage of flexion errors on both legs, for all movements.
 
-    The movements left out, and the last 40 % of each movement after training on the first 60 % of
-    all four.
+    The first part evaluates left-out movements. The second part evaluates the last 40 % of each
+    movement after training on the first 60 % of all four.
     """
     unseen, later = [], []
     for trials in _both(data).values():
@@ -125,11 +125,11 @@ def coverage(data: Path) -> list[Result]:
 
 
 def standing(data: Path) -> list[Result]:
-    """Return the errors in the static pose of the recorded subject, in natural stance.
+    """Errors in the static pose of the recorded subject, in natural stance.
 
-    In stance the bones lean and the knees are slightly flexed. The sensor-to-segment alignments
-    make the mean equal to the reference, so any correction is an error. The methods are trained on
-    squats, and on the part of the squats with a larger flexion alone.
+    In natural stance, the bones lean and the knees are slightly flexed. The sensor-to-segment
+    alignments make the mean equal to the reference, so any correction is an error. The methods are
+    trained on squats, and on the part of the squats with larger flexion alone.
     """
     figures = []
     for side, trials in _both(data).items():
@@ -157,7 +157,7 @@ def _both(data: Path, errors_of: tuple[int, ...] = AS_RECORDED) -> dict[str, dic
 
 
 def _risen(trials: dict[str, KneeTrial]) -> dict[str, Errors]:
-    """Return the errors in sit-to-stand; trained on 60 % of squats, walking and jump."""
+    """Return the errors in sit-to-stand after training on 60 % of squats, walking and jump."""
     squats = trials["squats1"]
     begin = squats.part(slice(0, training_frames(squats)))
     taught = [begin, trials["walking1"], trials["DJ1"]]

@@ -1,7 +1,7 @@
-"""Two sensors a segment on the recorded knee: baselines, default, and degraded cases.
+"""Two sensors per segment on the recorded knee: baselines, default, and degraded cases.
 
-One subject, one leg, virtual sensors made of skin markers, a model as reference. The results detect
-regressions; they do not validate the product.
+The data are from one leg of one subject, with virtual sensors made of skin markers and a model as
+reference. The results detect regressions; they do not validate the product.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ THIGH, SHANK = (0, 1), (2, 3)
 
 
 class KneeModels:
-    """Models of both segments, for one method and one choice of sensors.
+    """Models of both segments, for one method and one selection of sensors.
 
-    Each segment uses the mean of its neighbour's sensors, as in a rig.
+    Each segment uses the mean of the sensors on its neighbour, as in a rig.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ def _goals(errors: tuple[float, ...], goals: tuple[float, ...], label: str = "")
 
 
 def held_out(data: Path) -> list[Result]:
-    """The anchored correction on the last 40 % of the squats."""
+    """Anchored correction on the last 40 % of the squats."""
     squats = Squats(data)
     models = KneeModels("anchored", [squats.training])
     return _goals(squats.judge.errors(models.predict(squats.held), squats.held), (1.4, 1.6, 1.2))
@@ -135,7 +135,7 @@ def three_movements(data: Path) -> list[Result]:
 
 
 def facing_elsewhere(data: Path) -> list[Result]:
-    """Largest change of any orientation if the subject faces another way."""
+    """Largest change of an orientation if the subject faces another direction."""
     squats = Squats(data)
     models = KneeModels("anchored", [squats.training])
     straight = models.predict(squats.held)
@@ -150,7 +150,7 @@ def facing_elsewhere(data: Path) -> list[Result]:
 
 
 def one_sensor(data: Path) -> list[Result]:
-    """A model for each single sensor, used when the other is lost."""
+    """Models for each single sensor, which apply if the other sensor is lost."""
     squats = Squats(data)
     figures = []
     for index, goals in ((0, (1.5, 1.9)), (1, (2.1, 2.0))):

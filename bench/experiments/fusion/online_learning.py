@@ -1,9 +1,9 @@
-"""Online learning: subjects calibrated on walking then squat and sit in view of the cameras.
+"""Online learning: subjects are calibrated on walking, then squat and sit in view of the cameras.
 
-Simulated subjects with the settings of the demo. Ground truth are the bones, which no fit receives.
-Circles and walking are calibrated; squats and sit-to-stand are learned in three rounds. The
-evaluation uses later repetitions of both and of walking, to detect forgetting. Errors are RMS over
-all subjects; those of segments include heading drift.
+The subjects are simulated with the settings of the demo. The ground truth is their bones, which no
+fit receives. The calibration uses circles and walking. Squats and sit-to-stand are learned in three
+rounds. The evaluation uses later repetitions of both, and of walking to detect forgetting. Errors
+are RMS over all subjects. Segment errors include heading drift.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ FRESH_HZ = 10.0
 ROUNDS = 3
 ROUND_S = 80.0
 TURN_DEG = 15.0
-"""Rotation of each sensor on the skin at re-donning."""
+"""Rotation of each sensor on the skin at re-donning, deg."""
 OTHER_SKIN = 0.25
-"""Standard deviation of the factor by which the soft-tissue artefact of the new place differs."""
+"""Standard deviation of the relative change of the soft-tissue artefact at the new position."""
 PLAN = (
     Step("plate", 24.0), Step("stand", 9.0), Step("functional", 15.0), Step("walk", 40.0),
     *(Step(name, 20.0) for _ in range(ROUNDS) for name in ("squat", "sit_to_stand") * 2),
@@ -126,7 +126,7 @@ def person(seed: int) -> Person:
 
 @cache
 def calibrated(seed: int) -> Calibration | None:
-    """Return the calibration of the subject, or None if the daemon would request another pose."""
+    """Return the calibration of the subject; None if the daemon would request another pose."""
     rig, one = bench_rig(), person(seed)
     settings = replace(rig.calibration, functional_min_s=0.0)
     try:
@@ -139,7 +139,7 @@ def calibrated(seed: int) -> Calibration | None:
 
 
 def fresh(one: Person, calibration: Calibration, begin_s: float, end_s: float) -> OnlineFrames:
-    """Return the trial that the daemon collects in a span in view of the cameras."""
+    """Return the frames that the daemon collects in a period in view of the cameras."""
     trial = one.trial(begin_s, end_s)
     optical = trial.optical
     if optical is None:
@@ -177,7 +177,7 @@ def taught(seed: int, calibration: Calibration) -> tuple[Calibration, int]:
 
 
 def squares(one: Person, calibration: Calibration, span: tuple[float, float]) -> Array:
-    """Return the mean squared errors of flexion, thigh and shank in a span, rad²."""
+    """Return the mean squared errors of flexion, thigh and shank in a period, rad²."""
     now = (one.t_s >= span[0]) & (one.t_s < span[1])
     part = Worn(
         one.t_s[now] - one.t_s[now][0],
@@ -196,7 +196,7 @@ def squares(one: Person, calibration: Calibration, span: tuple[float, float]) ->
 
 
 def online(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Return the errors before and after online learning."""
+    """Errors before and after online learning."""
     taken, people = 0, 0
     rows: dict[tuple[str, str], list[Array]] = {}
     worst = -np.inf
@@ -242,7 +242,7 @@ def _two_names(new: OnlineFrames) -> OnlineFrames:
 
 
 def _moved(new: OnlineFrames) -> OnlineFrames:
-    """Rotate the whole cluster of the thigh by 12°, which leaves its fit unchanged."""
+    """Rotate the marker cluster of the thigh by 12° as a whole, so its rigid fit is unchanged."""
     x = new.markers["thigh"]
     middle = x.mean(axis=1, keepdims=True)
     local = new.sensors["S1"]
@@ -268,7 +268,7 @@ SPOILERS: dict[str, Callable[[OnlineFrames], OnlineFrames]] = {
 
 
 def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Return the number of rounds accepted from a wrong optical reference."""
+    """Number of accepted rounds with a wrong optical reference."""
     taken = dict.fromkeys(SPOILERS, 0)
     for seed in seeds:
         calibration = calibrated(seed)
@@ -289,7 +289,7 @@ def guarded(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
 
 
 def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Return the errors of learned subjects after re-donning, with a new static pose only."""
+    """Errors after re-donning of subjects with online learning, with a new static pose only."""
     rows: dict[str, list[Array]] = {"as calibrated": [], "re-donned": []}
     for seed in seeds:
         calibration = calibrated(seed)
@@ -317,7 +317,7 @@ def redonned(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
 
 
 def _anew(one: Person, calibration: Calibration, dice: np.random.Generator) -> Person:
-    """Return the subject with every sensor rotated and another soft-tissue artefact."""
+    """Return the subject with all sensors rotated and another soft-tissue artefact."""
     said = {}
     for name, q in one.said.items():
         item = calibration.sensor[name]

@@ -1,9 +1,10 @@
-"""Every fusion method on both legs of a recorded adult, by movement, with two references.
+"""Every fusion method on both legs of a recorded adult, by movement and with two references.
 
-A column is the median error over eight deals of filter errors, of one segment or of flexion, for
-one leg, movement, training and reference. The default method must be the best in every column, or
-within `MARGIN_DEG` of the best. Another experiment evaluates the errors about the long axes of the
-segments while the knee is nearly straight, where the reference is least certain.
+A column is the median error of one segment or of flexion over eight assignments (deals) of filter
+errors. Each column has one leg, movement, training set and reference. The default method must be
+the best in every column, or within `MARGIN_DEG` of the best. Another experiment evaluates the
+errors about the long axes of the segments while the knee is nearly straight, where the reference is
+least certain.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ MARGIN_DEG = 0.1
 RIVALS = ("single", "mean", "markley", "patent6", "patent12")
 SHORT_MOVEMENTS = ("walking1", "DJ1")
 STRAIGHT_DEG = 30.0
-"""Rotation of the knee below which thigh and shank are nearly in line, deg."""
+"""Knee rotation below which thigh and shank are nearly in line, deg."""
 LONG_AXIS_RESULTS = (
     ("share of the thigh's squared error", ""),
     ("share of the shank's squared error", ""),
@@ -53,7 +54,7 @@ LONG_AXIS_RESULTS = (
 
 
 def guided(trials: Trials) -> list[tuple[list[KneeTrial], Trials]]:
-    """Return the first 60 % of all movements for training, and the rest of each."""
+    """Return the first 60 % of all movements for training, and the rest for evaluation."""
     training, rest = [], {}
     for movement, trial in trials.items():
         count = training_frames(trial)
@@ -63,14 +64,14 @@ def guided(trials: Trials) -> list[tuple[list[KneeTrial], Trials]]:
 
 
 def squats_alone(trials: Trials) -> list[tuple[list[KneeTrial], Trials]]:
-    """Return the first 60 % of the squats for training; the rest of them and the others."""
+    """Return the first 60 % of the squats for training; all other data are for evaluation."""
     squats = trials["squats1"]
     count = training_frames(squats)
     return [([squats.part(slice(0, count))], trials | {"squats1": squats.part(slice(count, None))})]
 
 
 def columns(data: Path, training: Training, deals: Sequence[int] = DEALS) -> list[Result]:
-    """Return the median over `deals` of the default's error in every column.
+    """Median error of the default method over `deals` in every column.
 
     The threshold is the smallest median of the other methods plus `MARGIN_DEG`.
     """
@@ -89,10 +90,11 @@ def columns(data: Path, training: Training, deals: Sequence[int] = DEALS) -> lis
 
 
 def straight_knee(data: Path, deals: Sequence[int] = DEALS) -> list[Result]:
-    """Return the share of the squared error that is a rotation about the long axis, knee straight.
+    """Share of the squared error that is a rotation about the long axis with a straight knee.
 
-    A thigh and shank in line turn about one axis. The markers of pelvis and foot determine this
-    rotation of the reference poorly, and the knee of its model couples both segments.
+    If thigh and shank are in line, both rotate about the same axis. The markers of pelvis and foot
+    determine this rotation of the reference poorly, and the knee of its model couples both
+    segments.
     """
     results = []
     for reference in REFERENCES:
@@ -110,7 +112,7 @@ def straight_knee(data: Path, deals: Sequence[int] = DEALS) -> list[Result]:
 
 
 def _long_axis(data: Path, case: LegCase) -> dict[str, tuple[float, ...]]:
-    """Return the values of `LONG_AXIS_RESULTS` for the later parts of the short movements."""
+    """Return the values of `LONG_AXIS_RESULTS` for the last parts of the short movements."""
     trials = {movement: recorded_leg(data, movement, case) for movement in MOVEMENTS}
     ((taught, evaluated),) = guided(trials)
     predict = fusion_methods.fit(DEFAULT, taught)
@@ -147,7 +149,7 @@ def _column(name: str, draws: dict[str, list[float]]) -> Result:
 def _errors(
     data: Path, case: LegCase, training: Training
 ) -> dict[tuple[str, str], tuple[float, float, float]]:
-    """Return the errors by movement and method."""
+    """Return the errors of thigh, shank and flexion, by movement and method."""
     trials = {movement: recorded_leg(data, movement, case) for movement in MOVEMENTS}
     judge = Judge.of(trials["squats1"])
     errors = {}

@@ -1,7 +1,7 @@
 """Every fusion method on the recorded movements of the knee.
 
-One subject, one leg, virtual sensors made of skin markers, a model as reference. The results detect
-regressions; they do not validate the product.
+The data are from one leg of one subject, with virtual sensors made of skin markers and a model as
+reference. The results detect regressions; they do not validate the product.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ HOLD_OUT_GOALS = (1.2, 1.4, 1.0)
 HEADING_GOAL_DEG = 0.01
 DONNED_GOAL_DEG = 1.0
 POSE_SD_DEG = 1.0
-"""Repeatability of a static pose measured by each sensor, deg per axis."""
+"""Standard deviation of a sensor's static pose between repetitions, deg per axis."""
 DEFAULT = "anchored"
 FIT_GOAL_S = 0.5
 TOLERANCE = 0.05
-"""Tolerance of shares."""
+"""Tolerance of coverage values."""
 
 
 @cache
@@ -65,7 +65,7 @@ def _errors(judge: Judge, taught: list[KneeTrial], trial: KneeTrial) -> dict[str
 def _beside(
     found: Mapping[str, Sequence[float]], goals: Sequence[float], prefix: str = ""
 ) -> list[Result]:
-    """Return the errors of every method; only the default has thresholds."""
+    """Return the errors of every method as results; only the default method has thresholds."""
     return [
         Result(f"{prefix}{method}: {name}", error, round(goal, 3) if method == DEFAULT else NOTHING)
         for method, errors in found.items()
@@ -74,16 +74,16 @@ def _beside(
 
 
 def hold_out(data: Path) -> list[Result]:
-    """Train on the first 60 % of the squats; evaluate on the rest."""
+    """Train on the first 60 % of the squats, and evaluate on the rest."""
     training, held = _halves(data)
     judge = Judge.of(training)
     return _beside(_errors(judge, [training], held), HOLD_OUT_GOALS)
 
 
 def left_out(data: Path) -> list[Result]:
-    """Train on two movements; evaluate on the third.
+    """Train on two movements, and evaluate on the third movement.
 
-    The default may not be worse than the mean of two or patent12 in any result.
+    No result of the default method may be worse than the mean of two sensors or patent12.
     """
     trials = _trials(data)
     judge = Judge.of(_halves(data)[0])
@@ -97,7 +97,7 @@ def left_out(data: Path) -> list[Result]:
 
 
 def together(data: Path) -> list[Result]:
-    """Train on three movements together; evaluate on the last 40 % of the squats."""
+    """Train on three movements together, and evaluate on the last 40 % of the squats."""
     training, held = _halves(data)
     trials = [training, *(_trials(data)[name] for name in MOVEMENTS[1:])]
     found = _errors(Judge.of(training), trials, held)
@@ -105,7 +105,7 @@ def together(data: Path) -> list[Result]:
 
 
 def turned_and_donned(data: Path) -> list[Result]:
-    """A heading that changed after calibration, and re-donned sensors with a new static pose."""
+    """A change of heading after calibration, and re-donned sensors with a new static pose."""
     training, held = _halves(data)
     judge = Judge.of(training)
     predict = fusion_methods.fit(DEFAULT, [training])
@@ -135,9 +135,9 @@ def turned_and_donned(data: Path) -> list[Result]:
 
 
 def coverage(data: Path) -> list[Result]:
-    """Coverage of errors: same movement, other movements, one of several.
+    """Coverage of errors in the training movement, in other movements, and in one of several.
 
-    Seconds of one movement hold few independent frames, so only the total has a threshold.
+    A few seconds of one movement contain few independent frames, so only the total has a threshold.
     """
     training, held = _halves(data)
     trials = _trials(data)
@@ -183,7 +183,7 @@ def fit_time(data: Path) -> list[Result]:
 def flexion_scores(
     taught: list[KneeTrial], judged: KneeTrial, method: str = DEFAULT
 ) -> NDArray[np.float64]:
-    """Return the flexion errors divided by their predicted deviations, shape (n,)."""
+    """Return the flexion errors divided by their predicted standard deviations, shape (n,)."""
     alike = fusion_methods.correlation(taught) if method == DEFAULT else 0.0
     return joint_scores(fusion_methods.models(taught, method), alike, judged)
 
@@ -191,7 +191,7 @@ def flexion_scores(
 def joint_scores(
     models: Sequence[SegmentModel], alike: float, judged: KneeTrial
 ) -> NDArray[np.float64]:
-    """Return the flexion errors of two models, whose errors have the correlation `alike`."""
+    """Return the normalized flexion errors for two models with error correlation `alike`."""
     said, claimed = [], []
     for model, segment in zip(models, fusion_methods.segments(judged), strict=True):
         said.append(model.predict(segment.sensors, segment.other))
@@ -206,9 +206,9 @@ def joint_scores(
 
 
 def _donned(trial: KneeTrial, seed: int) -> KneeTrial:
-    """Return the trial with mounts rotated by 10 to 20 degrees and a new static pose.
+    """Return the trial with sensors rotated by 10 to 20 degrees and a new static pose.
 
-    The new pose corrects the rotated mount up to the repeatability of the pose.
+    The new pose corrects the rotated alignment, except for the repeatability of the pose.
     """
     rng = np.random.default_rng(seed)
     sensors = []

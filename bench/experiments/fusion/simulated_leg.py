@@ -1,9 +1,9 @@
 """Calibration and live estimation of simulated subjects, without wire formats.
 
-Each seed is another subject: alignment, headings, soft-tissue artefact and sensor errors differ, at
-the settings of the demo. Ground truth are the bones; the optical reference consists of skin
-markers. Calibrated on 60 s (joint circles, walking, squats, sit-to-stand), evaluated on 24 s
-afterwards.
+Each seed is another subject with its own alignment, headings, soft-tissue artefact and sensor
+errors, at the settings of the demo. The ground truth is the bones. The optical reference is skin
+markers. The calibration uses 60 s (joint circles, walking, squats, sit-to-stand), and the
+evaluation uses 24 s afterwards.
 """
 
 from __future__ import annotations
@@ -42,16 +42,17 @@ if TYPE_CHECKING:
     from jointfit_simulators.body import LegGeometry
 
 SEEDS = tuple(range(1, 9))
-"""The first one is the subject of the demo."""
+"""Seeds of the subjects. The first subject is the subject of the demo."""
 METHODS: tuple[Method, ...] = ("anchored", "patent12", "patent6", "mean")
 SEGMENTS = ("thigh", "shank")
 BEGIN_S = 100.0
-"""Errors and soft-tissue artefact change with time: the live part is later than the calibration."""
+"""Start of the live part, s. Errors and soft-tissue artefact change with time, so the live part is
+later than the calibration."""
 LIVE = (("walk", 8.0), ("squat", 8.0), ("sit_to_stand", 8.0))
 RATE_HZ = 50.0
 KNEE_GOAL_DEG = 3.0
 NS = 1_000_000_000
-_STILL_S = np.arange(3.0, 8.0, 0.1)  # of a standing subject
+_STILL_S = np.arange(3.0, 8.0, 0.1)  # standing subject
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,11 +62,11 @@ class Live:
     t_ns: list[int]
     said: dict[str, list[Quaternion]]
     bones: dict[str, Array]
-    """q_optical_segment, shape (n, 4)."""
+    """Orientation q_optical_segment by segment, shape (n, 4)."""
     flexion: Array
     """Knee flexion, rad, shape (n,)."""
     standing_m: dict[str, Array]
-    """Joint centers in the static pose, shape (3,)."""
+    """Joint centers in the static pose, m, shape (3,), by joint."""
 
 
 @dataclass(slots=True)
@@ -85,7 +86,7 @@ def wear_live(seed: int) -> Live:
 
 
 def live_of(knobs: Knobs, geometry: LegGeometry | None = None) -> Live:
-    """Return the live part of a subject with these magnitudes of errors and bones."""
+    """Return the live part of a subject with the given error settings and bones."""
     still = SimulatedSubject(knobs, [Step("stand", 9.0)], geometry=geometry).observe(
         [np.empty(0)] * 4, np.empty(0), _STILL_S
     )
@@ -170,7 +171,7 @@ def people(seeds: tuple[int, ...] = SEEDS) -> Mapping[Method, list[Errors]]:
 
 
 def take_pose(static: CalibrationTrial, rig: Rig) -> StaticPose | None:
-    """Return the accepted static pose, or None if the daemon would request another."""
+    """Return the accepted static pose; None if the daemon would request another pose."""
     until_ns = min(int(track.t_ns[0]) for track in static.sensors.values())
     until_ns += round(rig.calibration.static_s * NS)
     optical = static.optical
@@ -218,7 +219,7 @@ def _row(method: Method) -> Callable[[Path], list[Result]]:
 
 
 def centers(_: Path) -> list[Result]:
-    """Return the distances of the joint centers from ground truth in the static pose."""
+    """Distances of the joint centers from the ground truth in the static pose."""
     errors = people()["anchored"]
     figures: list[Result] = []
     for joint in ("hip", "knee", "ankle"):

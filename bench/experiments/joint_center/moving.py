@@ -1,7 +1,7 @@
-"""Running centers of a simulated leg whose knee center moves after the calibration, or does not.
+"""Running estimates of the centers of a simulated leg whose knee center may move after calibration.
 
-The movement of the calibration (walking, squats, guided movement) differs from that of the test
-(walking, sitting down and standing up), so the soft-tissue artefact differs, too.
+The movement of the calibration (walking, squats, guided movement) differs from the movement of the
+test (walking, sitting down and standing up). The soft-tissue artefact therefore differs, too.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ if TYPE_CHECKING:
 WEARERS = (1, 2, 3, 4)
 STILL_S, TAUGHT_S, TESTED_S = 8.0, 45.0, 70.0
 LEAD_S = 2.0
-"""Transition between two motions, which is not used."""
+"""Duration of the transition between two motions, s. It is not evaluated."""
 MEMORY_S = 10.0
 MOVED_AT_S = 15.0
 CAMERAS_HZ = 40.0
 RIGID, WORN = 0.0, 5.0
-"""Soft-tissue artefact of the markers, mm RMS."""
+"""RMS soft-tissue artefact of the markers, mm: without artefact, and on a subject."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,8 @@ class Wearer:
     calibration: Calibration
     track: OpticalTrack
     forward: Array
-    """Positions of the tested frames move along this direction with the thigh, (m, 3)."""
+    """Forward direction of the thigh in each tested frame, shape (m, 3). The markers are moved
+    along it."""
 
 
 @cache
@@ -110,7 +111,7 @@ def wearer(seed: int, tissue_mm: float) -> Wearer:
 
 
 def followed(one: Wearer, moved_m: float) -> list[tuple[float, RunningCenter]]:
-    """Return time, s, and running centers while the knee lies further forward from some time on."""
+    """Return times, s, and running centers; the knee center moves forward at `MOVED_AT_S`."""
     rig, track = bench_rig(), one.track
     below = [*rig.calibration.markers["shank"], *rig.calibration.markers["foot"]]
     columns = [track.markers.index(name) for name in below]
@@ -132,7 +133,7 @@ def followed(one: Wearer, moved_m: float) -> list[tuple[float, RunningCenter]]:
 
 
 def moving(tissue_mm: float, shifts_mm: tuple[float, ...], _: Path) -> list[Result]:
-    """Return false reports without a shift; for each shift its reports and measured size."""
+    """False reports without a shift; reports and measured size for each shift."""
     still = [found for seed in WEARERS for found in followed(wearer(seed, tissue_mm), 0.0)]
     compared = [center.moved for _, center in still if center.moved is not None]
     share = 100.0 * sum(compared) / len(compared)

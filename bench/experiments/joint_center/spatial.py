@@ -1,4 +1,4 @@
-"""Centers of rotation in space: markers, spheres, two moving bodies; bounds and coverage."""
+"""Centers of rotation in space from markers, spheres and two moving bodies; bounds and coverage."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ if TYPE_CHECKING:
 
 MM = 1000.0
 NOISE = 1e-3
-"""Noise of every coordinate, m."""
+"""Standard deviation of the noise of every coordinate, m."""
 
 
 AT_20, AT_45 = (2.15, 2.15, 2.28, 3.26, inf), (0.85, 0.85, 0.91, 1.00, inf)
-"""Results of other authors for these methods, mm; the last method is not recommended."""
+"""Results of other authors for these methods, mm. The last method is not recommended."""
 
 
 def rms(errors: list[Array]) -> float:
@@ -62,7 +62,7 @@ def rms(errors: list[Array]) -> float:
 
 
 def four_markers(_: Path) -> list[Result]:
-    """Arc of 20°, noise of 2 mm, four markers about the joint, 400 runs."""
+    """Four markers about the joint with an arc of 20° and a noise of 2 mm, 400 runs."""
     rng = np.random.default_rng(7)
     truth, noise = fan(20.0), 2e-3
     bound = np.sqrt(sphere_bound(truth, noise))
@@ -87,13 +87,13 @@ def four_markers(_: Path) -> list[Result]:
 
 
 def upper_rms(errors: list[Array]) -> float:
-    """Return the RMS error that 5 % of such sets of runs would exceed, m."""
+    """Return the upper 95 % confidence limit of the RMS error, m."""
     squares = np.array([e @ e for e in errors])
     return float(np.sqrt(squares.mean() + 1.645 * squares.std() / np.sqrt(len(squares))))
 
 
 def frame_by_frame(_: Path) -> list[Result]:
-    """Streaming sphere fit against batch sums, with occluded markers."""
+    """Streaming sphere fit compared with batch sums, with occluded markers."""
     rng = np.random.default_rng(5)
     points = carried(star_turns(45.0, 1000)) + rng.normal(0, NOISE, (1000, 4, 3))
     points[rng.uniform(size=points.shape[:2]) < 0.1] = np.nan
@@ -109,9 +109,9 @@ def frame_by_frame(_: Path) -> list[Result]:
 
 
 def ball_joint(rom: float, goals: tuple[float, ...], runs: int = 200) -> list[Result]:
-    """Noise of 1 mm on all markers of both bodies; from 1000 runs on, upper 95 % limits.
+    """Two bodies with a noise of 1 mm on all markers; upper 95 % limits from 1000 runs on.
 
-    Fewer runs than the 200 of the definition vary by chance, and the tolerance allows for that.
+    Results of fewer than 200 runs vary by chance, and the tolerance allows for this variation.
     """
     rng = np.random.default_rng(10)
     errors: dict[str, list[Array]] = {}
@@ -145,7 +145,7 @@ def _ball_joint(rom: float, goals: tuple[float, ...], runs: int, _: Path) -> lis
 
 
 def hinge_axis(_: Path) -> list[Result]:
-    """Rotation about z by 45°, 200 runs."""
+    """Axis of a hinge that rotates about z by 45°, 200 runs."""
     rng = np.random.default_rng(11)
     markers = CHILD[:, [0, 2, 1]]
     off, angle, told = [], [], 0
@@ -165,7 +165,7 @@ def hinge_axis(_: Path) -> list[Result]:
 
 
 def parent_covariance(_: Path) -> list[Result]:
-    """Covariance of a point in a noisy frame, 20 000 frames."""
+    """Covariance of a point in a frame with noise, 20 000 frames."""
     rng = np.random.default_rng(12)
     point, noise = CHILD[1], 1e-3
     turns = np.tile(np.eye(3), (20_000, 1, 1))
@@ -182,18 +182,18 @@ def parent_covariance(_: Path) -> list[Result]:
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """One movement with one kind of noise."""
+    """One movement with one type of noise."""
 
     name: str
     paths: Paths
     """True paths of the markers, m, shape (n, k, d)."""
     see: Callable[[np.random.Generator, Array], Array]
     efficient: float = inf
-    """Threshold of RMS error over the bound."""
+    """Threshold for the ratio of RMS error to the bound."""
 
 
 def measured(setup: Setup, runs: int, seed: int = 2024) -> list[Result]:
-    """Return coverage and RMS error over the bound of the streaming estimator."""
+    """Return coverage, and ratio of RMS error to the bound, of the streaming estimator."""
     rng = np.random.default_rng(seed)
     errors, bounds, held, refused = [], [], 0, 0
     for _run in range(runs):
@@ -224,7 +224,7 @@ def white(rng: np.random.Generator, truth: Array) -> Array:
 
 
 def lasting(rng: np.random.Generator, truth: Array) -> Array:
-    """Add noise with a correlation of one half between neighbouring frames."""
+    """Add noise with a correlation of 0.5 between neighbouring frames."""
     e = rng.normal(0, NOISE, truth.shape)
     for t in range(1, len(e)):
         e[t] = 0.5 * e[t - 1] + np.sqrt(0.75) * e[t]
@@ -244,7 +244,7 @@ def hinge(arc: float, markers: Array = CHILD) -> Paths:
 
 
 def circling(_: np.random.Generator) -> Array:
-    """Return a smooth movement in all directions, 45° wide, as requested of a hip."""
+    """Return a smooth hip movement of 45° in all directions."""
     return carried(star_turns(45.0, 300))
 
 

@@ -1,7 +1,7 @@
-"""Refined markers evaluated by the inverse kinematics of OpenSim.
+"""Refined markers, evaluated by the inverse kinematics of OpenSim.
 
-The models are unchanged except for marker positions. Trials called unseen were used neither for
-learning nor for any choice.
+Only the marker positions of the models are changed. Trials that are called unseen were used neither
+for learning nor for any choice.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ THREE = ("walking1", "squats1", "DJ1")
 EVERYTHING = (*THREE, "STS1")
 _EVENNESS = (0.0, 1.0, 2.0, 4.0)
 _DEARER = 1.02
-"""Largest mean error of held-out movements, relative to the smallest."""
+"""Largest accepted mean error of held-out movements, relative to the smallest mean error."""
 
 
 def _less(before: float, after: float) -> float:
@@ -44,7 +44,7 @@ def _less(before: float, after: float) -> float:
 
 
 def scaled_only(data: Path) -> list[Result]:
-    """gait2354 as scaled: refined markers in OpenSim's inverse kinematics."""
+    """Refined markers of the scaled model gait2354 in OpenSim's inverse kinematics."""
     subject = gait2354(data)
     chain, walk = subject.chain(), [subject.motion("walk1")]
     before = subject.verdicts(["walk1"])["walk1"].rms
@@ -66,7 +66,7 @@ def _off(found: Refinement, verdict: Verdict) -> float:
 
 
 def beside_opensim(data: Path) -> list[Result]:
-    """Compare simultaneous refinement with the published coordinate search through OpenSim."""
+    """Simultaneous refinement compared with the published coordinate search through OpenSim."""
     subject = gait2354(data)
     chain, walk = subject.chain(), [subject.motion("walk1")]
     refine_markers(chain, walk, PLAIN)
@@ -130,7 +130,7 @@ def walking_alone(data: Path) -> list[Result]:
 
 
 def _to_the_end(subject: OpensimSubject, found: Refinement) -> list[Result]:
-    """OpenSim's result for the walk at an accuracy that does not stop it early."""
+    """OpenSim's result for walking at an accuracy that does not stop it early."""
     walk = subject.judged["walking1"]
     before = judge(subject.model, walk, accuracy=CONVERGED).rms
     after = judge(subject.model, walk, found.model, CONVERGED).rms
@@ -151,7 +151,7 @@ def _to_the_end(subject: OpensimSubject, found: Refinement) -> list[Result]:
 
 
 def three_movements(data: Path) -> list[Result]:
-    """One marker set for three movements; the weighting of the trials is chosen on these three."""
+    """One marker set for three movements, which also determine the weighting of the trials."""
     subject = opencap(data)
     evenness = chosen_evenness(subject, THREE)
     figures = [Result("evenness chosen by cross-validation", evenness, inf, unit="")]
@@ -185,17 +185,17 @@ def _across(verdicts: Mapping[str, Verdict]) -> float:
 def refined_evenly(
     subject: OpensimSubject, trained: Sequence[str], power: float, judged: Sequence[str] = ()
 ) -> Refinement:
-    """Return markers learned from some trials, those with larger errors weighted more."""
+    """Return markers learned from some trials; trials with larger errors have larger weights."""
     settings = RefinementSettings(huber_m=None, frames=100, evenness=power)
     trials, others = ([subject.motion(n) for n in names] for names in (trained, judged))
     return refine_markers(subject.chain(), trials, settings, others)
 
 
 def chosen_evenness(subject: OpensimSubject, trained: Sequence[str]) -> float:
-    """Return the largest exponent of the weighting that does not raise the held-out error.
+    """Return the largest weighting exponent that does not increase the held-out error.
 
-    Each training trial is held out in turn. Among the exponents whose mean held-out error is within
-    2 % of the smallest, the largest one distributes the remaining errors most evenly.
+    Each training trial is held out in turn. Some exponents have a mean held-out error within 2 % of
+    the smallest. The largest of these exponents distributes the remaining errors most evenly.
     """
     means = {}
     for power in _EVENNESS:

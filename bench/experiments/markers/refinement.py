@@ -1,8 +1,9 @@
-"""Marker refinement on the movements of a recorded adult and on simulated ones.
+"""Marker refinement on the movements of a recorded adult and on simulated movements.
 
-The thresholds are the results of a reference implementation of the same equations, with a margin.
-The published results of the coordinate search (tracking error −38.4 %, its variance −53.7 %) refer
-to its own training trials; the experiment on simulated subjects reports the same quantities.
+The thresholds are the results of a reference implementation of the same equations, plus a margin.
+The published results of the coordinate search (tracking error −38.4 %, variance of the tracking
+error −53.7 %) refer to its training trials. The experiment on simulated subjects reports the same
+quantities.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ if TYPE_CHECKING:
 
 _MM = 1000.0
 _EVERY = {"walking1": 1, "squats1": 8, "DJ1": 2, "STS1": 8}
-"""Evaluated frames; every tenth frame of the squats is used for learning."""
+"""Step between evaluated frames, by movement. For learning, every tenth frame of the squats is
+used."""
 _RECORDED = (FOLDER,)
 _ALL = 10_000
 _PELVIS = 4
@@ -58,7 +60,7 @@ def rms_mm(found: Refinement, trial: str) -> float:
 
 @cache
 def walked(data: Path) -> tuple[Refinement, float]:
-    """Return the refinement on walking alone, and its time, s."""
+    """Return the refinement on walking alone, and its duration, s."""
     model, trials = oc4_lower(data), [motion(data, "walking1")]
     refine_markers(model, trials, PLAIN)
     began = time.process_time()
@@ -87,7 +89,7 @@ def same_minimum(data: Path) -> list[Result]:
 
 
 def never_rises(data: Path) -> list[Result]:
-    """The objective never increases: 20 starts, each marker displaced by 15 mm an axis."""
+    """The objective never increases in 20 runs; each marker starts displaced by 15 mm per axis."""
     model, trial = oc4_lower(data), motion(data, "walking1", 8)
     rises = steps = 0
     for seed in range(20):
@@ -105,7 +107,7 @@ def never_rises(data: Path) -> list[Result]:
 
 
 def misplaced(data: Path) -> ChainModel:
-    """Return the chain with all markers displaced by 10 mm an axis, except those of the pelvis."""
+    """Return the chain with all markers except the pelvis markers displaced by 10 mm per axis."""
     model = oc4_lower(data)
     off = np.random.default_rng(11).normal(0.0, 0.01, (29, 3))
     off[:_PELVIS] = 0.0
@@ -114,7 +116,7 @@ def misplaced(data: Path) -> ChainModel:
 
 
 def beside_search(data: Path, every: int = 1) -> list[Result]:
-    """The published coordinate search from a displaced start, and the simultaneous method."""
+    """The published coordinate search and the simultaneous method from a displaced start."""
     model, trials = misplaced(data), [motion(data, "walking1", every)]
     validation = [motion(data, "STS1")]
     began = time.process_time()
@@ -150,7 +152,7 @@ def beside_search(data: Path, every: int = 1) -> list[Result]:
 
 
 def unseen(data: Path) -> list[Result]:
-    """Refined on three movements, evaluated on a fourth."""
+    """Refine on three movements, and evaluate on a fourth movement."""
     trials = [motion(data, "walking1"), motion(data, "squats1", 10), motion(data, "DJ1")]
     found = refine_markers(oc4_lower(data), trials, PLAIN, [motion(data, "STS1")])
     before, after = found.variance_of_trials(trained=True)
@@ -172,7 +174,7 @@ def invisible(data: Path) -> list[Result]:
 
 
 def _tissue(rng: np.random.Generator, clean: Array, rate: int) -> Array:
-    """Return markers that slide by 6 mm to and fro, with 1 mm of noise."""
+    """Return markers that slide back and forth by 6 mm, with 1 mm of noise."""
     frames, markers = clean.shape[:2]
     turns = (1 + 0.3 * rate) * np.arange(frames)[:, None, None] / frames
     phase = rng.uniform(0.0, 2 * np.pi, (markers, 1))
@@ -181,7 +183,7 @@ def _tissue(rng: np.random.Generator, clean: Array, rate: int) -> Array:
 
 
 def people(data: Path, count: int = 8) -> list[Result]:
-    """Simulated subjects at three speeds; the first speed is learned."""
+    """Simulated subjects at three speeds; the first speed is the training trial."""
     model = oc4_lower(data)
     held = {m.name: (True, True, True) for m in model.markers[:_PELVIS]}
     walk = solve_frames(model, measured(data, "walking1", model)).state
@@ -211,7 +213,7 @@ def people(data: Path, count: int = 8) -> list[Result]:
 
 @dataclass(frozen=True, slots=True)
 class _Draw:
-    """Simulated movements with 3 mm of noise; free markers displaced by 10 mm an axis."""
+    """Simulated movements with 3 mm of noise; free markers are displaced by 10 mm per axis."""
 
     start: ChainModel
     clean: dict[str, Array]
@@ -226,7 +228,7 @@ class _Draw:
 def _draws(
     model: ChainModel, truly: dict[str, ChainState], right: tuple[str, ...], count: int
 ) -> Iterator[_Draw]:
-    """Draw displacements and noise; the named markers are exact and locked."""
+    """Draw random displacements and noise; the markers in `right` are exact and locked."""
     free = np.array([not any(a in m.name for a in right) for m in model.markers])
     held = {m.name: (True,) * 3 for m, f in zip(model.markers, free, strict=True) if not f}
     rng = np.random.default_rng(2)
@@ -247,7 +249,7 @@ def _moved(data: Path) -> dict[str, ChainState]:
 
 
 def truth(data: Path, count: int = 8) -> list[Result]:
-    """Noise of 3 mm, displacements of 10 mm, anatomical markers exact and locked."""
+    """Noise of 3 mm and displacements of 10 mm; anatomical markers are exact and locked."""
     model, truly = oc4_lower(data), _moved(data)
     off_mm, shares, errors = [], [], []
     for draw in _draws(model, truly, _ANATOMICAL, count):
@@ -267,10 +269,10 @@ def truth(data: Path, count: int = 8) -> list[Result]:
 
 
 def feet_let_go(data: Path, count: int = 32) -> list[Result]:
-    """Heels and toes are displaced and free too, so the foot's rotation is undetermined.
+    """Heels and toes are also displaced and free, so the foot's rotation is undetermined.
 
-    The result of an ideal trial is reported as well: learned from noise-free movements, with a
-    prior that only selects among equally good markers.
+    The results include an ideal case: learned from noise-free movements, with a prior that only
+    selects among equally good markers.
     """
     model, truly = oc4_lower(data), _moved(data)
     shares = []
@@ -290,13 +292,13 @@ def feet_let_go(data: Path, count: int = 32) -> list[Result]:
 def _all_off(
     model: ChainModel, fitted: ChainModel, truly: dict[str, ChainState], seen: dict[str, Array]
 ) -> float:
-    """Return the RMS difference of joint angles from ground truth over movements, rad."""
+    """Return the RMS error of the joint angles over all movements, rad."""
     off = [_angles_off(model, fitted, truly[name], y) for name, y in seen.items()]
     return float(np.sqrt(np.mean(np.square(off))))
 
 
 def _angles_off(model: ChainModel, fitted: ChainModel, true: ChainState, y: Array) -> float:
-    """Return the RMS difference of all joint angles from ground truth, rad."""
+    """Return the RMS error of all joint angles, rad."""
     found = solve_frames(fitted, y)
     step = step_between(model, true, found.state)[:, 6:]
     return float(np.sqrt(np.mean(step**2)))

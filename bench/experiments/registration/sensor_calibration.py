@@ -1,8 +1,8 @@
-"""Error of orientations from raw readings before and after the calibration of the sensor.
+"""Error of orientations from raw readings, before and after the calibration of the sensor.
 
-Twelve simulated sensors with different biases, scale errors, soft and hard iron are calibrated by
-the guided steps of `jointfit calibrate sensor`, and then turned for half a minute. The orientation
-comes from the filter of the drivers.
+Twelve simulated sensors have different biases, scale errors, soft and hard iron. They are
+calibrated by the guided steps of `jointfit calibrate sensor`, and then turned for half a minute.
+The filter of the drivers computes the orientation.
 """
 
 from __future__ import annotations
@@ -55,7 +55,10 @@ POSES = DIRECTIONS[[0, 1, 2, 3, 4, 5, 6, 7, 10, 11, 14, 15]]
 
 @dataclass(frozen=True)
 class SimulatedSensor:
-    """Biases and matrices; those of accelerometer and magnetometer are symmetric."""
+    """Biases and error matrices of a sensor.
+
+    The matrices of accelerometer and magnetometer are symmetric.
+    """
 
     biases: Array
     rate_matrix: Array
@@ -64,7 +67,7 @@ class SimulatedSensor:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> SimulatedSensor:
-        """Return a sensor with errors of low-cost parts."""
+        """Return a sensor with random errors of low-cost parts."""
         biases = rng.normal(0.0, 1.0, (3, 3)) * np.array((0.01, 0.3, 25.0))[:, None]
         rate_matrix = _near_identity(rng, 0.02, 0.0) + rng.normal(0.0, 0.004, (3, 3))
         return cls(
@@ -74,7 +77,7 @@ class SimulatedSensor:
     def measure(
         self, up: Array, north: Array, rates: Array, rng: np.random.Generator
     ) -> list[SensorReading]:
-        """Return readings; up and field direction are unit vectors in sensor axes."""
+        """Return readings; `up` and `north` are unit vectors in sensor axes."""
         true = (
             rates @ self.rate_matrix.T,
             GRAVITY * up @ self.force_matrix,
@@ -94,7 +97,7 @@ class SimulatedSensor:
 
 
 def calibrate(sensor: SimulatedSensor, rng: np.random.Generator) -> SensorCalibrationSettings:
-    """Return the table that the guided steps yield."""
+    """Return the calibration table that the guided steps yield."""
     still = np.zeros((8 * RATE_HZ, 3))
     level = np.tile((0.0, 0.0, 1.0), (len(still), 1))
     rest, static, free = GyroscopeStep(), AccelerometerStep(), MagnetometerStep()
@@ -128,7 +131,7 @@ def _posed(sensor: SimulatedSensor, rng: np.random.Generator) -> list[SensorRead
 
 
 def _turned(sensor: SimulatedSensor, rng: np.random.Generator) -> list[SensorReading]:
-    """Return readings of a rotation to all sides."""
+    """Return readings of a rotation in all directions."""
     north = _unit(rng.normal(size=(600, 3)))
     return sensor.measure(north, north, np.zeros(north.shape), rng)
 
@@ -153,7 +156,7 @@ def turned_sensor(
 def orientation_error(
     q: Array, readings: list[SensorReading], calibration: SensorCalibrationSettings | None
 ) -> tuple[float, float]:
-    """Return RMS errors after 10 s, deg: of the whole orientation, and of its vertical."""
+    """Return the RMS errors after 10 s, deg, of the whole orientation and of its vertical."""
     correction = None if calibration is None else SensorCorrection(calibration)
     samples = RawSamples(RATE_HZ, magnetometer=True, correction=correction)
     found = [
@@ -173,7 +176,7 @@ def orientation_error(
 
 
 def before_and_after(_: Path) -> list[Result]:
-    """Return median and largest RMS errors of the sensors, and errors of the gyroscope's scale."""
+    """Median and largest RMS errors of the sensors, and errors of the gyroscope scale."""
     errors, scales = [], []
     for seed in range(SENSORS):
         rng = np.random.default_rng(seed)
@@ -184,7 +187,7 @@ def before_and_after(_: Path) -> list[Result]:
         corrected = np.array(calibration.gyroscope_matrix) @ sensor.rate_matrix
         factors = (np.diag(sensor.rate_matrix), np.diag(corrected))
         scales.append([100.0 * np.abs(each - 1.0).max() for each in factors])
-    table = np.array(errors)  # sensor, before or after, whole or tilt
+    table = np.array(errors)  # axes: sensor, before/after, whole/tilt
     limits: Mapping[tuple[str, str], float] = {
         ("after", "orientation"): 0.4,
         ("after", "inclination"): 0.2,

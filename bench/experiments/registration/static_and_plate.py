@@ -1,4 +1,4 @@
-"""Stillness, the static mean, and the alignment of sensor and optical world."""
+"""Detection of rest, the static mean, and the alignment of sensor world and optical world."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def _rms(values: list[float]) -> float:
 
 
 def stillness(data: Path) -> list[Result]:
-    """Detected rest, and motion detected as rest, in two whole trials of a board."""
+    """Share of detected rest, and of motion detected as rest, in two whole trials of a board."""
     h5py = import_module("h5py")  # imported by this experiment only
     figures = []
     for name in TRIALS:
@@ -53,7 +53,10 @@ def stillness(data: Path) -> list[Result]:
 
 
 def static_mean(_: Path) -> list[Result]:
-    """Scatter of 1 degree per axis, a fifth of the frames rotated by 30 to 90 degrees."""
+    """Static mean with a scatter of 1 degree per axis; outliers are 30 to 90 degrees off.
+
+    A fifth of the frames are outliers.
+    """
     rng = np.random.default_rng(2)
     errors = []
     for _run in range(100):
@@ -71,7 +74,7 @@ def static_mean(_: Path) -> list[Result]:
 def random_walk(
     rng: np.random.Generator, outliers: float = 0.0, axis: tuple[float, ...] | None = None
 ) -> tuple[Array, Array, Array, Array]:
-    """Return orientations of sensor and body of a hand-turned plate, and true q_W and q_B."""
+    """Return orientations of sensor and body of a hand-held plate, and the true q_W and q_B."""
     n, steps = 2000, rng.normal(0.0, 0.05, (1999, 3))
     if axis is not None:
         steps = steps[:, :1] * np.array(axis)
@@ -88,7 +91,7 @@ def random_walk(
 
 
 def plate(_: Path) -> list[Result]:
-    """World and mount of a plate, with and without 15 % random orientations, 10 runs each."""
+    """World and alignment from a plate, with and without 15 % random orientations, 10 runs each."""
     figures = []
     for share, label in ((0.0, "clean"), (0.15, "15 % outliers")):
         world, mount = [], []
@@ -128,7 +131,7 @@ def _aligned(q_s: Array, q_opt: Array, kept: slice) -> list[Result]:
 
 
 def real_plate(data: Path) -> list[Result]:
-    """A recorded board, its orientation from a filter; 30 s of motion at 47.6 Hz."""
+    """Recorded board with its orientation from a filter; 30 s of motion at 47.6 Hz."""
     h5py, vqf = import_module("h5py"), import_module("vqf")  # imported by this experiment only
     with h5py.File(data / "broad" / f"{TRIALS[0]}.hdf5") as trial:
         rate = float(trial.attrs["sampling_rate"])
@@ -140,7 +143,7 @@ def real_plate(data: Path) -> list[Result]:
 
 
 def integrated_plate(data: Path) -> list[Result]:
-    """The same board, its orientation from integrated angular rate; 30 s, 5 s into the motion."""
+    """Recorded board with its orientation from integrated rate; 30 s of motion after 5 s."""
     with np.load(data / "broad_excerpts" / f"{TRIALS[0]}_60s.npz", allow_pickle=False) as trial:
         rate = float(trial["sampling_rate"])
         gyr = trial["imu_gyr"].astype(np.float64)
@@ -148,7 +151,7 @@ def integrated_plate(data: Path) -> list[Result]:
         first = int(np.flatnonzero(trial["movement"])[0])
     rates = gyr - gyr[:first].mean(axis=0)
     steps = rotation.exp(0.5 * (rates[1:] + rates[:-1]) / rate)
-    q_s = q_opt.copy()  # starts in the optical world, so that ground truth is known
+    q_s = q_opt.copy()  # it starts in the optical world, so the truth is known
     for i in range(first, len(steps)):
         q_s[i + 1] = rotation.multiply(q_s[i], steps[i])
     begin = first + int(5 * rate)

@@ -1,8 +1,9 @@
 """Sensors that are lost, stick, slip or drift, on simulated subjects.
 
-Settings of the demo: 5 degrees of common soft-tissue artefact and 3 of each sensor, errors of the
-sensors' filters, any alignment and heading. Jumps are counted against the same subject without the
-fault, in units of the RMS error predicted for that frame.
+The subjects have the settings of the demo: 5 degrees of common soft-tissue artefact, 3 degrees of
+each sensor, filter errors of the sensors, and random alignments and headings. A jump is a
+difference from the same subject without the fault. Its unit is the predicted RMS error of that
+frame.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ SEEDS = (1, 2, 5, 6, 7, 8)
 RATE_HZ = 50.0
 FAULT_S = 60.0
 FIRST_S, APART_S = 17.3, 6.1
-"""Start times of the faults, in all kinds of movement, s."""
+"""First start time of a fault, and time between faults, s. The faults occur in all movements."""
 SLIPS_DEG = (10.0, 15.0, 30.0)
 RATES = (0.0, 1.0, 3.0, 10.0)
 DRIFT_S, DRIFT_HZ = 300.0, 25.0
@@ -73,7 +74,7 @@ def _cases(
     seeds: tuple[int, ...],
     spoil: Callable[[faulty_wearer.Worn, str, float, int], faulty_wearer.Worn],
 ) -> Iterator[tuple[float, str, list[tuple[float, SensorReport]], Array]]:
-    """Yield for every subject and sensor: start of the fault, subject, events, jumps."""
+    """Yield for every subject and sensor: start of the fault, sensor, events, and jumps."""
     for seed, calibration in calibrated_people(seeds):
         person = faulty_wearer.live(seed, FAULT_S, RATE_HZ)
         before, _ = faulty_wearer.play(fuser_of(calibration), person)
@@ -115,17 +116,17 @@ def _found(
 
 
 def stuck(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Delay until a sensor that repeats its value is reported."""
+    """Time until a stuck sensor is reported."""
     return _found(lambda p, name, t, _: faulty_wearer.stuck(p, name, t), "stuck", 0.5, seeds)
 
 
 def silent(_: Path, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Delay until a silent sensor is reported."""
+    """Time until a silent sensor is reported."""
     return _found(lambda p, name, t, _: faulty_wearer.silent(p, name, t), "lost", 0.5, seeds)
 
 
 def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Result]:
-    """Delay until a slip is reported."""
+    """Time until a slip is reported."""
     angle = np.deg2rad(degrees)
     figures = _found(
         lambda p, name, t, dice: faulty_wearer.slipped(p, name, t, float(angle), dice),
@@ -140,7 +141,7 @@ def slip(_: Path, degrees: float, seeds: tuple[int, ...] = SEEDS) -> list[Result
 def false_alarms(
     _: Path, seeds: tuple[int, ...] = SEEDS[:4], hours: float = HOURS_EACH
 ) -> list[Result]:
-    """Events of healthy sensors per hour."""
+    """Number of fault events per hour for sensors without faults."""
     told, played = 0, 0.0
     part_s = 300.0
     for seed, calibration in calibrated_people(seeds):
@@ -161,12 +162,15 @@ def false_alarms(
 
 
 def real_skin(data: Path, trained: str, deals: Sequence[int] = DEALS) -> list[Result]:
-    """Share of recorded movements with an event of healthy sensors, trained on one of them."""
+    """Share of recorded movements with a fault event although no sensor has a fault.
+
+    The model is trained on one of the movements.
+    """
     mounts = {name: rotation.IDENTITY for group in KNEE.sensors for name in group}
     alarms, seconds = [], 0.0
     for case in (LegCase(leg, deal, name) for name in REFERENCES for leg in LEGS for deal in deals):
         training = _offline(recorded_leg(data, trained, case), trained)
-        calibration = fit_offline(KNEE, [training], mounts, "mean")  # all methods have its links
+        calibration = fit_offline(KNEE, [training], mounts, "mean")  # has the links of all methods
 
         for movement in MOVEMENTS:
             if movement != trained:

@@ -1,8 +1,8 @@
 """Magnetic disturbance: the headings of one or both sensors deviate for half a minute.
 
-A filter with a magnetometer follows the field within seconds: 20 to 40 degrees, to either side, for
-one sensor or both of a segment, in all kinds of movement. The fused result is compared with the
-bones and with the result of the same subject without disturbance.
+A filter with a magnetometer follows the field within seconds. Its heading deviates by 20 to 40
+degrees in one direction, for one sensor or both sensors of a segment, in all movements. The fused
+result is compared with the bones, and with the result of the same subject without disturbance.
 """
 
 from __future__ import annotations
@@ -37,17 +37,17 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import LimbState
 
 PEOPLE = (*SEEDS, 11, 12, 13, 14)
-"""Four subjects more than those with which the limits were chosen."""
+"""Seeds of the subjects. The limits were chosen without the last four subjects."""
 MAGNET_S, FIRST_S, APART_S = 80.0, 12.3, 2.9
 LEAST_DEG, MOST_DEG = 20.0, 40.0
 PASSED_DEG = 10.0
-"""Deviation of the heading from which the delay of a report is counted, deg."""
+"""Deviation of the heading at which the delay of a report begins, deg."""
 OVER_S = 8.0
-"""Time after the end of the disturbance from which errors are evaluated, s."""
+"""Time from the end of the disturbance to the evaluation of errors, s."""
 ALONE = (("S1",), ("S2",), ("S3",), ("S4",))
 BOTH = (("S1", "S2"), ("S3", "S4"))
 FLEXION_GOAL = 1.96
-"""Standard deviations that contain 95 % of normal errors in one dimension."""
+"""Number of standard deviations that contains 95 % of normal errors in one dimension."""
 
 
 class Pulled(NamedTuple):
@@ -60,13 +60,15 @@ class Pulled(NamedTuple):
     others: int
     """Number of events about other segments or without a disturbance."""
     segment: Array
-    """Error over predicted RMS error of both segments during the disturbance, shape (2 n,)."""
+    """Error of both segments divided by the predicted RMS error, during the disturbance, shape (2
+    n,)."""
     flexion: Array
-    """Error of knee flexion over its predicted deviation during the disturbance."""
+    """Error of knee flexion divided by its predicted standard deviation, during the disturbance."""
     healthy: Array
-    """As `segment`, without disturbance."""
+    """Values of `segment` for the subject without disturbance."""
     knee: tuple[float, float, float]
-    """RMS error of the knee rotation: during, after, and in both times without disturbance, rad."""
+    """RMS error of the knee rotation, rad: during the disturbance, after it, and in both periods
+    without disturbance."""
 
 
 def _cases(
@@ -135,7 +137,7 @@ def _rms(x: Array) -> float:
 def magnet(
     _: Path, groups: Sequence[tuple[str, ...]], seeds: tuple[int, ...] = PEOPLE
 ) -> list[Result]:
-    """Return the events of a disturbance and the errors of the output."""
+    """Events about a disturbance, and errors of the output."""
     found = [_pulled(*case) for case in _cases(seeds, groups)]
     delays = np.array([case.delay_s for case in found])
     segment, healthy, flexion = (

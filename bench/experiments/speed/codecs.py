@@ -1,7 +1,7 @@
-"""Xbus, SLCAN and XCDI: codecs and decoders; python-can and cantools in the same run.
+"""Speed of the codecs and decoders of Xbus, SLCAN and XCDI, and of python-can and cantools.
 
-No package on PyPI decodes Xbus messages. cantools decodes the XCDI frames from a table of the same
-signals, without grouping them.
+All libraries are measured in the same run. No package on PyPI decodes Xbus messages. cantools
+decodes the XCDI frames from a table of the same signals, but does not group them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ PERIOD_NS = 2_500_000
 IDS = xcdi.id_block(0x100)
 SAMPLES = 33
 BATCH = 3 * SAMPLES
-"""Frames on the pty at once: 2 kB, well below the buffer of a tty."""
+"""Number of frames on the pseudo-terminal (pty) at once: 2 kB, much less than its buffer."""
 TABLE = f"""VERSION ""
 NS_ :
 BS_:
@@ -61,7 +61,7 @@ BO_ {IDS.quaternion} Quaternion: 8 MTI
 def _decoding(
     make: Callable[[], Decoder], chunks: list[Chunk]
 ) -> Callable[[], Callable[[], object]]:
-    """Return a function that prepares a run of a decoder; check that each chunk gives a sample."""
+    """Return a function that prepares a decoder run; check that each chunk yields a sample."""
     decoder = make()
     given = [item for chunk in chunks for item in decoder.feed(chunk)]
     assert sum(isinstance(item, ImuSample) for item in given) == len(chunks), given[:3]
@@ -159,7 +159,7 @@ def group_rows(quick: bool) -> list[Result]:
 
 
 class Line:
-    """Pty with SLCAN frames at the other end."""
+    """Pseudo-terminal (pty) that receives SLCAN frames at the other end."""
 
     def __init__(self) -> None:
         self._far, self.near = pty.openpty()
@@ -202,7 +202,7 @@ def _theirs(bus: Any) -> Callable[[], int]:
 
 
 def rival_rows(quick: bool) -> list[Result]:
-    """Read the same frames from the same pty with both libraries, in turns."""
+    """Read the same frames from the same pseudo-terminal with both libraries, in turns."""
     line = Line()
     bus: Any = can.Bus(interface="slcan", channel=line.path, sleep_after_open=0)
     ours: list[float] = []

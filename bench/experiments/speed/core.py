@@ -1,4 +1,4 @@
-"""The pure core: clock, aligner, fusion, complete frames, and the encoding of a frame."""
+"""Speed of the core: clock, aligner, fusion, complete frames, and the encoding of a frame."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 NS = 1_000_000_000
 START_NS = 1_000 * NS
 SETTLE_S = 3.0
-"""Time in which the clocks settle, not measured, s."""
+"""Time in which the clocks converge, s. It is not part of the measurement."""
 
 
 @cache
@@ -57,8 +57,10 @@ def clock_rows(quick: bool) -> list[Result]:
 
 
 def align_rows(quick: bool) -> list[Result]:
-    """Four streams at 400 Hz to frames at 100 Hz; time is advanced after each sample, as in the
-    core."""
+    """Align four streams at 400 Hz to frames at 100 Hz.
+
+    The time is advanced after each sample, as in the core.
+    """
     period_ns, seconds = 2_500_000, 2
     n = seconds * NS // period_ns
     orientations = walking("S1", NS / period_ns, seconds)
@@ -87,7 +89,7 @@ def _inputs(seconds: float) -> list[dict[str, Quaternion]]:
 
 
 def _plainly(frames: list[dict[str, Quaternion]]) -> Callable[[], object]:
-    """Apply the array form of the corrections to one frame at a time, nothing else."""
+    """Apply only the array form of the corrections, to one frame at a time."""
     segments = list(worn().segment.values())
     pairs = (("S1", "S2"), ("S3", "S4"))
     models = [segments[i].models[f"{'+'.join(pairs[i])}|{'+'.join(pairs[1 - i])}"] for i in (0, 1)]
@@ -138,7 +140,7 @@ def fusion_rows(quick: bool) -> list[Result]:
 
 @cache
 def events(rate_hz: float, seconds: float) -> list[Event]:
-    """Return the chunks of four IMUs during a walk, one a sample, in order of arrival."""
+    """Return the chunks of four IMUs during a walk, one per sample, in order of arrival."""
     period_ns = round(NS / rate_hz)
     chunks: list[tuple[Chunk, str]] = []
     for number, sensor in enumerate(SENSORS, 1):
@@ -157,7 +159,7 @@ def events(rate_hz: float, seconds: float) -> list[Event]:
 
 
 def frame_times(rate_hz: float, seconds: float) -> list[float]:
-    """Return the CPU time of each limb state, s: all its chunks and the state itself."""
+    """Return the CPU time of each limb state, s, including all its chunks."""
     core = Core()
     core.feed(Configured(START_NS, bench_rig(rate_hz), worn(), 1))
     stream = events(rate_hz, SETTLE_S + seconds)

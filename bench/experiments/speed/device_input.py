@@ -1,7 +1,8 @@
-"""CPU time of one arrival from a pty on an event loop: the readers of the daemon, and peers.
+"""CPU time per message that arrives on an event loop, for the daemon's readers and others.
 
-One message is in transit at a time, so that each wakes the loop once. The receiver writes the next
-one; the CPU time of writing is subtracted. The limit is a loop that only reads.
+The messages are read from a pseudo-terminal (pty). Only one message is in transit at a time, so
+each message wakes the loop once. The receiver writes the next message, and the CPU time of writing
+is subtracted. The limit is a loop that only reads.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ BAUD = 921_600
 PERIOD_NS = 10_000_000
 LONGEST_S = 60.0
 UVLOOP = " on uvloop"
-"""End of the names of readers that run on uvloop instead of the loop of asyncio."""
+"""Suffix of the names of readers that run on uvloop instead of the asyncio loop."""
 IDS = XcdiIds(5, 6, 33, status_word=None, error=None)
 
 Take: TypeAlias = "Callable[[], None]"
@@ -48,7 +49,7 @@ Reader: TypeAlias = "Callable[[_Line, Take], AbstractAsyncContextManager[None]]"
 
 
 class _Line:
-    """A pty that sends one message whenever the one before was taken."""
+    """Pseudo-terminal (pty) that sends a message when the previous message was received."""
 
     def __init__(self, messages: list[bytes]) -> None:
         self._far, self.near = pty.openpty()
@@ -60,7 +61,7 @@ class _Line:
         self._done: asyncio.Future[None] | None = None
 
     async def cost_s(self) -> float:
-        """Return the CPU time of one arrival on the running loop, s."""
+        """Return the CPU time per message on the running loop, s."""
         self._left, self._writing_s = len(self._messages), 0.0
         self._done = asyncio.get_running_loop().create_future()
         began = time.thread_time()
@@ -104,7 +105,7 @@ async def _bare(line: _Line, take: Take) -> AsyncIterator[None]:
 @contextlib.asynccontextmanager
 async def _running(work: Coroutine[Any, Any, None]) -> AsyncIterator[None]:
     task = asyncio.create_task(work)
-    await asyncio.sleep(0.05)  # the reader is in place
+    await asyncio.sleep(0.05)  # the reader is ready
     try:
         yield
     finally:
@@ -163,7 +164,7 @@ async def _notifier(line: _Line, take: Take) -> AsyncIterator[None]:
 
 
 async def _measure(messages: list[bytes], reader: Reader) -> float:
-    """Return the CPU time of an arrival, s."""
+    """Return the CPU time per message, s."""
     line = _Line(messages)
     try:
         async with reader(line, line.take):
@@ -182,7 +183,7 @@ def _fast_loop() -> asyncio.AbstractEventLoop:
 def _rows(
     name: str, messages: list[bytes], readers: dict[str, Reader], quick: bool
 ) -> list[Result]:
-    """Return the times of all readers, and the ratios of the first, ours, to the others."""
+    """Return the times of all readers, and the ratios of the first reader (ours) to the others."""
     times: dict[str, list[float]] = {reader: [] for reader in readers}
     for _ in range(QUICK_ROUNDS if quick else ROUNDS):  # in turns
         for reader, read in readers.items():
@@ -204,7 +205,7 @@ def _rows(
 
 
 def serial_rows(quick: bool) -> list[Result]:
-    """Messages of an Xbus device."""
+    """Return the times for messages of an Xbus device."""
     messages = device_bytes.xbus_messages(walking("S1", 100.0, MESSAGES / 100.0), PERIOD_NS)
     readers: dict[str, Reader] = {
         "jointfit": _serial_port,
@@ -217,7 +218,7 @@ def serial_rows(quick: bool) -> list[Result]:
 
 
 def can_rows(quick: bool) -> list[Result]:
-    """CAN frames of an SLCAN adapter, each with an orientation."""
+    """Return the times for CAN frames of an SLCAN adapter, each with an orientation."""
     orientations = walking("S1", 100.0, MESSAGES / 100.0)
     groups = device_bytes.xcdi_frames(orientations, PERIOD_NS, IDS)
     messages = device_bytes.slcan_lines([group[-1:] for group in groups])

@@ -1,8 +1,8 @@
 """Growth of the core's CPU time and memory with sensors, segments, markers and run time.
 
-A rig of each size is fed the same way: all chunks of a frame, then the next frame. The sizes take
-turns, so that a busy machine slows all of them. The cost of a size is the median over the turns of
-the mean CPU time of a frame.
+Each rig receives all chunks of a frame, then the next frame. The sizes take turns, so a busy
+machine slows all of them equally. The cost of a size is the median over the turns of the mean CPU
+time of a frame.
 """
 
 from __future__ import annotations
@@ -35,20 +35,22 @@ SENSORS = (1, 2, 4, 8, 16, 32)
 SEGMENTS = (1, 2, 4, 8, 16)
 MARKERS = (3, 10, 30, 100, 300)
 SETTLE = 300
-"""Frames in which clocks and windows of a new core settle, not measured."""
+"""Number of frames in which the clocks and windows of a new core settle. They are not measured."""
 ROUNDS, QUICK_ROUNDS = 15, 3
 BLOCK = 100
-"""Frames whose mean CPU time is one measurement."""
+"""Number of frames whose mean CPU time is one measurement."""
 FRAMES, QUICK_FRAMES = 100_000, 3_000
-"""Length of the run in which the cost of a frame must not grow; 17 minutes at 100 Hz."""
+"""Number of frames of a full run and of a short run. The cost of a frame must not grow during a
+run. A full run is 17 minutes at 100 Hz."""
 DRIFT, SHORT_DRIFT, DRIFT_TARGET = 0.1, 0.5, 0.02
-"""Thresholds of a full and a short run, and target, of the exponent in run time, without sign."""
+"""Limits for the absolute value of the exponent in run time: threshold of a full run, threshold of
+a short run, and target."""
 LARGEST = 1.05
 """Threshold of the exponents in sensors, segments and markers."""
 
 
 class LoadedCore:
-    """A core with its rig, and the number of the next frame."""
+    """A core, its rig, and the number of the next frame."""
 
     def __init__(self, rig: GrowingRig) -> None:
         self._rig = rig
@@ -64,7 +66,7 @@ class LoadedCore:
         self._next = 0
 
     def cpu_s(self, count: int) -> float:
-        """Feed frames; return the mean CPU time of one, s."""
+        """Process `count` frames; return the mean CPU time of a frame, s."""
         core, states, spent = self.core, 0, 0.0
         for events in self._frames(count):
             began = time.thread_time()
@@ -77,7 +79,7 @@ class LoadedCore:
         return spent / count
 
     def instructions(self, count: int) -> float:
-        """Feed frames; return the interpreted instructions of one."""
+        """Process `count` frames; return the mean number of interpreted instructions of a frame."""
         frames, feed = self._frames(count), self.core.feed
         return count_instructions(lambda: [feed(one) for each in frames for one in each]) / count
 
@@ -88,7 +90,7 @@ class LoadedCore:
 
 
 def frame_costs(rigs: Mapping[int, GrowingRig], rounds: int) -> dict[int, float]:
-    """Return the CPU time of a frame by size, s: the sizes take turns."""
+    """Return the CPU time of a frame, s, by size; the sizes are measured in turns."""
     cores = {size: LoadedCore(rig) for size, rig in rigs.items()}
     for core in cores.values():
         core.cpu_s(SETTLE)
@@ -110,13 +112,13 @@ def size_rows(
     sizes: tuple[int, ...],
     quick: bool,
 ) -> list[Result]:
-    """Return the exponent in one size, the marginal cost of the largest step, and all costs."""
+    """Return the growth exponent, the marginal cost of the largest step, and all costs."""
     costs = frame_costs({size: make(size) for size in sizes}, QUICK_ROUNDS if quick else ROUNDS)
     us = [1e6 * costs[size] for size in sizes]
     found = growth_exponent(sizes, us)
     step = (us[-1] - us[-2]) / (sizes[-1] - sizes[-2])
     return [
-        # a short run has too few frames for the threshold: it finds only a cost that explodes
+        # A short run has too few frames for this threshold. It detects a very large growth only.
         Result(
             f"{name}: exponent", round(found.value, 3), 1.5 if quick else LARGEST, unit="",
             note=f"± {found.half_width:.3f}, {sizes[0]} to {sizes[-1]}",
@@ -130,7 +132,7 @@ def size_rows(
 
 
 def memory_rows(quick: bool) -> list[Result]:
-    """Return the memory of the core for each sensor, and the time to configure a core."""
+    """Return the memory of the core per sensor, and the time to configure a core."""
     sizes = (1, 8, 32)
     kib, start_ms = [], []
     for size in sizes:
@@ -156,18 +158,21 @@ def memory_rows(quick: bool) -> list[Result]:
 
 
 def sensor_rows(quick: bool) -> list[Result]:
-    """Sensors of one segment, and the memory of each."""
+    """Return the growth with the sensors of one segment, and the memory per sensor."""
     rows = size_rows("sensors of a segment", partial(GrowingRig, 1), SENSORS, quick)
     return rows + memory_rows(quick)
 
 
 def segment_rows(quick: bool) -> list[Result]:
-    """Segments with one sensor each."""
+    """Return the growth with the number of segments, which have one sensor each."""
     return size_rows("segments", lambda count: GrowingRig(count, 1), SEGMENTS, quick)
 
 
 def marker_rows(quick: bool) -> list[Result]:
-    """Markers of one segment, with one sensor; and the configuration with the most markers."""
+    """Return the growth with the markers of a segment with one sensor.
+
+    The results include the configuration with the most markers.
+    """
     rows = size_rows("markers", lambda count: GrowingRig(1, 1, count), MARKERS, quick)
     rig = GrowingRig(1, 1, MARKERS[-1])
     began = time.thread_time()
@@ -178,17 +183,17 @@ def marker_rows(quick: bool) -> list[Result]:
 
 
 def run_time_rows(quick: bool) -> list[Result]:
-    """Return the exponents of time and instructions of a frame in the number of frames before it.
+    """Return the exponents of a frame's time and instructions in the number of earlier frames.
 
-    The time of each block of frames is divided by that of a fixed loop just before it, so that the
-    load of the machine cancels. Each point of the regression is the median of a third of a decade,
-    at the end of which instructions are counted.
+    The time of each block of frames is divided by the time of a fixed loop just before the block,
+    so the load of the machine cancels. Each point of the regression is the median of a third of a
+    decade. The instructions are counted at the end of this third.
     """
     core = LoadedCore(GrowingRig(1, 1))
     frames = QUICK_FRAMES if quick else FRAMES
     ages, costs, counts = [], [], []
     ladder = np.geomspace(BLOCK, frames, 1 + round(3 * np.log10(frames / BLOCK))).round()
-    core.cpu_s(BLOCK)  # clocks settle
+    core.cpu_s(BLOCK)  # the clocks settle
     for begin, end in itertools.pairwise(ladder.astype(int).tolist()):
         times = []
         for _ in range(max(1, (end - begin) // BLOCK - 1)):

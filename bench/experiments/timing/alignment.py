@@ -1,8 +1,9 @@
 """Alignment of streams to frames: interpolation error and latency.
 
-Samples pass through the aligner of the daemon. The shaken body rotates about three axes at once,
-550 deg/s RMS and at most 950 deg/s. ``broad`` is a recorded board turned by hand, 579 deg/s RMS,
-its angular rate integrated; every third or fifth sample is used and the others are ground truth.
+Samples pass through the aligner of the daemon. The simulated body (``shaken``) rotates about three
+axes at once, 550 deg/s RMS and at most 950 deg/s. ``broad`` is a recorded board that was turned by
+hand, 579 deg/s RMS. Its orientation is the integrated angular rate. Every third or fifth sample is
+used, and the others are the ground truth.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ FRAME_NS = 10 * MS
 SECONDS = 20.0
 FAST, SLOW = "07_undisturbed_fast_rotation_B", "02_undisturbed_slow_rotation_B"
 _REST = 571  # samples at rest before the movement
-_SWINGS = ((1.2, 1.1, 0.0), (0.9, 1.4, 1.0), (0.7, 1.7, 2.0))  # rad, Hz, rad; about z, x, y
+_SWINGS = ((1.2, 1.1, 0.0), (0.9, 1.4, 1.0), (0.7, 1.7, 2.0))  # rad, Hz, rad about z, x, y
 
 
 def shaken(t_ns: int) -> Quaternion:
@@ -81,7 +82,7 @@ def _rms(values: Sequence[float]) -> float:
 
 
 def errors_deg(frames: Sequence[AlignedFrame], motion: Motion) -> list[float]:
-    """Return the error of every orientation in the frames, deg, without the first few."""
+    """Return the error of every orientation except in the first frames, deg."""
     return [
         degrees(angle_between_one(q, motion(frame.t_ns)))
         for frame in frames[5:]
@@ -90,7 +91,7 @@ def errors_deg(frames: Sequence[AlignedFrame], motion: Motion) -> list[float]:
 
 
 def slerped_deg(period_ns: float, frames: Sequence[AlignedFrame], phase_ns: int) -> float:
-    """Return the RMS error of a slerp between neighbouring samples in the same frames."""
+    """Return the RMS error of spherical interpolation (slerp) between samples in these frames."""
     found = []
     for frame in frames[5:]:
         k = int((frame.t_ns - BEGIN_NS - phase_ns) // period_ns)
@@ -101,7 +102,10 @@ def slerped_deg(period_ns: float, frames: Sequence[AlignedFrame], phase_ns: int)
 
 
 def interpolation(_data: Path) -> list[Result]:
-    """Streams of 60, 100 and 120 Hz to frames at 100 Hz, midway between samples if fixed."""
+    """Interpolation of streams of 60, 100 and 120 Hz to frames at 100 Hz.
+
+    If the phase of a stream is fixed, the frames are midway between its samples.
+    """
     figures = []
     for rate_hz, goal in ((60.0, 0.025), (100.0, 0.008), (120.0, 0.004)):
         period_ns, phase_ns = NS / rate_hz, 5 * MS
@@ -127,7 +131,7 @@ def interpolation(_data: Path) -> list[Result]:
 
 @cache
 def _board(data: Path, trial: str) -> tuple[list[Quaternion], float]:
-    """Return the orientations of a trial, integrated from angular rate, and their rate, Hz."""
+    """Return the orientations integrated from a trial's angular rate, and their rate, Hz."""
     with np.load(data / "broad_excerpts" / f"{trial}_60s.npz", allow_pickle=False) as file:
         rate_hz = float(file["sampling_rate"])
         gyro = file["imu_gyr"][_REST:].astype(float)
@@ -138,7 +142,7 @@ def _board(data: Path, trial: str) -> tuple[list[Quaternion], float]:
 
 
 def _left_out_rms(truth: Sequence[Quaternion], rate_hz: float, step: int) -> float:
-    """Return the RMS error in the samples between every `step`-th one, deg."""
+    """Return the RMS error at the omitted samples, deg; every `step`-th sample is used."""
     period_ns = round(NS / rate_hz)  # one frame per original sample
     begin_ns = -(-BEGIN_NS // period_ns) * period_ns
 
@@ -152,7 +156,10 @@ def _left_out_rms(truth: Sequence[Quaternion], rate_hz: float, step: int) -> flo
 
 
 def board(data: Path) -> list[Result]:
-    """Every third or fifth sample of a recorded board; the omitted samples are ground truth."""
+    """Interpolation of every third or fifth sample of a recorded board.
+
+    The omitted samples are the ground truth.
+    """
     figures = []
     for trial, name, goals in ((FAST, "fast", (0.03, 0.12)), (SLOW, "slow", (0.008, 0.025))):
         truth, rate_hz = _board(data, trial)
@@ -176,7 +183,7 @@ class _TimedOrientation:
 def _ahead_rms(
     truth: Sequence[Quaternion], rate_hz: float, scatter_rad: float, bend: float
 ) -> float:
-    """Return the RMS error of extrapolation by up to one period after every third sample, deg."""
+    """Return the RMS error of extrapolation by up to one period of every third sample, deg."""
     dice, period_ns = np.random.default_rng(5), round(NS / rate_hz)
     samples = []
     for k in range(0, len(truth), 3):
@@ -193,7 +200,7 @@ def _ahead_rms(
 
 
 def ahead(data: Path) -> list[Result]:
-    """Extrapolation with constant rate, with part of the acceleration (daemon), and with all."""
+    """Extrapolation with constant rate, with part of the acceleration (daemon), or all of it."""
     figures = []
     for trial, name, scatter_deg, goal in (
         (FAST, "fast", 0.0, 0.45),
@@ -216,7 +223,7 @@ def ahead(data: Path) -> list[Result]:
 # --- latency ----------------------------------------------------------------------------------
 
 STREAMS = {"S1": (1.3, 2.0), "S2": (3.7, 1.0), "S3": (6.1, 2.0), "S4": (8.8, 1.0)}
-"""Phase and least delay, ms: two on UART, two on CAN, all at 100 Hz."""
+"""Phase and minimum delay of each stream, ms: two on UART, two on CAN, all at 100 Hz."""
 
 
 def four(mode: Mode, seed: int = 7) -> list[AlignedFrame]:
@@ -239,7 +246,7 @@ def four(mode: Mode, seed: int = 7) -> list[AlignedFrame]:
 
 
 def latency(_data: Path) -> list[Result]:
-    """Time from the instant of a frame to its completion, and the error of its orientations."""
+    """Latency from the time of a frame to its completion, and error of its orientations."""
     figures = []
     goals: dict[Literal["smooth", "fast"], tuple[float, float, float]] = {
         "smooth": (10.5, 13.0, 0.006),
@@ -260,7 +267,7 @@ def latency(_data: Path) -> list[Result]:
 
 
 def honesty(_data: Path) -> list[Result]:
-    """Five clocks within 50 ppm; one sensor reboots, another is silent for half a second."""
+    """Five clocks within 50 ppm; one sensor reboots, and another is silent for half a second."""
     run = simulated(30.0)
     trace = traced(run.events)
     errors = true_errors(trace, run.taken_ns, run.unseen_ns)

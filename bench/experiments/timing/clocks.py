@@ -1,4 +1,4 @@
-"""Device clocks to host time, simulated on their transports."""
+"""Conversion of device clocks to host time, simulated with the delays of each transport."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ SERVER_SKEW = 42e-6
 
 
 def exponential(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """UART: 0.3 ms of jitter."""
+    """Return delays of a UART with 0.3 ms of jitter."""
     return rng.exponential(3e5, n)
 
 
 def spiky(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """The same with 2 % of spikes of 5 to 20 ms."""
+    """Return delays of a UART, 2 % of which are spikes of 5 to 20 ms."""
     return rng.exponential(3e5, n) + (rng.random(n) < 0.02) * rng.uniform(5e6, 20e6, n)
 
 
 def usb_polling(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """Bus that is polled every millisecond."""
+    """Return delays of a bus that is polled every millisecond."""
     return rng.uniform(0, 1e6, n) + rng.exponential(5e4, n)
 
 
 def latency_timer(rng: np.random.Generator, n: int) -> NDArray[np.float64]:
-    """USB bridge with a latency timer of 16 ms."""
+    """Return delays of a USB bridge with a latency timer of 16 ms."""
     return rng.uniform(0, 16e6, n)
 
 
 def passive_run(
     seed: int, delays: Delays, seconds: float
 ) -> tuple[NDArray[np.float64], DeviceClock, NDArray[np.float64]]:
-    """Return the error of every stamp, ms, the clock at the end, and every sigma, ms."""
+    """Return the error of every stamp, ms, the final clock, and every sigma, ms."""
     rng, clock = np.random.default_rng(seed), DeviceClock(PERIOD)
     n = int(seconds * S) // PERIOD
     true = START + PERIOD * np.arange(n)
@@ -74,7 +74,7 @@ def server_ticks(t: float) -> int:
 
 
 def echo_run(seed: int) -> tuple[float, float, float]:
-    """Return the errors after 10 and after 60 s of echoes, us, and that of the skew, ppm."""
+    """Return the errors after 10 s and 60 s of echoes, us, and the skew error, ppm."""
     rng, clock = np.random.default_rng(seed), DeviceClock(PERIOD)
     now, first, error = START, 0.0, 0.0
     for number in range(70):
@@ -88,12 +88,15 @@ def echo_run(seed: int) -> tuple[float, float, float]:
 
 
 def spread(values: NDArray[np.float64]) -> tuple[float, float]:
-    """Return RMS and 99th percentile of the magnitude."""
+    """Return the RMS and the 99th percentile of the absolute values."""
     return float(np.sqrt(np.mean(values**2))), float(np.quantile(np.abs(values), 0.99))
 
 
 def echoes(_: Path, runs: int = 200) -> list[Result]:
-    """Round trips of 0.86 ms and 0.1 ms exponential each way, 1 % spikes of 20 ms."""
+    """Echoes with round trips of 0.86 ms, exponential delays of 0.1 ms each way, and spikes.
+
+    1 % of the echoes have spikes of 20 ms.
+    """
     first, last, skew = np.array([echo_run(seed) for seed in range(runs)]).T
     (sd10, p10), (sd60, p60) = spread(first), spread(last)
     return [
@@ -108,7 +111,7 @@ def echoes(_: Path, runs: int = 200) -> list[Result]:
 def passive(
     delays: Delays, seconds: float, goals: tuple[float, float], runs: int
 ) -> tuple[list[Result], NDArray[np.float64], NDArray[np.float64]]:
-    """Return RMS and 99th percentile of the final errors, skew errors, and errors in sigmas."""
+    """Return final errors (RMS, 99th percentile), skew errors, and errors divided by sigma."""
     ends, skews, scaled = [], [], []
     for seed in range(runs):
         errors, clock, sigmas = passive_run(seed, delays, seconds)
@@ -125,7 +128,7 @@ def passive(
 
 
 def jitter(_: Path, runs: int = 60) -> list[Result]:
-    """Passive clocks under ordinary jitter."""
+    """Passive clocks with usual jitter."""
     figures: list[Result] = []
     skews = np.zeros(0)
     for delays, seconds, goals in (
@@ -148,7 +151,7 @@ def timer(_: Path, runs: int = 90) -> list[Result]:
 
 
 def wraps_and_restarts(_: Path) -> list[Result]:
-    """Wrap of every clock type, then a reboot."""
+    """Overflow of every clock type, then a reboot."""
     worst, settle, early = 0.0, 0.0, 0
     for tick_ns, modulus in ((1000, 1 << 32), (100_000, 1 << 32), (100_000, 864_000_000)):
         for seed in range(3):
@@ -162,7 +165,7 @@ def wraps_and_restarts(_: Path) -> list[Result]:
 
 
 def _wrapped(seed: int, clock: TickClock) -> tuple[float, float, int]:
-    """Return the largest error across the wrap, the settling time, and wrong synced stamps."""
+    """Return the largest error at the overflow, the settling time, and wrong synced stamps."""
     rng, device = np.random.default_rng(seed), DeviceClock(PERIOD)
     modulus = clock.modulus or 1
     worst, settled_at, wrong = 0.0, None, 0
@@ -185,7 +188,7 @@ def _wrapped(seed: int, clock: TickClock) -> tuple[float, float, int]:
 
 
 def cost(_: Path) -> list[Result]:
-    """Time of one sample with refits, best of five minutes of samples."""
+    """Time per sample including refits, best of five runs of one minute."""
     rng = np.random.default_rng(0)
     n = 6000
     best = float("inf")

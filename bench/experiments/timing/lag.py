@@ -1,8 +1,8 @@
 """Lag of an IMU behind the cameras, estimated from motion.
 
-On recordings the optics are resampled at 120 Hz with a random phase, and a random lag within 50 ms
-is added to the angular rate. The true lag of both recordings is half a frame of their cameras,
-1/240 s.
+In recordings, the optical data are resampled at 120 Hz with a random phase, and a random lag within
+50 ms is added to the angular rate. The true lag of both recordings is half a frame of their
+cameras, 1/240 s.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ FAST, SLOW = "07_undisturbed_fast_rotation_B", "02_undisturbed_slow_rotation_B"
 MARGIN_S = 0.3
 FAST_SD_MS = {2.0: 0.054, 5.0: 0.025, 10.0: 0.02, 30.0: 0.02}
 SLOW_SD_MS = {2.0: 0.307, 5.0: 0.21, 10.0: 0.14, 30.0: 0.14}
-"""Target standard deviations by length of the window, s."""
+"""Target standard deviations of the lag, ms, by length of the window, s."""
 
 
 class Recording(NamedTuple):
@@ -69,7 +69,7 @@ AS_IT_IS = Treatment()
 
 
 class Window(NamedTuple):
-    """Estimate of one window, with the injected lag subtracted."""
+    """Lag estimate of one window, relative to the injected lag."""
 
     lag_ms: float
     sigma_ms: float
@@ -91,7 +91,7 @@ def whole(data: Path, name: str) -> Recording:
 
 
 def between(recording: Recording, stamps: Floats) -> Floats:
-    """Return the optical orientation at any stamps, ns, along the shorter arc."""
+    """Return the optical orientations at given stamps, ns, interpolated along the shorter arc."""
     at = np.clip(np.searchsorted(recording.t_ns, stamps, "right") - 1, 0, len(recording.t_ns) - 2)
     a, b = recording.optical[at], recording.optical[at + 1]
     share = (stamps - recording.t_ns[at]) / (recording.t_ns[at + 1] - recording.t_ns[at])
@@ -187,7 +187,10 @@ def honest(data: Path) -> list[Result]:
 
 
 def quaternion_input(data: Path) -> list[Result]:
-    """Orientations propagated from the angular rate lead it by half a sample, also when rounded."""
+    """Orientations integrated from the angular rate lead the rate by half a sample.
+
+    The lead is the same if the orientations are rounded.
+    """
     recording = excerpt(data, FAST)
     steps = rotation.exp(recording.gyro * 0.0035)
     path = np.empty_like(steps)
@@ -209,7 +212,7 @@ def quaternion_input(data: Path) -> list[Result]:
 def made_up(
     seed: int, seconds: float, lag_ms: float, *, drift: float = 0.0, noise: float = 0.1
 ) -> LagTracks:
-    """Return stamps and orientations of a wearer's sensor and of the cameras, with known truth."""
+    """Return simulated stamps and orientations of a sensor and of the cameras."""
     rng = np.random.default_rng(seed)
 
     def body(t: Floats) -> Floats:
@@ -249,7 +252,7 @@ def estimate_between(
 
 
 def sigma(_: Path) -> list[Result]:
-    """Errors over sigma in 32 independent windows, at five levels of optical noise.
+    """Ratios of error to sigma in 32 independent windows, at five levels of optical noise.
 
     The simulated stamps are exact.
     """
@@ -269,7 +272,7 @@ def sigma(_: Path) -> list[Result]:
 
 
 def track(drift: float, seed: int) -> tuple[float, float]:
-    """Return the drift estimated over two minutes, and its sigma, both in ppm."""
+    """Return the estimated drift over two minutes and its sigma, both in ppm."""
     tracks = made_up(seed, 121.0, 5.0, drift=drift)
     tracker, tracked = LagTracker(), None
     for start_s in np.arange(0.4, 110.0, 2.5):
@@ -299,9 +302,9 @@ def drift(_: Path) -> list[Result]:
 
 
 def cost(data: Path) -> list[Result]:
-    """A 10 s window at 120 Hz against an angular rate at 286 Hz, median of nine; a tracker update.
+    """Cost of a window of 10 s (120 and 286 Hz, median of nine), and of a tracker update.
 
-    CPU time of this thread, independent of other processes.
+    The cost is the CPU time of this thread, so other processes do not affect it.
     """
     recording = excerpt(data, FAST)
     part = (recording.t_ns > 10e9) & (recording.t_ns < 20e9)

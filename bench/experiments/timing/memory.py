@@ -1,9 +1,10 @@
-"""Memory of the core: after ten simulated hours it holds as much as after the first.
+"""Memory of the core, which does not grow from the first to the tenth simulated hour.
 
-The complete core is fed: four IMUs on UART and CAN, and cameras with one echo a second. Every hour
-one sensor reboots and another is silent for a minute, in turn. All run at 5 Hz, so that ten hours
-are 900 000 samples instead of 19 million. Buffers limited by time (windows, histograms, buckets,
-echoes) fill as at any rate; those limited by number reach their limit within minutes.
+The complete core processes four IMUs on UART and CAN, and cameras with one echo per second. In
+every hour, one sensor reboots and another is silent for a minute, in turn. All devices run at 5 Hz,
+so ten hours are 900 000 samples instead of 19 million. Buffers with a time limit (windows,
+histograms, buckets, echoes) fill as at any rate. Buffers with a number limit are full within
+minutes.
 """
 
 from __future__ import annotations
@@ -49,32 +50,32 @@ PERIOD_NS = round(NS / RATE_HZ)
 BEGIN_NS = 1_000 * NS
 MINUTE_NS = 60 * NS
 REBOOT, SILENCE = 20, 40
-"""Minutes of each hour with these events."""
+"""Minutes of each hour in which a sensor reboots and in which a sensor is silent."""
 SETTLE_H = 0.5
-"""Time after which windows and histograms are full."""
+"""Time after which windows and histograms are full, h."""
 _SHARED = (type, ModuleType, FunctionType, BuiltinFunctionType, MethodType)
 _SKEW = {"S1": -40e-6, "S2": -10e-6, "S3": 20e-6, "S4": 50e-6, "mocap": 30e-6}
 
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """Objects that a core keeps alive at one time."""
+    """Objects that a core references at one time."""
 
     hours: float
     size: int
-    """Bytes of all objects except code."""
+    """Size of all objects except code, bytes."""
     objects: int
 
 
 def rig() -> Rig:
-    """Return a rig of four sensors and cameras, everything at 5 Hz."""
+    """Return a rig of four sensors and cameras, all at 5 Hz."""
     table = bench_rig().table
     imus = [{**imu, "rate_hz": RATE_HZ} for imu in table["imu"]]
     return parse_rig({**table, "imu": imus, "rig": {**table["rig"], "output_rate_hz": RATE_HZ}})
 
 
 def held(root: object, hours: float) -> Held:
-    """Return the objects that `root` keeps alive."""
+    """Return the number and size of the objects that `root` references."""
     seen: set[int] = set()
     todo: list[Any] = [root]
     size = 0
@@ -99,7 +100,7 @@ class Hardware:
         self._dice = np.random.default_rng(11)
 
     def minutes(self) -> Iterator[list[ChunkArrived]]:
-        """Yield the events of one minute after the other."""
+        """Yield the events of each successive minute."""
         for minute in count():
             begin_ns = BEGIN_NS + minute * MINUTE_NS
             hour, of_hour = divmod(minute, 60)
@@ -119,7 +120,7 @@ class Hardware:
         self._numbers[name] = 0
 
     def _taken(self, name: str, begin_ns: int) -> list[tuple[int, int, int]]:
-        """Return number, device time and arrival of the samples of a minute."""
+        """Return number, device time and arrival time of the samples of a minute."""
         clock, found = self._clocks[name], []
         late = self._dice.exponential(0.5 * MS, round(60 * RATE_HZ)).tolist()
         for k, late_ns in enumerate(late):
@@ -155,7 +156,7 @@ class Hardware:
 
 
 def watch(hours: float, looks_an_hour: int) -> tuple[list[Held], int, int]:
-    """Run a core for some hours; return its memory, samples and limb states."""
+    """Run a core for some hours; return its memory over time, samples and limb states."""
     core = Core()
     made = rig()
     core.feed(Configured(BEGIN_NS, made, None))
@@ -177,7 +178,7 @@ def watch(hours: float, looks_an_hour: int) -> tuple[list[Held], int, int]:
 
 
 def growth(looks: list[Held]) -> float:
-    """Return the growth of a core after settling, bytes per hour (least squares)."""
+    """Return the memory growth of a core after settling, bytes per hour (least squares)."""
     settled = [look for look in looks if look.hours > SETTLE_H]
     hours = [look.hours for look in settled]
     return float(np.polyfit(hours, [look.size for look in settled], 1)[0])
