@@ -1,4 +1,4 @@
-"""Marker errors of inverse kinematics that the field accepts.
+"""Accepted marker errors of inverse kinematics in biomechanics.
 
 Source: OpenSim documentation, "Simulation with OpenSim: Best Practices", checklist of inverse
 kinematics. The limits are an RMS error of about 2 cm, a marker error of 4 cm, and a landmark error

@@ -1,13 +1,12 @@
-r"""Named joint coordinates of a chain, such as ``hip_flexion_r``: values and standard deviations.
+r"""Values and standard deviations of named joint coordinates, such as ``hip_flexion_r``.
 
-The state of a chain consists of rotation matrices. The coordinates of a joint parametrize its
-rotation matrix A: the pose of the joint is a function f(q) of the coordinates q. This module
-inverts f by Gauss-Newton steps on the manifold,
+The state of a chain consists of rotation matrices. The coordinates q of a joint parametrize its
+rotation matrix A by a function f(q). This module inverts f by Gauss-Newton steps on the manifold,
 
 .. math:: q \leftarrow q + G^{+}\,\log(f(q)^{-1} A), \qquad G = \partial\log / \partial q
 
-:math:`G^{+}` is the pseudo-inverse of G. The standard deviations follow from the covariance C of a
-step as :math:`G^{+} C G^{+T}`.
+:math:`G^{+}` is the pseudo-inverse of G. The covariance of the coordinates is
+:math:`G^{+} C G^{+T}`, where C is the covariance of a step.
 """
 
 from __future__ import annotations
@@ -31,43 +30,44 @@ if TYPE_CHECKING:
 
 _ITERATIONS = 30
 _LARGEST_STEP = 0.2
-"""Largest step of an angle, rad: near a gimbal lock longer steps lead to other solutions."""
+"""Largest step of an angle, rad. Near a gimbal lock longer steps would lead to other solutions."""
 _CONVERGED = 1e-10
-"""Largest step of a converged inversion, rad and m."""
+"""Length of a step below which the inversion has converged, rad and m."""
 _DIFFERENCE = 1e-5
 """Half the interval of a central difference, rad and m; the derivative has an error of about
 1e-10."""
 _RIDGE = 1e-12
-"""Regularization added to G^T G, so that a gimbal lock yields finite angles."""
+"""Regularization that is added to G^T G, so that angles are finite at a gimbal lock."""
 _TRIED = 24
 """Number of start angles per coordinate that an inversion tries, 15 degrees apart."""
 _TOGETHER = 250
-"""Number of instants that are compared with the tried poses at once; it limits the memory."""
+"""Number of instants that are compared with the start poses at once, which limits the memory."""
 _THREE_ANGLES = 3
 
 
 @dataclass(frozen=True, slots=True)
 class JointCoordinates:
-    """Coordinates of one segment relative to its parent, or to the world if it is free."""
+    """Coordinates of one segment relative to its parent, or to the world if it has a free joint."""
 
     segment: str
     names: tuple[str, ...]
     is_angle: tuple[bool, ...]
     """Whether each coordinate is an angle, rad, or a translation, m."""
     pose: Callable[[Array], tuple[Array, Array]] | None
-    """Maps values, shape (n, k), to A_i of the chain, shape (n, 3, 3), and the world origin of a
-    free segment, m, shape (n, 3). None: the coordinate of a coupled joint.
+    """Function that maps values, shape (n, k), to the rotation A_i of `ChainState`, shape (n, 3,
+    3), and to the world origin of a free segment, m, shape (n, 3). None for a coupled joint, whose
+    coordinate is part of the state.
     """
     middle: int | None = None
     """Index of the second of three successive rotations, which remains within 90 degrees."""
 
 
 def default_coordinates(model: ChainModel) -> tuple[JointCoordinates, ...]:
-    """Return coordinates for a model without names of its own.
+    """Return coordinates with default names for a model that does not name its coordinates.
 
     A hinge or coupled joint has ``NAME_angle``, rad. Ball and free joints have ``NAME_rx``,
-    ``NAME_ry``, ``NAME_rz``: R = Rx Ry Rz, rad; a free joint also ``NAME_tx``, ``NAME_ty``,
-    ``NAME_tz``, m, in the world with z up.
+    ``NAME_ry`` and ``NAME_rz``, rad, with R = Rx Ry Rz. A free joint also has ``NAME_tx``,
+    ``NAME_ty`` and ``NAME_tz``, m, in the world with z up.
     """
     found = []
     for segment in model.segments:
@@ -93,11 +93,11 @@ def euler_coordinates(
     Parameters
     ----------
     name
-        Segment, and first part of the coordinate names.
+        Name of the segment, which is the first part of the coordinate names.
     is_free
-        Include the translations.
+        Whether the joint has translations.
     order
-        Axes of the chain that a file calls x, y and z.
+        Indices of the chain's axes that a file calls x, y and z.
     """
 
     def pose(values: Array) -> tuple[Array, Array]:
@@ -113,7 +113,7 @@ def euler_coordinates(
 
 @dataclass(frozen=True, slots=True)
 class CoordinateTable:
-    """Coordinates at T instants; K coordinates."""
+    """Values of K coordinates at T instants."""
 
     names: tuple[str, ...]
     is_angle: tuple[bool, ...]
@@ -122,7 +122,7 @@ class CoordinateTable:
     sd: Array
     """Standard deviations, rad and m, shape (T, K)."""
     misfit: dict[str, float]
-    """Largest rotation of each segment that its coordinates do not describe, rad."""
+    """Largest rotation by segment that the coordinates do not describe, rad."""
 
 
 def coordinate_table(
@@ -139,14 +139,14 @@ def coordinate_table(
     model
         The chain.
     state
-        Its state at T instants.
+        State of the chain at T instants.
     covariance
         Covariance of a step, rad^2 and m^2, shape (T, nq, nq).
     coordinates
         One entry for each segment, in the order of the model.
     known
-        Values that the measurement determines, shape (T, K); None: all. Angles are continuous over
-        the determined values, because undetermined values are arbitrary.
+        Mask of the values that the measurement determines, shape (T, K); all if None. Angles are
+        continuous over these values, because the others are arbitrary.
     """
     values, sd, misfit, coupled, column = [], [], {}, 0, 0
     count = sum(len(joint.names) for joint in coordinates)
@@ -167,7 +167,8 @@ def coordinate_table(
         found, G, left = _inverted(joint, state.rotations[:, i], origin, is_free=is_free)
         values.append(_continuous(found, joint.is_angle, determined))
 
-        # a hinge has one step, a ball joint three rotations, a free joint also three translations
+        # a step has one angle for a hinge, three rotations for a ball joint, and six values for a
+        # free joint
         step = np.asarray(segment.joint.axis)[:, None] if segment.joint.kind == "hinge" else None
         P = _pseudo_inverse(G) if step is None else _pseudo_inverse(G) @ step
         sd.append(np.sqrt(np.einsum("tkj,tjl,tkl->tk", P, block, P)))
@@ -238,7 +239,7 @@ def _step(R: Array, t: Array, to_R: Array, to_t: Array) -> Array:
 
 
 def _derivative(joint: JointCoordinates, values: Array) -> Array:
-    """Return the derivative of a step by the values, shape (T, 6, k), by central differences."""
+    """Return d(step)/d(values), shape (T, 6, k), from central differences."""
     columns = []
     for k in range(values.shape[1]):
         shift = _DIFFERENCE * np.eye(values.shape[1])[k]

@@ -34,12 +34,12 @@ def find_exchanged_labels(
     Returns
     -------
     list of tuple of int
-        Each marker of a group is at the model position of the next marker, the last marker at the
-        model position of the first.
+        Groups of indices. Each marker of a group is at the model position of the next marker, and
+        the last marker is at the model position of the first.
     """
     rows = np.flatnonzero(far)
     square = ((places[rows, None] - measured[None, rows]) ** 2).sum(axis=-1)
-    # the marker at each model position if all labels are reassigned
+    # marker at each model position after the best assignment of all labels
     nearest = linear_sum_assignment(square)[1]
     place_of = np.argsort(nearest)
 

@@ -2,11 +2,11 @@ r"""Joint angles from the rotation between two segments.
 
 .. math:: q_j = q_{proximal}^* \otimes q_{distal}
 
-R is the matrix of this quaternion, with indices from 0. CONVENTIONS.md defines segment axes (x to
-the right, y anterior, z proximal) and signs. Angles are in rad; q and -q give the same result.
-`AngleConvention` selects the three angles of a joint. Where two axes of a sequence coincide, one of
-the two angles is 0 and the other angle contains the whole rotation. The frame is then flagged as
-gimbal-locked.
+R is the matrix of this quaternion; its indices start at 0. CONVENTIONS.md defines segment axes (x
+to the right, y anterior, z proximal) and signs. Angles are in rad; q and -q give the same result.
+`AngleConvention` selects the three angles of a joint. If two axes of a sequence coincide, the two
+angles are not unique. One angle is then set to 0, the other contains the whole rotation, and the
+frame is flagged as gimbal-locked.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 GIMBAL_SINE = 0.9999
 """Sine of the middle angle above which the two outer angles are not separated."""
 LOCKED_SINE = sqrt(1.0 - GIMBAL_SINE**2)
-"""Sine of the elevation below which plane and axial rotation are not separated: within 0.8°."""
+"""Sine of the elevation (0.8°) below which plane and axial rotation are not separated."""
 _SMALL_TILT = 1e-6
 """Sine of half the tilt below which the tilt is computed as twice this sine."""
 
@@ -40,7 +40,7 @@ def joint_rotation(q_proximal: ArrayLike, q_distal: ArrayLike) -> Array:
 
 
 def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
-    r"""Split a rotation: first a twist about `axis` of the distal frame, then a swing normal to it.
+    r"""Split a rotation into a twist about `axis` of the distal frame, then a swing normal to it.
 
     .. math:: \mathrm{twist} = 2\,\mathrm{atan2}(q_v \cdot a, q_0), \qquad
               \mathrm{swing} = q_j \otimes \mathrm{twist}^*
@@ -55,7 +55,7 @@ def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
     -------
     swing : ndarray, shape (..., 4)
     twist : ndarray, shape (...)
-        rad in (-pi, pi].
+        Twist angle, rad in (-pi, pi].
     """
     q = np.asarray(q_joint, dtype=np.float64)
     a = np.asarray(axis, dtype=np.float64)
@@ -65,7 +65,7 @@ def swing_twist(q_joint: ArrayLike, axis: ArrayLike) -> tuple[Array, Array]:
 
 
 def functional_axis(q_joint: ArrayLike) -> Array:
-    """Return the principal rotation axis of a joint: unit, shape (3,), pointing to the right.
+    """Return the principal rotation axis of a joint as a unit vector to the right, shape (3,).
 
     The axis is the first right singular vector of the rotation vectors of `q_joint`, shape (n, 4).
     """
@@ -78,14 +78,15 @@ class JointReading(NamedTuple):
 
     angles: JointAngles
     inner: float
-    """Angle between the segments, rad: pi when straight."""
+    """Angle between the segments, rad; pi when straight."""
     gimbal: bool
     sd_factor: float
     """Ratio of the standard deviation of the main angle to the standard deviation of the rotation
     per axis.
 
-    The main angle is elevation in the convention ``elevation``, otherwise flexion. Infinite where
-    the main angle is not defined."""
+    The main angle is elevation in the convention ``elevation``, otherwise flexion. The ratio is
+    infinite where the main angle is not defined.
+    """
 
 
 def read_joint(
@@ -96,14 +97,14 @@ def read_joint(
     left: bool,
     convention: AngleConvention = AngleConvention.FLEXION,
 ) -> JointReading:
-    r"""Return the angles of a convention and the inner angle of one frame of plain tuples.
+    r"""Return the angles of a convention, and the inner angle, from two plain tuples.
 
     .. math:: \text{flexion: } R = R_x(\phi) R_y(\theta) R_z(\psi): \quad
               \phi = \mathrm{atan2}(-R_{12}, R_{22}),\; \theta = \arcsin R_{02},\;
               \psi = \mathrm{atan2}(-R_{01}, R_{00})
 
-    The other conventions are those of ``_elevation``, ``_tilt_torsion`` and ``_trunk``. The inner
-    angle is the same in all of them.
+    ``_elevation``, ``_tilt_torsion`` and ``_trunk`` define the other conventions. The inner angle
+    is the same in all conventions.
 
     Source: Grood and Suntay 1983, doi 10.1115/1.3138397, in the axes of CONVENTIONS.md; Wu et al.
     2002, doi 10.1016/S0021-9290(01)00222-6, and 2005, doi 10.1016/j.jbiomech.2004.05.042.
@@ -115,8 +116,9 @@ def read_joint(
     flexion_sign : float
         +1 for hip and ankle, -1 for the knee, where flexion moves the heel back.
     left : bool
-        Whether the limb is a left limb. A left limb is mirrored at its sagittal plane, so that both
-        sides agree. Not used for the trunk.
+        Whether the limb is a left limb. The angles of a left limb are mirrored at the sagittal
+        plane, so that equal movements of both sides have equal angles. The trunk does not use this
+        parameter.
     convention : AngleConvention
         Definition of the three angles.
     """
@@ -154,8 +156,8 @@ def _flexion(w: float, x: float, y: float, z: float, sign: float) -> JointReadin
 def _trunk(q_lower_upper: Quaternion) -> JointReading:
     """Return forward flexion, bending to the right and rotation to the left of the upper segment.
 
-    The sequence of rotations equals the sequence of the convention ``flexion``, for the upper
-    segment relative to the lower segment. Chains list the upper segment first.
+    The sequence of rotations is the sequence of the convention ``flexion``, for the upper segment
+    relative to the lower segment. In a chain the upper segment is the proximal segment.
     """
     return _flexion(*q_lower_upper, -1.0)
 
@@ -168,8 +170,8 @@ def _elevation(w: float, x: float, y: float, z: float) -> JointReading:
               \gamma, \psi = \mathrm{atan2}(z, w) \pm \mathrm{atan2}(x, -y)
 
     γ is the plane, ε the elevation, ψ the axial rotation. The plane is 0 in abduction and 90
-    degrees in forward flexion. Plane and axial rotation are not separable where the elevation is 0
-    or 180 degrees: the plane is then 0.
+    degrees in forward flexion. If the elevation is 0 or 180 degrees, plane and axial rotation are
+    not separable, and the plane is 0.
     """
     swing, twist = hypot(x, y), hypot(w, z)
     elevation = 2.0 * atan2(swing, twist)
@@ -189,11 +191,11 @@ def _tilt_torsion(w: float, x: float, y: float, z: float, sign: float) -> JointR
 
     .. math:: R = \exp(v_x, v_y, 0)\, R_z(\tau), \quad \tau = 2\,\mathrm{atan2}(z, w)
 
-    The tilt :math:`|v|` equals the elevation, and its direction the plane of elevation. In a
-    sagittal or frontal movement, :math:`v` is the flexion or adduction of the convention
+    The tilt :math:`|v|` equals the elevation, and the direction of v is the plane of elevation. In
+    a sagittal or frontal movement, :math:`v` is the flexion or adduction of the convention
     ``flexion``. Only a tilt of 180 degrees is singular.
 
-    A rotation error across the tilt is magnified by :math:`|v| / \sin|v|`.
+    A rotation error perpendicular to the tilt is magnified by :math:`|v| / \sin|v|`.
     """
     swing, twist = hypot(x, y), hypot(w, z)
     tilt = 2.0 * atan2(swing, twist)
@@ -212,19 +214,20 @@ def _tilt_torsion(w: float, x: float, y: float, z: float, sign: float) -> JointR
 
 
 class PatentReading(NamedTuple):
-    """Joint angles of the patent in one frame; see ``read_patent``."""
+    """Joint angles of the patent in one frame, as returned by ``read_patent``."""
 
     alpha: float
     """Rotation about x, rad."""
     beta: float
     """Rotation about y, rad."""
     gamma: float
-    """Angle about z, rad; 0 in gimbal lock."""
+    """Rotation about z, rad; 0 in gimbal lock."""
     joint: float
-    """pi - abs(alpha), rad: the patent's joint angle."""
+    """Joint angle of the patent, pi - abs(alpha), rad."""
     gimbal: bool
-    """Whether the frame is gimbal-locked: beta is close to 90 degrees, and alpha contains the
-    rotation."""
+    """Whether the frame is gimbal-locked. Beta is then close to 90 degrees, and alpha contains the
+    rotation.
+    """
 
 
 def read_patent(q_proximal: Quaternion, q_distal: Quaternion) -> PatentReading:

@@ -1,10 +1,11 @@
-"""Unit quaternions as numpy arrays: products, rotation vectors, matrices, means.
+"""Unit quaternions as NumPy arrays, with products, rotation vectors, matrices and means.
 
-Hamilton quaternions, scalar first, arrays of shape (..., 4) that broadcast against each other;
-vectors have shape (..., 3). ``q_a_b`` maps b-coordinates to a-coordinates and chains as ``q_a_c =
-multiply(q_a_b, q_b_c)``. A quaternion and its negative are the same rotation: differences, averages
-and interpolation in this module are independent of the sign. Code that uses single components must
-align signs first. ``rotation_scalar`` is faster for one sample at a time.
+Quaternions are Hamilton quaternions, scalar first. Arrays have the shape (..., 4) and broadcast
+against each other; vectors have the shape (..., 3). ``q_a_b`` maps b-coordinates to a-coordinates,
+and the composition is ``q_a_c = multiply(q_a_b, q_b_c)``. A quaternion and its negative are the
+same rotation. Differences, averages and interpolation in this module are independent of the sign.
+Code that uses individual components must align signs first. ``rotation_scalar`` is faster for one
+sample at a time.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def multiply(p: ArrayLike, q: ArrayLike) -> Array:
     Parameters
     ----------
     p, q : array_like, shape (..., 4)
-        Broadcast against each other.
+        Factors, which broadcast against each other.
 
     Returns
     -------
@@ -72,7 +73,7 @@ def normalize(q: ArrayLike) -> Array:
 
 
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
-    r"""Rotate vectors: v + w t + q_v x t, with t = 2 q_v x v and q = (w, q_v).
+    r"""Rotate vectors by v + w t + q_v x t, where t = 2 q_v x v and q = (w, q_v).
 
     Parameters
     ----------
@@ -169,7 +170,8 @@ def heading(angle: ArrayLike) -> Array:
 def heading_of(q: ArrayLike) -> Array:
     """Return the rotation about the vertical, rad in (-pi, pi], shape (...).
 
-    The result is the heading closest to q, ``2 atan2(z, w)``, and 0 if z and w are zero.
+    The result, ``2 atan2(z, w)``, is the rotation about the vertical that is closest to q. It is 0
+    if z and w are zero.
     """
     q = _floats(q)
     twice = 2.0 * np.arctan2(q[..., 3], q[..., 0])
@@ -178,7 +180,7 @@ def heading_of(q: ArrayLike) -> Array:
 
 
 def interpolate(q0: ArrayLike, q1: ArrayLike, a: ArrayLike) -> Array:
-    """Return the rotation at fraction `a` (shape (...)) from q0 to q1: q0 exp(a log(q0* q1))."""
+    """Return q0 exp(a log(q0* q1)), the rotation at fraction `a`, shape (...), from q0 to q1."""
     share = _floats(a)[..., None]
     return multiply(q0, exp(share * log(multiply(conjugate(q0), q1))))
 
@@ -215,7 +217,7 @@ def average(q: ArrayLike, weights: ArrayLike | None = None) -> Array:
 
 
 def align_hemisphere(q: ArrayLike, ref: ArrayLike) -> Array:
-    """Return q or -q, whichever has a non-negative dot product with `ref`; shape (..., 4)."""
+    """Return q or -q with a non-negative dot product with `ref`; shape (..., 4)."""
     q = _floats(q)
     product = np.sum(q * _floats(ref), axis=-1, keepdims=True)
     return np.where(product < 0.0, -q, q)
@@ -224,7 +226,7 @@ def align_hemisphere(q: ArrayLike, ref: ArrayLike) -> Array:
 def continuous(q: ArrayLike) -> Array:
     """Return a series, shape (n, 4), with non-negative dot products of successive quaternions.
 
-    Rows with NaN stay NaN; continuity extends across them.
+    Rows with NaN are unchanged. The rows before and after them also have a non-negative product.
     """
     q = _floats(q).copy()
     seen = np.flatnonzero(np.isfinite(q).all(axis=-1))

@@ -1,6 +1,6 @@
 """Unit quaternions as plain tuples, for code that runs once per sample or frame.
 
-Conventions and formulas are those of ``rotation``. The overhead of one numpy call, about a
+Conventions and formulas are the same as in ``rotation``. The overhead of one NumPy call, about a
 microsecond, exceeds the time of a whole product of plain floats.
 """
 
@@ -89,7 +89,7 @@ def log_one(q: Quaternion) -> Vector:
 
 
 def difference_one(a: Quaternion, b: Quaternion) -> Vector:
-    """Return the rotation vector from a to b, rad: ``log_one(between_one(a, b))`` in one call."""
+    """Return ``log_one(between_one(a, b))``, the rotation vector from a to b, rad, in one call."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     w = aw * bw + ax * bx + ay * by + az * bz
@@ -104,7 +104,7 @@ def difference_one(a: Quaternion, b: Quaternion) -> Vector:
 
 
 def perturb_one(q: Quaternion, r: Vector) -> Quaternion:
-    """Return q rotated by r in its own frame: ``multiply_one(q, exp_one(r))`` in one call."""
+    """Return ``multiply_one(q, exp_one(r))``, q rotated by r in its own frame, in one call."""
     pw, px, py, pz = q
     x, y, z = r
     angle = sqrt(x * x + y * y + z * z)

@@ -1,4 +1,4 @@
-r"""Coupled joints: rotation and translation as functions of one coordinate, as in a knee.
+r"""Coupled joints, such as a knee: rotation and translation are functions of one coordinate.
 
 The pose consists of a quaternion p and a shift s. Each component is a cubic spline of the
 coordinate q between samples; the quaternion is normalized afterwards. Per unit of q the segment
@@ -40,15 +40,16 @@ class CoupledCurve:
     knots: Array
     """Coordinates of the samples, shape (n,), increasing."""
     pieces: Array
-    """Cubic coefficients, highest first, of (w, x, y, z) and the shift; shape (4, n - 1, 7)."""
+    """Cubic coefficients of (w, x, y, z) and the shift, highest power first, shape (4, n - 1, 7).
+    """
     starts: list[float]
-    """The values of `knots` as plain floats."""
+    """Values of `knots` as plain floats."""
     rows: list[list[list[float]]]
-    """The coefficients in `pieces` as plain floats, by piece, then by component."""
+    """Coefficients in `pieces` as plain floats, by piece, then by component."""
 
     @classmethod
     def through(cls, path: Sequence[Sequence[float]]) -> CoupledCurve:
-        """Return the curve through samples (q, w, x, y, z, shift), shape (n, 8), q growing."""
+        """Return the curve through samples (q, w, x, y, z, shift), shape (n, 8), with rising q."""
         rows = np.array(path, dtype=np.float64)
         q = rows[:, 1:5]
         flips = np.cumprod(np.where((q[1:] * q[:-1]).sum(axis=1) < 0.0, -1.0, 1.0))
@@ -91,7 +92,7 @@ class CoupledCurve:
         return R, found
 
     def _at_one(self, amount: float) -> tuple[Array, Array]:
-        """Return ``at`` of one instant; plain floats are ten times faster than arrays."""
+        """Return ``at`` for one instant; plain floats are ten times faster than arrays."""
         starts = self.starts
         inside = min(max(amount, starts[0]), starts[-1])
         piece = min(max(bisect_left(starts, inside) - 1, 0), len(starts) - 2)

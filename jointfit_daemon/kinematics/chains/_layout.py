@@ -1,4 +1,4 @@
-"""Index arrays of a chain model: parents, columns and levels, computed once per model."""
+"""Index arrays of a chain model, such as parents, columns and levels, computed once per model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LEVI.setflags(write=False)
 
 @dataclass(frozen=True, slots=True)
 class ChainLayout:
-    """Arrays used by every computation on a chain; S segments, nq degrees of freedom."""
+    """Arrays that every computation on a chain uses, for S segments and nq degrees of freedom."""
 
     nq: int
     levels: tuple[tuple[Index | slice, Index | slice], ...]
@@ -44,22 +44,23 @@ class ChainLayout:
     columns: tuple[tuple[int, slice], ...]
     """Index and degrees of freedom of each segment."""
     turns: Array
-    """Axis (x, y, z, 0) of each rotational degree of freedom and a point (x, y, z, 1) on it, in
-    segment axes; zero axis for translations. Shape (nq, 4, 2).
+    """Axis (x, y, z, 0) of each rotational degree of freedom, and a point (x, y, z, 1) on the axis,
+    in segment axes, shape (nq, 4, 2). The axis of a translation is zero.
     """
     shifts: Index
     """Indices of the degrees of freedom that translate a free segment."""
     shift_twists: Array
     """Twists of the translations in `shifts`, shape (len(shifts), 6)."""
     spread: Array
-    """Maps a step to the rotation vectors of all segments; shape (nq, 3 S)."""
+    """Matrix that maps a step to the rotation vectors of all segments, shape (nq, 3 S)."""
     below: Array
     """Matrix with 1 where segment j is segment i or a descendant of segment i, shape (S, S)."""
     moves: Array
     """Matrix with 1 where a degree of freedom moves a segment, shape (S, nq)."""
     lower: Array
-    """Matrix with 1 where the segment of the column is the segment of the row or one of its
-    ancestors, and the column is not after the row; shape (nq, nq)."""
+    """Matrix, shape (nq, nq), with 1 if the column is not after the row, and its segment is the
+    segment of the row or an ancestor of this segment.
+    """
     strictly_lower: Array
     """Matrix `lower` without its diagonal."""
     coupled: tuple[tuple[int, int, CoupledCurve], ...]
@@ -71,7 +72,7 @@ def layout_of(model: ChainModel) -> ChainLayout:
     kept = model.__dict__.get("_layout")
     if not isinstance(kept, ChainLayout):
         kept = _layout(model)
-        # cached like the properties, because the model is immutable
+        # cached like the properties of the model, which is immutable
         model.__dict__["_layout"] = kept
     return kept
 

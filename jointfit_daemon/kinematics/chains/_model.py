@@ -1,15 +1,15 @@
 r"""Chain models: a tree of rigid segments on joints, with markers fixed to the segments.
 
-The data are immutable, and parents precede children. The pose of segment i follows from the pose of
-its parent p,
+The data are immutable, and parents precede children. The pose of segment i is computed from the
+pose of its parent p,
 
 .. math:: R_i = R_p A_i, \qquad t_i = t_p + R_p\, c_p - R_i\, c_i
 
 R is a rotation to the world, t an origin, and c the joint center in parent (p) and segment (i). The
-joint rotation :math:`A_i` is arbitrary (``ball``), :math:`A_{rest}\exp(a\theta)` with axis a and
-angle θ (``hinge``), or arbitrary with a free origin (``free``). One coordinate of a ``coupled``
-joint moves :math:`A_i` and :math:`c_p` along a path. Axes and centers are in segment axes, in
-metres.
+joint rotation :math:`A_i` of a ``ball`` joint is arbitrary. For a ``hinge`` it is
+:math:`A_{rest}\exp(a\theta)` with axis a and angle θ. A ``free`` joint has an arbitrary rotation
+and origin. One coordinate of a ``coupled`` joint moves :math:`A_i` and :math:`c_p` along a path.
+Axes and centers are in segment axes, in metres.
 """
 
 from __future__ import annotations
@@ -50,21 +50,25 @@ class Joint:
 
     kind: JointKind = "free"
     center_in_parent: Vector = _ORIGIN
-    """Joint center in the parent's axes (the world's without a parent), m; unused when free."""
+    """Joint center in the axes of the parent or, without a parent, of the world, m. A free joint
+    does not use it.
+    """
     center: Vector = _ORIGIN
-    """Joint center in the segment's own axes, m; unused when free."""
+    """Joint center in the axes of the segment, m. A free joint does not use it."""
     axis: Vector = (1.0, 0.0, 0.0)
-    """Unit axis of a hinge in own axes; positive rotations are right-handed about it."""
+    """Unit axis of a hinge in segment axes. Positive rotations about it are right-handed."""
     rest: Quaternion = (1.0, 0.0, 0.0, 0.0)
-    """Rotation q_parent_segment of a hinge at angle zero. For a ball joint, the start of a search
-    without data."""
+    """Rotation q_parent_segment of a hinge at angle zero. For a ball joint it is the initial
+    rotation of a search without data.
+    """
     limits: tuple[float, float] | None = None
-    """Least and greatest angle of a hinge or coordinate of a coupled joint, rad; None: unlimited.
+    """Least and greatest angle of a hinge, or coordinate of a coupled joint, rad. None if
+    unlimited.
     """
     path: tuple[Sample, ...] = ()
-    """Samples of a coupled joint: coordinate, rad, q_parent_segment, and the shift added to
-    ``center_in_parent`` in the parent's axes, m. Poses between samples are interpolated by cubic
-    splines.
+    """Samples of a coupled joint. A sample consists of the coordinate, rad, q_parent_segment, and
+    the shift that is added to ``center_in_parent`` in the parent's axes, m. Poses between samples
+    are interpolated by cubic splines.
     """
 
 
@@ -74,7 +78,7 @@ class Segment:
 
     name: str
     parent: str | None = None
-    """Name of the parent; None: the world."""
+    """Name of the parent; None is the world."""
     joint: Joint = Joint()
 
 
@@ -94,7 +98,7 @@ class Marker:
 
 @dataclass(frozen=True)
 class ChainModel:
-    """Segments, parents first, and the markers of the segments.
+    """Chain of segments, with parents first, and the markers of the segments.
 
     The class has no slots, because derived arrays are cached properties.
 
@@ -166,7 +170,7 @@ class ChainModel:
 
     @cached_property
     def columns(self) -> tuple[slice, ...]:
-        """Columns of each segment; a free segment has three rotations, then three translations."""
+        """Columns of a step by segment, with rotations before translations."""
         ends = np.cumsum([0, *(DEGREES_OF_FREEDOM[s.joint.kind] for s in self.segments)]).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
@@ -188,10 +192,10 @@ class ChainModel:
         )
 
     def scaled(self, factors: Mapping[str, ArrayLike]) -> ChainModel:
-        """Return the model with scaled segments: one factor or one per axis, by segment name.
+        """Return the model with segments scaled by one factor or by one factor per axis.
 
-        Scaling applies to the markers, the joint center of the segment, and the joint centers of
-        its children.
+        The keys of `factors` are segment names. Scaling changes the markers, the joint center of
+        the segment, and the joint centers of its children.
         """
         unknown = set(factors) - set(self.segment_names)
         if unknown:

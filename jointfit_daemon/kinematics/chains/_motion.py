@@ -1,12 +1,13 @@
-r"""Poses of a chain: segments and markers in the world, their Jacobian, and steps.
+r"""Poses of the segments and markers of a chain, their Jacobian, and steps.
 
-The first axis of all arrays is the T instants. A step moves a state on its manifold,
+The first axis of all arrays has the length T, the number of instants. A step δ moves a state on its
+manifold,
 
 .. math:: A_i \leftarrow A_i \exp(\delta_i), \qquad t_{root} \leftarrow t_{root} + \delta_t
 
-with :math:`\delta` in the columns of `ChainModel.columns`: rotations in the segment's own axes,
-rad, then for a free segment the translation of its origin in the world, m. The column of a coupled
-joint is the step of its coordinate.
+`ChainModel.columns` defines the columns of :math:`\delta`. The columns of a segment are rotations
+in its own axes, rad. A free segment also has the translation of its origin in the world, m. The
+column of a coupled joint is the step of its coordinate.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.arrays import Array
 
 
-_TINY = 1e-30  # rad^2, far below rounding: avoids 0/0 in sin(x)/x
+_TINY = 1e-30  # rad^2, far below rounding; avoids 0/0 in sin(x)/x
 _EYE = np.eye(3)
 
 
@@ -39,10 +40,10 @@ class ChainState:
     rotations: Array
     """A_i = R_parent_segment (R_world_segment without a parent), shape (T, S, 3, 3)."""
     origins: Array
-    """World origins of the free segments, in their order, m, shape (T, F, 3)."""
+    """World origins of the F free segments, in the order of the model, m, shape (T, F, 3)."""
     couplings: Array | None = None
-    """Coordinates of the coupled joints, in their order, with their derivatives
-    (`CoupledCurve.at`), shape (T, C, 10); None without coupled joints.
+    """Coordinates and derivatives of the C coupled joints, in the order of the model, as returned
+    by `CoupledCurve.at`, shape (T, C, 10). None without coupled joints.
     """
 
     def __len__(self) -> int:
@@ -107,9 +108,10 @@ def marker_positions(model: ChainModel, state: ChainState) -> Array:
 def twists(layout: ChainLayout, world: Array, couplings: Array | None = None) -> Array:
     r"""Return the twist of each degree of freedom, shape (T, nq, 6).
 
-    The row is :math:`(\alpha, \beta)`: a point x moves by :math:`\alpha\times x + \beta`. For a
-    rotation about the world axis :math:`\alpha` through C, :math:`\beta = C \times \alpha`. A
-    coupled joint adds its translation to :math:`\beta`.
+    The row of a degree of freedom is :math:`(\alpha, \beta)`, and moves a point x by
+    :math:`\alpha\times x + \beta`. For a rotation about the world axis :math:`\alpha` through C,
+    :math:`\beta = C \times \alpha`. The twist of a coupled joint also contains its translation in
+    :math:`\beta`.
     """
     found = np.empty((len(world), layout.nq, 6))
 
@@ -139,8 +141,8 @@ def jacobian(model: ChainModel, state: ChainState) -> Array:
 
     .. math:: \partial x_m/\partial q_k = \alpha_k \times (x_m - C_k)
 
-    with α the world axis of the rotation and C a point on this axis. The equation applies to the
-    rotations of all joints between the world and the marker's segment. The derivative is the
+    where α is the world axis of the rotation and C a point on this axis. The equation applies to
+    the rotations of all joints between the world and the marker's segment. The derivative is the
     identity for translations of the root of the chain, and zero for all other degrees of freedom.
     """
     layout = layout_of(model)
@@ -149,7 +151,7 @@ def jacobian(model: ChainModel, state: ChainState) -> Array:
     x = (world[:, s, :3, :3] @ model.positions[:, :, None])[..., 0] + world[..., :3, 3][:, s]
     motion = twists(layout, world, state.couplings)
 
-    # alpha x X + beta as one product: [skew(alpha), beta] times (X, 1).
+    # alpha x X + beta is computed as one product, [skew(alpha), beta] times (X, 1).
     maps = np.empty((len(world), layout.nq, 3, 4))
     maps[..., :3] = skew(motion[..., :3])
     maps[..., 3] = motion[..., 3:]
@@ -184,9 +186,9 @@ def place_coupled(
     Parameters
     ----------
     rotations, origins
-        As in `ChainState`; rotations of coupled joints are overwritten in place.
+        Fields of `ChainState`. Rotations of coupled joints are overwritten in place.
     amounts
-        Coordinates of the coupled joints, rad, shape (T, C); None: coordinates at rest.
+        Coordinates of the coupled joints, rad, shape (T, C); coordinates at rest if None.
     """
     if not layout.coupled:
         return ChainState(rotations, origins)
@@ -200,7 +202,8 @@ def place_coupled(
 def exp_matrix(r: Array) -> Array:
     """Return rotation matrices (..., 3, 3) of rotation vectors (..., 3), rad.
 
-    I + sin(x)/x K + (1 - cos x)/x^2 K^2 (Rodrigues), with x the angle and K the vector as matrix.
+    The formula of Rodrigues is I + sin(x)/x K + (1 - cos x)/x^2 K^2, where x is the angle and K the
+    cross-product matrix of the vector.
     """
     K = skew(r)
     angle = np.sqrt(np.einsum("...i,...i->...", r, r) + _TINY)[..., None, None]
@@ -231,8 +234,8 @@ def _exp_of_few(r: Array) -> Array:
 def step_between(model: ChainModel, a: ChainState, b: ChainState) -> Array:
     """Return the step, shape (T, nq), that takes state a to state b by `apply_step`.
 
-    The step of a joint is log(A_a^T A_b), for a hinge the component about the hinge axis. The step
-    of a coupled joint is the difference of the coordinates.
+    The step of a joint is log(A_a^T A_b). For a hinge it is the component of this vector about the
+    hinge axis, and for a coupled joint the difference of the coordinates.
     """
     layout = layout_of(model)
     between = rotation.from_matrix(np.swapaxes(a.rotations, -1, -2) @ b.rotations)

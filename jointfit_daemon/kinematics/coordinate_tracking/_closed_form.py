@@ -1,17 +1,17 @@
-r"""Joints whose coordinates follow from a pose in closed form.
+r"""Joints whose coordinates can be computed from a pose in closed form.
 
 A joint of three successive rotations about perpendicular axes is
 
 .. math:: A = A_0 \exp(q_1 b_1) \exp(q_2 b_2) \exp(q_3 b_3), \qquad
           B^T A_0^T A B = R_x(q_1) R_y(q_2) R_z(\pm q_3)
 
-with the axes b as columns of B and the angles q. The third axis is reversed if B would be
-left-handed otherwise. A hinge has the first rotation only. A free joint also has an origin :math:`t
-= t_0 + D q_t + A c` with translations :math:`q_t` and center c. All constants are computed from the
-pose function of the joint, so that they apply to every file format.
+where q are the angles and the axes b are the columns of B. If B would be left-handed, the third
+axis is reversed. A hinge has only the first rotation. A free joint also has an origin
+:math:`t = t_0 + D q_t + A c` with translations :math:`q_t` and center c. All constants are computed
+from the pose function of the joint, independent of the file format of the model.
 
-Invariant: a joint has a closed form only if the closed form reproduces the pose function at all
-probes.
+Invariant: a joint has a closed form only if the closed form equals the pose function at all test
+values.
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ if TYPE_CHECKING:
 
 _PROBES = 8
 _GOLDEN = 0.6180339887498949
-"""Golden ratio minus 1. Its multiples modulo 1 are evenly distributed, and give probes without a
-random generator."""
+"""Golden ratio minus 1. Its multiples modulo 1 are evenly distributed, and are used as test values
+instead of random numbers.
+"""
 _SMALL = 0.1
-"""Rotation angle at which an axis is computed, rad."""
+"""Rotation angle that is used to compute an axis, rad."""
 _EXACT = 1e-9
 """Largest accepted difference between a closed form and the pose function of the joint, rad and
 m."""
@@ -49,8 +50,9 @@ class ClosedForm:
     angles: tuple[int, ...]
     """Indices of the angles among the coordinates of the joint, in the order of the rotations."""
     signs: tuple[float, ...]
-    """Sign of each angle: -1 where a positive angle is a negative rotation about the column of
-    B."""
+    """Sign of each angle. It is -1 if a positive angle is a negative rotation about the column of
+    B.
+    """
     left: Array
     """Matrix B^T A_0^T, shape (3, 3)."""
     basis: Array
@@ -92,7 +94,7 @@ def closed_form(joint: JointCoordinates, kind: JointKind) -> ClosedForm | None:
     if joint.pose is None or (len(angles), len(shifts)) != wanted.get(kind):
         return None
 
-    # Evenly distributed values of all coordinates, at which a candidate must be exact.
+    # A candidate must be exact at evenly distributed values of all coordinates.
     count = len(joint.names)
     numbers = np.arange(1, _PROBES + 1)[:, None] * np.arange(1, count + 1) * _GOLDEN
     probes: Array = np.asarray(2.0 * (2.0 * (numbers % 1.0) - 1.0), dtype=np.float64)
@@ -103,7 +105,7 @@ def closed_form(joint: JointCoordinates, kind: JointKind) -> ClosedForm | None:
             continue
         A, t = found.pose(probes)
         off = float(np.abs(A - expected[0]).max())
-        if shifts:  # the origin of a joint that is not free follows from the parent
+        if shifts:  # without a free joint the parent determines the origin
             off = max(off, float(np.abs(t - expected[1]).max()))
         second = order[1] if len(order) == _ANGLES else None
         if off < _EXACT and joint.middle in (None, second):
@@ -114,7 +116,7 @@ def closed_form(joint: JointCoordinates, kind: JointKind) -> ClosedForm | None:
 def _candidate(
     joint: JointCoordinates, order: tuple[int, ...], shifts: list[int]
 ) -> ClosedForm | None:
-    """Return the closed form of rotations in some order, None if their axes do not allow it."""
+    """Return the closed form for an order of rotations; None if the axes are not perpendicular."""
     if joint.pose is None:
         return None
 
@@ -142,7 +144,7 @@ def _candidate(
     if not shifts:
         return ClosedForm(order, tuple(signs), left, basis)
 
-    # Translations move the origin along D; rotations about the origin of the coordinates by A c.
+    # Translations move the origin by D q_t, and rotations by A c.
     D = np.stack([t[1 + k] - t[0] for k in shifts], axis=1)
     rows = [1 + k for k in order]
     center = np.linalg.lstsq((A[rows] - A[0]).reshape(-1, 3), (t[rows] - t[0]).ravel())[0]

@@ -22,23 +22,28 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chain_coordinates import JointCoordinates
 
 STEPS_PER_JOINT = 2
-"""Number of steps per instant of a joint with known coordinates at the preceding instant."""
+"""Number of steps per instant for a joint whose coordinates at the preceding instant are known."""
 SPARE_STEPS = 6
 """Number of additional steps per instant, for joints that move fast or have unknown coordinates."""
 _DIFFERENCE = 1e-5
 """Half the interval of a central difference, rad and m; the derivative has an error of about
 1e-10."""
 _RIDGE = 1e-12
-"""Regularization added to G^T G, so that a gimbal lock yields finite angles. G is the derivative of
-a step by the coordinates."""
+"""Regularization that is added to G^T G, so that angles are finite at a gimbal lock. G is the
+derivative of a step with respect to the coordinates.
+"""
 _MOST_ITERATIONS = 8
-"""Largest number of iterations from one start; from the values of the preceding instant two are
-typical."""
+"""Largest number of iterations from one start. From the values of the preceding instant two
+iterations are typical.
+"""
 _FARTHEST_STEP = 0.8
-"""Largest step of an angle, rad: most inversions begin close to the solution."""
+"""Largest step of an angle, rad. It is rarely needed, because most inversions start close to the
+solution.
+"""
 _CLOSE = 1e-3
-"""Distance to the pose, rad and m, below which one more step is the last: the remaining error is
-about the square of the distance."""
+"""Distance to the pose, rad and m, below which the next step is the last. After this step the error
+is about the square of the distance.
+"""
 _SETTLED = 1e-4
 """Largest last step, rad and m, of a joint whose coordinates describe only a part of the pose."""
 _FARTHEST_MISFIT = 0.5
@@ -53,12 +58,12 @@ _MOST_ANGLES = 3
 
 
 class NumericInversion:
-    """Numerical inversion of the poses of several joints, instant by instant.
+    """Computes the coordinates of several joints numerically from their poses, instant by instant.
 
     Parameters
     ----------
     joints
-        Coordinates by number of the segment.
+        Coordinates of the joints, by index of the segment.
     """
 
     def __init__(self, joints: Mapping[int, JointCoordinates]) -> None:
@@ -76,16 +81,16 @@ class NumericInversion:
     def invert(
         self, poses: Mapping[int, tuple[Array, Array]], last: Mapping[int, Array]
     ) -> dict[int, tuple[Array, Array]]:
-        """Return values, shape (k,), and derivative, (3 or 6, k), of each joint with a solution.
+        """Return values, shape (k,), and derivative, (3 or 6, k), of each joint that was solved.
 
         Parameters
         ----------
         poses
             Rotation, shape (3, 3), and origin of a free segment, m, (3,) or (0,), of each joint.
         last
-            Values at the preceding instant of each joint that had a solution.
+            Values at the preceding instant, for each joint that was solved.
         """
-        # Known joints come first. The others take turns with the rest of the steps.
+        # Known joints are processed first. The other joints share the remaining steps in turn.
         self._turn += 1
         numbers = sorted(poses)
         searching = [i for i in numbers if i not in last]
@@ -106,7 +111,7 @@ class NumericInversion:
     def _step(
         self, i: int, A: Array, origin: Array, last: Array | None
     ) -> tuple[Array, Array] | None:
-        """Take one step, and return values and derivative if the step leads to the pose."""
+        """Take one step; return values and derivative if the step reaches the pose, or None."""
         joint = self._joints[i]
         values = self._open.get(i)
         if values is None:
@@ -115,7 +120,7 @@ class NumericInversion:
         self._iterations[i] += 1
         values, G, is_found = _stepped(joint, values, A, origin)
         if is_found:
-            # limit angles to half a turn, and the second of three rotations to a quarter turn
+            # Angles are limited to ±180°, and the second of three rotations to ±90°.
             values = values - 2.0 * np.pi * np.round(values / (2.0 * np.pi)) * joint.is_angle
             if joint.middle is None or abs(values[joint.middle]) <= 0.5 * np.pi + _CLOSE:
                 self._open.pop(i, None)
@@ -130,7 +135,7 @@ class NumericInversion:
         return None
 
     def _start(self, i: int, A: Array) -> Array:
-        """Return the start values nearest to A; after each failure, the next nearest values."""
+        """Return the start values nearest to A or, after each failure, the next nearest values."""
         values, rotations = self._starts[i]
         nearest = np.argsort(-(rotations @ A.ravel()), kind="stable")
         return np.asarray(values[nearest[max(self._attempts[i] - 1, 0) % len(values)]])
@@ -172,14 +177,14 @@ def _stepped(
     to_R = np.concatenate((A[None], R[1 + count :]))
     between = R[: 1 + count].swapaxes(-1, -2) @ to_R
 
-    # sin(x) instead of x, which is exact for the small rotations of the last steps
+    # sin(x) replaces x, which is accurate for the small rotations of the last steps
     steps = np.zeros((1 + count, 6))
     steps[:, :3] = 0.5 * (between[:, (2, 0, 1), (1, 2, 0)] - between[:, (1, 2, 0), (2, 0, 1)])
     if len(origin):
         steps[:, 3:] = np.concatenate((origin[None], t[1 + count :])) - t[: 1 + count]
     missing, G = steps[0, :rows], steps[1:, :rows].T / (2.0 * _DIFFERENCE)
 
-    # the sine is also small near half a turn, where the trace is below 1
+    # the sine is also small near 180°, where the trace is below 1
     far = float(between[0].trace()) < 1.0
     off = np.inf if far else float(np.abs(missing).max())
 

@@ -1,6 +1,6 @@
 """Tracker that computes the coordinates of a chain state by state.
 
-Invariant: the number of numerical steps per instant is bounded for any poses.
+Invariant: the number of numerical steps per instant is bounded for every pose.
 """
 
 from __future__ import annotations
@@ -28,20 +28,21 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.coordinate_tracking._closed_form import ClosedForm
 
 _LOCKED = 1e-3
-"""Cosine of the second of three rotations below which the other two are almost indistinguishable.
-Below this cosine the values of the preceding instant decide."""
+"""Cosine of the second of three rotations below which the other two rotations are almost
+indistinguishable. In this case the values of the preceding instant are used.
+"""
 _NO_OFFSET_M = 1e-12
 _Row = tuple[float, float, float]
 _Angles = tuple[_Row, tuple[_Row, _Row, _Row]]
-"""Three angles, and the derivatives (rates) of the angles by a step of the state."""
+"""Three angles, and their derivatives (rates) with respect to a step of the state."""
 
 
 class CoordinateTracker:
     """Tracker of the coordinates of a chain, state by state.
 
-    The result equals the result of `coordinate_table`. Joints with a closed form use the closed
-    form. Other joints are inverted numerically from the preceding values; during a search their
-    coordinates are unknown.
+    The result equals the result of `coordinate_table`. The coordinates of joints with a closed form
+    are computed in closed form. For other joints a numerical search starts from the preceding
+    values. Until the search ends, their coordinates are unknown.
 
     Parameters
     ----------
@@ -64,7 +65,8 @@ class CoordinateTracker:
         ends = np.cumsum([0, *(len(joint.names) for joint in coordinates)]).tolist()
         self._rows = [slice(a, b) for a, b in pairwise(ends)]
 
-        # Maps a step to coordinates, shape (K, nq): the part that does not depend on the state.
+        # Part of the map from a step to coordinates that does not depend on the state, shape (K,
+        # nq).
         self._rates = np.zeros((ends[-1], model.nq))
         self._coupled = [i for i, joint in enumerate(coordinates) if joint.pose is None]
         self._couplings = [curves[i] for i in self._coupled]
@@ -107,7 +109,7 @@ class CoordinateTracker:
         self._last = np.full(ends[-1], np.nan)
 
     def read(self, state: ChainState, covariance: Array) -> tuple[Array, Array]:
-        """Return values and standard deviations, rad and m, shape (K,); angles within half a turn.
+        """Return values and standard deviations, rad and m, shape (K,).
 
         Parameters
         ----------
@@ -119,14 +121,15 @@ class CoordinateTracker:
         Returns
         -------
         values, sd
-            Arrays with NaN for a joint whose pose the coordinates do not describe.
+            Arrays with angles within ±180°. They contain NaN for a joint whose pose the coordinates
+            do not describe.
         """
         values, rates = np.full(len(self._last), np.nan), self._rates.copy()
         for i, c in zip(self._coupled, self._couplings, strict=True):
             if state.couplings is not None:
                 values[self._rows[i]] = state.couplings[0, c, 0]
 
-        # Process hinges first, in the order of `_closed`.
+        # `_closed` contains hinges first.
         turned = (self._left @ state.rotations[0, self._closed] @ self._right).tolist()
         count = len(self._hinges)
         if count:
@@ -169,7 +172,7 @@ class CoordinateTracker:
 
 
 class _Rotations(NamedTuple):
-    """Joints of three rotations in closed form, in arrays over J joints."""
+    """Arrays over the J joints of three rotations that have a closed form."""
 
     rows: NDArray[np.intp]
     """Indices of the rotation angles among the coordinates, shape (J, 3)."""
@@ -215,13 +218,13 @@ class _Shift(NamedTuple):
     inverse: Array
     start: Array
     center: Array | None
-    """Joint center; None: zero."""
+    """Joint center; None is zero."""
 
     @classmethod
     def of(
         cls, form: ClosedForm, segment: int, free: list[int], first: int, column: int
     ) -> _Shift | None:
-        """Return the translations of a free joint, from coordinate `first` on; otherwise None."""
+        """Return the translations of a free joint, which start at coordinate `first`, or None."""
         if form.shift_inverse is None or form.start is None or form.center is None:
             return None
         center = form.center if np.abs(form.center).max() > _NO_OFFSET_M else None
@@ -230,7 +233,7 @@ class _Shift(NamedTuple):
         return cls(segment, number, rows, column, form.shift_inverse, form.start, center)
 
     def write(self, state: ChainState, values: Array, rates: Array) -> None:
-        """Write the translations, and the derivatives of the translations by segment rotations."""
+        """Write the translations, and their derivatives with respect to segment rotations."""
         moved = state.origins[0, self.number] - self.start
         if self.center is not None:
             # d(A c) = A (w x c) = -A [c]x w
@@ -245,9 +248,10 @@ _NONE = np.zeros(0)
 
 
 def _three_angles(M: list[list[float]]) -> _Angles:
-    """Return the angles of M = Rx Ry Rz, and their derivatives by a step in the axes after Rz.
+    """Return the angles of M = Rx Ry Rz, and their derivatives by a step in rotated axes.
 
-    The result is NaN where the second rotation is a quarter turn.
+    The step is in the axes after all three rotations. The result is NaN if the second rotation is
+    90°.
     """
     (m00, m01, sine), (_, _, m12), (_, _, m22) = M
     cosine = hypot(m00, m01)

@@ -1,4 +1,4 @@
-"""Inverse kinematics: the poses of a chain model that best fit measured markers."""
+"""Inverse kinematics, which computes the poses of a chain model that best fit measured markers."""
 
 from jointfit_daemon.kinematics.inverse_kinematics._levenberg_marquardt import Band, limits_of
 from jointfit_daemon.kinematics.inverse_kinematics._local_minima import restart_local_minima

@@ -1,9 +1,9 @@
-"""Initial pose of a search: each segment aligned with its own markers.
+"""Initial pose of a search, with each segment aligned to its own markers.
 
-Segments are aligned from the root outwards. The rotation of a segment best maps its markers to the
-measured markers, and its joint center to the joint center given by the parent (Wahba's problem).
-For a hinge only the rotation about the hinge axis is used, for a coupled joint the nearest pose on
-the curve.
+Segments are aligned from the root outwards. The rotation of a segment is the best map of its
+markers to the measured markers, and of its joint center to the joint center in the parent (Wahba's
+problem). A hinge uses only the rotation about the hinge axis. A coupled joint uses the nearest pose
+on its curve.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _THIN_M2 = 1e-4
 """Second largest moment of a marker cloud, m², below which its rotation is undetermined: (1 cm)².
 """
 _PULL_TO_REST = 1e-9
-"""Relative weight of the rest rotation; this weight matters only along undetermined directions."""
+"""Relative weight of the rest rotation, which has an effect only along undetermined directions."""
 
 
 def start_from_markers(
@@ -96,7 +96,7 @@ def start_from_markers(
 def _with_center(
     points: Array, measured: Array, weights: Array, own: Array, center: Array
 ) -> tuple[Array, Array, Array]:
-    """Return a cloud with the joint center, known from the parent, as an additional point."""
+    """Return a marker cloud with the joint center in the parent as an additional point."""
     count = len(points)
     return (
         np.concatenate((points, np.broadcast_to(own[:, None], (count, 3, 1))), axis=-1),
@@ -119,15 +119,15 @@ def _laid(
     B = (y * weights[:, None]) @ np.swapaxes(p, -1, -2)
     R = _nearest_rotation(B + (_PULL_TO_REST * size + 1e-12)[:, None, None] * rest)
     minors = 0.5 * (size**2 - np.einsum("tij,tij->t", moments, moments))
-    second = minors / np.maximum(size, 1e-12)  # slightly larger than the eigenvalue
+    second = minors / np.maximum(size, 1e-12)  # upper bound of the eigenvalue
     return R, middle_y - (R @ middle_p[..., None])[..., 0], second
 
 
 def _nearest_rotation(B: Array) -> Array:
     """Return the rotations, shape (T, 3, 3), that maximize :math:`tr(R^T B)`.
 
-    The quaternion is the dominant eigenvector of Davenport's matrix, computed by repeated squaring:
-    ten products without a decomposition. Source: Horn 1987, doi 10.1364/JOSAA.4.000629.
+    The quaternion is the dominant eigenvector of Davenport's matrix. It is computed by ten
+    squarings of the matrix, without a decomposition. Source: Horn 1987, doi 10.1364/JOSAA.4.000629.
     """
     K = np.empty((len(B), 4, 4))
     trace = np.trace(B, axis1=-2, axis2=-1)
@@ -136,7 +136,7 @@ def _nearest_rotation(B: Array) -> Array:
         (B[:, 2, 1] - B[:, 1, 2], B[:, 0, 2] - B[:, 2, 0], B[:, 1, 0] - B[:, 0, 1]), axis=-1
     )
     K[:, 0, 0] = trace
-    shift = np.sqrt(np.einsum("tij,tij->t", B, B))  # beyond the lowest eigenvalue / sqrt(3)
+    shift = np.sqrt(np.einsum("tij,tij->t", B, B))  # makes all eigenvalues positive
     diagonal = np.arange(4)
     K[:, diagonal, diagonal] += 1.8 * shift[:, None]
     K[:, diagonal[1:], diagonal[1:]] -= trace[:, None]
@@ -148,7 +148,7 @@ def _nearest_rotation(B: Array) -> Array:
 
 
 def _about_axis(rest: Array, turned: Array, axis: tuple[float, float, float]) -> Array:
-    r"""Return the hinge's rotation nearest to `turned`, shape (T, 3, 3).
+    r"""Return the rotation of a hinge nearest to `turned`, shape (T, 3, 3).
 
     .. math:: \tan\theta = \frac{\sum_{ij} R_{ij} [a]_{\times,ij}}{tr R - a^T R a}, \qquad
               R = R_{rest}^T R_{turned}

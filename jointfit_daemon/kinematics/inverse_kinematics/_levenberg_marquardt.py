@@ -1,15 +1,15 @@
-r"""Levenberg-Marquardt search over many instants, each with its own damping.
+r"""Levenberg-Marquardt search over many instants, each of which has its own damping.
 
-Invariant: a step is accepted only at instants where the step lowers the cost; at other instants the
-damping grows. Converged instants are excluded. In addition to the marker errors the cost contains
-bands,
+Invariant: a step is accepted only at instants where the step lowers the cost. At other instants the
+damping is increased. Converged instants are excluded. In addition to the marker errors the cost
+contains *bands*, which penalize joint rotations outside a range:
 
 .. math:: \sum_k w_k \left(v_k - clip(v_k, low_k, high_k)\right)^2, \qquad
           v = \log(A_{ref}^T A)
 
-with the rotation v of each joint from the reference :math:`A_{ref}` and the weight w. A band of
-zero width restricts undetermined joints to the pose at the preceding instant. Other bands restrict
-joints to their limits.
+where v is the rotation of each joint from the reference :math:`A_{ref}`, and w the weight. A band
+of zero width restricts undetermined joints to the pose at the preceding instant. Other bands
+restrict joints to their limits.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ if TYPE_CHECKING:
 _DAMPING = 1e-4
 """Initial relative damping."""
 _EASIER = 0.2
-"""Factor of the damping after an accepted step."""
+"""Factor by which the damping is multiplied after an accepted step."""
 _HARDER = 8.0
-"""Factor of the damping after a rejected step."""
+"""Factor by which the damping is multiplied after a rejected step."""
 _HOPELESS = 1e6
-"""Damping at which an instant is stopped."""
+"""Damping above which the search at an instant ends."""
 _RIDGE = 1e-10
 """Absolute damping, for degrees of freedom without information."""
 _STILL = 1e-8
-"""Step that counts as rounding, rad and m."""
+"""Step below which it counts as a rounding error, rad and m."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ class Band:
     """Allowed range of joint rotations, with the weight of the excess."""
 
     reference: ChainState
-    """State with A_ref, at T instants or one."""
+    """State with A_ref, at T instants or at one instant."""
     weights: Array
     """Weight of the squared excess, m^2/rad^2, shape (T, nq)."""
     low: Array
@@ -68,7 +68,7 @@ class Band:
 
     @classmethod
     def holding(cls, model: ChainModel, reference: ChainState, weights: Array) -> Band:
-        """Return a band of zero width at `reference` for all joints except free ones."""
+        """Return a band of zero width at `reference` for all joints except free joints."""
         layout = layout_of(model)
         joint = np.array([s.joint.kind != "free" for s in model.segments])[layout.segment_of]
         zero = np.zeros(layout.nq)
@@ -89,7 +89,7 @@ class Band:
 
 
 def limits_of(model: ChainModel, weight: float) -> tuple[Band, ...]:
-    """Return the band of the model's joint limits; none without limits or weight."""
+    """Return the band of the model's joint limits; empty without limits or weight."""
     joints = [s.joint for s in model.segments]
     low, high = np.full(model.nq, -np.inf), np.full(model.nq, np.inf)
     for joint, columns in zip(joints, model.columns, strict=True):
@@ -171,11 +171,11 @@ class PoseProblem:
 
 @dataclass(frozen=True, slots=True)
 class PoseSolution:
-    """Result of `find_poses`: the minimum at each instant."""
+    """Result of `find_poses`, which is the minimum at each instant."""
 
     state: ChainState
     weights: Array
-    """Final weights, robust factors included, shape (T, S, K)."""
+    """Final weights, including robust factors, shape (T, S, K)."""
     converged: NDArray[np.bool_]
     iterations: NDArray[np.intp]
 
@@ -186,7 +186,7 @@ def find_poses(problem: PoseProblem, start: ChainState) -> PoseSolution:
     if problem.huber_m is None:
         return found
 
-    # errors above Huber's threshold have reduced weight, which moves the minimum slightly
+    # reduced weights of errors above the Huber threshold move the minimum slightly
     iterations = found.iterations
     for _ in range(problem.reweightings):
         errors = problem.at(found.state)[0].errors
@@ -241,7 +241,7 @@ def _descend(problem: PoseProblem, start: ChainState) -> PoseSolution:
 def _kept(
     better: NDArray[np.bool_], new: tuple[ChainState, MarkerFit], old: tuple[ChainState, MarkerFit]
 ) -> tuple[ChainState, MarkerFit]:
-    """Return the new state and fit at instants with a lower cost, else the old state and fit."""
+    """Return the new state and fit at instants with a lower cost, and the old values elsewhere."""
     keep = better[:, None, None]
     (onward, there), (state, at) = new, old
     couplings = (

@@ -1,9 +1,9 @@
 """Detection of local minima of inverse kinematics, and restarts from other poses.
 
-Every instant is solved from its own markers, so single instants, or a whole trial, may end in a
-local minimum. Two kinds of instants are solved again from perturbed poses: instants with an error
+Every instant is solved from its own markers. Single instants or a whole trial may therefore end in
+a local minimum. Two kinds of instants are solved again from perturbed poses: instants with an error
 well above the error of neighboring instants, and some evenly spaced instants. After an improvement,
-the neighbors are solved from the improved pose, as long as this reduces their error.
+the neighbors are solved from the improved pose, as long as their error decreases.
 
 Invariant: the cost of an instant never increases.
 """
@@ -33,25 +33,27 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel, ChainState
 
 _SURROUNDINGS = 31
-"""Instants in the running median of the error."""
+"""Number of instants in the running median of the error."""
 _JUMP = 1.5
 """Smallest ratio of the error to its running median that counts as a jump."""
 _JUMP_M = 0.003
 """Smallest excess of the error over its running median that counts as a jump, m."""
 _PROBES = 24
-"""Evenly spaced instants that are solved from perturbed poses."""
+"""Number of evenly spaced instants that are solved from perturbed poses."""
 _POSES = 6
-"""Perturbed poses per instant."""
+"""Number of perturbed poses per instant."""
 _PERTURBATION = 1.0
 """Largest perturbation of a rotation, rad."""
 _GOLDEN = 0.6180339887498949
-"""Golden ratio minus 1. Its multiples modulo 1 are evenly distributed, and give perturbations
-without a random generator."""
+"""Golden ratio minus 1. Its multiples modulo 1 are evenly distributed, and are used as
+perturbations instead of random numbers.
+"""
 _GAIN = 0.99
 """Largest ratio of the new cost to the old cost that counts as an improvement. Smaller differences
-are rounding and the tolerance of the solver."""
+result from rounding and from the tolerance of the solver.
+"""
 _PASSES = 400
-"""Largest number of instants over which an improvement spreads in one direction."""
+"""Largest number of neighbors in one direction that are solved after an improvement."""
 
 
 def restart_local_minima(
@@ -66,7 +68,7 @@ def restart_local_minima(
     Parameters
     ----------
     model, markers, weights, options
-        As in `solve_frames`.
+        Parameters of `solve_frames`.
     found
         Result of `solve_frames`.
 
@@ -100,7 +102,7 @@ def restart_local_minima(
         )
         best.try_from(probes, start)
 
-    # stop where a start from the neighbor does not reduce the cost
+    # stop at an instant if the start from its neighbor does not reduce the cost
     last = np.flatnonzero(best.improved)
     for _ in range(_PASSES):
         ahead = [(last + s, last) for s in (-1, 1)]
@@ -142,7 +144,7 @@ class _Best:
         self.improved = np.zeros(len(every), dtype=np.bool_)
 
     def try_from(self, at: NDArray[np.intp], start: ChainState) -> NDArray[np.bool_]:
-        """Solve some instants from other states, and return where this reduced the cost."""
+        """Solve some instants from other states; return a mask of the improved instants."""
         trial = self._trial
         new = solve_frames(
             trial.model, trial.measured[at], trial.weights[at], start=start, options=trial.options

@@ -6,13 +6,13 @@ With the twists :math:`S_k=(\alpha_k,\beta_k)` of the degrees of freedom, a mark
 .. math:: I = \sum_m w_m \begin{pmatrix} |x|^2 1 - x x^T & [x]_\times \\ -[x]_\times & 1
           \end{pmatrix}
 
-with the position x and the weight w of each marker m that both k and l move. One sum over markers
-per instant is needed. All other operations are on segments and degrees of freedom only, as in the
-composite rigid body algorithm with markers as masses. Source: Featherstone, Rigid Body Dynamics
-Algorithms, 2008, section 6.2.
+The sum is over the markers m that both k and l move, with position x and weight w. One sum over
+markers per instant is needed. All other operations are only on segments and degrees of freedom, as
+in the composite rigid body algorithm with markers as masses. Source: Featherstone, Rigid Body
+Dynamics Algorithms, 2008, section 6.2.
 
-Internally the markers of each segment are padded to K slots, shape (T, S, 3, K). Empty slots have
-weight zero.
+Internally the markers of each segment are stored in K slots, shape (T, S, 3, K). Empty slots have
+the weight zero.
 """
 
 from __future__ import annotations
@@ -86,26 +86,27 @@ def _slots(model: ChainModel) -> MarkerSlots:
 
 @dataclass(frozen=True, slots=True)
 class MarkerFit:
-    """Chain at T instants with its marker errors."""
+    """Poses of a chain at T instants, with the marker errors."""
 
     world: Array
     """Transforms of the segments, shape (T, S, 4, 4)."""
     cloud: Array
-    """Rows x, y, z, 1 of each model marker, then the three errors of the marker; shape (T, S, 7,
-    K)."""
+    """Rows x, y, z, 1 of each model marker, and three rows with the errors of the marker, shape (T,
+    S, 7, K).
+    """
     weighted: Array
     """Array ``cloud`` multiplied by the marker weights."""
     couplings: Array | None = None
-    """Couplings of the state."""
+    """Field `couplings` of the state."""
 
     @property
     def errors(self) -> Array:
-        """Model minus measured, m, shape (T, S, 3, K)."""
+        """Marker position of the model minus measured position, m, shape (T, S, 3, K)."""
         return self.cloud[..., 4:, :]
 
     @property
     def cost(self) -> Array:
-        """Sum of weighted squares, m^2, shape (T,)."""
+        """Sum of the weighted squared errors, m^2, shape (T,)."""
         return np.asarray(
             np.einsum("tsik,tsik->t", self.cloud[..., 4:, :], self.weighted[..., 4:, :])
         )
@@ -131,9 +132,9 @@ def marker_fit(slots: MarkerSlots, state: ChainState, measured: Array, weights: 
     state
         State of the chain.
     measured
-        Shape (T, S, 3, K), m, finite.
+        Measured positions, m, shape (T, S, 3, K), finite.
     weights
-        Shape (T, S, K), zero where markers are missing.
+        Weights of the markers, shape (T, S, K), zero where markers are missing.
     """
     world = transforms(slots.layout, state)
     cloud = np.empty((*world.shape[:2], 7, slots.shape[1]))
@@ -171,14 +172,14 @@ def normal_equations(slots: MarkerSlots, at: MarkerFit) -> tuple[Array, Array]:
 
 
 def lower_equations(slots: MarkerSlots, at: MarkerFit) -> tuple[Array, Array]:
-    """Return the lower triangle of J^T W J, as used by Cholesky, and J^T W e."""
+    """Return the lower triangle of J^T W J, for a Cholesky decomposition, and J^T W e."""
     layout, count = slots.layout, len(at.world)
     sums = at.cloud[..., :4, :] @ at.weighted.swapaxes(-1, -2)
     beyond = layout.below @ sums.reshape(count, -1, 28)
     bodies = (beyond @ _INERTIA).reshape(count, -1, 6, 7)
     motion = twists(layout, at.world, at.couplings)
 
-    # Loop over segments: the inertia of all degrees of freedom at once would need more memory.
+    # A loop over segments needs less memory than the inertia of all degrees of freedom at once.
     pushed = np.empty((*motion.shape[:2], 7))
     for s, columns in layout.columns:
         np.matmul(motion[:, columns], bodies[:, s], out=pushed[:, columns])

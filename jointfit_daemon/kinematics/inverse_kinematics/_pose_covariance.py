@@ -1,14 +1,14 @@
 r"""Covariance of poses from inverse kinematics, and the degrees of freedom without information.
 
-With J the derivative of the marker positions by a step and W the weights, the covariance of a step
-is
+Let J be the derivative of the marker positions with respect to a step, and W the weights. The
+covariance of a step is
 
 .. math:: C_t = s^2 (J_t^T W_t J_t)^{-1}, \qquad
           s^2 = \frac{\sum_{tm} w_{tm} |e_{tm}|^2}{\sum_t (3 n_t - n_q)}
 
-with :math:`n_t` the number of markers at instant t, :math:`n_q` the degrees of freedom, and e the
-marker errors. The covariance assumes independent marker errors. Errors of the model (scale, joint
-centers) are not included.
+where :math:`n_t` is the number of markers at instant t, :math:`n_q` the number of degrees of
+freedom, and e are the marker errors. The covariance assumes independent marker errors. Errors of
+the model (scale, joint centers) are not included.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.inverse_kinematics._solver import IkResult
 
 _RIDGE = 1e-9
-"""Information, m^2/rad^2, that makes the matrix of undetermined instants invertible."""
+"""Information, m^2/rad^2, that is added to make the matrix of undetermined instants invertible."""
 _TOGETHER = 500
-"""Instants computed at once, which bounds the memory."""
+"""Number of instants that are computed at once, which limits the memory."""
 
 
 def pose_covariance(model: ChainModel, found: IkResult) -> tuple[Array, NDArray[np.bool_]]:
@@ -41,8 +41,8 @@ def pose_covariance(model: ChainModel, found: IkResult) -> tuple[Array, NDArray[
     covariance
         Covariance of a step from the true state, rad^2 and m^2, shape (T, nq, nq).
     determined
-        Mask, shape (T, nq). False if the information about a degree of freedom, with all others
-        free, is less than the information of one marker 2 cm from the axis.
+        Mask, shape (T, nq). It is False if the information about a degree of freedom, while all
+        others are free, is less than the information of one marker 2 cm from the axis.
     """
     w = found.weights
     seen = np.where(np.isfinite(found.residuals).all(axis=-1), w, 0.0) > 0.0

@@ -1,4 +1,4 @@
-r"""Sequential inverse kinematics: one instant at a time, with the covariance of each pose.
+r"""Sequential inverse kinematics for one instant at a time, with the covariance of each pose.
 
 The solver extrapolates the last pose to the next instant, and takes one or a few safeguarded
 Gauss-Newton steps. If the marker errors remain large, the solver restarts from the markers alone
@@ -6,12 +6,12 @@ Gauss-Newton steps. If the marker errors remain large, the solver restarts from 
 
 .. math:: \Sigma = \sigma^2 \left(\sum_m w_m J_m^T J_m\right)^{-1}
 
-with :math:`\sigma` the marker error per axis, given or estimated from the residuals. J is the
-Jacobian and w the weight of marker m. Degrees of freedom that the markers leave undetermined keep
-their last values; their variance in :math:`\Sigma` is large, but finite.
+where :math:`\sigma` is the marker error per axis, which is configured or estimated from the
+residuals. J is the Jacobian and w the weight of marker m. Degrees of freedom that the markers do
+not determine keep their last values. Their variance in :math:`\Sigma` is large, but finite.
 
-Invariant: an instant evaluates the marker errors at most `MOST_EVALUATIONS` times, whatever the
-markers.
+Invariant: the marker errors are evaluated at most `MOST_EVALUATIONS` times per instant, for every
+input.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _MOST_FOLLOWING = 8
 """Largest number of evaluations in an instant without a restart. A search that reaches this number
 continues in the next instant."""
 _TRIES = 6
-"""Largest number of attempts of a step, each with more damping."""
+"""Largest number of attempts of a step; each attempt has more damping."""
 _RESTART_STEPS = 10
 """Largest number of steps after a restart."""
 _LAST_STEP = 3e-3
@@ -57,11 +57,15 @@ _OPEN_SLACK = 1e-2  # tolerance, because the regularization may raise the marker
 _FORGETTING = 0.02
 _FIRST_SD_M = 0.003
 _FIRST_INSTANTS = 5
-"""Weight of the initial standard deviation in the estimate of the marker error, in instants."""
+"""Number of instants to which the initial standard deviation is equivalent in the estimate of the
+marker error.
+"""
 _MOST_PATIENCE = 32
-"""Most restart intervals between two restarts of a chain that does not fit its markers."""
+"""Largest number of restart intervals between two restarts of a chain that does not fit its
+markers.
+"""
 _STRAIGHTEN = 32
-"""Instants between two re-orthonormalizations of the rotations."""
+"""Number of instants between two re-orthonormalizations of the rotations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,16 +73,21 @@ class LiveOptions:
     """Options of the sequential solver; the defaults are for skin-mounted markers at 100 Hz."""
 
     steps: int = 2
-    """Largest number of steps per instant; after two steps the cost is within 0.1 % of the minimum
-    at 100 Hz."""
+    """Largest number of steps per instant. At 100 Hz the cost is within 0.1 % of the minimum after
+    two steps.
+    """
     huber_m: float | None = None
     """Huber threshold c of the marker error, m: larger errors have weight c/|e|; None: least
     squares.
     """
     hold_m2: float = 1e-4
-    """Weight, m^2/rad^2, toward the last instant where the markers leave a joint undetermined."""
+    """Weight of the pose at the last instant for joints that the markers do not determine,
+    m^2/rad^2.
+    """
     marker_sd_m: float | None = None
-    """Marker error per axis, m; None: estimated from the residuals of the last 50 instants."""
+    """Marker error per axis, m. If None, it is estimated from the residuals of the last 50
+    instants.
+    """
     lost_m: float = 0.06
     """Tracking error, m, above which an instant restarts from the markers alone."""
     restart_interval: int = 1
@@ -87,7 +96,7 @@ class LiveOptions:
 
 @dataclass(frozen=True, slots=True)
 class LivePose:
-    """Chain at one instant."""
+    """Pose of a chain at one instant."""
 
     state: ChainState
     """State of the chain at this instant."""
@@ -96,15 +105,15 @@ class LivePose:
     origins: Array
     """Origins of the segments in the world, m, shape (S, 3)."""
     residuals: Array
-    """Marker of the model minus measured, m, shape (M, 3); NaN where missing."""
+    """Marker position of the model minus measured position, m, shape (M, 3); NaN where missing."""
     covariance: Array
     """Covariance of the step from the true state, rad^2 and m^2, shape (nq, nq)."""
     determined: NDArray[np.bool_]
-    """Degrees of freedom with at least the information of one marker at a distance of 2 cm from
-    the axis, while all others are free; shape (nq,).
+    """Mask of the degrees of freedom that the markers determine, shape (nq,). The information about
+    them, while all others are free, is at least that of one marker 2 cm from the axis.
     """
     underdetermined: bool
-    """Whether the markers left a degree of freedom undetermined, which then kept its last value."""
+    """Whether the markers do not determine a degree of freedom, which then keeps its last value."""
     restarted: bool
     """Whether the solver restarted from the markers instead of the last pose."""
     evaluations: int
@@ -119,7 +128,7 @@ class LiveInverseKinematics:
     model
         The chain.
     options
-        `LiveOptions()` by default.
+        Options of the solver; `LiveOptions()` by default.
     """
 
     def __init__(self, model: ChainModel, options: LiveOptions | None = None) -> None:
@@ -133,8 +142,9 @@ class LiveInverseKinematics:
         self._fed = 0
         self._restarted_at = 0
         self._patience = 1
-        """Number of restart intervals to wait; every restart without improvement doubles this
-        number."""
+        """Number of restart intervals to wait. Every restart without improvement doubles this
+        number.
+        """
         self._learned = 0
         self._still = np.zeros(model.nq)
         self._lead = self._still
@@ -168,7 +178,7 @@ class LiveInverseKinematics:
         self._lead = self._still if place.is_open or restarted else place.moved
         self._state = place.state
         if self._fed % _STRAIGHTEN == 0:
-            # Make the rotations orthonormal by one Newton step to A^T A = 1.
+            # Make the rotations orthonormal by one Newton step towards A^T A = 1.
             A = place.state.rotations
             turned = 1.5 * A - 0.5 * (A @ (A.swapaxes(-1, -2) @ A))
             self._state = replace(place.state, rotations=turned)
@@ -211,11 +221,11 @@ class LiveInverseKinematics:
         weights: Array,
         limits: tuple[int, int],
     ) -> _Place:
-        """Take the steps of one instant, starting from the last state extrapolated by `lead`.
+        """Take the steps of one instant, starting from the last state moved by the step `lead`.
 
         `limits` are the largest numbers of steps and of evaluations in the instant. The returned
-        Cholesky factor was computed at the start of the last step. The difference from the factor
-        at the final state is far below the accuracy of a covariance.
+        Cholesky factor was computed at the start of the last step. Its difference from the factor
+        at the final state is negligible in a covariance.
         """
         steps, most = limits
         place, w = self._moved(last, lead, measured, weights), weights
@@ -247,7 +257,7 @@ class LiveInverseKinematics:
             return weights
         errors = at.errors
         square = np.einsum("tsik,tsik->tsk", errors, errors)
-        # ignore the meaningless, often large errors of missing markers
+        # errors of missing markers are meaningless and often large
         square *= weights > 0.0
         if square.max() <= (limit - _ROUNDING) ** 2:
             return weights
@@ -256,8 +266,7 @@ class LiveInverseKinematics:
     def _equations(self, place: _Place, reference: ChainState) -> _Equations:
         """Return normal matrix and gradient.
 
-        Both are regularized toward `reference` where markers leave a degree of freedom
-        undetermined.
+        Both are regularized toward `reference` if the markers do not determine a degree of freedom.
         """
         lower, gradient = lower_equations(self._slots, place.at)
         H, g = lower[0], gradient[0]
@@ -293,7 +302,7 @@ class LiveInverseKinematics:
         residuals = self._slots.taken(place.at.errors)[0]
         residuals[~seen] = np.nan
         self._learn(place.cost, int(seen.sum()))
-        # dpotri would start threads for every matrix, however small
+        # dpotri would start threads even for small matrices
         inverse = lapack.dpotrs(place.factor, self._identity, lower=1)[0]
         determined = inverse.diagonal() * OPEN_M2 * self._typical <= 1.0
         covariance = self._variance * inverse
@@ -333,7 +342,7 @@ class _Equations(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Place:
-    """State from which an instant may start."""
+    """State during the solution of one instant."""
 
     state: ChainState
     at: MarkerFit
@@ -354,6 +363,6 @@ class _Place:
 
 
 def _straightened(state: ChainState) -> ChainState:
-    """Return the state with orthonormal rotations: one Newton step to A^T A = 1."""
+    """Return the state with orthonormal rotations, by one Newton step towards A^T A = 1."""
     A = state.rotations
     return replace(state, rotations=1.5 * A - 0.5 * (A @ (A.swapaxes(-1, -2) @ A)))

@@ -4,11 +4,11 @@ At every instant
 
 .. math:: q_t = \arg\min_q \sum_m w_{tm} |x_m(q) - y_{tm}|^2
 
-is solved by the Levenberg-Marquardt method, with marker positions x of the model, measured
-positions y and weights w. All instants are solved in parallel, each with its own damping. Missing
-markers (NaN) have no weight. Instants at which the markers leave a degree of freedom undetermined
-are reported. A second pass solves these instants in order, each starting from the preceding pose
-and regularized toward this pose.
+is computed by the Levenberg-Marquardt method, where x are marker positions of the model, y measured
+positions and w weights. All instants are solved in parallel, each with its own damping. Missing
+markers (NaN) have no weight. If the markers do not determine a degree of freedom at an instant, the
+instant is reported. A second pass solves these instants in order. Each starts from the preceding
+pose and is regularized toward this pose.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.kinematics.chains import ChainModel, ChainState
 
 _TOGETHER = 4096
-"""Degrees of freedom solved together, so that their arrays fit in the processor cache."""
+"""Number of degrees of freedom that are solved together, so that their arrays fit in the processor
+cache.
+"""
 OPEN_M2 = 4e-4
 """Information, m^2/rad^2, below which a degree of freedom is undetermined: (2 cm)²."""
 
@@ -58,14 +60,16 @@ class IkOptions:
     reweightings: int = 2
     """Number of passes with updated robust weights."""
     hold_m2: float = 1e-4
-    """Weight, m^2/rad^2, toward the instant before where the markers leave a joint undetermined."""
+    """Weight of the pose at the preceding instant for joints that the markers do not determine,
+    m^2/rad^2.
+    """
     limit_m2: float = 0.0
-    """Weight, m^2/rad^2, of the excess over a joint's limits; 0 ignores the limits."""
+    """Weight of the squared excess over a joint's limits, m^2/rad^2; 0 ignores the limits."""
 
 
 @dataclass(frozen=True, slots=True)
 class IkResult:
-    """Poses at T instants with their marker errors; S segments, M markers."""
+    """Poses of S segments at T instants, with the errors of M markers."""
 
     state: ChainState
     rotations: Array
@@ -73,13 +77,14 @@ class IkResult:
     origins: Array
     """World origins of the segments, m, shape (T, S, 3)."""
     residuals: Array
-    """Model minus measured marker, m, shape (T, M, 3); NaN where missing."""
+    """Marker position of the model minus measured position, m, shape (T, M, 3); NaN where missing.
+    """
     weights: Array
-    """Final weights, shape (T, M): 0 where missing, robust factors included."""
+    """Final weights, including robust factors, shape (T, M); 0 where missing."""
     converged: NDArray[np.bool_]
     """Whether the iteration converged, shape (T,)."""
     underdetermined: NDArray[np.bool_]
-    """Whether the markers left a degree of freedom undetermined, shape (T,)."""
+    """Whether the markers do not determine a degree of freedom, shape (T,)."""
     iterations: NDArray[np.intp]
     """Number of iterations, shape (T,)."""
 
@@ -103,14 +108,14 @@ def solve_frames(
     weights : array_like, shape (M,) or (T, M), optional
         Weights of squared errors; the weights of the model by default.
     start
-        Initial state of length T; computed from the markers by default.
+        Initial state at T instants; computed from the markers by default.
     options
-        `IkOptions()` by default.
+        Options of the solver; `IkOptions()` by default.
 
     Raises
     ------
     ValueError
-        Inconsistent shapes or negative weights.
+        Shapes are inconsistent or weights are negative.
     """
     options = options or IkOptions()
     measured, seen = checked_markers(model, markers)
@@ -176,7 +181,7 @@ class _Solution:
         self.iterations[instants] += found.iterations
 
     def is_open(self) -> NDArray[np.bool_]:
-        """Return the instants at which the markers leave a degree of freedom undetermined.
+        """Return the instants at which the markers do not determine a degree of freedom.
 
         At these instants a Cholesky pivot of the normal matrix is small. A pivot is the information
         about one degree of freedom while all later degrees of freedom are free.
@@ -190,9 +195,9 @@ class _Solution:
     ) -> None:
         """Solve the undetermined instants again, each from the preceding instant.
 
-        At the start of the trial, the following instant is used. Runs of undetermined instants are
-        independent: the first instants of all runs are solved together, then the second instants,
-        and so on.
+        At the start of the trial, the following instant is used instead. Runs of undetermined
+        instants are independent. The first instants of all runs are therefore solved together, then
+        the second instants, and so on.
         """
         for instants, before in _waves(doubtful):
             last = self.state.take(before)
@@ -227,7 +232,7 @@ def open_instants(H: Array) -> NDArray[np.bool_]:
 
 
 def _waves(doubtful: NDArray[np.bool_]) -> list[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-    """Return groups of instants to solve together, with the solved instants as start."""
+    """Return groups of instants to solve together, with the instants from which they start."""
     good = np.flatnonzero(~doubtful)
     bad = np.flatnonzero(doubtful)
     if not good.size:
