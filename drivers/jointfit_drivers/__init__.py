@@ -1,4 +1,4 @@
-"""Drivers open, configure and read devices: one package per device family, found by entry point."""
+"""Drivers that open, configure and read devices: one package per device family."""
 
 from jointfit_variant import select_variant
 

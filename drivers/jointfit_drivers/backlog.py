@@ -1,28 +1,30 @@
 """Delay of the messages of one device, relative to its fastest messages.
 
-After a silence, buffered messages arrive together: all of them are late, the last one by the least.
-Device time and arrival time then advance differently although the device continued. With e the
-elapsed arrival time and d the advance of device time between two messages, the delay of the second
-is
+After a silence, buffered messages arrive together. All of them are late; the first has the largest
+delay and the last the smallest. Device time and arrival time then advance differently although the
+device continued. Between two messages, e is the elapsed arrival time and d is the advance of device
+time. The delay L' of the second message follows from the delay L of the first:
 
     L' = max(0, L + (1 - m) e - d),   m = 0.1 %.
 
-The margin m keeps the skew of a slow device clock from accumulating as delay. After opening, the
-delay is unknown until messages have arrived at their own pace.
+The margin m prevents the skew of a slow device clock from accumulating as delay. After the port is
+opened, the delay is unknown until messages have arrived at the device's own rate.
 
+Invariant: the result depends only on the steps fed, in any unit of time. The module reads no clock.
 Invariant: a function of the steps fed, without a clock of its own; any unit of time.
 """
 
 from __future__ import annotations
 
 _SKEW = 0.001
-"""Margin m, relative; twice the largest plausible skew of a device clock."""
+"""Margin m, relative. It is twice the largest plausible skew of a device clock."""
 _BURST_SHARE = 0.5
-"""A delay below the shortest one by more than this share of the advance shows a burst."""
+"""Share of the advance. A delay that is below the shortest delay by more than this share shows a
+burst."""
 
 
 class BacklogDelay:
-    """Delay of the last message of one device."""
+    """Estimates the delay of the last message of one device."""
 
     __slots__ = ("_delay", "_paced")
 
@@ -31,14 +33,14 @@ class BacklogDelay:
         self._paced = 0.0  # time since the shortest delay was found
 
     def feed(self, advance: float, elapsed: float) -> None:
-        """Add a message of a device that continued.
+        """Add a message of a device that continued to run.
 
         Parameters
         ----------
         advance
-            Step of device time since the message before it.
+            Step of device time since the previous message.
         elapsed
-            Time between their arrivals, in the same unit.
+            Time between the arrivals of the two messages, in the same unit.
         """
         delay = self._delay + (1.0 - _SKEW) * elapsed - advance
         burst = -delay > _BURST_SHARE * advance
@@ -51,9 +53,9 @@ class BacklogDelay:
         Parameters
         ----------
         settle
-            Time at the device's own pace after which the delay is known.
+            Time with messages at the device's own rate after which the delay is known.
         unknown
-            Limit until then.
+            Limit that is returned until the delay is known.
         """
         return self._delay if self._paced >= settle else max(self._delay, unknown)
 
@@ -61,8 +63,8 @@ class BacklogDelay:
 def device_continued(delay: float, advance: float, elapsed: float, tolerance: float) -> bool:
     """Return whether a backlog and the arrival times explain a step of device time.
 
-    Device time may advance more than the arrival times by at most the delay of the message before
-    it: no message arrives before it was sent.
+    Device time may advance by more than the elapsed arrival time, but only by the delay of the
+    previous message, because no message arrives before it is sent.
 
     Parameters
     ----------
@@ -71,8 +73,8 @@ def device_continued(delay: float, advance: float, elapsed: float, tolerance: fl
     advance
         Step of device time.
     elapsed
-        Time between the arrivals.
+        Time between the arrivals of the two messages.
     tolerance
-        Largest error of the comparison; all four in the same unit.
+        Largest error of the comparison. All four arguments have the same unit.
     """
     return -tolerance <= advance - elapsed <= delay + tolerance

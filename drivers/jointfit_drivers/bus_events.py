@@ -1,6 +1,6 @@
-"""Corrupt data and errors of a CAN bus, for the decoder of one of its devices.
+"""Events of corrupt data and errors on a CAN bus, for the decoder of one device on the bus.
 
-Invariant: the output depends only on the frames added; no clock and no bus is read.
+Invariant: the output depends only on the frames added. The module reads no clock and no bus.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Decoded, DeviceEventKind
 
 _REPEAT_NS = 1_000_000_000
-"""Shortest interval, ns, between reports of the same error."""
+"""Shortest interval between two reports of the same error, ns."""
 
 
 class BusEvents:
-    """Counts discarded bytes, and reports errors."""
+    """Counts discarded bytes, and reports errors of the bus."""
 
     def __init__(self) -> None:
         self.discarded_bytes = 0
-        """Number of bytes in rejected records and in lost lines of an adapter."""
+        """Number of bytes in rejected records and in lines that an adapter lost."""
         self._text = ""
         self._reported_ns = 0
 
     def discard(self, count: int, reason: str, rejected: int = 0) -> Corrupt:
-        """Count `count` corrupt bytes, `rejected` messages in them, and return them as an event."""
+        """Count `count` corrupt bytes with `rejected` messages, and return them as an event."""
         self.discarded_bytes += count
         return Corrupt(count, reason, rejected)
 
     def add_error_frame(self, frame: can.CanFrame) -> list[Decoded]:
-        """Return the events of an error frame of the controller, its driver or the host."""
+        """Return the events of an error frame from the controller, its driver or the host."""
         if frame.can_id == can.HOST_CORRUPT:
             return [self.discard(can.host_count(frame), "no SLCAN line")]
         if frame.can_id == can.HOST_DROPPED:
@@ -44,7 +44,7 @@ class BusEvents:
         return self.limited("error" if serious else "warning", text, frame.t_ns)
 
     def limited(self, kind: DeviceEventKind, text: str, t_ns: int) -> list[Decoded]:
-        """Return an event unless the same one was reported within a second before `t_ns`."""
+        """Return an event, unless the same event was reported within a second before `t_ns`."""
         if text == self._text and 0 <= t_ns - self._reported_ns < _REPEAT_NS:
             return []
         self._text, self._reported_ns = text, t_ns

@@ -1,9 +1,9 @@
-"""Parts that decoders of IMUs on a CAN bus share: records to frames, and errors of the bus.
+"""Base class of decoders for IMUs on a CAN bus: conversion of records to frames, and bus errors.
 
-A chunk of a CAN bus contains records of 24 bytes: frames of the device, error frames of the
-controller, and notes of this host about frames and bytes that it lost.
+A chunk of a CAN bus contains records of 24 bytes. A record is a frame of the device, an error frame
+of the controller, or a note of this host about lost frames and bytes.
 
-Invariant: the output depends only on the chunks fed; no clock and no bus is read.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no bus.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 
 class CanDecoder(ABC):
-    """Decoder of one device; a subclass converts its frames.
+    """Decoder of one device. A subclass converts the device's frames.
 
     Parameters
     ----------
     ids : collection of CanKey
-        Number of each of its identifiers, and whether it has 29 bits. Other frames are ignored.
+        Identifiers of the device: number, and whether it has 29 bits. Other frames are ignored.
     samples : CheckedSamples
-        New checks; `convert` adds its samples to them.
+        Checks for samples. `convert` adds its samples to them.
     """
 
     def __init__(self, ids: Collection[CanKey], samples: CheckedSamples) -> None:
@@ -43,27 +43,27 @@ class CanDecoder(ABC):
     def convert(self, frame: can.CanFrame) -> Iterable[Decoded]:
         """Return the samples and events that a frame of the device completes.
 
-        `frame.t_ns` is its arrival. A frame that cannot be used is counted by
-        ``self.samples.refuse(RECORD_BYTES, reason)``.
+        `frame.t_ns` is the arrival of the frame. If a frame cannot be used, call
+        ``self.samples.refuse(RECORD_BYTES, reason)``, which counts it.
         """
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """Unit and modulus of the device time; None without one."""
+        """Unit and modulus of the device time; None if the device sends no time."""
         return self.samples.tick_clock
 
     @property
     def messages(self) -> int:
-        """Number of well-formed frames of this device so far."""
+        """Number of well-formed frames received from this device."""
         return self._frames - self.samples.refused
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records and in lost lines of an adapter."""
+        """Number of bytes in rejected records and in lines that an adapter lost."""
         return self._bus.discarded_bytes + self.samples.refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
+        """Return the samples and events that `chunk` completes, in wire order; never raise."""
         out: list[Decoded] = []
         for item in can.unpack_frames(chunk.data):
             if not isinstance(item, can.CanFrame):
@@ -76,5 +76,5 @@ class CanDecoder(ABC):
         return out
 
     def flush(self) -> list[Decoded]:
-        """Refuse a sample that waits for confirmation."""
+        """Reject a sample that waits for confirmation."""
         return self.samples.flush()

@@ -1,4 +1,4 @@
-"""Reception of the frames of one device on a CAN bus, over all attempts of its driver."""
+"""Reception of the frames of one device on a CAN bus, across all attempts of its driver."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _LONGEST_SILENCE_S = 30.0
-"""Longest wait, s, for the first frame of a device that is lost; the wait doubles with every
-attempt. The device stays subscribed meanwhile, so its first frame is received at once. From then
-on `silence_s` applies."""
+"""Longest wait for the first frame of a lost device, s. The wait doubles with every attempt. During
+the wait the device stays subscribed, so its first frame is received at once. After the first frame
+`silence_s` applies."""
 _RAW_FRAMES = 20
-"""Frames logged at debug level, so that the log contains raw data of a device."""
+"""Number of frames that are logged at debug level, so that the log contains raw data of a
+device."""
 
 
 class CanDeviceSettings(Protocol):
-    """Keys of an ``[[imu]]`` table on a CAN bus."""
+    """Keys that the ``[[imu]]`` table of a device on a CAN bus must have."""
 
     @property
     def id(self) -> str:
@@ -34,11 +35,11 @@ class CanDeviceSettings(Protocol):
 
     @property
     def can(self) -> CanBusSettings:
-        """Settings of the CAN bus of the sensor."""
+        """Settings of the sensor's CAN bus."""
 
     @property
     def silence_s(self) -> float:
-        """Time without a frame after which it counts as lost, s."""
+        """Time without a frame after which the device counts as lost, s."""
 
 
 class CanReception:
@@ -49,7 +50,7 @@ class CanReception:
     settings : CanDeviceSettings
         Table of the device in rig.toml.
     configured_by : str
-        How its identifiers and outputs are changed, for error messages.
+        Description of how to change the device's identifiers and outputs, for error messages.
     """
 
     def __init__(self, settings: CanDeviceSettings, configured_by: str) -> None:
@@ -65,19 +66,19 @@ class CanReception:
         needed: CanKey,
         resembles: Callable[[bytes], bool] = lambda _: False,
     ) -> None:
-        """Emit the frames with one of `ids` until cancelled; see `SharedBus.pump`.
+        """Emit the frames that have one of `ids` until cancelled; see `SharedBus.pump`.
 
         Parameters
         ----------
         emit : callable
-            Receives chunks of packed frames.
+            Function that receives chunks of packed frames.
         ids : mapping
-            Name of the quantity that each identifier carries, for error messages.
+            Identifiers of the device, each with the name of its quantity for error messages.
         needed : CanKey
-            Identifier in `ids` of the frames with measurements.
+            Identifier of the frames with measurements; one of `ids`.
         resembles : callable
-            Whether the data of a frame resemble the data of `needed`, for a hint in the error
-            message.
+            Function that returns whether the data of a frame resemble those of `needed`. It is used
+            for a hint in the error message.
         """
         settings = self._settings
         left = _RAW_FRAMES if log.isEnabledFor(logging.DEBUG) else 0

@@ -1,9 +1,9 @@
-"""Checks that every IMU sample passes: norm and sign of its quaternion, its time and its counter.
+"""Checks of every IMU sample: norm and sign of the quaternion, device time and message counter.
 
-Decoders of one device share them. Lost messages, restarts, a wrong scale and another rate than the
-configured one become device events.
+The decoders of all IMUs use these checks. Lost messages, restarts, a wrong scale and a rate other
+than the configured rate become device events.
 
-Invariant: the output depends only on the samples added; no clock and no port is read.
+Invariant: the output depends only on the samples added. The module reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ if TYPE_CHECKING:
 
 
 _INTERVALS = 20
-"""Intervals whose median is the period: lost messages do not change it."""
+"""Number of intervals whose median is the period, so that lost messages do not change it."""
 _WRONG_RATE = 0.1
-"""Largest relative deviation of the rate from the configured one without a warning."""
+"""Largest relative deviation from the configured rate that causes no warning."""
 
 
 class _HeldSample(NamedTuple):
@@ -44,9 +44,10 @@ class CheckedSamples(Refusals):
     tick_clock : TickClock, optional
         Unit and modulus of the device time; None if the device sends none.
     counts : int, optional
-        Number of values of the message counter, 256 for one byte; None if it never wraps.
+        Number of values of the message counter, for example 256 for one byte; None if it never
+        wraps.
     tolerance : float
-        Largest deviation of the quaternion norm from 1; 0.05 suits integers in thousandths.
+        Largest deviation of the quaternion norm from 1. Use 0.05 for integers in thousandths.
     """
 
     def __init__(
@@ -73,9 +74,10 @@ class CheckedSamples(Refusals):
         Parameters
         ----------
         sample
-            `q_world_sensor` has the canonical direction and axes; norm and sign are arbitrary.
+            Next sample. `q_world_sensor` has the canonical direction and axes, but any norm and
+            sign.
         size
-            Bytes of its message on the wire.
+            Number of bytes of the sample's message on the wire.
         """
         if sample.ticks is None and sample.counter is None:
             return self._admit(sample, size)
@@ -96,7 +98,7 @@ class CheckedSamples(Refusals):
             out = self.flush()  # the next sample contradicts the held one
             lost = step.lost
 
-        # one sample never proves a restart: a checksum passes some corrupt messages
+        # A single sample cannot prove a restart, because some corrupt messages pass a checksum.
         if step.held:
             self._held = _HeldSample(sample, size)
             return out
@@ -106,14 +108,14 @@ class CheckedSamples(Refusals):
 
     @override
     def flush(self) -> list[Decoded]:
-        """Refuse a sample that no later one confirmed."""
+        """Reject a sample that no later sample confirmed."""
         held, self._held = self._held, None
         if held is None:
             return []
         return [self.refuse(held.size, "time and counter disagree with the other samples")]
 
     def _admit(self, sample: ImuSample, size: int) -> list[Decoded]:
-        """Return the sample with a unit quaternion, or the reason why it has none."""
+        """Return the sample with a unit quaternion, or the reason why the sample is rejected."""
         q = self._gate.admit(sample.q_world_sensor)
         if q is not None:
             checked = sample._replace(q_world_sensor=q)
@@ -121,7 +123,7 @@ class CheckedSamples(Refusals):
                 return [checked]
             return [checked, *self._rate_warning(sample.ticks)]
 
-        # Warn once if hardly any of the first quaternions has norm 1.
+        # Warn once if hardly any of the first quaternions has the norm 1.
         out: list[Decoded] = [self.refuse(size, "quaternion norm is not 1")]
         norm = None if self._norm_checked else self._gate.misconfigured_norm
         if norm is not None:
@@ -132,7 +134,7 @@ class CheckedSamples(Refusals):
         return out
 
     def _rate_warning(self, ticks: int) -> list[Decoded]:
-        """Return a warning, once, if the first samples have another rate in device time."""
+        """Return a warning, once, if the first samples have another rate by device time."""
         last, self._last_ticks = self._last_ticks, ticks
         if last is None:
             return []

@@ -1,8 +1,8 @@
 """Driver of Bosch / CEVA BNO085 and BNO086 on a serial port.
 
 `RvcDecoder` and `ShtpDecoder` are the pure part. `Bno085Imu.run` opens the port, makes the device
-send and reads until cancelled. `run` passes nothing but chunks to the decoder. The mode of the
-device determines the speed of the port.
+send and reads until cancelled. The decoder receives only the chunks that `run` emits. The mode of
+the device determines the speed of the port.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Bno085Imu:
-    """One BNO085 or BNO086: orientation and an 8-bit number of samples, without device time."""
+    """One BNO085 or BNO086: orientation and an 8-bit sample number, without device time."""
 
     Settings: ClassVar[type[Bno085Settings]] = Bno085Settings
     wire: ClassVar[Wire] = "stream"
@@ -48,7 +48,7 @@ class Bno085Imu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the device is of another kind or in another mode, or it
+            The file is not a serial port, or the device is of another kind, in another mode, or
             does not accept the rate.
         """
         settings = self._settings

@@ -1,10 +1,11 @@
-"""From an open port to a BNO085 that sends the required reports, or to the error.
+"""Start of a BNO085: makes it send the required reports, or raises an error with the cause.
 
-In UART-RVC the device sends without being asked and ignores the host. In UART-SHTP it is silent
-after a reset; the settings of reports are read, and changed only where they differ. The settings
-are lost at the next reset: the driver stores nothing.
+In the mode UART-RVC, the device sends without a request and ignores the host. In the mode
+UART-SHTP, it is silent after a reset. The driver reads the settings of the reports, and changes
+only those that differ. The device loses these settings at the next reset, because the driver does
+not store them.
 
-Source: BNO08X data sheet 1000-3927, section 1.3.1: bytes to the device are separated by 100 us.
+Source: BNO08X data sheet 1000-3927, section 1.3.1. Bytes to the device must be separated by 100 us.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ if TYPE_CHECKING:
     from jointfit_drivers.ports.serial_port import SerialPort
 
 _LISTEN_S = 0.5
-"""Longest wait for a frame of UART-RVC, s: fifty frames."""
+"""Longest wait for a UART-RVC frame, s, equal to fifty frames."""
 _REPLY_S = 0.5
 """Longest wait for a reply, s."""
 _BYTE_PAUSE_S = 0.0002
@@ -51,7 +52,7 @@ _RATE_TOLERANCE = 0.1
 
 
 class ShtpConversation(SerialConversation[ShtpPacket | ShtpBufferStatus]):
-    """Requests to one device in UART-SHTP and its replies."""
+    """Requests to one device in UART-SHTP, and the device's replies."""
 
     def __init__(self, port: SerialPort, emit: Emit) -> None:
         super().__init__(port, emit, ShtpCodec)
@@ -65,10 +66,10 @@ class ShtpConversation(SerialConversation[ShtpPacket | ShtpBufferStatus]):
             await asyncio.sleep(_BYTE_PAUSE_S)
 
     async def control(self, data: bytes, *, tries: int) -> bytes | None:
-        """Send a request on the control channel; return its reply, or None.
+        """Send a request on the control channel, and return its reply; None if there is none.
 
-        The reply to a request for the product id is that id. The reply to a request for a report is
-        the settings of the report.
+        The reply to a request for the product id is the product id. The reply to a request for a
+        report is the settings of the report.
         """
         wire = encode_shtp(ShtpChannel.CONTROL, self._sequence, data)
         self._sequence += 1
@@ -82,7 +83,7 @@ class ShtpConversation(SerialConversation[ShtpPacket | ShtpBufferStatus]):
 
 
 def _reply_to(request: bytes, message: ShtpPacket | ShtpBufferStatus) -> bytes | None:
-    """Return the report in `message` that answers `request`."""
+    """Return the report in `message` that answers `request`; None if there is none."""
     if not isinstance(message, ShtpPacket) or message.channel != ShtpChannel.CONTROL:
         return None
     for report in split_reports(message.payload) or ():
@@ -97,14 +98,14 @@ def _reply_to(request: bytes, message: ShtpPacket | ShtpBufferStatus) -> bytes |
 
 
 async def ensure_rvc(port: SerialPort, emit: Emit, settings: Bno085Settings) -> None:
-    """Return when frames of UART-RVC arrive.
+    """Return when UART-RVC frames arrive.
 
     Raises
     ------
     DeviceLostError
-        The line is silent.
+        No bytes arrive.
     DeviceMisconfiguredError
-        The bytes are no frames.
+        The received bytes are not UART-RVC frames.
     """
     conversation = SerialConversation[RvcFrame](port, emit, RvcCodec)
     conversation.reset()
@@ -122,12 +123,12 @@ async def ensure_rvc(port: SerialPort, emit: Emit, settings: Bno085Settings) -> 
 
 
 async def ensure_shtp(port: SerialPort, emit: Emit, settings: Bno085Settings) -> None:
-    """Return when the device was configured to send the required reports.
+    """Return when the device is configured to send the required reports.
 
     Raises
     ------
     DeviceLostError
-        The device is silent, or stopped answering.
+        The device does not answer, or has stopped answering.
     DeviceMisconfiguredError
         The device is of another kind or in another mode, or does not accept the rate.
     """
@@ -156,7 +157,7 @@ async def ensure_shtp(port: SerialPort, emit: Emit, settings: Bno085Settings) ->
 async def _interval(
     conversation: ShtpConversation, request: bytes, settings: Bno085Settings
 ) -> int:
-    """Return the interval of a report after a request, us; 0 if it is off."""
+    """Send a request; return the interval of the report in the reply, us; 0 if it is off."""
     reply = await conversation.control(request, tries=3)
     found = None if reply is None else decode_interval(reply)
     if found is None:

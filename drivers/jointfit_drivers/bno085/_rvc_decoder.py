@@ -1,14 +1,16 @@
-r"""Decoder of the mode UART-RVC: Euler angles to samples with canonical orientation.
+r"""Decoder of the mode UART-RVC: converts Euler angles to samples with canonical orientation.
 
-According to the data sheet, yaw, pitch and roll are successive rotations about z, y and x. The
-example message of the data sheet contradicts this: pitch -1.10 and roll 20.85 degrees with
-accelerations of -371, -20 and 977 mg. With pitch about x and roll about y (``zxy``),
+According to the data sheet, yaw, pitch and roll are successive rotations about z, y and x
+(``zyx``). The example message of the data sheet contradicts this. It contains pitch -1.10 and roll
+20.85 degrees with accelerations of -371, -20 and 977 mg. With pitch about x and roll about y
+(``zxy``),
 
 .. math:: R = R_z(\text{yaw})\, R_x(\text{pitch})\, R_y(\text{roll}), \qquad
     R^T e_z = (-0.356, -0.019, 0.934),
 
-which is the measured direction (-0.355, -0.019, 0.935); ``zyx`` gives (0.019, 0.356, 0.934). The
-default is therefore ``zxy``, and accelerations at rest show which one fits the device.
+which is the measured direction (-0.355, -0.019, 0.935). With ``zyx`` the direction is (0.019,
+0.356, 0.934). The default is therefore ``zxy``. Accelerations at rest show which order of axes fits
+the device.
 
 Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
 """
@@ -37,15 +39,15 @@ _FORCE = 9.80665e-3
 """Specific force of one count, m/s^2."""
 _COUNTS = 256
 _MOST_LOST = 128
-"""Smallest step of the index, modulo 256, that counts as a decrease."""
+"""Smallest step of the frame index, modulo 256, that counts as a decrease."""
 _REST = 0.06
-"""Largest deviation of an acceleration from 1 g at rest, relative."""
+"""Largest relative deviation of an acceleration from 1 g at rest."""
 _DISTINCT = 0.2
-"""Least difference of the two directions of gravity for a comparison."""
+"""Smallest difference between the two computed directions of gravity for a comparison."""
 _COMPARED = 100
-"""Frames at rest after which the two orders are compared."""
+"""Number of frames at rest after which the two orders of axes are compared."""
 _BETTER = 3.0
-"""Ratio of the two mean deviations from which the other order fits."""
+"""Ratio of the two mean deviations from which the other order of axes fits better."""
 _G_COUNTS = 1000.0
 
 
@@ -90,7 +92,7 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
         return out
 
     def _compare(self, frame: RvcFrame) -> list[Decoded]:
-        """Compare both orders with an acceleration at rest; warn if only the other order fits."""
+        """Compare both orders of axes with an acceleration at rest; warn if only the other fits."""
         x, y, z = frame.acceleration
         strength = sqrt(x * x + y * y + z * z) / _G_COUNTS
         if abs(strength - 1.0) > _REST:
@@ -112,11 +114,11 @@ class RvcDecoder(SerialMessageDecoder[RvcFrame]):
 
 
 def quaternion_of(angles: tuple[int, int, int], euler: Literal["zxy", "zyx"]) -> Quaternion:
-    """Return the orientation of yaw, pitch and roll in 0.01 degrees, sensor to world, z up."""
+    """Return the orientation q_world_sensor of yaw, pitch and roll in 0.01 degrees, z up."""
     (cz, sz), (cp, sp), (cr, sr) = (
         (cos(0.5 * _ANGLE * angle), sin(0.5 * _ANGLE * angle)) for angle in angles
     )
-    # q = q_z ⊗ (a + b i + c j + d k), with the product of pitch and roll in brackets
+    # q = q_z ⊗ (a + b i + c j + d k); the brackets contain the product of pitch and roll.
     if euler == "zxy":
         a, b, c, d = cp * cr, sp * cr, cp * sr, sp * sr
     else:

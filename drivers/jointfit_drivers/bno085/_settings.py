@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 RVC_BAUD, SHTP_BAUD = 115_200, 3_000_000
 """Speeds of the two modes, which the pins PS0 and PS1 select, bit/s."""
 RVC_HZ = 100
-"""Rate of the mode UART-RVC, Hz."""
+"""Output rate of the mode UART-RVC, Hz."""
 MAX_RATE_HZ = 400
 """Highest rate of rotation vectors, Hz."""
 _BITS = 10
 _PACKET_BYTES = 31
-"""Length of a packet with a base time and a rotation vector, with flags and some escapes, bytes."""
+"""Length of a packet with base time, rotation vector, flags and some escape bytes, bytes."""
 _REPORTS = {
     "rotation_vector": HubReportId.ROTATION_VECTOR,
     "game_rotation_vector": HubReportId.GAME_ROTATION_VECTOR,
@@ -52,10 +52,10 @@ class Bno085Settings(SerialImuSettings, GatewaySettings):
 
     @property
     def reports(self) -> tuple[HubReportId, ...]:
-        """Reports that make up one sample in UART-SHTP."""
+        """Ids of the reports that one sample consists of in UART-SHTP."""
         if self.orientation == "device":
             return (_REPORTS[self.report],)
-        # the report of the gyroscope is last: it completes a sample
+        # The gyroscope report is last, because it completes a sample.
         field = (HubReportId.MAGNETIC_FIELD,) if self.magnetometer else ()
         return (HubReportId.ACCELEROMETER, *field, HubReportId.GYROSCOPE_UNCALIBRATED)
 

@@ -1,9 +1,9 @@
-"""Decoder of the mode UART-SHTP: rotation vectors, or raw readings, to samples.
+"""Decoder of the mode UART-SHTP: converts rotation vectors or raw readings to samples.
 
-Reports have a number of 8 bits and no absolute time: a packet contains the time between measurement
-and transmission. A sample is stamped with the arrival of the first byte of its packet minus that
-time. There is no checksum: the decoder rejects packets with an impossible length or content, and
-quaternions whose norm is not 1.
+Reports have an 8-bit number and no absolute time. A packet contains the time between measurement
+and transmission. The stamp of a sample is the arrival of the first byte of its packet minus that
+time. Packets have no checksum. The decoder therefore rejects packets with an impossible length or
+content, and quaternions whose norm is not 1.
 
 Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
 """
@@ -46,18 +46,19 @@ if TYPE_CHECKING:
 
 _COUNTS = 256
 _MOST_LOST = 128
-"""Smallest step of a number, modulo 256, that counts as a decrease."""
+"""Smallest step of the report number, modulo 256, that counts as a decrease."""
 _OLDEST = 10_000
-"""Largest age of a measurement at transmission, 100 us; a larger one is corrupt."""
+"""Largest age of a measurement at transmission, 100 us. A measurement with a larger age is
+corrupt."""
 _RESET_COMPLETE = b"\x01"
 _PERIOD_COUNTS = 200
-"""Readings after which their measured period replaces the nominal one."""
+"""Number of readings after which their measured period replaces the nominal period."""
 _STALE_COUNTS = 2
-"""An acceleration is too old after this many readings of the gyroscope."""
+"""Number of gyroscope readings after which an acceleration is too old."""
 _SATURATED = 32_760
-"""Count of a gyroscope or accelerometer from which it is out of range."""
+"""Count of a gyroscope or accelerometer from which the reading is out of range."""
 _NEWEST = NewestKnown((3,), "the host that configures the device")
-"""Version of the SH-2 software that the reference manual describes."""
+"""Newest version of the SH-2 software, which the reference manual describes."""
 _CHANNELS = frozenset(map(int, ShtpChannel))
 _RATE_COUNT, _FORCE_COUNT = 2.0**-9, 2.0**-8
 
@@ -70,7 +71,8 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
     baud : int, optional
         Line speed, bit/s, for back-dating of stamps; None for USB.
     raw : RawSamples, optional
-        Computes orientations from raw readings; None if the device sends rotation vectors.
+        Filter that computes orientations from raw readings; None if the device sends rotation
+        vectors.
     preferred : int
         Rotation vector that is used if the device sends several kinds, whose headings differ. Until
         it arrives, the first kind is used.
@@ -124,7 +126,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return self._reports(message, reports)
 
     def _device_events(self, report: bytes) -> list[Decoded]:
-        """Return the events of a reply, with a warning about newer firmware."""
+        """Return the events of a reply, and a warning if the firmware is newer than supported."""
         events = _device_events(report)
         firmware = decode_firmware(report)
         if firmware is None:
@@ -132,7 +134,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return events + self._newer.take_version(".".join(map(str, firmware[0])))
 
     def _reports(self, packet: ShtpPacket, reports: list[bytes]) -> list[Decoded]:
-        """Return the samples of a packet of measurements."""
+        """Return the samples in a packet of measurements."""
         out: list[Decoded] = []
         base = 0
         sent_ns = self._arrival_of(packet)
@@ -148,7 +150,8 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
             if not -_OLDEST <= age <= _OLDEST:
                 return [*out, self._refusals.refuse(packet.size - 2, "time out of range")]
 
-            # an older measurement may follow a younger one of another sensor: stamps never decrease
+            # A report may follow a younger report of another sensor, but stamps must never
+            # decrease.
             self._arrival_ns = max(self._arrival_ns, sent_ns - max(age, 0) * TICK_NS)
             if self._raw is not None:
                 out += self._reading(report, self._raw)
@@ -157,7 +160,10 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return out
 
     def _orientation(self, packet: ShtpPacket, report: HubReport) -> list[Decoded]:
-        """Return the sample of a rotation vector, which is sent as i j k real."""
+        """Return the sample of a rotation vector.
+
+        The device sends it in the order i, j, k, real.
+        """
         i, j, k, real = report.values[:4]
         native = (real, i, j, k)
         q = self._gate.admit(native)
@@ -204,7 +210,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return kind == self._selected
 
     def _step(self, report: HubReport) -> tuple[int, list[Decoded]]:
-        """Return the number of steps since the last report of this sensor, and a loss."""
+        """Return the steps since the last report of this sensor, and the event of a loss."""
         last = self._sequences.get(report.report_id)
         self._sequences[report.report_id] = report.sequence
         step = 1 if last is None else (report.sequence - last) % _COUNTS
@@ -214,7 +220,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return step, [DeviceEvent("gap", f"{lost} messages lost", {"lost": lost})]
 
     def _reading(self, report: HubReport, raw: RawSamples) -> list[Decoded]:
-        """Process a raw reading; a reading of the gyroscope returns a sample."""
+        """Process a raw reading. A gyroscope reading returns a sample."""
         kind = report.report_id
         if kind == HubReportId.ACCELEROMETER:
             self._force, self._force_age = report, 0
@@ -242,9 +248,9 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return out + raw.take(stamp, reading, clipped=clipped)
 
     def _time_of_reading(self, step: int, nominal_ns: float) -> int:
-        """Return the time of a reading, ns: its number times the measured period.
+        """Return the time of a reading, ns, which is its number times the measured period.
 
-        Without a clock of the device, the period is computed from the arrivals since the first
+        The device has no clock, so the period is computed from the arrivals since the first
         reading.
         """
         if self._readings == 0:
@@ -258,7 +264,7 @@ class ShtpDecoder(SerialMessageDecoder[ShtpPacket | ShtpBufferStatus]):
         return self._reading_ns
 
     def _reset(self) -> list[Decoded]:
-        """Return the restart of a device that measured."""
+        """Return a restart event if the device measured before the reset."""
         self._gate.forget()
         self._sequences.clear()
         self._accuracy = None

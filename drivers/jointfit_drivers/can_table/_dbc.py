@@ -1,6 +1,6 @@
-"""Places of signals from a DBC file, which `cantools` reads (extra ``dbc``).
+"""Positions of signals in CAN frames, from a DBC file. `cantools` (extra ``dbc``) reads the file.
 
-Invariant: the package is imported by the functions of this module, and nowhere else.
+Invariant: only the functions of this module import that package.
 """
 
 from __future__ import annotations
@@ -22,33 +22,33 @@ PACKAGE_MISSING = (
     "`type` of the fields"
 )
 _NAMED = 12
-"""Most names that one error message lists."""
+"""Largest number of names in one error message."""
 _UNITS = {
     "rad/s": "rad/s", "deg/s": "deg/s", "dps": "deg/s", "°/s": "deg/s",
     "m/s2": "m/s2", "m/s^2": "m/s2", "m/s²": "m/s2", "g": "g", "mg": "mg",
     "s": "s", "ms": "ms", "us": "us", "µs": "us", "ns": "ns",
 }  # fmt: skip
-"""Units of rig.toml by their spelling in DBC files."""
+"""Units of rig.toml by their spellings in DBC files."""
 
 
 class DbcSignal(NamedTuple):
     """One signal of a DBC file."""
 
     key: tuple[int, bool]
-    """Identifier of its frame, and whether that has 29 bits."""
+    """Identifier of the signal's frame, and whether the identifier has 29 bits."""
     place: TableField
-    """Place in the frame, with scale and zero of the file."""
+    """Position in the frame, with scale and offset as in the file."""
     unit: str | None
-    """Unit of the signal, if rig.toml has it."""
+    """Unit of the signal; None if rig.toml has no such unit."""
 
 
 def read_signals(path: str, names: Sequence[str]) -> list[DbcSignal]:
-    """Return signals of a DBC file, named SIGNAL or MESSAGE.SIGNAL.
+    """Return signals of a DBC file. Their names are SIGNAL or MESSAGE.SIGNAL.
 
     Raises
     ------
     FieldFaultError
-        The package or the file is missing, the file is malformed or its signals overlap, or a
+        The package or the file is missing, the file is malformed, or its signals overlap. Or a
         signal is missing, ambiguous or multiplexed.
     """
     if find_spec("cantools") is None:
@@ -67,7 +67,7 @@ def read_signals(path: str, names: Sequence[str]) -> list[DbcSignal]:
 
 @lru_cache(maxsize=8)
 def _messages(path: str, stamp: int) -> list[Any] | str:
-    """Return the messages of a file, or why it cannot be used."""
+    """Return the messages of a file, or the reason why it cannot be used."""
     del stamp  # a changed file is read again
     import cantools  # noqa: PLC0415 - an extra
 

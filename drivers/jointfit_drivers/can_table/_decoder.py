@@ -1,10 +1,10 @@
-"""Decoder of the can-table driver: records of CAN frames in, samples in SI units out.
+"""Decoder of the driver can-table: converts records of CAN frames to samples in SI units.
 
-A sample is stamped with the first of its frames, because arbitration delays the later ones. Every
-record of 24 bytes is one of four: a frame of this device, a frame of another device, a note of the
+The stamp of a sample is the arrival of its first frame, because arbitration may delay the later
+frames. A record of 24 bytes is a frame of this device, a frame of another device, a note of the
 host, or a rejected record.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no bus.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no bus.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Chunk, Decoded, TickClock
 
 _HALVED = 20
-"""Number of incomplete samples before the first complete one at which a warning is given."""
+"""Number of incomplete samples, before the first complete sample, that causes a warning."""
 
 
 class CanTableDecoder:
@@ -31,9 +31,9 @@ class CanTableDecoder:
     Parameters
     ----------
     table : CanTable
-        Description of its frames.
+        Layout of the device's frames.
     form : SampleForm
-        Meaning of their numbers.
+        Meaning of the numbers in the frames.
     """
 
     def __init__(self, table: CanTable, form: SampleForm) -> None:
@@ -45,21 +45,21 @@ class CanTableDecoder:
 
     @property
     def tick_clock(self) -> TickClock | None:
-        """Unit and modulus of the device time; None without one."""
+        """Unit and modulus of the device time; None if the device sends no time."""
         return self._samples.tick_clock
 
     @property
     def messages(self) -> int:
-        """Number of well-formed frames of this device so far."""
+        """Number of well-formed frames received from this device."""
         return self._codec.messages - self._samples.refused
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records and in lost lines of an adapter."""
+        """Number of bytes in rejected records and in lines that an adapter lost."""
         return self._bus.discarded_bytes + self._samples.refused_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
+        """Return the samples and events that `chunk` completes, in wire order; never raise."""
         out: list[Decoded] = []
         for item in can.unpack_frames(chunk.data):
             if not isinstance(item, can.CanFrame):
@@ -83,7 +83,7 @@ class CanTableDecoder:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Discard an incomplete sample and one that waits for confirmation."""
+        """Discard an incomplete sample, and a sample that waits for confirmation."""
         self._codec.flush()
         return self._samples.flush()
 

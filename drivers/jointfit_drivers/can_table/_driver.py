@@ -1,6 +1,6 @@
 """Driver of IMUs on a CAN bus that rig.toml or a DBC file describes.
 
-The driver only receives: a table does not describe how a device is configured.
+The driver sends nothing, because a table does not describe how a device is configured.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ class CanTableImu:
         Raises
         ------
         DeviceLostError
-            The bus is absent or down, the adapter unplugged, or this device silent for `silence_s`.
+            The bus is absent or down, the adapter is unplugged, or the device is silent for
+            `silence_s`.
         DeviceMisconfiguredError
-            This kind of bus is not available, or another sensor of the rig uses the same
+            This type of bus is not available, or another sensor of the rig uses the same
             identifiers.
         """
         keys, names = self._settings.keys(), self._settings.order()

@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 
 _FRAME_BYTES = 8
 _SHARE_OF_PERIOD = 0.5
-"""Most time between the frames of a sample, in nominal periods."""
+"""Longest time between the first and the last frame of a sample, in nominal periods."""
 
 
 class CanFieldSettings(FieldSettings):
-    """One quantity of the frames, or some of its components."""
+    """One quantity in the frames, or some of its components."""
 
     frame: str | None = Field(
         None,
@@ -56,7 +56,7 @@ Parts = Annotated[tuple[CanFieldSettings, ...], parts_of(CanFieldSettings)]
 
 
 class CanFields(Settings):
-    """Quantities of the frames."""
+    """All quantities in the frames."""
 
     quaternion: Parts = Field((), description="orientation")
     rate: Parts = Field((), description="rate of turn, sensor axes")
@@ -104,7 +104,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Refuse tables whose fields do not fit their frames."""
+        """Yield the keys whose fields do not fit the frames."""
         if not self._is_readable():
             return  # reported; nothing can be placed
         faults = list(self._id_faults())
@@ -133,30 +133,30 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         yield from orientation_faults(form, self, timed=False)
 
     def order(self) -> tuple[str, ...]:
-        """Return the names of the frames in the order of sending."""
+        """Return the names of the frames in the order in which the device sends them."""
         return self.sequence or tuple(sorted(self.ids, key=self.ids.__getitem__))
 
     def keys(self) -> tuple[tuple[int, bool], ...]:
-        """Return identifier, and whether it has 29 bits, in the order of sending."""
+        """Return all identifiers and whether they have 29 bits, in the order of sending."""
         numbers = [self.ids[name] for name in self.order()]
         return tuple((number, self.extended_ids or number > STANDARD_MAX) for number in numbers)
 
     def places(self) -> TableForm:
-        """Return the place of every number."""
+        """Return the position of every number in the frames."""
         quantities: Any = dict(self.fields)
         return place_fields(quantities, self._place)
 
     def sample_form(self) -> SampleForm:
-        """Return the meaning of the numbers."""
+        """Return the meaning of the numbers in the frames."""
         return sample_form(self.places(), self, is_text=False)
 
     def can_table(self) -> CanTable:
-        """Return the description of the frames for their codec."""
+        """Return the layout of the frames for the codec."""
         longest_ns = round(_SHARE_OF_PERIOD * 1e9 / self.rate_hz)
         return CanTable(self.keys(), self.places().fields, longest_ns, self.order())
 
     def _place(self, name: Quantity, part: FieldSettings, count: int) -> list[TableField]:
-        """Return the places of a part, by offset or from the DBC file."""
+        """Return the positions of a field, from its offset or from the DBC file."""
         signals = getattr(part, "signals", None)
         if signals is None:
             return binary_place(part, count, self.byte_order, self._frame(name, part))
@@ -186,7 +186,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
         return placed
 
     def _frame(self, name: Quantity, part: FieldSettings) -> int:
-        """Return the number of the frame that contains a part."""
+        """Return the number of the frame that contains a field."""
         order = self.order()
         frame = getattr(part, "frame", None)
         if frame is None:
@@ -217,7 +217,7 @@ class CanTableSettings(CanImuSettings, TableImuSettings):
             yield "sequence", f"expected each name of `ids` once: {', '.join(self.ids)}"
 
     def _is_readable(self) -> bool:
-        """Return whether no key that places fields had a fault; such keys are None."""
+        """Return whether the keys that define field positions are valid; faulty keys are None."""
         ids: Any = self.ids
         keys: list[Any] = [self.extended_ids, self.sequence, self.byte_order, self.rate_hz]
         fields: Any = self.fields

@@ -1,4 +1,4 @@
-"""Orientation on the gateway, from the raw measurements of one IMU."""
+"""Computation of the orientation on the gateway, from the raw measurements of one IMU."""
 
 from jointfit_drivers.gateway_orientation._filter import (
     LONGEST_SETTLE_S,

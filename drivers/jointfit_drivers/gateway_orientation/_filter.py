@@ -1,31 +1,33 @@
-r"""Orientation on the gateway, from the raw measurements of one IMU, by the VQF filter.
+r"""Computation of the orientation from the raw measurements of one IMU, by the VQF filter.
 
-A relative error of the sample time causes the same relative error of every rotation. The time
-between measurements is therefore the device time (`RawReading.t_ns`). The filter works with steps
-of the first interval. If the mean interval differs from the first interval (ticks too coarse for
-one interval), angular rates are scaled so that every step rotates by the true angle:
+VQF stands for "versatile quaternion-based filter". A relative error of the sample interval causes
+the same relative error of every rotation. The interval is therefore computed from the device time
+(`RawReading.t_ns`). The filter has a fixed step, which is the first interval T_s. If ticks are too
+coarse for one interval, the mean interval differs from the first. Angular rates are then scaled so
+that every step rotates by the true angle:
 
 .. math:: \omega_\text{fed} = \omega\, \bar T / T_s
 
-Up to three missing measurements are interpolated. After a longer gap the filter restarts: it
-retains the gyroscope bias and, without a magnetometer, continues with the last heading, which is
-uncertain.
+Up to three missing measurements are interpolated. After a longer gap the filter restarts. It
+retains the gyroscope bias. Without a magnetometer, it continues with the last heading, which is
+then uncertain.
 
 A filter that has just started takes its vertical from one accelerometer measurement. In fast motion
-the error is 20 degrees in the first second and 4 degrees in the next two, and normal afterwards
-(``gateway-orientation-start-in-motion``). No orientation is therefore returned until the filter has
-detected rest or has run for `SETTLE_S`.
+the error is 20 degrees in the first second and 4 degrees in the next two seconds. After that it is
+as small as usual (experiment ``gateway-orientation-start-in-motion``). Orientations are therefore
+returned only when the filter has detected rest or has run for `SETTLE_S`.
 
 With a magnetometer, `StartEstimator` then estimates orientation and gyroscope bias from the
-readings since the start, and continues with every reading. Orientations are returned once their
-standard deviation is at most `SETTLED_SD`. VQF continues with the result at the first rest, or once
-the bias is known as well as VQF estimates it in motion, but after `CONVERGE_S` at the latest.
-Magnetometers are slower than gyroscopes: at 579 degrees per second the delay of 13 ms of the
-recorded sensor is an error of 8 degrees. The delay is estimated from the readings since the start
-and compensated.
+readings since the start, and continues with every reading. Orientations are returned when their
+standard deviation is at most `SETTLED_SD`. VQF takes over the result at the first rest, or when the
+bias is known as well as VQF estimates it in motion, but after `CONVERGE_S` at the latest.
 
-Invariant: a function of the readings fed, without a clock of its own: a replay yields identical
-orientations. Only this module imports ``vqf`` (an extra), and it contains no device.
+A magnetometer has a delay relative to the gyroscope. For the recorded sensor the delay is 13 ms,
+which is an error of 8 degrees at 579 degrees per second. The delay is estimated from the readings
+since the start, and compensated.
+
+Invariant: the output depends only on the readings fed, so a replay yields identical orientations.
+Only this module imports ``vqf`` (an extra), and it names no device.
 
 Source: Laidig and Seel 2023, Information Fusion 91, 187-204, and their package ``vqf``.
 """
@@ -58,33 +60,33 @@ PACKAGE_MISSING = (
     'orientation = "device"'
 )
 MOST_MISSING = 3
-"""Consecutive missing readings that are interpolated; more restart the filter."""
+"""Largest number of consecutive missing readings that are interpolated; more restart the filter."""
 SETTLE_S = 3.0
-"""Time constant of the filter's accelerometer, s: its vertical is a mean over this time."""
+"""Time constant of the filter's accelerometer, s. The vertical is a mean over this time."""
 LONGEST_SETTLE_S = 8.0
-"""Time, s, after which orientations are returned, however uncertain they are."""
+"""Time after which orientations are returned, however uncertain they are, s."""
 SETTLED_SD = radians(5.0)
-"""Standard deviation of the angle of the orientation, rad, of a settled filter."""
+"""Standard deviation of the angle of the orientation at which a filter counts as settled, rad."""
 CONVERGE_S = 60.0
-"""Longest time that the start is estimated, s."""
+"""Longest duration of the estimation at the start, s."""
 KNOWN_BIAS_SD = radians(0.1)
 """Standard deviation of the bias, rad/s, that VQF reaches in motion (its ``biasSigmaMotion``)."""
 FASTEST = 200.0
-"""Largest plausible angular rate, rad/s: 11 000 degrees per second."""
+"""Largest plausible angular rate, rad/s; equal to 11 000 degrees per second."""
 HARDEST = 5000.0
-"""Largest plausible specific force, m/s^2: 500 g."""
+"""Largest plausible specific force, m/s^2; equal to 500 g."""
 STRONGEST = 1e6
-"""Largest plausible component of the magnetic field in any unit: 1 T in microtesla."""
+"""Largest plausible component of the magnetic field in any unit; equal to 1 T in microtesla."""
 FIELD_RATIO = 2.0
-"""Largest ratio between the strength of a field and the median, or the reverse, with which a
-reading contributes to the delay of the magnetometer."""
+"""Largest ratio of the field strength to its median, or the reverse, at which a reading is used to
+estimate the delay of the magnetometer."""
 RIDGE_RATE = 1.0
-"""Angular rate, rad/s, below which the delay of the magnetometer is not estimated: there, a delay
-of 20 ms changes the field by 2 % at most."""
+"""Angular rate below which the delay of the magnetometer is not estimated, rad/s. At this rate, a
+delay of 20 ms changes the field by at most 2 %."""
 MOST_DELAY_S = 0.05
 """Largest delay of the magnetometer, s."""
 NO_FIELD = (0.0, 0.0, 0.0)
-"""Field of a reading without one, which the filter ignores."""
+"""Field of a reading without magnetic field; the filter ignores it."""
 _NS = 1e9
 
 
@@ -92,20 +94,21 @@ class RawReading(NamedTuple):
     """Measurements of one IMU at one instant, in sensor axes."""
 
     t_ns: int
-    """Device time without wrap, ns."""
+    """Device time without wraps, ns."""
     rate: Vector
-    """Angular rate, rad/s, bias included."""
+    """Angular rate including bias, rad/s."""
     force: Vector
-    """Specific force, m/s^2; +9.81 upwards at rest."""
+    """Specific force, m/s^2 (+9.81 upwards at rest)."""
     magnetic: Vector | None = None
-    """Magnetic field, any unit."""
+    """Magnetic field in any unit; None if not measured."""
 
 
 class FilterOutput(NamedTuple):
     """Output of the filter for one reading."""
 
     q_world_sensor: Quaternion
-    """World ENU; y is magnetic north with a magnetometer, otherwise arbitrary."""
+    """Orientation in an ENU world. With a magnetometer, y is magnetic north, otherwise
+    arbitrary."""
     rate: Vector
     """Angular rate without bias, sensor axes, rad/s."""
 
@@ -114,28 +117,29 @@ class FilterStep(NamedTuple):
     """Result of one reading."""
 
     oriented: tuple[FilterOutput, ...]
-    """Orientations: none while the filter settles, then one per reading. Without a settling time,
-    the first reading waits for the second, which returns both."""
+    """Orientations. There is none while the filter settles, then one per reading. Without a
+    settling time, the second reading returns the orientations of the first and second reading."""
     missing: int = 0
-    """Readings missing before this one."""
+    """Number of readings missing before this reading."""
     restarted: bool = False
-    """Whether the filter restarted after a gap: heading is uncertain, inclination comes from the
-    accelerometer."""
+    """Whether the filter restarted after a gap. The heading is then uncertain, and the inclination
+    comes from the accelerometer."""
 
 
 class FilterState(NamedTuple):
-    """State of the filter."""
+    """State of the filter for reports."""
 
     rest: bool
-    """The sensor is at rest, and its bias is being estimated."""
+    """Whether the sensor is at rest, so that its bias is being estimated."""
     bias: Vector
     """Gyroscope bias, rad/s."""
     bias_sd: float
     """Upper bound of the bias standard deviation, rad/s."""
     disturbed: bool
-    """Magnetic disturbance: heading comes from the gyroscope alone."""
+    """Whether a magnetic disturbance was detected. The heading then comes from the gyroscope
+    alone."""
     converging: bool
-    """The filter started in motion, and its bias is not known yet."""
+    """Whether the bias is not known yet, because the filter started in motion."""
 
 
 def is_installed() -> bool:
@@ -144,7 +148,7 @@ def is_installed() -> bool:
 
 
 def is_plausible(reading: RawReading) -> bool:
-    """Return whether a reading is finite and in range; one NaN would stay in the filter."""
+    """Return whether a reading is finite and in range. A single NaN would stay in the filter."""
     if not all(-FASTEST < value < FASTEST for value in reading.rate):
         return False
     if not all(-HARDEST < value < HARDEST for value in reading.force):
@@ -153,17 +157,17 @@ def is_plausible(reading: RawReading) -> bool:
 
 
 class GatewayOrientation:
-    """The filter of one IMU.
+    """The orientation filter of one IMU.
 
     Parameters
     ----------
     rate_hz : float
-        Nominal rate, Hz, used before the second reading only.
+        Nominal rate, Hz, which is used only until the second reading.
     magnetometer : bool
-        Whether heading comes from the magnetometer (9D) or drifts (6D).
+        Whether the heading comes from the magnetometer (9D). Otherwise it drifts (6D).
     settle_s : float
-        Longest time without output after a start of the filter, s; without magnetometer at most
-        `SETTLE_S`.
+        Longest time without output after a start of the filter, s. Without magnetometer it is at
+        most `SETTLE_S`.
     """
 
     def __init__(
@@ -187,17 +191,17 @@ class GatewayOrientation:
 
     @property
     def period_ns(self) -> float:
-        """Mean interval of the readings so far, ns; the nominal one before the second reading."""
+        """Mean interval of the readings so far, ns; nominal before the second reading."""
         return self._passed_ns / self._steps if self._steps else self._nominal_ns
 
     @property
     def settling(self) -> bool:
-        """Whether the filter has started and has not settled yet."""
+        """Whether the filter has started but has not settled yet."""
         return self._started_ns is not None
 
     @property
     def state(self) -> FilterState | None:
-        """State of the filter; None before its start."""
+        """State of the filter; None before its first reading."""
         if self._filter is None:
             return None
         bias, sd = self._filter.getBiasEstimate()
@@ -212,7 +216,7 @@ class GatewayOrientation:
         )
 
     def take(self, reading: RawReading) -> FilterStep:
-        """Update the filter with the next plausible reading, in order of time."""
+        """Update the filter with the next plausible reading; readings must be in order of time."""
         last, self._last = self._last, reading
         if last is None:
             return FilterStep(())
@@ -234,14 +238,14 @@ class GatewayOrientation:
             for k in range(1, steps):
                 self._update(_interpolate(last, reading, k / steps))
         else:
-            # A new inclination, and the same gyroscope bias.
+            # The filter gets a new inclination, but keeps the gyroscope bias.
             bias, sd = self._filter.getBiasEstimate()
             self._start(self._period_ns, reading.t_ns)
             self._filter.setBiasEstimate(bias, sd)
             oriented.clear()
         oriented.append(self._update(reading, follows=followed))
 
-        # No output before the filter has settled.
+        # There is no output before the filter has settled.
         if self._started_ns is not None:
             self._settle(reading.t_ns, reading.t_ns - self._started_ns)
             oriented = [] if self.settling else [self._output(reading)]
@@ -250,16 +254,16 @@ class GatewayOrientation:
     def _start(self, period_ns: float, t_ns: int) -> None:
         self._period_ns = period_ns
         self._started_ns = t_ns if self._settle_ns else None
-        # The last readings suffice, however long the filter settles.
+        # Only the most recent readings are stored, however long the filter settles.
         self._withheld = deque(maxlen=ceil(SETTLE_S * _NS / period_ns) + MOST_MISSING)
         self._estimator = None
         self._filter = import_module("vqf").VQF(period_ns / _NS)  # an extra
-        # Orientations by the gyroscope assume a constant bias until the start is estimated.
+        # The integrated orientations assume a constant bias until the start is estimated.
         self._filter.setMotionBiasEstEnabled(not (self._magnetic and self.settling))
 
     def _update(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
-        """Update with one reading; after a gap, continue with the same heading."""
-        # w_fed = w T_mean / T_s: every step turns by the true angle
+        """Update the filter with one reading. After a gap, continue with the same heading."""
+        # w_fed = w T_mean / T_s, so that every step rotates by the true angle.
         scale = self.period_ns / self._period_ns
         x, y, z = reading.rate
         fed = (x * scale, y * scale, z * scale)
@@ -284,7 +288,7 @@ class GatewayOrientation:
         return self._output(reading, follows=follows)
 
     def _settle(self, t_ns: int, waited_ns: int) -> None:
-        """Start the estimate of the start, and note when the filter has settled."""
+        """Begin the estimation of the start, and store when the filter has settled."""
         rest = self._filter.getRestDetected()
         if not rest and waited_ns < min(self._settle_ns, SETTLE_S * _NS):
             return
@@ -297,7 +301,7 @@ class GatewayOrientation:
             self._started_ns = None
 
     def _estimate_start(self, t_ns: int, *, rest: bool) -> None:
-        """Estimate orientation and bias from the readings since the start."""
+        """Estimate orientation and bias from all readings since the start."""
         withheld = list(self._withheld)
         self._withheld.clear()
         if not any(any(part.field) for part in withheld):
@@ -312,7 +316,7 @@ class GatewayOrientation:
             for part in withheld
         ]
 
-        # At rest the mean rate is the bias.
+        # At rest, the mean angular rate is the bias.
         assumed, bias_sd = self._filter.getBiasEstimate()
         bias = assumed
         if rest:
@@ -323,14 +327,15 @@ class GatewayOrientation:
         self._continue_start(self._estimator, t_ns)
 
     def _continue_start(self, estimator: StartEstimator, t_ns: int) -> None:
-        """Set the filter to the estimated bias, and to the whole estimate at the end."""
+        """Set the filter to the estimated bias; at the end, set it to all estimates."""
         known = estimator.bias_sd <= KNOWN_BIAS_SD
         late = t_ns - self._converging_ns >= CONVERGE_S * _NS
         if not (known or late or self._filter.getRestDetected()):
             self._filter.setBiasEstimate(estimator.bias, estimator.bias_sd)
             return
 
-        # The mean of the accelerometer begins as if it had always been the estimated vertical.
+        # The filter's accelerometer mean is set as if the estimated vertical had always been
+        # measured.
         vqf, state = self._filter, self._filter.state
         q = estimator.q_world_gyro
         up = rotate(np.array([(q[0], -q[1], -q[2], -q[3])]), np.array([(0.0, 0.0, GRAVITY)]))[0]
@@ -338,8 +343,8 @@ class GatewayOrientation:
         initial = [vqf.filterInitialState(float(value), *low_pass) for value in up]
         state["lastAccLp"], state["accLpState"] = up.tolist(), np.concatenate(initial).tolist()
 
-        # The frame of VQF retains its heading, because the bias estimator contains means in this
-        # frame.
+        # The internal frame of VQF keeps its heading, because the bias estimator stores means in
+        # this frame.
         w, _, _, z = _heading_between(tuple(state["accQuat"]), q)
         state["accQuat"] = list(multiply_one((w, 0.0, 0.0, -z), q))
         state["delta"] = remainder(2.0 * atan2(z, w), tau)
@@ -351,7 +356,7 @@ class GatewayOrientation:
         self._estimator = None
 
     def _output(self, reading: RawReading, *, follows: bool = True) -> FilterOutput:
-        """Return the present orientation, and the rate of a reading without bias."""
+        """Return the current orientation, and the angular rate of a reading without bias."""
         vqf = self._filter
         if self._estimator is not None:
             w, i, j, k = multiply_one(self._estimator.q_world_gyro, tuple(vqf.getQuat3D().tolist()))
@@ -373,22 +378,23 @@ class GatewayOrientation:
 def _field_delay(
     q: NDArray[np.float64], rates: NDArray[np.float64], fields: NDArray[np.float64]
 ) -> float | None:
-    r"""Return the delay of the magnetometer behind the gyroscope, s; None without enough rotation.
+    r"""Return the delay of the magnetometer relative to the gyroscope, s; None without rotation.
 
-    The field is constant in the world. With a delay d the measured field m, rotated to the world,
-    is to first order
+    The field is constant in the world. If the measured field m has a delay d, the field rotated to
+    the world is, to first order,
 
     .. math:: R m = m_w + d\, R (\omega \times m) ,
 
-    a linear regression. The ridge is the ratio of a disturbance of 2 % of the field to a delay of
-    20 ms; below it the delay is unknown. Fields of implausible strength are left out.
+    which is a linear regression. The ridge of the regression is the ratio of a disturbance of 2 %
+    of the field to a delay of 20 ms. If the rotation is too slow to exceed the ridge, the delay is
+    unknown. Fields of implausible strength are excluded.
 
     Parameters
     ----------
     q : ndarray, shape (n, 4)
-        q_world_sensor; the heading is arbitrary.
+        Orientations q_world_sensor; the heading is arbitrary.
     rates, fields : ndarray, shape (n, 3)
-        Angular rates, rad/s, and fields in sensor axes; rows of zeros are missing fields.
+        Angular rates, rad/s, and fields in sensor axes. Rows of zeros are missing fields.
     """
     strength = np.linalg.norm(fields, axis=1)
     known = strength > 0.0
@@ -418,7 +424,7 @@ def turned_field(field: Vector, rate: Vector, delay_s: float) -> Vector:
 
 
 def _heading_between(q_from: Quaternion, q_to: Quaternion) -> Quaternion:
-    """Return the rotation about the vertical that brings `q_from` nearest to `q_to`."""
+    """Return the rotation about the vertical that minimizes the angle from `q_from` to `q_to`."""
     w, x, y, z = q_from
     a, b, c, d = q_to
     half = atan2(d * w - a * z - b * y + c * x, a * w + b * x + c * y + d * z)
@@ -426,7 +432,7 @@ def _heading_between(q_from: Quaternion, q_to: Quaternion) -> Quaternion:
 
 
 def _interpolate(before: RawReading, after: RawReading, share: float) -> RawReading:
-    """Return the linear interpolation at `share` of the interval."""
+    """Return the linear interpolation between two readings at `share` of the interval."""
 
     def mix(a: Vector, b: Vector) -> Vector:
         x, y, z = (p + share * (q - p) for p, q in zip(a, b, strict=True))

@@ -1,9 +1,9 @@
 """Samples of an IMU whose orientation the gateway computes from raw measurements.
 
-`RawSamples` contains the orientation filter and reports its state, gaps and saturation as device
-events. Drivers convert the measurements of their devices to a `RawReading` and its `RawStamp`.
+`RawSamples` contains the orientation filter, and reports its state, gaps and saturation as device
+events. Drivers convert the measurements of their devices to a `RawReading` with a `RawStamp`.
 
-Invariant: the output depends only on the readings fed; no clock and no port is read.
+Invariant: the output depends only on the readings fed. The module reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from jointfit_drivers.gateway_orientation._settings import GatewaySettings
 
 _REPORT_NS, _SOON_NS = 10_000_000_000, 1_000_000_000
-"""Period, ns, of the filter's state events: in general, and after a change."""
+"""Intervals between state events of the filter, ns: in general, and after a change."""
 FAST = 5.0
-"""Angular rate, rad/s, below which no gyroscope saturates."""
+"""Angular rate below which no gyroscope saturates, rad/s."""
 _NEW_HEADING = (
     "orientation from gyroscope and accelerometer started with an arbitrary heading: "
     "repeat the static pose"
@@ -40,7 +40,7 @@ _IDENTITY: Quaternion = (1.0, 0.0, 0.0, 0.0)
 
 
 class RawStamp(NamedTuple):
-    """Fields of a raw message besides its measurements."""
+    """Fields of a raw message other than its measurements."""
 
     arrival_ns: int
     ticks: int | None
@@ -58,11 +58,11 @@ class RawSamples:
     magnetometer : bool
         Whether heading comes from the magnetometer.
     settle_s : float
-        Longest time without output after the start of the filter, s.
+        Longest time without output after a start of the filter, s.
     correction : SensorCorrection, optional
         Correction of the readings; None if the sensor is not calibrated.
     readings_only : bool
-        Return uncorrected readings without orientation, as a calibration needs them.
+        Whether uncorrected readings are returned without orientation, for a calibration.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class RawSamples:
         """Whether uncorrected readings are returned."""
         self._correction = None if readings_only else correction
         self.magnetometer = magnetometer
-        """Whether heading comes from the magnetometer."""
+        """Whether the heading comes from the magnetometer."""
         self._filter = GatewayOrientation(rate_hz, magnetometer=magnetometer, settle_s=settle_s)
         self._waiting: tuple[RawStamp, RawReading] | None = None
         self._t_ns = 0
@@ -89,7 +89,7 @@ class RawSamples:
 
     @classmethod
     def of(cls, settings: GatewaySettings) -> Self:
-        """Return the samples of a sensor with these settings."""
+        """Return an object for a sensor with these settings."""
         calibration = settings.sensor_calibration
         return cls(
             settings.rate_hz,
@@ -101,7 +101,7 @@ class RawSamples:
 
     @classmethod
     def maker(cls, settings: GatewaySettings) -> Callable[[], Self] | None:
-        """Return a function that makes new samples; None if the device has the orientation."""
+        """Return a function that creates an object; None if the device computes the orientation."""
         return partial(cls.of, settings) if settings.orientation == "gateway" else None
 
     @property
@@ -110,7 +110,7 @@ class RawSamples:
         return self._filter.period_ns
 
     def correct_field(self, field: Vector) -> Vector:
-        """Return a magnetic field without the errors of the sensor, if they are known."""
+        """Return a magnetic field, corrected for the errors of the sensor if they are known."""
         return field if self._correction is None else self._correction.correct_field(field)
 
     def take(
@@ -128,11 +128,11 @@ class RawSamples:
         stamp
             Arrival, device time and status of the message.
         reading
-            Measurements of the message, at a later time than the preceding reading.
+            Measurements of the message. Their time must be later than that of the previous reading.
         clipped
             Whether the device reported that a measurement is out of range.
         field_corrected
-            Whether the magnetic field went through `correct_field`.
+            Whether `correct_field` was already applied to the magnetic field.
         """
         self._t_ns = reading.t_ns
         if self.readings_only:
@@ -167,7 +167,7 @@ class RawSamples:
             )
             out.append(DeviceEvent("warning", text, {"missing": missing}))
 
-        # A device need not report saturation. Saturation is therefore also detected by repetition:
+        # Some devices do not report saturation. It is therefore also detected from repeated values:
         # because of noise, a high rate repeats exactly only at the end of the gyroscope's range.
         before, self._rate = self._rate, reading.rate
         pairs = zip(self._rate, before, strict=True)
@@ -179,7 +179,7 @@ class RawSamples:
         return out
 
     def _state_events(self) -> list[Decoded]:
-        """Return the filter's state if it is due."""
+        """Return an event with the filter's state if it is due."""
         out: list[Decoded] = []
         if not self._started and not self.magnetometer:
             out.append(DeviceEvent("warning", _NEW_HEADING))
@@ -221,6 +221,6 @@ def _sample(
 ) -> ImuSample:
     q = oriented.q_world_sensor
     arrival_ns, ticks, counter, status = stamp
-    # The device sends the mean rate since the previous sample, not the present one.
+    # The device sends the mean rate since the previous sample, not the current rate.
     rate, force, field = None, reading.force, reading.magnetic
     return ImuSample(arrival_ns, q, q, ticks, counter, status, rate, force, field)

@@ -1,6 +1,6 @@
-"""Correction of raw readings by the stored calibration of the sensor.
+"""Correction of raw readings by the stored calibration of a sensor.
 
-Invariant: the correction depends on one reading only; the filter takes much longer.
+Invariant: the correction of a reading depends on this reading only.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class SensorCorrection:
     Parameters
     ----------
     calibration
-        Errors of the sensor.
+        Errors of the sensor, as the calibration determined them.
     """
 
     def __init__(self, calibration: SensorCalibrationSettings) -> None:
@@ -39,7 +39,7 @@ class SensorCorrection:
             calibration.magnetometer_matrix or _IDENTITY,
         )
         self.date = calibration.date
-        """Day of the calibration."""
+        """Date of the calibration."""
 
     def correct(self, reading: RawReading, *, field: bool) -> RawReading:
         """Return a corrected reading; without `field`, its magnetic field is already correct."""

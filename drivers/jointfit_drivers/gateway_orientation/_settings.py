@@ -1,4 +1,4 @@
-"""Keys of an ``[[imu]]`` table whose device can send raw measurements."""
+"""Keys of an ``[[imu]]`` table for a device that can send raw measurements."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class GatewaySettings(ImuSettings):
     @field_validator("orientation")
     @classmethod
     def _filter_that_is_installed(cls, orientation: str) -> str:
-        """Refuse a missing package before the port is opened."""
+        """Reject ``gateway`` before a port is opened if the filter package is missing."""
         if orientation == "gateway" and not is_installed():
             raise ValueError(PACKAGE_MISSING)
         return orientation
@@ -68,7 +68,7 @@ class GatewaySettings(ImuSettings):
     def _calibration_of_readings(
         cls, found: SensorCalibrationSettings | None, info: ValidationInfo
     ) -> SensorCalibrationSettings | None:
-        """Refuse a calibration of readings that are not used."""
+        """Reject a calibration of raw readings if the readings are not used."""
         if found is not None and info.data.get("orientation") == "device":
             raise ValueError(
                 'needs orientation = "gateway": the device computes its orientation from '
@@ -79,7 +79,7 @@ class GatewaySettings(ImuSettings):
     @field_validator("magnetometer")
     @classmethod
     def _magnetometer_of_a_filter(cls, magnetometer: bool, info: ValidationInfo) -> bool:
-        """Refuse a magnetometer without a filter on the gateway."""
+        """Reject the use of a magnetometer if the gateway has no filter."""
         if magnetometer and info.data.get("orientation") == "device":
             raise ValueError('needs orientation = "gateway": a device uses its own as it is set')
         return magnetometer

@@ -1,28 +1,30 @@
 r"""Orientation, gyroscope bias and field of an IMU whose orientation filter has just started.
 
-VQF takes the vertical from a mean over 3 s, and the heading from the field with that vertical. With
-a dip of 70 degrees, the heading has 2.7 times the error of the vertical, and an unknown bias
-rotates heading and vertical. VQF does not use the field to estimate the bias. This Kalman filter
-estimates vertical, heading and bias from gravity and field together, in steps of `STEP_S`. The
-state of the filter is
+VQF takes the vertical from a mean over 3 s, and the heading from the field relative to that
+vertical. With a magnetic dip of 70 degrees, the error of the heading is 2.7 times the error of the
+vertical. An unknown bias rotates heading and vertical, and VQF does not use the field to estimate
+the bias. This Kalman filter estimates vertical, heading and bias together from gravity and field,
+in steps of `STEP_S`. The state of the filter is
 
 .. math:: (\varphi, b, v, B_n, B_u)
 
-with the error of the orientation, rad, in the world; the bias, rad/s; the velocity relative to its
-mean, m/s; and the north and up components of the field. :math:`R` is the orientation by a gyroscope
-whose bias is assumed as :math:`\hat b`. With sums over the readings of a step, at intervals T,
+The components are the error of the orientation, rad, in the world; the bias, rad/s; the velocity
+relative to its mean, m/s; and the north and up components of the field. :math:`R` is the integrated
+orientation of a gyroscope with the assumed bias :math:`\hat b`. f is the specific force, and T the
+interval of the readings. The sums extend over the readings of a step:
 
 .. math::
 
     \varphi &\leftarrow \varphi - \sum R\,T\,(b - \hat b) \\
     v &\leftarrow v + \sum R f\,T - g\,\Delta t + \varphi \times \sum R f\,T
 
-Two observations follow. The velocity of a body part is limited, and the mean field of the step is
+There are two observations. The velocity of a body part is limited. The mean field of the step is
 :math:`\bar y = B + B \times \varphi`. Deviations from both observations last for about a second.
-The variance of one step is therefore the variance of the deviation times `LASTING_S` over the
-length of the step.
+The variance of one step is therefore the variance of the deviation times `LASTING_S`, divided by
+the length of the step.
 
-Invariant: a function of the readings added; no clock, no device and no other filter.
+Invariant: the result depends only on the readings added. The module uses no clock, no device and no
+other filter.
 
 Source: error-state Kalman filter, Solà 2017, arXiv:1711.02508.
 """
@@ -45,43 +47,43 @@ if TYPE_CHECKING:
     from jointfit_daemon.model import Quaternion, Vector
 
 STEP_S = 0.1
-"""Length of a step, s."""
+"""Length of one step of the filter, s."""
 GRAVITY = 9.81
 """Gravity, m/s^2."""
 SPEED_SD = 0.7
 """Expected standard deviation of the velocity of a body part about its mean, m/s."""
 SPEED_KNOWN_S = 1.0
-"""Weight of the expectation against the velocity that is estimated, s."""
+"""Weight of the expected velocity relative to the estimated velocity, s."""
 FIELD_SD = 0.03
-"""Standard deviation of the field in motion, relative to its strength."""
+"""Standard deviation of the field during motion, relative to its strength."""
 FIELD_LIMIT = 0.1
-"""Deviation of the field, relative to its strength, above which its weight decreases."""
+"""Deviation of the field above which its weight decreases, relative to its strength."""
 LASTING_S = 1.0
-"""Correlation time of velocity and field, s."""
+"""Correlation time of deviations of velocity and field, s."""
 SCALE_SD = 0.002
-"""Error of the scale and the axes of a gyroscope."""
+"""Standard deviation of the scale and the axes of a gyroscope, relative."""
 FORCE_SD = 0.3
-"""Error of an accelerometer in motion, m/s^2."""
+"""Standard deviation of an accelerometer during motion, m/s^2."""
 REVERSAL_S = 0.3
-"""Time in which a movement reverses, s: the correlation time of both errors."""
+"""Time after which a movement reverses, s, which is the correlation time of both errors."""
 RATE_NOISE = radians(0.02)
-"""Noise of the angle by a gyroscope, rad per root second."""
+"""Noise of the integrated angle of a gyroscope, rad per root second."""
 TILT_SD = radians(1.0)
-"""Standard deviation of the first vertical of a sensor without change of velocity, rad."""
+"""Standard deviation of the first vertical if the velocity of the sensor does not change, rad."""
 HEADING_SD = 0.5
 """Standard deviation of the first heading, rad."""
 
 _PHI, _BIAS, _VELOCITY, _FIELD = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 11)
 _SIZE = 11
 _HALF_TURN = np.array((-1.0, -1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, 1.0, -1.0, 1.0))
-"""Signs of the state after half a turn of the world about the vertical."""
+"""Factors of the state variables if the world is rotated by half a turn about the vertical."""
 
 
 class StartReading(NamedTuple):
-    """One reading, with the orientation by the gyroscope."""
+    """One reading, with the orientation integrated from the gyroscope."""
 
     q: Quaternion
-    """Orientation by integrated angular rates; arbitrary at the start."""
+    """Orientation integrated from the angular rates; its first value is arbitrary."""
     rate: Vector
     """Angular rate, rad/s."""
     force: Vector
@@ -91,20 +93,20 @@ class StartReading(NamedTuple):
 
 
 class StartEstimator:
-    """Kalman filter of one IMU.
+    """Kalman filter for the start of one IMU.
 
     Parameters
     ----------
     readings : sequence of StartReading
-        Readings since the start of the filter, some of them with a field.
+        Readings since the start of the filter. At least some of them contain a field.
     period_s : float
         Interval of the readings, s.
     assumed : ndarray, shape (3,)
-        Bias that the orientations of these readings assume, rad/s.
+        Bias that was assumed when the orientations of these readings were integrated, rad/s.
     bias : ndarray, shape (3,)
-        Expected bias, rad/s.
+        Expected gyroscope bias, rad/s.
     bias_sd : float
-        Standard deviation of the bias, rad/s.
+        Standard deviation of the expected bias, rad/s.
     """
 
     def __init__(
@@ -119,13 +121,14 @@ class StartEstimator:
         self._step = max(1, round(STEP_S / period_s))
         self._pending: list[StartReading] = []
 
-        # vertical: mean specific force in the frame of the gyroscope
+        # The vertical is the mean specific force in the frame of the integrated orientation.
         q, force, field = (np.array([part[kind] for part in readings]) for kind in (0, 2, 3))
         matrices = to_matrix(q)
         up = np.einsum("nij,nj->i", matrices, force)
         self.q_world_gyro = _shortest_rotation(up / np.linalg.norm(up))
 
-        # heading: median field, which short disturbances do not turn, horizontal part to the north
+        # The horizontal part of the median field points north. Short disturbances do not change the
+        # median.
         known = field.any(axis=1)
         self._strength = float(np.median(np.linalg.norm(field[known], axis=1)))
         usual = np.median(np.einsum("nij,nj->ni", matrices[known], field[known]), axis=0)
@@ -134,7 +137,7 @@ class StartEstimator:
         self.q_world_gyro = multiply_one((cos(half), 0.0, 0.0, sin(half)), self.q_world_gyro)
         self._field = np.array((np.hypot(east, north), up_part))
 
-        # The second pass knows from the first how fast the sensor moves.
+        # The second pass uses the speed of the sensor that the first pass estimated.
         begins = range(0, len(readings) - self._step + 1, self._step)
         parts = [readings[begin : begin + self._step] for begin in begins]
         start = (self.q_world_gyro, self._field)
@@ -143,7 +146,7 @@ class StartEstimator:
             self.q_world_gyro, self._field = start[0], start[1].copy()
             self.bias, self._velocity = np.array(bias), np.zeros(3)
 
-            # A change of velocity during the readings tilts their mean.
+            # A change of velocity during the readings tilts their mean specific force.
             tilt_sd = TILT_SD + sqrt(2.0) * speed_sd / (GRAVITY * (len(readings) * period_s))
             variances = np.empty(_SIZE)
             variances[_PHI] = (tilt_sd**2, tilt_sd**2, HEADING_SD**2)
@@ -178,7 +181,7 @@ class StartEstimator:
         return self.covariance[_BIAS, _BIAS]
 
     def add(self, reading: StartReading) -> bool:
-        """Add the next reading, which assumes the present bias; return whether it ends a step."""
+        """Add the next reading, integrated with the current bias; return whether it ends a step."""
         self._pending.append(reading)
         if len(self._pending) < self._step:
             return False
@@ -187,12 +190,12 @@ class StartEstimator:
         return True
 
     def _update(self, readings: Sequence[StartReading], assumed: NDArray[np.float64]) -> None:
-        """Update with the readings of one step, whose orientations assume a bias."""
+        """Update the filter with the readings of one step, integrated with the bias `assumed`."""
         q, rate, force, field = (np.array(kind) for kind in zip(*readings, strict=True))
         duration_s = len(readings) * self._period_s
         matrices = to_matrix(self.q_world_gyro) @ to_matrix(q)
 
-        # prediction
+        # Prediction of the state.
         turn = matrices.sum(axis=0) * self._period_s
         impulse = np.einsum("nij,nj->i", matrices, force) * self._period_s
         error = np.zeros(_SIZE)
@@ -209,7 +212,7 @@ class StartEstimator:
         covariance[_PHI, _PHI] += angle_variance * duration_s * np.eye(3)
         covariance[_VELOCITY, _VELOCITY] += FORCE_SD**2 * REVERSAL_S * duration_s * np.eye(3)
 
-        # observation of the velocity and, if there is one, of the field
+        # Observation of the velocity and, if it was measured, of the field.
         known = field.any(axis=1)
         has_field = bool(known.any())
         count = 6 if has_field else 3
@@ -238,14 +241,15 @@ class StartEstimator:
         self._correct(error, duration_s)
 
     def _correct(self, error: NDArray[np.float64], duration_s: float) -> None:
-        """Move an estimated error into the estimates."""
+        """Add an estimated error to the estimates."""
         x, y, z = (0.5 * error[_PHI]).tolist()
         self.q_world_gyro = normalize_one(multiply_one((1.0, x, y, z), self.q_world_gyro))
         self.bias += error[_BIAS]
         self._velocity += error[_VELOCITY]
         self._field += error[_FIELD]
 
-        # A first heading that was wrong by more than a right angle: half a turn about the vertical.
+        # The first heading was wrong by more than 90 degrees, so the world is rotated by half a
+        # turn.
         if self._field[0] < 0.0:
             self.q_world_gyro = multiply_one((0.0, 0.0, 0.0, 1.0), self.q_world_gyro)
             self._velocity[:2] *= -1.0
@@ -257,7 +261,7 @@ class StartEstimator:
 
 
 def _shortest_rotation(up: NDArray[np.float64]) -> Quaternion:
-    """Return the shortest rotation that brings a unit vector to +z."""
+    """Return the shortest rotation from a unit vector to +z."""
     x, y, z = up.tolist()
     if z < -1.0 + 1e-12:
         return (0.0, 1.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""Drivers for LP-Research LPMS sensors: LP-BUS on a serial port or USB, and channels on CAN."""
+"""Drivers for LP-Research LPMS sensors, with LP-BUS on a serial port or USB, or on a CAN bus."""
 
 from jointfit_drivers.lpms._can_decoder import LpmsCanDecoder
 from jointfit_drivers.lpms._can_driver import LpmsCanImu

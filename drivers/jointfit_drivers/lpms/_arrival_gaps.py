@@ -1,10 +1,10 @@
-"""Losses in a stream without time and counter, from the arrivals alone.
+"""Detection of losses in a stream without time and counter, from the arrival times alone.
 
-A lost frame delays all later arrivals by a whole period for good, a busy bus or host delays some of
-them for a while. The least delay of every ten samples, relative to a line with the nominal rate,
-separates the two.
+A lost frame delays all later arrivals permanently by a whole period. A busy bus or host delays some
+arrivals temporarily. The smallest delay of every ten samples, relative to a straight line with the
+nominal rate, distinguishes the two cases.
 
-Invariant: pure arithmetic on arrival stamps.
+Invariant: the result depends only on the arrival stamps.
 """
 
 from __future__ import annotations
@@ -12,32 +12,32 @@ from __future__ import annotations
 from typing import NamedTuple
 
 _SAMPLES = 10
-"""Samples of a window."""
+"""Number of samples in a window."""
 _LOST = 0.75
-"""Increase of the least delay, periods, that proves a loss."""
+"""Increase of the smallest delay that proves a loss, periods."""
 _DRIFT = 0.1
-"""Largest increase of the least delay, periods, by a difference of the two clocks."""
+"""Largest increase of the smallest delay that a difference of the two clocks can cause, periods."""
 _WRONG_RATE = 0.2
-"""Relative difference of the mean interval from the period that shows another rate."""
+"""Relative difference between mean interval and period from which the rate counts as different."""
 _WINDOWS = 3
-"""Consecutive windows that prove another rate."""
+"""Number of consecutive windows that prove a different rate."""
 _NS = 1e9
 
 
 class ArrivalStep(NamedTuple):
-    """Finding of a window."""
+    """Result of adding one sample."""
 
     lost: int = 0
-    """Number of samples lost."""
+    """Number of lost samples."""
     rate_hz: float | None = None
-    """Measured rate, Hz, if it is another than the nominal one; reported once."""
+    """Measured rate, Hz, if it differs from the nominal rate; it is reported once."""
 
 
 _CONTINUES = ArrivalStep()
 
 
 class ArrivalGaps:
-    """Finds losses in the arrivals of one sensor.
+    """Detects losses from the arrivals of one sensor.
 
     Parameters
     ----------
@@ -84,6 +84,6 @@ class ArrivalGaps:
         if delay > _LOST:
             self._base_ns = least_ns
             return ArrivalStep(round(delay))
-        # a window in which the loss happened also contains a few delays from before
+        # The window in which the loss occurred also contains some delays from before the loss.
         self._base_ns = min(least_ns, base_ns + _DRIFT * self._period_ns)
         return _CONTINUES

@@ -1,12 +1,12 @@
-"""Decoder of the driver of LPMS sensors on CAN: records of CAN frames in, samples out.
+"""Decoder of LPMS sensors on CAN: converts records of CAN frames to samples.
 
-The sensor sends no time and no sequence number. A sample is stamped with the kernel's receive time
-of its first frame, and losses are found in the arrivals.
+The sensor sends no time and no sequence number. The stamp of a sample is the kernel's receive time
+of its first frame, and losses are detected from the arrivals.
 
-Every record of 24 bytes is a message of this sensor, a foreign frame, a note of the host, or
-discarded.
+A record of 24 bytes is a message of this sensor, a frame of another device, a note of the host, or
+a rejected record.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no bus.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no bus.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 _NS = 1_000_000_000
 _TORN = 20
-"""Frames of incomplete quaternions in a row after which the order of the frames is reported."""
+"""Number of consecutive frames with incomplete quaternions after which their order is reported."""
 
 
 class LpmsCanDecoder:
@@ -50,7 +50,7 @@ class LpmsCanDecoder:
     """
 
     tick_clock = None
-    """The sensor sends no time."""
+    """None, because the sensor sends no time."""
 
     def __init__(self, settings: LpmsCanSettings) -> None:
         self._codec = LpmsCanCodec(
@@ -70,23 +70,24 @@ class LpmsCanDecoder:
 
     @property
     def messages(self) -> int:
-        """Number of well-formed frames of this sensor so far."""
+        """Number of well-formed frames received from this sensor."""
         return self._codec.messages - self._refused
 
     @property
     def discarded_bytes(self) -> int:
-        """Number of bytes in rejected records and in lost lines of an adapter."""
+        """Number of bytes in rejected records and in lines that an adapter lost."""
         return self._bus.discarded_bytes
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
+        """Return the samples and events that `chunk` completes, in wire order; never raise."""
         out: list[Decoded] = []
         for item in can.unpack_frames(chunk.data):
             if not isinstance(item, can.CanFrame):
                 out.append(self._bus.discard(item.discarded, item.reason))
             elif item.error:
                 if item.can_id in {can.HOST_CORRUPT, can.HOST_DROPPED}:
-                    # frames may be missing here: halves before and after are of different samples
+                    # Frames may be missing here, so the halves before and after may belong to
+                    # different samples.
                     out += self.flush()
                 out += self._bus.add_error_frame(item)
             else:
@@ -128,7 +129,7 @@ class LpmsCanDecoder:
         if converted is None:
             self._refused += 1
             if self._floats and not self._is_mapped:
-                # The first frame of these floats may be a quaternion of 16-bit integers.
+                # The first frame of these floats may contain a quaternion of 16-bit integers.
                 floats = [*quaternion.values, *[0.0] * 4]
                 frame = encode_frames(range(FRAMES), floats, "float32")[0]
                 if unit_of(decode_frame(frame.data, "int16") or ()) is not None:
@@ -139,7 +140,7 @@ class LpmsCanDecoder:
         out.append(ImuSample(quaternion.t_ns, q, native, None, None))
 
     def _heartbeat(self, beat: Heartbeat, out: list[Decoded]) -> None:
-        """Append the event of a changed state."""
+        """Append an event if the state of the sensor has changed."""
         before, self._state = self._state, beat.state
         if beat.state == before:
             return
@@ -154,7 +155,7 @@ class LpmsCanDecoder:
             out.append(DeviceEvent("warning", text, {"state": beat.state}))
 
     def _report_incomplete(self, out: list[Decoded]) -> None:
-        """Append the loss of frames whose quaternion is not complete."""
+        """Append the event of lost frames, if their quaternion is not complete."""
         count = self._codec.incomplete - self._incomplete
         self._incomplete += count
         if not count:
@@ -172,7 +173,7 @@ class LpmsCanDecoder:
 
 
 _PLAIN = (1, 2, 3, 4)
-"""Channels of w, x, y and z in the order of the frames."""
+"""Channels of w, x, y and z, in the usual order of the frames."""
 _NORM_REMEDY = "change `precision` or `mapping`, and remove `scale`"
 _OUT_OF_ORDER = (
     "the frames of a quaternion do not follow each other within half a period: change `rate_hz` to "

@@ -1,7 +1,8 @@
 """Driver of LP-Research LPMS sensors on CAN.
 
-This driver only receives. The sensor is configured once over its UART or USB with the vendor's
-tool: identifiers, precision, and the quantity of each channel.
+The driver only receives. The user configures the sensor once over its UART or USB with the vendor's
+tool. The configuration consists of the identifiers, the precision, and the quantity of each
+channel.
 """
 
 from __future__ import annotations
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import Emit, Wire
 
 _MOST = 1.01
-"""Largest component of a quaternion."""
+"""Largest plausible component of a quaternion."""
 _LEAST = 1e-12
-"""Smallest component that is not 0: smaller floats are integers that were read as floats."""
+"""Smallest plausible component other than 0. Smaller values are integers interpreted as floats."""
 
 
 class LpmsCanImu:
@@ -42,9 +43,9 @@ class LpmsCanImu:
     def candidate_tables(cls, seen: Mapping[tuple[int, bool], int]) -> Iterator[dict[str, Any]]:
         """Yield the settings of sensors that may have sent the received frames.
 
-        A candidate has a first frame of 8 bytes. This frame belongs to a node in CANopen style, or
-        is the first of four consecutive frames. Both precisions are candidates. See
-        `jointfit_daemon.device_search`.
+        The first frame of a candidate has 8 bytes. It belongs to a node in CANopen style, or is the
+        first of four frames with consecutive identifiers. Each candidate is tried with both
+        precisions. See `jointfit_daemon.device_search`.
         """
         full = {number for (number, long), size in seen.items() if size == FRAME_BYTES and not long}
         for number in sorted(full):
@@ -76,9 +77,10 @@ class LpmsCanImu:
         Raises
         ------
         DeviceLostError
-            The bus is absent or down, the adapter unplugged, or this sensor silent for `silence_s`.
+            The bus is absent or down, the adapter is unplugged, or the sensor is silent for
+            `silence_s`.
         DeviceMisconfiguredError
-            This kind of bus is not available, or another sensor of the rig uses the same
+            This type of bus is not available, or another sensor of the rig uses the same
             identifiers.
         """
         settings, precision = self._settings, self._settings.precision
@@ -89,7 +91,7 @@ class LpmsCanImu:
         last = frames_of(settings.mapping, precision)[-1]
 
         def resembles(data: bytes) -> bool:
-            """Whether `data` may contain a quaternion or half a quaternion."""
+            """Return whether `data` may contain a quaternion or half a quaternion."""
             values = decode_frame(data, precision)
             if values is None:
                 return False

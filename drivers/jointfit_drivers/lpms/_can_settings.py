@@ -28,7 +28,7 @@ _MOST_NODES = 127
 
 
 class LpmsCanIdSettings(Settings):
-    """CAN identifiers of the four channel frames, as LpmsControl shows them."""
+    """CAN identifiers of the four channel frames, as LpmsControl displays them."""
 
     frame1: int = Field(ge=0, le=STANDARD_MAX, description="first channels")
     frame2: int = Field(ge=0, le=STANDARD_MAX, description="second frame")
@@ -37,7 +37,7 @@ class LpmsCanIdSettings(Settings):
 
     @property
     def frames(self) -> tuple[int, int, int, int]:
-        """The identifiers in the order of the channels."""
+        """Identifiers in the order of the channels."""
         return self.frame1, self.frame2, self.frame3, self.frame4
 
 
@@ -61,7 +61,7 @@ class LpmsCanSettings(CanImuSettings, LpmsConventionSettings):
 
     @property
     def channel_ids(self) -> ChannelIds:
-        """Identifiers of its frames and of its heartbeat."""
+        """Identifiers of the sensor's channel frames and heartbeat."""
         frames = self.ids.frames
         beat = HEARTBEAT + frames[0] - TPDO[0] if self.mode == "canopen" else None
         return ChannelIds(frames, beat)
@@ -73,7 +73,7 @@ class LpmsCanSettings(CanImuSettings, LpmsConventionSettings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Refuse identifiers that the mode cannot have, and channels that do not exist."""
+        """Yield identifiers that the mode does not permit, and channels that do not exist."""
         known: Any = (self.mode, self.ids, self.precision, self.mapping)  # None: cannot be read
         if None in known:
             return

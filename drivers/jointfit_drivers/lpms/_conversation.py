@@ -1,4 +1,4 @@
-"""LP-BUS commands to a sensor and its replies."""
+"""Exchange of LP-BUS commands and replies with one sensor."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from jointfit_protocols.corrupt import CorruptBytes
 
 MODE_S = 1.0
-"""Longest wait for the acknowledgement of command mode, s: a sensor first sends its queue."""
+"""Longest wait for the acknowledgement of command mode, s. A sensor first sends its queued data."""
 REPLY_S = 0.5
 """Longest wait for any other reply, s."""
 _KEPT = 512
-"""Last bytes stored for the recognition of text."""
+"""Number of received bytes that are stored in order to recognize text."""
 _ACKNOWLEDGEMENTS = frozenset({LpmsCommand.ACK, LpmsCommand.NACK})
 
 
@@ -35,7 +35,7 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
     port : SerialPort
         Open port.
     emit : Emit
-        Receives all bytes from the first reply on.
+        Function that receives all bytes from the first reply on.
     sensor_id : int
         Address of the sensor.
     """
@@ -44,9 +44,9 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
         super().__init__(port, emit, LpBusCodec)
         self._sensor_id = sensor_id
         self.last_bytes = b""
-        """Last bytes received."""
+        """The most recently received bytes."""
         self.ids: set[int] = set()
-        """Addresses in the messages received."""
+        """Addresses that occurred in received messages."""
 
     @override
     def reset(self) -> None:
@@ -55,17 +55,17 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
         self.ids.clear()
 
     async def enter_command_mode(self, *, tries: int = 3, wait_s: float | None = None) -> bool:
-        """Stop the stream; return whether the sensor replied.
+        """Stop the stream, and return whether the sensor replied.
 
-        Old firmware does not acknowledge. A reply to a read, which is one in both generations, then
-        shows that the sensor is in command mode.
+        Old firmware does not acknowledge this command. In this case the sensor receives a read
+        command that exists in both generations. A reply shows that it is in command mode.
 
         Parameters
         ----------
         tries
-            Largest number of requests.
+            Largest number of attempts.
         wait_s
-            Wait for each acknowledgement, s; default: `MODE_S`.
+            Longest wait for each acknowledgement, s. The default is `MODE_S`.
         """
         wait_s = MODE_S if wait_s is None else wait_s
         for _ in range(tries):
@@ -76,7 +76,7 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
         return await self._exchange(LpmsCommand.IDENTIFY, replies, wait_s=wait_s) is not None
 
     async def read(self, command: int) -> bytes | None:
-        """Return the data of the reply to a read; None if it is refused, or none arrives."""
+        """Return the data of the reply to a read command; None if it is refused or unanswered."""
         for _ in range(2):
             reply = await self._exchange(command, {command, LpmsCommand.NACK})
             if reply is not None:
@@ -86,12 +86,12 @@ class LpBusConversation(SerialConversation[LpBusMessage]):
     async def write(
         self, command: int, data: bytes = b"", *, wait_s: float = REPLY_S
     ) -> bool | None:
-        """Send a command; return whether it was acknowledged, or None without any reply."""
+        """Send a command; return whether the sensor acknowledged it, or None without any reply."""
         reply = await self._exchange(command, _ACKNOWLEDGEMENTS, data, wait_s=wait_s)
         return None if reply is None else reply.command == LpmsCommand.ACK
 
     async def start_stream(self) -> bool | None:
-        """Start the stream; return whether it was acknowledged or data arrive, None if neither."""
+        """Start the stream; return whether it was acknowledged or data arrived; None if neither."""
         for _ in range(3):
             replies = _ACKNOWLEDGEMENTS | {LpmsCommand.DATA}
             reply = await self._exchange(LpmsCommand.STREAM_MODE, replies)

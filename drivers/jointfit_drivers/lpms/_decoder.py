@@ -1,10 +1,10 @@
-"""Decoder of the driver of LPMS sensors on a serial line: chunks in, samples out.
+"""Decoder of LPMS sensors on a serial line: converts chunks to samples.
 
-A data packet does not name its outputs. The driver reads their mask before the stream begins, and
-the reply is part of the recorded bytes: the decoder takes the mask from there. Without a reply, it
-finds the quaternion by its norm.
+A data packet does not state which outputs it contains. The driver reads the mask of outputs before
+the stream begins. The reply is part of the recorded bytes, and the decoder takes the mask from it.
+Without a reply, the decoder finds the quaternion by its norm.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ if TYPE_CHECKING:
 
 _NS = 1_000_000_000
 _SECONDS_CLOCK = TickClock(1_000, None)
-"""Device time of firmware that sends seconds: converted to microseconds."""
+"""Device time of firmware that sends seconds, which are converted to microseconds."""
 _MOST_SECONDS = 1e9
 _DATA = int(LpmsCommand.DATA)
 _TEXT_BYTES = 256
-"""Number of bytes without a message after which these bytes are examined for text."""
+"""Number of bytes without a message after which they are checked for text."""
 _HALF = TICK_MODULUS // 2
 
 
 class _Packet(NamedTuple):
-    """A data packet that has not been accepted yet."""
+    """A data packet that is not accepted yet."""
 
     message: LpBusMessage
     arrival_ns: int
@@ -93,11 +93,11 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
 
     @override
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the content that `chunk` completed, in wire order; never raises."""
+        """Return the samples and events that `chunk` completes, in wire order; never raise."""
         if self._codec.messages or len(self._noise) >= _TEXT_BYTES:
             return super().feed(chunk)
 
-        # Warn once if the device sends text in place of messages.
+        # Warn once if the device sends text instead of messages.
         out: list[Decoded] = []
         self._noise += chunk.data[:_TEXT_BYTES]
         if len(self._noise) >= _TEXT_BYTES and is_text(self._noise):
@@ -106,7 +106,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
 
     @override
     def flush(self) -> list[Decoded]:
-        """Discard a pending message and a packet that waits for confirmation."""
+        """Discard an incomplete message, and a packet that waits for confirmation."""
         out = super().flush() + self._decode_packets(self._search.flush())
         return out + self._drop_held()
 
@@ -132,7 +132,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         return out + [event for packet in ready for event in self._decode_packet(packet)]
 
     def _decode_packet(self, arrived: ArrivedPacket) -> list[Decoded]:
-        """Return the content of a data packet after the check of its time."""
+        """Check the time of a data packet, and return the packet's content."""
         message, arrival_ns = arrived
         measurement = self._layout.decode(message.data)
         if measurement is None or "quaternion" not in self._layout.places:
@@ -173,7 +173,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         return out + self._sample(packet)
 
     def _device_ticks(self, tick: int) -> int | None:
-        """Return the device time in units of `tick_clock`, without wraps; None if it has none."""
+        """Return the device time in ticks of `tick_clock`, without wraps; None if there is none."""
         if self._is_seconds:
             seconds = seconds_of(tick)
             is_time = isfinite(seconds) and 0 <= seconds < _MOST_SECONDS
@@ -198,7 +198,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         return [*out, ImuSample(packet.arrival_ns, q, native, ticks, None)]
 
     def _property_events(self, message: LpBusMessage) -> list[Decoded]:
-        """Return the events of a reply; it may change the layout of the data packets."""
+        """Return the events of a reply, which may change the layout of later data packets."""
         command, data = message.command, message.data
         part = decode_configuration(self._table, command, data)
         if part is not None:
@@ -223,7 +223,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         return [DeviceEvent("info", text, known)] if known else []
 
     def _take_firmware(self, data: bytes) -> dict[str, object]:
-        """Return the firmware version, and set the form of the device time that it sends."""
+        """Return the firmware version, and set the format of the device time accordingly."""
         version = decode_firmware(self._table, data)
         if version is None:
             return {}
@@ -238,7 +238,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
     # --- findings in the stream ---------------------------------------------------------------
 
     def _time_warning(self, tick: int, arrival_ns: int) -> list[Decoded]:
-        """Return a warning if device time has another unit than configured."""
+        """Return a warning if the unit of device time differs from the configured unit."""
         fault = self._check.feed(tick, arrival_ns)
         if fault is None:
             return []
@@ -256,7 +256,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         return [DeviceEvent("warning", text, {"ticks_per_s": round(fault.ticks_per_s, 1)})]
 
     def _length_warning(self, message: LpBusMessage) -> list[Decoded]:
-        """Return a warning about packets of a length that does not fit the outputs, once each."""
+        """Return a warning, once per length, if the length of packets does not fit the outputs."""
         size = len(message.data)
         if size in self._sizes:
             return []
@@ -275,7 +275,7 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
         return [DeviceEvent("warning", text, {"data_bytes": size})]
 
     def _drop_held(self) -> list[Decoded]:
-        """Reject a packet that no later one confirmed."""
+        """Reject a packet that no later packet confirmed."""
         held, self._held = self._held, None
         if held is None:
             return []
@@ -284,12 +284,12 @@ class LpmsDecoder(SerialMessageDecoder[LpBusMessage]):
 
 
 def is_text(data: bytes) -> bool:
-    """Return whether `data` are lines of printable ASCII, as in the text format of a sensor."""
+    """Return whether `data` are lines of printable ASCII, as the text format of a sensor has."""
     printable = sum(0x20 <= byte < 0x7F or byte in b"\r\n\t" for byte in data)  # noqa: PLR2004 - a generation, or ASCII
     return bool(data) and printable >= _TEXT_SHARE * len(data)
 
 
 _TEXT_SHARE = 0.95
-"""Least share of printable bytes in text; the first line may be cut."""
+"""Smallest share of printable bytes in text. The first line may be incomplete."""
 TEXT_REMEDY = "set its output format to LP-BUS (binary) with LpmsControl, then restart it"
 _NORM_REMEDY = "remove `scale`, and check with LpmsControl that the quaternion is enabled"

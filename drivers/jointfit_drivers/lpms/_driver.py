@@ -1,7 +1,7 @@
 """Driver of LP-Research LPMS sensors that use LP-BUS on a serial port or USB.
 
-`LpmsDecoder` is the pure part. `LpmsImu.run` opens the port, brings the sensor into stream mode and
-reads until cancelled. `run` passes nothing but chunks to the decoder.
+`LpmsDecoder` is the pure part. `LpmsImu.run` opens the port, starts the stream of the sensor and
+reads until cancelled. The decoder receives only the chunks that `run` emits.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class LpmsImu:
-    """One LPMS sensor: orientation, and device time in ticks of its filter."""
+    """One LPMS sensor, which sends orientation and device time in ticks of its filter."""
 
     Settings: ClassVar[type[LpmsSettings]] = LpmsSettings
     wire: ClassVar[Wire] = "stream"
@@ -33,15 +33,15 @@ class LpmsImu:
         return LpmsDecoder(self._settings)
 
     async def run(self, emit: Emit) -> None:
-        """Open the port, bring the sensor into stream mode, and read until cancelled.
+        """Open the port, start the stream of the sensor, and read until cancelled.
 
         Raises
         ------
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, no LPMS sensor answers, its speed, generation or address
-            differ, or it does not accept the settings.
+            The file is not a serial port, or no LPMS sensor answers. Or the sensor has another
+            speed, generation or address, or does not accept the settings.
         """
         settings = self._settings
         await self._reception.run(

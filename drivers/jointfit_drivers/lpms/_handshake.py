@@ -1,12 +1,12 @@
-"""From an open port to a streaming LPMS sensor, or to the error that explains the failure.
+"""Start of an LPMS sensor: makes it stream, or raises an error that explains the failure.
 
-The settings of the sensor are read and compared. Only settings that differ are written, and then
-read again, because old firmware acknowledges nothing. The settings are stored in flash only with
+The driver reads the settings of the sensor and writes only settings that differ. It then reads them
+again, because old firmware acknowledges nothing. The sensor stores the settings in flash only with
 ``persist``.
 
-Some commands have another meaning in the other generation. Before the first such command, the
-driver sends a query that has no effect in either generation. The reply to this query differs
-between the generations.
+Some commands have a different meaning in the other generation of sensors. Before the first such
+command, the driver sends a query that has no effect in either generation. The reply shows the
+generation.
 """
 
 from __future__ import annotations
@@ -35,27 +35,27 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600)
-"""Line speeds to search, bit/s: factory settings and common choices first."""
+"""Line speeds for the search, bit/s: factory settings and usual speeds first."""
 _LISTEN_S = 0.15
-"""Time at each speed of the search, s."""
+"""Duration of the search at each speed, s."""
 _STORE_S = 3.0
 """Longest wait for the acknowledgement of a flash write, s."""
 _FIRST_S, _FIRST_PERIODS = 1.0, 5
-"""Longest wait for the first data packet, s, and in periods of a slow sensor."""
+"""Longest wait for the first data packet: in seconds, and in periods of a slow sensor."""
 
 
 class LpmsHandshake:
-    """Brings one sensor into stream mode.
+    """Makes one sensor stream.
 
     Parameters
     ----------
     port, emit : SerialPort, Emit
-        Open port, and the receiver of the sensor's bytes.
+        Open port, and function that receives the sensor's bytes.
     settings : LpmsSettings
         Table of the device in rig.toml.
     hunt : bool
-        Whether to search for a silent sensor at other speeds. A sensor whose bytes cannot be
-        decoded is always searched for.
+        Whether to search for a silent sensor at other speeds. If the sensor's bytes cannot be
+        decoded, the other speeds are always searched.
     """
 
     def __init__(
@@ -69,15 +69,15 @@ class LpmsHandshake:
         self._path = settings.port
 
     async def ensure_streaming(self) -> None:
-        """Return when the sensor streams according to the settings.
+        """Return when the sensor streams with the configured settings.
 
         Raises
         ------
         DeviceLostError
-            The sensor is silent, unplugged, or stopped answering.
+            The sensor does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            Speed, generation or address differ from the settings, the device is of another kind, or
-            it does not accept the settings.
+            Speed, generation or address differ from the settings. Or the device is of another kind,
+            or does not accept the settings.
         """
         settings = self._settings
         settings.require_line_speed("the speed of the sensor")
@@ -91,7 +91,7 @@ class LpmsHandshake:
         await self._start()
 
     async def _ensure_generation(self) -> None:
-        """Refuse a sensor of the other generation before any command that could harm it."""
+        """Reject a sensor of the other generation before sending a command that could damage it."""
         reply = await self._conversation.read(LpmsCommand.IDENTIFY)
         found = None if reply is None else identify_generation(reply)
         if found is None:
@@ -108,7 +108,7 @@ class LpmsHandshake:
             )
 
     async def _ensure_configuration(self) -> None:
-        """Set outputs, rate and precision where they differ."""
+        """Set outputs, rate and precision if they differ from the settings."""
         settings = self._settings
         wanted = LpmsConfiguration(
             self._table.quaternion, int(settings.rate_hz), settings.precision == "float32"
@@ -136,7 +136,7 @@ class LpmsHandshake:
             await self._conversation.write(self._table.store, wait_s=_STORE_S)
 
     async def _read_configuration(self) -> LpmsConfiguration:
-        """Return the settings of the sensor; a precision that cannot be read is unknown."""
+        """Return the settings of the sensor. If the precision cannot be read, it is unknown."""
         found = LpmsConfiguration()
         for command in self._table.reads:
             data = await self._conversation.read(command)
@@ -151,7 +151,7 @@ class LpmsHandshake:
         return found
 
     def _describe(self, part: LpmsConfiguration) -> str:
-        """Return the known settings of `part` as text."""
+        """Return the known settings in `part` as text."""
         texts = []
         if part.outputs is not None:
             texts.append(f"outputs {' + '.join(self._table.names(part.outputs))}")
@@ -227,7 +227,7 @@ class LpmsHandshake:
         )
 
     async def _other_speed(self) -> int | None:
-        """Return the speed at which the sensor answers; it continues to stream as before."""
+        """Return the speed at which the sensor answers; the sensor then continues to stream."""
 
         async def answers() -> bool:
             entered = await self._conversation.enter_command_mode(tries=1, wait_s=_LISTEN_S)
@@ -241,7 +241,7 @@ class LpmsHandshake:
 
 
 def _differing(found: LpmsConfiguration, wanted: LpmsConfiguration) -> LpmsConfiguration:
-    """Return the settings of `wanted` that `found` has not, or that are unknown."""
+    """Return the settings of `wanted` that differ from `found` or are unknown in it."""
     return LpmsConfiguration(
         wanted.outputs if found.outputs != wanted.outputs else None,
         wanted.rate_hz if found.rate_hz != wanted.rate_hz else None,

@@ -1,4 +1,4 @@
-"""Quaternions of LPMS sensors as sent, converted to the canonical orientation.
+"""Conversion of LPMS quaternions, as sent, to the canonical orientation.
 
 Invariant: the output depends only on the quaternions fed.
 """
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
     from jointfit_protocols.orientation import Quaternion, World
 
 _CHECKED = 100
-"""Quaternions whose norms are reported once."""
+"""Number of quaternions whose norms are checked and reported once."""
 _COARSE_TOLERANCE = 0.05
 """Largest deviation of the norm from 1 for quaternions in thousandths."""
 
 
 class LpmsConvention(NamedTuple):
-    """Meaning of the quaternions of one sensor."""
+    """Meaning of the quaternions that one sensor sends."""
 
     world: World = "NWU"
     world_to_sensor: bool = True
     unit: int | None = None
-    """Counts of 1.0 in 16-bit data; None: determined from the norm."""
+    """Number of counts for 1.0 in 16-bit data; None if it is determined from the norm."""
 
     @classmethod
     def of(cls, settings: LpmsConventionSettings) -> LpmsConvention:
-        """Return the convention in the settings of a sensor."""
+        """Return the convention that the settings of a sensor define."""
         unit = None if settings.scale == "auto" else settings.scale
         return cls(settings.world, settings.direction == "world_to_sensor", unit)
 
@@ -49,7 +49,7 @@ class LpmsOrientation:
     convention : LpmsConvention
         Meaning of the quaternions.
     remedy : str
-        Settings to change if hardly any quaternion has norm 1.
+        Settings to change if hardly any quaternion has norm 1, for the error message.
     """
 
     def __init__(self, convention: LpmsConvention, remedy: str) -> None:
@@ -58,15 +58,15 @@ class LpmsOrientation:
         self._unit: int | None = None
         self._gate = OrientationGate()
         self.remedy = remedy
-        """Settings to change if hardly any quaternion has norm 1."""
+        """Settings to change if hardly any quaternion has the norm 1."""
         self._norms: list[float] = []
         self.events: list[Decoded] = []
-        """Events since they were last taken."""
+        """Events that were not returned yet."""
 
     def convert(
         self, values: Sequence[float], *, floats: bool
     ) -> tuple[Quaternion, Quaternion] | None:
-        """Return the scaled and the canonical quaternion; None if its norm is not 1."""
+        """Return the scaled and the canonical quaternion; None if the norm is not 1."""
         a, b, c, d = values
         if not floats:
             unit = self._scale.feed(values)
@@ -87,7 +87,7 @@ class LpmsOrientation:
         return None if q is None else (native, q)
 
     def forget(self) -> None:
-        """Restart sign continuity: the device restarted."""
+        """Restart the continuity of signs, because the device restarted."""
         self._gate.forget()
 
     def _check_norm(self, square: float) -> None:

@@ -48,17 +48,17 @@ class LpmsSettings(SerialImuSettings, LpmsConventionSettings):
 
     @property
     def table(self) -> CommandTable:
-        """Commands of its generation."""
+        """Commands of the configured generation."""
         return TABLES[self.generation]
 
     @property
     def ticks_per_s(self) -> int:
-        """Ticks of its time in a second."""
+        """Number of ticks of device time per second."""
         return self.tick_hz or self.table.tick_hz
 
     @property
     def data_bytes(self) -> int:
-        """Size of a data packet with its framing, bytes."""
+        """Size of a data packet including its framing, bytes."""
         sizes = PacketLayout(self.table, self.table.quaternion).sizes
         return sizes[self.precision == "int16"] + OVERHEAD
 
@@ -69,7 +69,7 @@ class LpmsSettings(SerialImuSettings, LpmsConventionSettings):
 
     @override
     def contradictions(self) -> Iterator[tuple[str, str]]:
-        """Refuse rates that the generation has not, and that its time cannot count."""
+        """Yield rates that the generation does not support, or that its time cannot count."""
         known: Any = (self.generation, self.rate_hz)  # None: cannot be read
         if None in known:
             return

@@ -1,9 +1,9 @@
-"""Check of the configured unit of device time against the arrivals.
+"""Check of the configured unit of device time against the arrival times.
 
-The ticks per second of each model are not verified on hardware, and old firmware sends seconds in
-place of ticks. Arrivals over spans of seconds show both.
+The number of ticks per second of each model was not verified on hardware, and old firmware sends
+seconds instead of ticks. The arrivals of several seconds show both faults.
 
-Invariant: pure arithmetic on ticks and arrival stamps.
+Invariant: the result depends only on ticks and arrival stamps.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from typing import NamedTuple
 from jointfit_protocols.lpms.measurement import TICK_MODULUS, seconds_of
 
 _SPAN_NS = 3_000_000_000
-"""Least span of arrivals that measures the rate, ns."""
+"""Shortest span of arrivals that permits a measurement of the rate, ns."""
 _CONTRADICTIONS = 2
-"""Consecutive spans that prove another unit."""
+"""Number of consecutive spans that prove another unit."""
 _NEAR = 0.05
 """Largest relative deviation of a measured rate."""
 _MOST_RATIO = 4.0
@@ -26,25 +26,25 @@ _NS = 1e9
 
 
 class TimeUnitFault(NamedTuple):
-    """Finding that device time has another unit than configured."""
+    """Finding that the unit of device time differs from the configured unit."""
 
     ticks_per_s: float
-    """Measured rate of the number sent, 1/s."""
+    """Measured rate of the number that the device sends, 1/s."""
     usual_hz: int | None
-    """Usual tick rate near it; None if there is none."""
+    """Usual tick rate near the measured rate; None if there is none."""
     is_seconds: bool
     """Whether the device sends float32 seconds."""
 
 
 class TickRateCheck:
-    """Compares the device time of one sensor with its arrivals, until it is checked.
+    """Compares the device time of one sensor with its arrivals until the unit is certain.
 
     Parameters
     ----------
     ticks_per_s : int
-        Configured rate; 1 for seconds.
+        Configured tick rate, 1/s; 1 for seconds.
     is_seconds : bool
-        Whether float32 seconds are configured.
+        Whether the configured unit is float32 seconds.
     """
 
     def __init__(self, ticks_per_s: int, *, is_seconds: bool) -> None:
@@ -55,7 +55,7 @@ class TickRateCheck:
         """Whether the check has ended: the unit was confirmed, or reported as wrong."""
 
     def feed(self, tick: int, arrival_ns: int) -> TimeUnitFault | None:
-        """Add a data packet; return the fault once, as soon as it is certain.
+        """Add a data packet. Return the fault once, as soon as it is certain.
 
         Parameters
         ----------
@@ -78,7 +78,7 @@ class TickRateCheck:
             self.done = True
             return None
 
-        # a restart of the device, or a pause of this host, falsifies one span
+        # A restart of the device or a pause of this host makes one span wrong.
         self._contradictions += 1
         if self._contradictions < _CONTRADICTIONS:
             return None

@@ -1,4 +1,4 @@
-"""Driver for motion capture that arrives as a stream of the Lab Streaming Layer."""
+"""Driver for motion capture that arrives as a stream of the Lab Streaming Layer (LSL)."""
 
 from jointfit_drivers.lsl_markers._decoder import LslMarkersDecoder
 from jointfit_drivers.lsl_markers._driver import LslMarkersMocap

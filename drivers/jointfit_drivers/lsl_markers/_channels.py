@@ -1,11 +1,11 @@
-"""Assignment of the channels of a stream to marker coordinates and body poses.
+"""Assignment of the channels of an LSL stream to marker coordinates and body poses.
 
-The convention is the MoCap meta-data of XDF: each channel has a label, a marker or an object, a
-type (PositionX to Z, OrientationA to D with A the scalar, Confidence) and a unit. Where the type is
-missing, the end of the label (``T1_X``, ``Thigh.qw``) replaces it. Streams without labels have the
-names of rig.toml, x y z each.
+The convention is the MoCap meta-data of XDF, the file format of LSL. Each channel has a label, a
+marker or an object, a type (PositionX to Z, OrientationA to D with scalar A, or Confidence) and a
+unit. If the type is missing, the end of the label (``T1_X``, ``Thigh.qw``) replaces it. If the
+channels have no labels, rig.toml defines the names, with x, y and z for each name.
 
-Invariant: pure; a channel that is not understood is reported, never guessed.
+Invariant: the functions are pure. An unknown channel is reported and never guessed.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ _UNITS_M = {
 }  # fmt: skip
 _AXES, _TURN = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
 _LISTED = 5
-"""Names that a warning lists."""
+"""Largest number of names in a warning."""
 
 
 class Columns(NamedTuple):
-    """Channels of one marker or body."""
+    """Channel numbers of one marker or body."""
 
     position: tuple[int, int, int]
     orientation: tuple[int, int, int, int] | None
@@ -51,12 +51,12 @@ class Columns(NamedTuple):
 
 
 class StreamLayout(NamedTuple):
-    """Content of a stream."""
+    """Meaning of the channels of a stream."""
 
     markers: tuple[ModelEntry, ...]
     bodies: tuple[ModelEntry, ...]
     columns: dict[ColumnKey, Columns]
-    """Channels of each entry, by its key."""
+    """Channel numbers of each marker or body, by its key."""
     scale_m: float
     """Length of one unit of the positions, m."""
     unit: str
@@ -65,7 +65,7 @@ class StreamLayout(NamedTuple):
 
 
 def stream_layout(description: StreamDescription, settings: LslMarkersSettings) -> StreamLayout:
-    """Return the content of a stream.
+    """Return the meaning of the channels of a stream.
 
     Parameters
     ----------
@@ -123,11 +123,11 @@ def stream_layout(description: StreamDescription, settings: LslMarkersSettings) 
 
 
 _Found = dict[tuple[str, str, bool], dict[str, int]]
-"""Channel of each part, by owner, name and whether the name belongs to an object."""
+"""Channel number of each component, by owner, name, and whether the owner is an object."""
 
 
 def _named(description: StreamDescription, names: tuple[str, ...], warnings: list[str]) -> _Found:
-    """Return the channels of a stream that are named by rig.toml."""
+    """Return the channels of a stream whose names rig.toml defines."""
     if 3 * len(names) != description.channel_count:
         warnings.append(
             f"names lists {len(names)} markers, which are {3 * len(names)} channels; the stream "
@@ -141,7 +141,7 @@ def _named(description: StreamDescription, names: tuple[str, ...], warnings: lis
 
 
 def _described(channels: tuple[Channel, ...], warnings: list[str]) -> _Found:
-    """Return the channels by their descriptions."""
+    """Return the channels according to their descriptions in the stream."""
     found: _Found = {}
     repeated: list[str] = []
     for number, channel in enumerate(channels):
@@ -181,7 +181,7 @@ def _unit(
     columns: dict[ColumnKey, Columns],
     warnings: list[str],
 ) -> str:
-    """Return the unit of the positions: as configured, as described, otherwise m."""
+    """Return the unit of the positions: the configured unit, the described unit, or else m."""
     if settings.unit != "auto":
         return settings.unit
     described = description.channels

@@ -1,10 +1,11 @@
-"""Decoder of the driver: chunks of a stream in, optical frames and echoes of the clock out.
+"""Decoder of LSL streams: converts chunks to optical frames and clock echoes.
 
-A sample is a frame. A coordinate that is not a finite number, exactly zero in all three axes, or
-without confidence is not seen. Each comparison of the clocks is an echo, once the stamps were found
-to be on the clock of LSL: some programs send the time of their cameras instead.
+A sample of the stream is a frame. A position counts as occluded if a coordinate is not finite, if
+all three coordinates are exactly zero, or if its confidence is zero. Some programs stamp samples
+with the time of their cameras instead of the LSL clock. If the stamps were found to be on the LSL
+clock, each comparison of the clocks is returned as an echo.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no stream.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no stream.
 """
 
 from __future__ import annotations
@@ -39,15 +40,14 @@ if TYPE_CHECKING:
 _NS = 1_000_000_000
 _CLOCK = TickClock(1, None)
 _LATEST_S = 9e9
-"""Largest time stamp, s: its nanoseconds still fit 64 bits."""
+"""Largest time stamp, s, whose value in nanoseconds fits into 64 bits."""
 _BACKWARDS_NS = _NS
-"""Decrease of the stamps, ns, from which on it shows a restart of the sender."""
+"""Decrease of the stamps from which it shows a restart of the sender, ns."""
 _GAP_PERIODS, _LEAST_GAP_NS = 5, 100_000_000
-"""Steps of the stamps of a regular stream, periods and ns, above both of which samples were lost.
-Programs that stamp when they send have a jitter of several periods."""
+"""Steps of the stamps of a regular stream, in periods and in ns. If both are exceeded, samples were
+lost. Programs that stamp samples at transmission have a jitter of several periods."""
 _EARLY_NS, _LATE_NS = 500_000_000, 10 * _NS
-"""Largest time, ns, by which a stamp on the clock of LSL is later, and earlier, than its
-arrival."""
+"""Largest times by which a stamp on the LSL clock may be later and earlier than its arrival, ns."""
 
 
 class LslMarkersDecoder:
@@ -56,7 +56,7 @@ class LslMarkersDecoder:
     Parameters
     ----------
     settings : LslMarkersSettings
-        Names in rig.toml, unit, up axis and clock.
+        The ``[mocap]`` table with names, unit, up axis and clock.
     """
 
     def __init__(self, settings: LslMarkersSettings) -> None:
@@ -74,13 +74,13 @@ class LslMarkersDecoder:
         self._on_lsl_clock: bool | None = None  # None: not known yet
         self._zeros_reported = False
         self.unpublished = 0
-        """Samples before the description of the stream."""
+        """Number of samples that arrived before the description of the stream."""
         self.suspicious = 0
-        """Samples and poses rejected because their numbers are implausible."""
+        """Number of samples and poses rejected because of implausible numbers."""
 
     @property
     def tick_clock(self) -> TickClock:
-        """Clock of the stamps, ns."""
+        """Clock of the stamps, in ns."""
         return _CLOCK
 
     @property
@@ -94,7 +94,7 @@ class LslMarkersDecoder:
         return self._codec.discarded
 
     def feed(self, chunk: Chunk) -> list[Decoded]:
-        """Return the frames, echoes and events of `chunk`; never raises."""
+        """Return the frames, echoes and events of `chunk`; never raise."""
         out: list[Decoded] = []
         for message in self._codec.feed(chunk.data):
             match message:
@@ -110,13 +110,13 @@ class LslMarkersDecoder:
         return out
 
     def flush(self) -> list[Decoded]:
-        """Return nothing: chunks are whole."""
+        """Return an empty list, because chunks are always complete."""
         return []
 
     # --- description --------------------------------------------------------------------------
 
     def _described(self, description: StreamDescription, out: list[Decoded]) -> None:
-        """Bind the channels of a new connection to the names of rig.toml."""
+        """Assign the channels of a new connection to the names in rig.toml."""
         before, self._description = self._description, description
         layout = stream_layout(description, self._settings)
         facts: dict[str, object] = {
@@ -155,7 +155,7 @@ class LslMarkersDecoder:
     # --- time ---------------------------------------------------------------------------------
 
     def _round_trip(self, trip: RoundTrip, out: list[Decoded]) -> None:
-        """Append the echo of a comparison of the clocks."""
+        """Append the echo for a comparison of the clocks."""
         if not abs(trip.remote_s) < _LATEST_S or trip.received_ns < trip.sent_ns:
             self.suspicious += 1
             return
@@ -166,7 +166,7 @@ class LslMarkersDecoder:
             out.append(_echo(trip))
 
     def _check_clock(self, stamp_ns: int, arrival_ns: int, out: list[Decoded]) -> None:
-        """Decide once in a connection whether the stamps are on the clock of LSL."""
+        """Decide once per connection whether the stamps are on the LSL clock."""
         trip = self._trip
         if self._on_lsl_clock is not None or trip is None or self._settings.time == "sender":
             return
@@ -187,7 +187,7 @@ class LslMarkersDecoder:
         )
 
     def _check_step(self, stamp_ns: int, out: list[Decoded]) -> None:
-        """Report lost samples of a regular stream, and a sender that restarted."""
+        """Report lost samples of a regular stream, and a restart of the sender."""
         if self._last is None or self._description is None:
             return
         step_ns, rate_hz = stamp_ns - self._last[0], self._description.rate_hz
@@ -232,7 +232,7 @@ class LslMarkersDecoder:
             )
 
     def _position(self, values: tuple[float, ...], columns: Columns, out: list[Decoded]) -> Vector:
-        """Return a position, z up, m; NaN if it was not seen."""
+        """Return a position with z up, m; NaN if occluded."""
         i, j, k = columns.position
         x, y, z = values[i], values[j], values[k]
         if columns.confidence is not None and not values[columns.confidence] > 0.0:
@@ -258,7 +258,7 @@ class LslMarkersDecoder:
     def _pose(
         self, values: tuple[float, ...], columns: Columns, out: list[Decoded]
     ) -> tuple[Vector, Quaternion]:
-        """Return position and orientation of a body, z up; both NaN if it was not seen."""
+        """Return position and orientation of a body with z up; both are NaN if it is occluded."""
         position = self._position(values, columns, out)
         if columns.orientation is None or position is NO_POSITION:
             return ABSENT

@@ -1,6 +1,6 @@
 """Driver of motion capture that arrives as a stream of the Lab Streaming Layer.
 
-`LslMarkersDecoder` is the pure part. `LslMarkersMocap.run` searches the stream, and emits
+`LslMarkersDecoder` is the pure part. `LslMarkersMocap.run` searches for the stream. It emits
 description, samples and clock comparisons as chunks, so that a replay has the same input as the
 live decoder.
 """
@@ -19,12 +19,13 @@ if TYPE_CHECKING:
 
 
 class LslMarkersMocap:
-    """One stream: markers or rigid bodies, stamped by the clock of LSL on the sending PC."""
+    """One stream of markers or rigid bodies, stamped by the LSL clock of the sending PC."""
 
     Settings: ClassVar[type[LslMarkersSettings]] = LslMarkersSettings
     wire: ClassVar[Wire] = "datagram"
     least_delay_ms: ClassVar[tuple[float, float]] = (15.0, 10.0)
-    """Delay from exposure to stamp, ms: most programs stamp a sample when they send it."""
+    """Mean and standard deviation of the delay from exposure to stamp, ms. Most programs stamp a
+    sample when they send it."""
 
     find_servers = staticmethod(find_servers)
     diagnose = staticmethod(diagnose)
@@ -37,14 +38,14 @@ class LslMarkersMocap:
         return LslMarkersDecoder(self._settings)
 
     async def run(self, emit: Emit) -> None:
-        """Search the stream and read until cancelled.
+        """Search for the stream, and read until cancelled.
 
         Raises
         ------
         DeviceLostError
-            No stream fits, its sender ended it or does not answer, or sends no sample for
+            No stream fits, or the sender ended the stream, does not answer, or sends no sample for
             ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            pylsl is not installed, several streams fit, or the stream has no numbers.
+            pylsl is not installed, several streams fit, or the stream contains no numbers.
         """
         await LslSession(self._settings, emit).run()

@@ -1,6 +1,6 @@
-"""The library of the Lab Streaming Layer: its import, the search for streams, and its clock.
+"""Access to the library of the Lab Streaming Layer: import, search for streams, and clock.
 
-pylsl is an extra. Its calls block, so all of them run in threads of the driver.
+pylsl is an optional extra. Its calls block, so they all run in threads of the driver.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jointfit_daemon.driver import DeviceMisconfiguredError
 from jointfit_protocols.lsl import RoundTrip
 
 _READINGS = 5
-"""Number of comparisons of the LSL clock with the host clock; the fastest comparison is used."""
+"""Number of comparisons of the LSL clock with the host clock. The fastest comparison is used."""
 
 
 def load_library() -> Any:
@@ -44,27 +44,27 @@ def load_library() -> Any:
 def search_streams(
     lsl: Any, query: str, server: str | None, *, least: int, wait_s: float
 ) -> list[Any]:
-    """Return the `pylsl.StreamInfo` of the streams that answer; blocks for at most `wait_s`.
+    """Return the `pylsl.StreamInfo` of all streams that answer; block for at most `wait_s`.
 
     Parameters
     ----------
     lsl : module
-        pylsl.
+        The module pylsl.
     query : str
-        XPath predicate.
+        XPath predicate that selects streams.
     server : str, optional
-        Address or name of the sender; streams of others are left out.
+        Address or name of the sender. Streams of other senders are ignored.
     least : int
         Number of streams after which the search ends early.
     wait_s : float
-        Longest wait, s.
+        Longest duration of the search, s.
     """
     found = lsl.resolve_bypred(query, minimum=least, timeout=wait_s)
     return [info for info in found if server is None or _is_sender(server, info.hostname())]
 
 
 def _is_sender(server: str, hostname: str) -> bool:
-    """Return whether `server` is the PC called `hostname`; streams contain no address."""
+    """Return whether `server` is the PC with the name `hostname`; streams contain no address."""
     name = hostname.lower()
     if server.lower() in {name, name.partition(".")[0]}:
         return True
@@ -74,7 +74,7 @@ def _is_sender(server: str, hostname: str) -> bool:
 
 
 def addresses_of(host: str) -> set[str]:
-    """Return the IPv4 addresses of a host; empty if its name is unknown here."""
+    """Return the IPv4 addresses of a host; empty if its name cannot be resolved."""
     try:
         return {str(one[4][0]) for one in socket.getaddrinfo(host, None, family=socket.AF_INET)}
     except (OSError, UnicodeError):
@@ -84,8 +84,9 @@ def addresses_of(host: str) -> set[str]:
 def compare_clocks(lsl: Any, inlet: Any, wait_s: float) -> RoundTrip | None:
     """Return the latest comparison of the sender's clock with CLOCK_MONOTONIC of this host.
 
-    liblsl asks the sender every few seconds and uses the reply with the shortest round trip; its
-    uncertainty is that round-trip time. None if there is no reply within `wait_s`.
+    liblsl queries the sender every few seconds, and uses the reply with the shortest round-trip
+    time. The uncertainty is that round-trip time. The result is None if no reply arrives within
+    `wait_s`.
     """
     remote, uncertainty, code = ctypes.c_double(), ctypes.c_double(), ctypes.c_int()
     ask = lsl.lib.lib.lsl_time_correction_ex  # `StreamInlet.time_correction` has no uncertainty
@@ -100,7 +101,7 @@ def compare_clocks(lsl: Any, inlet: Any, wait_s: float) -> RoundTrip | None:
     if code.value:
         return None
 
-    # LSL's clock is CLOCK_MONOTONIC on Linux in usual builds; the difference is measured anyway.
+    # The LSL clock is CLOCK_MONOTONIC in the usual builds on Linux, but the difference is measured.
     readings = []
     for _ in range(_READINGS):
         before_ns = time.monotonic_ns()

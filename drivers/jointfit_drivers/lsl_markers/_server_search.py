@@ -1,7 +1,7 @@
-"""Search for streams of motion capture, and diagnosis of missing frames.
+"""Search for motion-capture streams of LSL, and diagnosis of missing frames.
 
-The search asks the network once; hosts that are named only select among the answers. The diagnosis
-connects as the driver does.
+The search queries the network once. Names of hosts only select among the answers. The diagnosis
+connects in the same way as the driver.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 _REMEDY = "start the LSL program of the camera software, and select markers or rigid bodies in it"
 _MOST_STREAMS = 32
 _PORT = 16_572
-"""First port of LSL; senders use it and the next ones."""
+"""First network port of LSL. Senders use this port and the following ports."""
 
 
 async def find_servers(
@@ -36,8 +36,8 @@ async def find_servers(
 ) -> list[FoundServer]:
     """Return the streams that answer; see `ServerSearch.find_servers`.
 
-    Without the extra ``lsl`` there are none. With a `port` there are none either: LSL has no fixed
-    port, so the search is for another family.
+    The result is empty if the extra ``lsl`` is not installed. It is also empty if `port` is given:
+    LSL has no fixed port, so the search is for another device family.
     """
     if port is not None or not (hosts or broadcast):
         return []
@@ -52,14 +52,14 @@ def _search(lsl: Any, hosts: Sequence[str], broadcast: bool, wait_s: float) -> l
     query = LslMarkersSettings(driver="lsl-markers").query()
     found = {}
     for server in [None] if broadcast else list(hosts):
-        # The search always takes the whole time, because any number of streams may answer.
+        # The search always takes its full duration, because any number of streams may answer.
         for info in search_streams(lsl, query, server, least=_MOST_STREAMS, wait_s=wait_s):
             found[info.uid()] = info
     return [_described(lsl, info, wait_s) for info in found.values()]
 
 
 def _described(lsl: Any, info: Any, wait_s: float) -> FoundServer:
-    """Return a stream with the names of its markers and bodies."""
+    """Return the description of a stream, with the names of its markers and bodies."""
     markers: tuple[str, ...] = ()
     bodies: tuple[str, ...] = ()
     try:

@@ -1,15 +1,15 @@
 """One connection to a stream: search, description, samples, and comparisons of the clocks.
 
-1. Search for the streams that fit. Without one, the device is lost; with several of different
-sources, it is misconfigured.
-2. The description is emitted, then samples as they arrive, each time in one chunk.
-3. A second thread asks for the offset of the sender's clock, because the first reply takes half a
-   second, and emits every new result.
+1. The session searches for streams that fit. If there is none, the device is lost. If there are
+several from different sources, the device is misconfigured.
+2. It emits the description, then the samples as they arrive. Each emission is one chunk.
+3. A second thread queries the offset of the sender's clock and emits every new result. It is a
+separate thread because the first reply takes half a second.
 
-The inlet does not recover by itself: after a loss the stream is searched again, so that a changed
-description is noticed.
+The inlet of pylsl does not reconnect by itself. After a loss, the session searches for the stream
+again, so that it detects a changed description.
 
-Invariant: chunks are emitted in the event loop, in order of arrival.
+Invariant: chunks are emitted in the event loop, in the order of arrival.
 """
 
 from __future__ import annotations
@@ -40,16 +40,16 @@ if TYPE_CHECKING:
 SEARCH_S = 3.0
 """Time to search for a stream, s."""
 _STEP_S = 0.3
-"""Longest blocking call of the library, s: a cancelled connection ends within it."""
+"""Longest duration of a blocking library call, s. A cancelled connection ends within this time."""
 _DESCRIPTION_S = 5.0
 _COMPARE_S = 1.0
-"""Interval between queries for a new clock comparison, s."""
+"""Interval between queries for a new comparison of the clocks, s."""
 _MOST_SAMPLES = 256
-"""Samples in a chunk."""
+"""Largest number of samples in a chunk."""
 _BUFFER_S = 10
-"""Samples kept for this host while it does not read, s."""
+"""Duration of the samples that the library stores while this host does not read, s."""
 _FORMATS = dict(enumerate(("", "float32", "double64", "string", "int32", "int16", "int8", "int64")))
-"""Names of the formats of liblsl, by number."""
+"""Names of the sample formats of liblsl, by number."""
 
 
 class LslSession:
@@ -60,7 +60,7 @@ class LslSession:
     settings : LslMarkersSettings
         The ``[mocap]`` table.
     emit : Emit
-        Receives every chunk.
+        Function that receives every chunk.
     """
 
     def __init__(self, settings: LslMarkersSettings, emit: Emit) -> None:
@@ -74,7 +74,7 @@ class LslSession:
         self._last_ns = 0
 
     async def run(self) -> None:
-        """Connect and read until cancelled; raises the errors of `LslMarkersMocap.run`."""
+        """Connect and read until cancelled. The errors are those of `LslMarkersMocap.run`."""
         lsl = load_library()
         reading = threading.Thread(target=self._read, args=(lsl,), name="lsl reader", daemon=True)
         reading.start()
@@ -102,12 +102,12 @@ class LslSession:
     # --- in threads ---------------------------------------------------------------------------
 
     def _call(self, function: Callable[..., None], *args: object) -> None:
-        """Call a method in the event loop, unless the connection has ended."""
+        """Call a function in the event loop, unless the connection has ended."""
         if not self._stop.is_set():
             self._loop.call_soon_threadsafe(function, *args)
 
     def _read(self, lsl: Any) -> None:
-        """Search, open and read the stream."""
+        """Search for the stream, open it and read it."""
         comparing: threading.Thread | None = None
         inlet: Any = None
         try:
@@ -132,7 +132,8 @@ class LslSession:
             self._stop.set()
             if comparing is not None:
                 comparing.join()
-            # Its destructor closes the sockets, before the connection counts as ended.
+            # The destructor of the inlet closes the sockets. This must happen before the connection
+            # counts as ended.
             inlet = None
             with suppress(RuntimeError):  # the event loop is closed
                 self._loop.call_soon_threadsafe(self._finished.set)
@@ -145,7 +146,7 @@ class LslSession:
         return f"{named} of {settings.server}" if settings.server else named
 
     def _find(self, lsl: Any) -> Any:
-        """Return the stream that fits; None if the connection was cancelled.
+        """Return the stream that fits the settings; None if the connection was cancelled.
 
         Raises
         ------
@@ -157,7 +158,8 @@ class LslSession:
         settings, until = self._settings, time.monotonic() + SEARCH_S
         while not self._stop.is_set():
             found = search_streams(lsl, settings.query(), settings.server, least=2, wait_s=_STEP_S)
-            # The same source may be announced twice while it restarts: the newest is alive.
+            # A source that restarts may be announced twice. The newest announcement is the valid
+            # one.
             newest = {
                 info.source_id() or info.uid(): info
                 for info in sorted(found, key=lambda info: info.created_at())
@@ -189,7 +191,7 @@ class LslSession:
         DeviceLostError
             The sender does not answer.
         DeviceMisconfiguredError
-            The stream has texts, or too many channels.
+            The stream contains texts, or too many channels.
         """
         info = self._answer(lsl, inlet.info)
         if info is None:
@@ -212,7 +214,7 @@ class LslSession:
         return kind
 
     def _answer(self, lsl: Any, ask: Callable[..., Any]) -> Any:
-        """Return the result of a call that waits for the sender; None if cancelled."""
+        """Return the result of a call that waits for the sender; None after cancellation."""
         until = time.monotonic() + _DESCRIPTION_S
         while not self._stop.is_set():
             try:
@@ -226,7 +228,7 @@ class LslSession:
         return None
 
     def _pull(self, inlet: Any, kind: str) -> None:
-        """Emit samples until the connection ends."""
+        """Emit samples until the connection has ended."""
         silence_s = self._settings.silence_s
         sample_ns = time.monotonic_ns()
         while not self._stop.is_set():

@@ -53,7 +53,7 @@ class LslMarkersSettings(MocapSettings):
     @field_validator("server")
     @classmethod
     def _server_with_a_name(cls, server: str | None) -> str | None:
-        """Refuse text that is neither an address nor a host name."""
+        """Reject text that is neither an address nor a host name."""
         if server is not None and (fault := host_fault(server)) is not None:
             raise ValueError(fault)
         return server
@@ -61,7 +61,7 @@ class LslMarkersSettings(MocapSettings):
     @field_validator("stream", "stream_type", "source_id")
     @classmethod
     def _quotable(cls, text: str | None) -> str | None:
-        """Refuse text that XPath cannot quote."""
+        """Reject text that XPath cannot quote."""
         if text is not None and "'" in text and '"' in text:
             raise ValueError("contains both kinds of quotation marks: use predicate")
         return text
@@ -77,7 +77,7 @@ class LslMarkersSettings(MocapSettings):
                 yield "names", f"{name!r} occurs twice: every marker needs a name of its own"
 
     def query(self) -> str:
-        """Return the XPath predicate with which the stream is searched."""
+        """Return the XPath predicate that selects the stream."""
         if self.predicate is not None:
             return self.predicate
         keys = {"name": self.stream, "type": self.stream_type, "source_id": self.source_id}
@@ -87,7 +87,7 @@ class LslMarkersSettings(MocapSettings):
                 mark = '"' if "'" in text else "'"
                 parts.append(f"{key}={mark}{text}{mark}")
         if not parts:
-            # Qualisys sends Mocap, the convention is MoCap. Our own outlet has this type, too.
+            # Qualisys uses the type Mocap; the convention and the project's own outlet use MoCap.
             parts = [
                 "translate(type,'MOCAP','mocap')='mocap'",
                 "not(starts-with(source_id,'jointfit-'))",

@@ -1,4 +1,4 @@
-"""MIP commands to a device and its replies."""
+"""Exchange of MIP commands and replies with one device."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ REPLY_S = 1.0
 
 
 class MipReply(NamedTuple):
-    """Reply to one command."""
+    """Reply of the device to one command."""
 
     code: int
     packet: MipPacket
@@ -27,7 +27,7 @@ class MipReply(NamedTuple):
         return self.code == commands.OK
 
     def data(self, descriptor: int) -> bytes:
-        """Return the data of a field; empty if the reply has none."""
+        """Return the data of a field in the reply; empty if the reply does not contain it."""
         return commands.reply_data(self.packet, descriptor) or b""
 
 
@@ -46,7 +46,7 @@ class MipConversation(SerialConversation[MipPacket]):
         tries: int = 3,
         wait_s: float = REPLY_S,
     ) -> MipReply | None:
-        """Send a command until its reply arrives; return None if it does not."""
+        """Send a command until its reply arrives; return None if no reply arrives."""
 
         def is_reply(packet: MipPacket) -> bool:
             known = packet.descriptor_set == command_set

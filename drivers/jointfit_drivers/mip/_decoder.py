@@ -1,10 +1,11 @@
-"""Decoder of the MIP driver: chunks in, samples in SI units with canonical orientation out.
+"""Decoder of MIP devices: converts chunks to samples in SI units with canonical orientation.
 
-A sample takes its time from a field of the same packet. An orientation without time is stamped with
-its arrival. If earlier orientations had a time, an orientation without time is rejected. The two
-data sets with orientations have different delays, so only one data set is decoded.
+MIP is the packet protocol of MicroStrain. The time of a sample comes from a field of the same
+packet. An orientation without time is stamped with its arrival, but it is rejected if earlier
+orientations had a time. Two data sets contain orientations, with different delays. Only the
+configured data set is decoded.
 
-Invariant: the output depends only on the chunks fed; the decoder reads no clock and no port.
+Invariant: the output depends only on the chunks fed. The decoder reads no clock and no port.
 """
 
 from __future__ import annotations
@@ -44,13 +45,13 @@ _TIME_OF_WEEK = int(SharedField.GPS_TIME)
 _RATE, _FORCE = int(SensorField.ANGULAR_RATE), int(SensorField.ACCELERATION)
 _FIELD = int(SensorField.MAGNETIC_FIELD)
 _DATA = 0x80
-"""Lowest descriptor set of data; lower ones are commands."""
+"""Lowest descriptor set with data. Lower descriptor sets contain commands."""
 _FOREIGN = 20
-"""Consecutive orientations of the other data set after which a warning is returned."""
+"""Number of consecutive orientations of the other data set that causes a warning."""
 _REPORT_NS = 10_000_000_000
-"""Least time between two reports of invalid orientations, ns."""
+"""Shortest time between two reports of invalid orientations, ns."""
 _NEWEST = NewestKnown((1,), "SensorConnect")
-"""Newest firmware that the vendor's SDK describes."""
+"""Newest firmware that the vendor's software development kit describes."""
 
 
 class MipDecoder(SerialMessageDecoder[MipPacket]):
@@ -61,9 +62,10 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
     baud : int, optional
         Line speed, bit/s, for back-dating of stamps; None for USB.
     required : RequiredFields
-        Data set and fields of its orientation.
+        Data set and fields that contain the orientation.
     make_raw : callable, optional
-        Returns a new filter of raw measurements; None if the device sends orientations.
+        Function that returns a new filter of raw measurements; None if the device sends
+        orientations.
     """
 
     tick_clock = _CLOCK
@@ -122,7 +124,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         return self._newer.take_unknown(name, self._stamps.chunk_ns)
 
     def _take_reply(self, packet: MipPacket) -> list[Decoded]:
-        """Return the events of a reply, with a warning about newer firmware."""
+        """Return the events of a reply, and a warning if the firmware is newer than supported."""
         out: list[Decoded] = []
         for event in reply_events(packet):
             out.append(event)
@@ -133,7 +135,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
     def _decode_values(
         self, packet: MipPacket, values: dict[int, tuple[Any, ...]]
     ) -> list[Decoded]:
-        """Return the samples of the decoded fields of one packet."""
+        """Return the samples that the decoded fields of one packet contain."""
         if not self._needed <= values.keys():  # fields with other decimations
             return []
 
@@ -165,7 +167,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         return out + self._samples.add(reading) if out else self._samples.add(reading)
 
     def _note_validity(self, arrival_ns: int, *, is_valid: bool) -> list[Decoded]:
-        """Return the event of a change between valid and invalid orientations."""
+        """Return an event if orientations change between valid and invalid."""
         since_ns = self._invalid_since_ns
         if is_valid:
             self._invalid_since_ns = None
@@ -186,7 +188,7 @@ class MipDecoder(SerialMessageDecoder[MipPacket]):
         return [DeviceEvent("warning", text)]
 
     def _note_other_set(self, packet: MipPacket) -> list[Decoded]:
-        """Return a warning if the orientations belong to the other data set, or it is unknown."""
+        """Return a warning if the packet's data set is the other one, or is unknown."""
         if known_fields(packet.descriptor_set) is None:
             return self._take_unknown("packets", packet)
         field = self._other.get(packet.descriptor_set)

@@ -1,4 +1,4 @@
-"""Replies of a MIP device as events: model, firmware, settings read back, and refused commands."""
+"""Conversion of MIP replies to events: model, firmware, settings, and refused commands."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ if TYPE_CHECKING:
     from jointfit_protocols.mip import MipPacket
 
 _SMALL = 1e-4
-"""Vector part of a rotation that counts as none: 0.01 degrees."""
+"""Largest vector part of a quaternion that counts as no rotation, equal to 0.01 degrees."""
 _FORMATS = {
     Setup.FORMAT_REPLY: None,
     Setup.IMU_FORMAT_REPLY: 0x80,
     Setup.FILTER_FORMAT_REPLY: 0x82,
 }
-"""Data set of a message format; None if the reply contains it."""
+"""Data set of each message format; None if the reply itself contains the data set."""
 
 
 def reply_events(packet: MipPacket) -> list[Decoded]:
-    """Return the events of a reply; fields of another size or unknown fields are ignored."""
+    """Return the events of a reply. Unknown fields and fields of unexpected size are ignored."""
     out: list[Decoded] = []
     for descriptor, data in packet.fields:
-        # An unknown command is a property of the model: the driver asks for several.
+        # A refused command is no fault, because the driver tries commands that some models lack.
         if descriptor == commands.REPLY and len(data) == commands.REPLY_BYTES:
             if data[1] not in {commands.OK, commands.UNKNOWN_COMMAND}:
                 name = f"command 0x{packet.descriptor_set:02X},0x{data[0]:02X}"
@@ -76,7 +76,7 @@ def _events_of(command_set: int, descriptor: int, data: bytes) -> Iterator[Decod
 
 
 def _transform(command_set: int, descriptor: int, data: bytes) -> Quaternion | None:
-    """Return the sensor-to-vehicle rotation in a reply."""
+    """Return the sensor-to-vehicle rotation in a reply; None if the reply contains none."""
     if (command_set, descriptor) == (CommandSet.SETUP, Setup.TRANSFORM_REPLY):
         found = commands.decode_floats(data, 4)
         return None if found is None else (found[0], found[1], found[2], found[3])

@@ -1,7 +1,7 @@
 """Driver of MicroStrain IMUs that use MIP on a serial port or USB.
 
 `MipDecoder` is the pure part. `MipImu.run` opens the port, makes the device stream and reads until
-cancelled. `run` passes nothing but chunks to the decoder.
+cancelled. The decoder receives only the chunks that `run` emits.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class MipImu:
-    """One MIP device: orientation and device time, ns."""
+    """One MIP device, which sends orientation and device time in ns."""
 
     Settings: ClassVar[type[MipSettings]] = MipSettings
     wire: ClassVar[Wire] = "stream"
@@ -42,8 +42,8 @@ class MipImu:
         DeviceLostError
             The port is absent, in use, unplugged, or silent for ``silence_s``. A retry may succeed.
         DeviceMisconfiguredError
-            The file is not a serial port, the device uses another speed, no MIP device answers, or
-            it cannot send the orientation at this rate.
+            The file is not a serial port, or no MIP device answers. Or the device uses another
+            speed, or cannot send the orientation at this rate.
         """
         settings = self._settings
         await self._reception.run(

@@ -1,9 +1,9 @@
-"""From an open port to a streaming MIP device, or to the error that explains the failure.
+"""Start of a MIP device: makes it stream, or raises an error that explains the failure.
 
-Settings are read and compared, and written only where they differ. Written settings are volatile:
-without ``persist`` the device returns to its stored settings at the next power-up. A fault that may
-clear by itself raises `DeviceLostError`, any other `DeviceMisconfiguredError`; the device then
-streams as before.
+The driver reads the settings of the device, and writes only settings that differ. Written settings
+are volatile: without ``persist``, the device returns to its stored settings at the next power-up. A
+fault that may end without a change of the settings raises `DeviceLostError`. All other faults raise
+`DeviceMisconfiguredError`, and the device streams as before.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LINE_SPEEDS = (115_200, 921_600, 460_800, 230_400, 57_600, 38_400, 19_200, 9_600)
-"""Line speeds to search, bit/s: factory setting and common choices first."""
+"""Line speeds for the search, bit/s: factory setting and usual speeds first."""
 _SAVE_S = 3.0
-"""Longest wait for settings to be saved, s."""
+"""Longest wait until settings are saved, s."""
 _READ = bytes((Function.READ,))
 _FORMAT_OF_ANY_SET = CommandSet.SETUP << 8 | Setup.FORMAT
 _LEGACY_SERIES = ("GX3", "GX4", "GX5", "CX5", "CV5", "RQ1", "GQ4")
-"""Parts of the names of legacy models."""
+"""Parts of model names by which legacy models are recognized."""
 
 
 class MipHandshake:
-    """Brings one device into streaming.
+    """Makes one device stream.
 
     Parameters
     ----------
     port, emit : SerialPort, Emit
-        Open port, and the receiver of the device's bytes.
+        Open port, and function that receives the device's bytes.
     settings : MipSettings
         Table of the device in rig.toml.
     hunt : bool
-        Whether to search for a silent device at other speeds. A device whose bytes cannot be
-        decoded is always searched for.
+        Whether to search for a silent device at other speeds. If the device's bytes cannot be
+        decoded, the other speeds are always searched.
     """
 
     def __init__(
@@ -69,14 +69,14 @@ class MipHandshake:
         self._required = settings.required
 
     async def ensure_streaming(self) -> None:
-        """Return when the device streams according to the settings.
+        """Return when the device streams with the configured settings.
 
         Raises
         ------
         DeviceLostError
-            The device is silent, unplugged, or stopped answering.
+            The device does not answer, was unplugged, or stopped answering.
         DeviceMisconfiguredError
-            The device uses another speed, is of another kind, or it cannot send the orientation at
+            The device uses another speed, is of another kind, or cannot send the orientation at
             this rate.
         """
         settings = self._settings
@@ -103,7 +103,7 @@ class MipHandshake:
         self._refuse(await self._answer(CommandSet.BASE, Base.RESUME), "refuses to resume")
 
     async def _configure(self) -> None:
-        """Write the settings that differ, while the device is idle."""
+        """Write the settings that differ; the device must be idle."""
         reply = await self._answer(CommandSet.BASE, Base.DEVICE_INFO)
         info = commands.decode_info(reply.data(Base.DEVICE_INFO_REPLY))
         if info is not None and info.model_name:
@@ -114,7 +114,8 @@ class MipHandshake:
         fields = self._required.with_time(family)
         self._refuse_missing(fields, supported)
 
-        # The decoder reports a stored transform. Models without the command refuse it.
+        # The decoder reports a stored transform. Some models do not support this command and refuse
+        # it.
         if family == "current":
             await self._answer(CommandSet.SETUP, Setup.TRANSFORM, _READ)
         else:
@@ -134,7 +135,7 @@ class MipHandshake:
             self._refuse(saved, "refuses to save its settings", "persist = false")
 
     async def _descriptors(self) -> frozenset[int]:
-        """Return the commands and fields that the device names; empty if it names none."""
+        """Return the commands and fields that the device lists; empty if it lists none."""
         found: frozenset[int] = frozenset()
         for command, reply in (
             (Base.DESCRIPTORS, Base.DESCRIPTORS_REPLY),
@@ -146,7 +147,7 @@ class MipHandshake:
         return found
 
     def _family(self, supported: frozenset[int]) -> Family:
-        """Return the family: as set, by the commands of the device, or by its model."""
+        """Return the family: from the settings, the commands of the device, or its model."""
         if self._settings.family != "auto":
             return self._settings.family
         if supported:
@@ -154,7 +155,7 @@ class MipHandshake:
         return "legacy" if any(name in self._model for name in _LEGACY_SERIES) else "current"
 
     def _refuse_missing(self, fields: tuple[int, ...], supported: frozenset[int]) -> None:
-        """Raise if the device names its fields, but not all required ones."""
+        """Raise an error if the device lists its fields and a required field is missing."""
         data_set = self._required.data_set
         missing = [field for field in fields if data_set << 8 | field not in supported]
         if not missing or not any(one >> 8 >= DataSet.SENSOR for one in supported):
@@ -165,7 +166,7 @@ class MipHandshake:
         )
 
     def _alternatives(self) -> str:
-        """Return the settings that need other fields."""
+        """Return the settings that require other fields, for the error message."""
         settings = self._settings
         if settings.orientation == "gateway":
             return "magnetometer = false" if settings.magnetometer else 'orientation = "device"'
@@ -189,10 +190,10 @@ class MipHandshake:
         return tuple(FormatEntry(field, decimation) for field in fields)
 
     async def _ensure_format(self, stream: StreamCommands, wanted: tuple[FormatEntry, ...]) -> bool:
-        """Make the device send `wanted`; return whether it was written.
+        """Make the device send the fields `wanted`; return whether the format was written.
 
-        Further fields may remain, as long as the line can take them: their decimation matters only
-        for the load.
+        Other fields in the format are kept, as long as the line has the capacity for them. Their
+        decimation matters only for the load of the line.
         """
         found = await self._format(stream)
         if set(wanted) <= set(found):
@@ -225,7 +226,7 @@ class MipHandshake:
         return commands.decode_outputs(stream.prefix, reply.data(stream.format_reply)) or ()
 
     async def _ensure_stream(self, stream: StreamCommands) -> bool:
-        """Switch the stream on if it is off; return whether it was."""
+        """Switch the stream on if it is off; return whether it was off."""
         selector = bytes((stream.selector,))
         reply = await self._answer(CommandSet.SETUP, Setup.STREAM, _READ + selector)
         if reply.data(Setup.STREAM_REPLY) == selector + b"\x01":
@@ -237,11 +238,11 @@ class MipHandshake:
         return True
 
     async def _once(self, command: Base, wait_s: float) -> MipReply | None:
-        """Return the reply to a command that is sent once."""
+        """Send a command once, and return its reply."""
         return await self._conversation.command(CommandSet.BASE, command, tries=1, wait_s=wait_s)
 
     async def _answer(self, command_set: int, command: int, data: bytes = b"") -> MipReply:
-        """Return the reply to a command that the device must answer; it may be a refusal."""
+        """Return the reply to a command that the device must answer; the reply may be a refusal."""
         reply = await self._conversation.command(command_set, command, data)
         if reply is None:
             raise self._settings.stopped_answering()
@@ -256,5 +257,5 @@ class MipHandshake:
 
 
 def _describe(outputs: tuple[FormatEntry, ...]) -> str:
-    """Return fields with their decimations."""
+    """Return text that lists fields with their decimations."""
     return ", ".join(f"0x{one.field:02X}/{one.decimation}" for one in outputs) or "nothing"

@@ -1,7 +1,8 @@
-"""Fields that a MIP device must send, by the source of its orientation.
+"""Fields that a MIP device must send, which depend on the source of the orientation.
 
-All fields, including the time, belong to one data set and need the same decimation. Otherwise a
-packet may contain an orientation without time, because each field has a separate decimation.
+All fields, including the time, belong to one data set and need the same decimation. The device has
+a separate decimation for each field, so otherwise a packet could contain an orientation without
+time.
 """
 
 from __future__ import annotations
@@ -20,27 +21,27 @@ if TYPE_CHECKING:
     from jointfit_protocols.mip.commands import Family
 
 _FRAME_BYTES = 6
-"""Framing of a packet, bytes."""
+"""Size of the framing of a packet, bytes."""
 QUATERNIONS = {DataSet.SENSOR: SensorField.QUATERNION, DataSet.FILTER: FilterField.QUATERNION}
 GPS_TIMES = {DataSet.SENSOR: SensorField.GPS_TIME, DataSet.FILTER: FilterField.GPS_TIME}
 RAW = (SensorField.ACCELERATION, SensorField.ANGULAR_RATE)
 
 
 class RequiredFields(NamedTuple):
-    """Fields of one data set."""
+    """Required fields of one data set."""
 
     data_set: DataSet
     measured: tuple[int, ...]
-    """Fields with measurements."""
+    """Fields that contain measurements."""
 
     def with_time(self, family: Family) -> tuple[int, ...]:
-        """Return all fields, the time of this family first."""
+        """Return all required fields, beginning with the time field of this family."""
         legacy = family == "legacy"
         return (GPS_TIMES[self.data_set] if legacy else SharedField.REFERENCE_TIME, *self.measured)
 
     @property
     def packet_bytes(self) -> int:
-        """Size of the smallest sufficient packet of a legacy device, bytes; others are smaller."""
+        """Size of the smallest sufficient packet of a legacy device, bytes; others send less."""
         fields = self.with_time("legacy")
         return _FRAME_BYTES + sum(field_bytes(self.data_set, field) for field in fields)
 
@@ -51,9 +52,9 @@ def required_fields(orientation: str, estimator: str, *, magnetometer: bool) -> 
     Parameters
     ----------
     orientation : {"device", "gateway"}
-        Where the orientation is computed.
+        Place where the orientation is computed.
     estimator : {"filter", "sensor"}
-        Which of the device's two orientations is used.
+        Selects one of the two orientations that the device computes.
     magnetometer : bool
         Whether the gateway uses the magnetometer.
     """

@@ -1,4 +1,4 @@
-"""Parts that drivers of motion capture share: named columns, poses in SI, continuity, route."""
+"""Common parts of motion-capture drivers: names of columns, poses, continuity, network route."""
 
 from jointfit_drivers.motion_capture._binding import (
     MOST_NAMED,

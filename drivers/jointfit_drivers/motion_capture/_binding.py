@@ -1,12 +1,14 @@
-"""Binding of the columns of frames to the names in rig.toml.
+"""Assignment of the columns of frames to the names in rig.toml.
 
-The plain marker name (``T1``) is sufficient where only one model has that name. A name with its
-model is always possible: ``Thigh/T1``, ``Thigh:T1``, ``Thigh_T1``, or ``Thigh_1`` with the number
-of the marker. The same holds for bones, and for bodies inside an asset. A column has the
-name in rig.toml, otherwise the plain name if it is unique, otherwise ``Thigh/T1``.
+The plain marker name (``T1``) is sufficient if only one model has a marker with that name. A name
+with the name of the model is always possible: ``Thigh/T1``, ``Thigh:T1``, ``Thigh_T1``, or
+``Thigh_1`` with the number of the marker. The same applies to bones, and to bodies inside an asset.
+A column gets the name that rig.toml uses for it. Other columns get the plain name if it is unique,
+and ``Thigh/T1`` if it is not.
 
-Invariant: pure; only names matter, not ids and orders. The time grows linearly with the model, and
-the number of columns is bounded, because a model of one datagram can contain 65 000 markers.
+Invariant: the functions are pure. Only names matter; ids and orders do not. The time is
+proportional to the size of the model. The number of columns is limited, because the model in one
+datagram can contain 65 000 markers.
 """
 
 from __future__ import annotations
@@ -26,16 +28,15 @@ if TYPE_CHECKING:
     from jointfit_daemon.driver import MocapSettings
 
 ColumnKey = int | tuple[str, int]
-"""Identity of a marker or body in the frames of a server: a number, or a name and a number."""
+"""Identity of a marker or body in the frames of a server: a number, or a name with a number."""
 
 _MOST_COLUMNS = 2000
-"""Columns besides those named in rig.toml. Further ones are dropped, because each costs time in
-every frame, and no camera system labels as many.
-"""
+"""Largest number of columns in addition to those named in rig.toml. Further columns are dropped,
+because each column takes time in every frame, and no camera system labels as many markers."""
 MOST_NAMED = 50
-"""Names of the server that a warning lists."""
+"""Largest number of server names in a warning."""
 _MOST_COMPARED = 500
-"""Names of the server that are compared with a misspelt one."""
+"""Largest number of server names that are compared with a misspelled name."""
 _MOST_SUGGESTED = 3
 """Misspelt names for which a similar one is suggested."""
 _MOST_LISTED = 200
