@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from jointfit_daemon.config import faults_of
-from jointfit_daemon.driver import CanBusSettings
+from jointfit_daemon.driver import CONTRADICTION, CanBusSettings
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -38,4 +38,10 @@ def decoder_settings(driver: type[Driver], name: str, given: Mapping[str, Any]) 
         return driver.Settings.model_validate(table)
     except ValidationError as error:
         faults = faults_of(error, driver.Settings, name)
-        raise ValueError("; ".join(fault.text() for fault in faults)) from None
+        texts = [fault.text() for fault in faults]
+        texts += [
+            f"{name}.{detail['msg']}"
+            for detail in error.errors()
+            if detail["type"] == CONTRADICTION
+        ]
+        raise ValueError("; ".join(texts) or str(error)) from None

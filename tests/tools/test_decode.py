@@ -235,6 +235,13 @@ def test_unknown_driver_is_reported_with_a_suggestion(shared_data: Path) -> None
     assert result.stdout == ""
 
 
+def test_settings_that_contradict_each_other_are_named(tmp_path: Path) -> None:
+    (tmp_path / "raw").write_bytes(bytes(40))
+    result = run(app, ["decode", "bno085", str(tmp_path / "raw"), "--set", "baud=9600"])
+    assert result.exit_code == 2
+    assert "bno085.baud: 9600 is no speed of a BNO085" in result.stderr
+
+
 def test_missing_capture_file_is_reported_by_name(tmp_path: Path) -> None:
     result = run(app, ["decode", "xbus", str(tmp_path / "gone.bin"), "--summary"])
     assert result.exit_code == 2
