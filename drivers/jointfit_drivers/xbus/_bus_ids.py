@@ -18,10 +18,16 @@ _SIGHTINGS = 10
 
 
 class BusIdSelection:
-    """Selects the device whose measurements are used: the first device that sends."""
+    """Selects the device whose measurements are used.
 
-    def __init__(self) -> None:
-        self._selected: int | None = None
+    Parameters
+    ----------
+    bus_id : int, optional
+        Configured device; None: the first device that sends.
+    """
+
+    def __init__(self, bus_id: int | None = None) -> None:
+        self._configured = self._selected = bus_id
         self._others = self._sightings = 0
 
     def admits(self, bus_id: int) -> bool:
@@ -29,6 +35,8 @@ class BusIdSelection:
         if bus_id == self._selected:
             self._others = 0
             return True
+        if self._configured is not None:
+            return False
         self._others += 1
         if self._selected is None or self._others > _MOST_OTHERS:
             self._selected, self._others = bus_id, 0
@@ -40,9 +48,12 @@ class BusIdSelection:
         self._sightings += 1
         if self._sightings != _SIGHTINGS or self._selected is None:
             return []
+        if self._configured is not None:
+            text = f"measurements with bus id {bus_id} arrive; only bus id {self._selected} is used"
+            return [DeviceEvent("info", text, {"bus_id": bus_id})]
         text = (
             f"measurements with bus id {bus_id} arrive, too: several devices send on this line. "
             f"Only those of bus id {self._selected} are used: connect each device to a port of its "
-            "own, without an Xbus master"
+            "own, without an Xbus master, or select another device of a capture with `bus_id`"
         )
         return [DeviceEvent("warning", text, {"bus_ids": sorted((self._selected, bus_id))})]

@@ -91,6 +91,8 @@ class XbusDecoder:
         Computes orientations from raw measurements; None if the device sends orientations.
     legacy : LegacyMeasurements, optional
         Fields of MTData; None for a device that sends MTData2.
+    bus_id : int, optional
+        Bus id of the device whose measurements are used; None: that of the first measurement.
     """
 
     def __init__(
@@ -100,6 +102,8 @@ class XbusDecoder:
         wires: Mapping[int, int] | None = None,
         raw: RawOrientation | None = None,
         legacy: LegacyMeasurements | None = None,
+        *,
+        bus_id: int | None = None,
     ) -> None:
         self._wires = wires or {}
         self._raw = raw
@@ -109,7 +113,7 @@ class XbusDecoder:
         self._layouts: dict[int, MTData2Layout | None] = {}
         """MTData2Layout of the first message of each length; a device sends one or two lengths."""
         self._xbus = XbusCodec()
-        self._bus_ids = BusIdSelection()
+        self._bus_ids = BusIdSelection(bus_id)
         self._byte_ns = 0.0 if baud is None else _BITS * 1e9 / baud
         self._silence_ns = max(1.5 * MAX_MESSAGE * self._byte_ns, _SILENCE_FLOOR_NS)
         self._continuity = XbusContinuity(rate_hz)

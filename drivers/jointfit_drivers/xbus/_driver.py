@@ -45,7 +45,7 @@ class XbusImu:
                 settings.output_mode, settings.output_settings, settings.legacy_world
             )
         wires = trigger_wires(settings.sync or ())
-        return XbusDecoder(baud, settings.rate_hz, wires, raw, legacy)
+        return XbusDecoder(baud, settings.rate_hz, wires, raw, legacy, bus_id=settings.bus_id)
 
     async def run(self, emit: Emit) -> None:
         """Open the port, bring the device into measurement mode, and read until cancelled.

@@ -41,6 +41,13 @@ class XbusSettings(GatewaySettings, SerialImuSettings):
         False, description="reset a device that streams but does not answer; its clock restarts"
     )
 
+    bus_id: int | None = Field(
+        None,
+        ge=0,
+        le=0xFF,
+        description="device whose measurements are used, on a line with several (Xbus master); "
+        "default: the first that sends",
+    )
     format: Literal["mtdata2", "mtdata"] = Field(
         "mtdata2",
         description="message of the measurements: `mtdata2`, or `mtdata` of older devices, whose"

@@ -376,6 +376,21 @@ def test_measurements_of_several_devices_on_one_line_are_not_mixed(
     assert set(bus_ids[:1]) < set(warning.data["bus_ids"]) <= set(bus_ids)  # type: ignore[call-overload]
 
 
+@pytest.mark.parametrize("bus_id", [1, 2, 0xFF])
+def test_the_configured_device_of_a_line_with_several_is_used(bus_id: int) -> None:
+    ids = (1, 2, 0xFF)
+    wire = [
+        encode(XbusMessageId.MT_DATA2, message(k, 100 * k + place)[4:-1], number)
+        for k in range(200)
+        for place, number in enumerate(ids)
+    ]
+    events = fed(XbusDecoder(115_200, 100.0, bus_id=bus_id), *wire)
+    place = ids.index(bus_id)
+    assert [one.ticks for one in samples(events)] == [100 * k + place for k in range(200)]
+    (info,) = [one for one in events if isinstance(one, DeviceEvent)]
+    assert info.kind == "info"
+
+
 def test_one_measurement_with_another_bus_id_does_not_stop_the_device() -> None:
     stray = encode(XbusMessageId.MT_DATA2, message(0, 0)[4:-1], 9)
     events = fed(decoder(), stray, *(message(k, 100 * k) for k in range(200)))
