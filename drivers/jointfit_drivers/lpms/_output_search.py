@@ -24,8 +24,10 @@ if TYPE_CHECKING:
     from jointfit_protocols.lpms import LpBusMessage
     from jointfit_protocols.lpms.configuration import CommandTable, LpmsOutput
 
-_FEWEST, _DECIDING, _MOST_HELD = 4, 16, 256
-"""Packets after which a search ends: without a possible place, with one, and with several."""
+_EXAMINED = (4, 16, 32, 64, 128, 256)
+"""Numbers of packets at which the places are examined; few, so that the time is linear."""
+_DECIDING, _MOST_HELD = _EXAMINED[1], _EXAMINED[-1]
+"""Packets after which a search ends: with one possible place, and with several."""
 _TOLERANCE = 0.01
 """Largest deviation of the norm from 1."""
 _CLEARER = 5.0
@@ -55,6 +57,7 @@ class OutputSearch:
         self._alone = PacketLayout(table, table.quaternion)
         self.layout = self._alone
         """Layout of the packets: quaternion alone until another layout is found."""
+        self._candidates: dict[int, list[PacketLayout]] = {}
         self._size: int | None = None  # of the packets that `layout` describes
         self._held: list[ArrivedPacket] = []
         self.events: list[Decoded] = []
@@ -74,7 +77,7 @@ class OutputSearch:
             ready = self._end(self._alone)
         self._held.append(packet)
         count = len(self._held)
-        if count == _FEWEST or count >= _DECIDING:
+        if count in _EXAMINED:
             found = self._find()
             if not found or count >= (_DECIDING if len(found) == 1 else _MOST_HELD):
                 ready += self._end(found[0] if len(found) == 1 else self._alone)
@@ -108,7 +111,10 @@ class OutputSearch:
     def _find(self) -> list[PacketLayout]:
         """Return the layouts that fit the stored packets; one if it fits clearly best."""
         rated = []
-        for layout in self._layouts(len(self._held[0].message.data)):
+        size = len(self._held[0].message.data)
+        if size not in self._candidates:
+            self._candidates[size] = self._layouts(size)
+        for layout in self._candidates[size]:
             deviations = [_deviation(layout, packet.message.data) for packet in self._held]
             known = [one for one in deviations if one is not None]
             if len(known) == len(deviations):
