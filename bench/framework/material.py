@@ -29,7 +29,7 @@ BOTH_KNEES = Material(
     "inverse kinematics of the subject's model without the markers of thighs and shanks",
 )
 BOARD = Material(
-    "1 IMU on a rigid board (BROAD, trials 02 slow and 07 fast); no soft tissue",
+    "1 IMU on a rigid board without soft tissue (BROAD, trials 02 slow and 07 fast)",
     "optical motion capture of the board",
 )
 LOWER_LIMBS = Material(

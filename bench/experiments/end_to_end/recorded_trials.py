@@ -67,7 +67,8 @@ LOAD = (
 EXPERIMENTS = (
     Experiment(
         "end-to-end-squats",
-        "Squats, hold-out: pose messages of the daemon against the offline evaluation",
+        "Errors of the daemon's pose messages in held-out squats, compared with the "
+        "offline evaluation",
         _beside("squats", METHODS),
         KNEE,
         (FOLDER,),
@@ -75,7 +76,8 @@ EXPERIMENTS = (
     ),
     Experiment(
         "end-to-end-walking",
-        "Walking, trained on squats: pose messages of the daemon against the offline evaluation",
+        "Errors of the daemon's pose messages in walking, trained on squats, compared with"
+        " the offline evaluation",
         _beside("walking", WALKERS),
         KNEE,
         (FOLDER,),

@@ -66,13 +66,13 @@ def round_trip(_: Path) -> list[Result]:
 EXPERIMENTS = (
     Experiment(
         "recursive-fit-equivalence",
-        "Recursive regression against the batch solution, largest difference",
+        "Largest difference between recursive regression and the batch solution",
         recursive,
         SEEDED,
     ),
     Experiment(
         "joint-angle-round-trip",
-        "20 000 random rotations to joint angles and back, largest error",
+        "Largest error after the conversion of 20 000 random rotations to joint angles and back",
         round_trip,
         SEEDED,
     ),

@@ -191,7 +191,7 @@ SHORT_TRAINING = (
 EXPERIMENTS = (
     Experiment(
         "sit-to-stand-both-legs",
-        "Sit-to-stand, trained on squats, walking and drop jump",
+        "Errors in sit-to-stand, trained on squats, walking and drop jump",
         sit_to_stand,
         BOTH_KNEES,
         _DATA,
@@ -199,7 +199,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "leave-one-movement-out-both-legs",
-        "Each of four movements left out of the training, default method",
+        "Errors of the default method in each of four movements, which is left out of the training",
         left_out,
         BOTH_KNEES,
         _DATA,
@@ -230,7 +230,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "sit-to-stand-exchanged-filter-errors",
-        "Sit-to-stand with the filter errors exchanged between sensors, five assignments",
+        "Errors in sit-to-stand with five assignments of the filter errors to the sensors",
         exchanged,
         BOTH_KNEES,
         _DATA,

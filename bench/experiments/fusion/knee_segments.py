@@ -164,14 +164,14 @@ _DATA = (FOLDER,)
 EXPERIMENTS = (
     Experiment(
         "knee-squat-baselines",
-        "Squats, hold-out: single sensors, mean, and the patent's regressions",
+        "Errors of single sensors, mean and the patent's regressions in held-out squats",
         baselines,
         KNEE,
         _DATA,
     ),
     Experiment(
         "knee-squat-holdout",
-        "Squats, hold-out: default method",
+        "Errors of the default method in held-out squats",
         held_out,
         KNEE,
         _DATA,
@@ -179,7 +179,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "knee-walking-from-squats",
-        "Walking, trained on squats: default method",
+        "Errors of the default method in walking, trained on squats",
         _untrained("walking1", (5.0, 3.6, 3.3)),
         KNEE,
         _DATA,
@@ -187,28 +187,28 @@ EXPERIMENTS = (
     ),
     Experiment(
         "knee-jump-from-squats",
-        "Drop jump, trained on squats: default method",
+        "Errors of the default method in a drop jump, trained on squats",
         _untrained("DJ1", (5.2, 4.5, 3.4)),
         KNEE,
         _DATA,
     ),
     Experiment(
         "knee-squat-three-movements",
-        "Squats, hold-out, trained on squats, walking and drop jump",
+        "Errors in held-out squats, trained on squats, walking and drop jump",
         three_movements,
         KNEE,
         _DATA,
     ),
     Experiment(
         "knee-heading-invariance",
-        "Squats, hold-out, with the subject turned by 10 to 180° after the training",
+        "Errors in held-out squats with the subject turned by 10 to 180° after the training",
         facing_elsewhere,
         KNEE,
         _DATA,
     ),
     Experiment(
         "knee-single-sensor",
-        "Squats, hold-out, with one sensor left on each segment",
+        "Errors in held-out squats with only one sensor on each segment",
         one_sensor,
         KNEE,
         _DATA,

@@ -231,7 +231,7 @@ WALKING_FLEXION = (
 EXPERIMENTS = (
     Experiment(
         "all-methods-squat-holdout",
-        "Squats, hold-out: all methods",
+        "Errors of all methods in held-out squats",
         hold_out,
         KNEE,
         _DATA,
@@ -239,7 +239,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "all-methods-leave-one-movement-out",
-        "Each movement left out of the training: all methods",
+        "Errors of all methods in each movement, which is left out of the training",
         left_out,
         KNEE,
         _DATA,
@@ -247,7 +247,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "all-methods-three-movements",
-        "Squats, hold-out, trained on squats, walking and drop jump: all methods",
+        "Errors of all methods in held-out squats, trained on squats, walking and drop jump",
         together,
         KNEE,
         _DATA,

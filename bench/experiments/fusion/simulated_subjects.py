@@ -141,7 +141,7 @@ def _shares(label: str, scores: Array, *, held: bool) -> list[Result]:
 EXPERIMENTS = (
     Experiment(
         "all-methods-simulated-subjects",
-        f"{len(SEEDS)} simulated subjects with soft-tissue artefact: all methods",
+        f"Errors of all methods, {len(SEEDS)} simulated subjects with soft-tissue artefact",
         simulated,
         SIMULATED_SUBJECTS,
         long=True,

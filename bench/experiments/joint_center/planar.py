@@ -292,19 +292,19 @@ def _timed(fit: Callable[[Array], object], sets: Array) -> tuple[float, float]:
 EXPERIMENTS = (
     Experiment(
         "circle-three-frames",
-        "Circle through three frames against Cramer's rule",
+        "Circle through three frames, compared with the solution by Cramer's rule",
         three_frames,
         SEEDED,
     ),
     Experiment(
         "circle-error-prediction",
-        "Predicted error of three frames at equal angles, against 200 000 simulated runs",
+        "Predicted error of three frames at equal angles, compared with 200 000 simulated runs",
         equal_steps,
         SEEDED,
     ),
     Experiment(
         "circle-unequal-noise",
-        "Predicted errors along x and y for unequal noise against 400 000 simulated runs",
+        "Predicted errors along x and y for unequal noise, compared with 400 000 simulated runs",
         unequal_noise,
         SEEDED,
     ),
@@ -322,7 +322,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "circle-streaming",
-        "Circle updated frame by frame against the batch fit",
+        "Difference between a circle updated frame by frame and the batch fit",
         streaming,
         SEEDED,
     ),

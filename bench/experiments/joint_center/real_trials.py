@@ -26,7 +26,7 @@ TRIALS = {
     "STS1": "sit to stand",
     "DJ1": "drop jump",
     "walking1": "walking",
-    "gait2354": "walking, three markers a segment",
+    "gait2354": "walking, three markers per segment",
 }
 KNEE_FLOOR_MM = 50.0
 
@@ -62,7 +62,7 @@ IDS = {
     "sit to stand": "model-centers-sit-to-stand",
     "drop jump": "model-centers-drop-jump",
     "walking": "model-centers-walking",
-    "walking, three markers a segment": "model-centers-gait",
+    "walking, three markers per segment": "model-centers-gait",
 }
 
 
@@ -70,7 +70,7 @@ def _comparison(trial: str, movement: str) -> Experiment:
     folder = "opensim_gait2354" if trial == "gait2354" else "opencap_subject4"
     return Experiment(
         IDS[movement],
-        f"Functional joint centres against those of the model: {movement}",
+        f"Functional joint centres compared with the centres of the model: {movement}",
         partial(compare, trial),
         MODEL_CENTERS,
         recordings=(folder,),

@@ -270,7 +270,7 @@ BALL_IDS = {20.0: "ball-joint-twenty-degrees", 45.0: "ball-joint-forty-five-degr
 EXPERIMENTS = (
     Experiment(
         "sphere-streaming",
-        "Sphere updated frame by frame against the batch fit",
+        "Difference between a sphere updated frame by frame and the batch fit",
         frame_by_frame,
         SEEDED,
     ),
@@ -305,7 +305,7 @@ EXPERIMENTS = (
     Experiment("hinge-axis", "Axis of a hinge (SARA), range of motion 45°", hinge_axis, SEEDED),
     Experiment(
         "parent-frame-covariance",
-        "Covariance due to noise of the proximal frame against Monte-Carlo simulation",
+        "Covariance due to noise of the proximal frame, compared with a Monte-Carlo simulation",
         parent_covariance,
         SEEDED,
     ),

@@ -120,7 +120,8 @@ def _knocked(functional: CalibrationTrial, pose: StaticPose, seed: int) -> Calib
 EXPERIMENTS = (
     Experiment(
         "daemon-marker-refinement",
-        f"Marker positions refined during calibration, {len(SEEDS)} simulated subjects",
+        f"Change of the errors by marker refinement during calibration, {len(SEEDS)} simulated "
+        "subjects",
         refined,
         SIMULATED_SUBJECTS,
         long=True,

@@ -143,7 +143,7 @@ _RECORDED = (FOLDER,)
 EXPERIMENTS = (
     Experiment(
         "chain-jacobian",
-        "Jacobian of the chain against central differences",
+        "Jacobian of the chain, compared with central differences",
         slope,
         LOWER_LIMBS,
         _RECORDED,

@@ -312,7 +312,7 @@ FREE_FEET = (
 EXPERIMENTS = (
     Experiment(
         "marker-refinement-walking",
-        "Simultaneous refinement on walking: tracking error afterwards",
+        "Marker error after simultaneous refinement on walking",
         fast,
         LOWER_LIMBS,
         _RECORDED,
@@ -334,7 +334,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "marker-refinement-coordinate-search",
-        "Misplaced markers: simultaneous refinement against coordinate search",
+        "Simultaneous refinement compared with coordinate search, misplaced markers",
         beside_search,
         LOWER_LIMBS,
         _RECORDED,
@@ -342,7 +342,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "marker-refinement-unseen-movement",
-        "Markers refined on three movements: tracking error on a fourth",
+        "Marker error in a fourth movement after refinement on three movements",
         unseen,
         LOWER_LIMBS,
         _RECORDED,
@@ -357,14 +357,15 @@ EXPERIMENTS = (
     ),
     Experiment(
         "marker-refinement-observability",
-        "Directions that the tracking error does not determine",
+        "Directions that the marker error does not determine",
         invisible,
         LOWER_LIMBS,
         _RECORDED,
     ),
     Experiment(
         "marker-refinement-locked-landmarks",
-        "Errors of refined markers against simulated truth, anatomical markers locked",
+        "Errors of refined markers compared with the simulated positions, anatomical "
+        "markers locked",
         truth,
         SIMULATED_MARKERS,
         _RECORDED,
@@ -372,7 +373,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "marker-refinement-free-feet",
-        "Errors of refined markers against simulated truth, feet not locked",
+        "Errors of refined markers compared with the simulated positions, feet not locked",
         feet_let_go,
         SIMULATED_MARKERS,
         _RECORDED,

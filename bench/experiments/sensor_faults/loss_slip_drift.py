@@ -289,7 +289,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "heading-drift",
-        "Knee rotation error in the fifth minute of heading drift",
+        "Error of knee rotation in the fifth minute of heading drift",
         drift,
         SIMULATED_SUBJECTS,
         long=True,

@@ -327,7 +327,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
     ),
     Experiment(
         "synchronization-flags",
-        "Samples that are flagged as synchronized, from received bytes to output frames",
+        "Errors of samples and frames that are flagged as synchronized",
         honesty,
         SIMULATED_CLOCKS,
         headline=True,

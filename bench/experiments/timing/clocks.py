@@ -232,7 +232,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "clock-wraps-and-restarts",
-        "Counter wrap and restart of a device",
+        "Clock errors at a counter wrap and at a restart of a device",
         wraps_and_restarts,
         SIMULATED_CLOCKS,
     ),

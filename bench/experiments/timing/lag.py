@@ -362,13 +362,13 @@ EXPERIMENTS = (
     ),
     Experiment(
         "lag-uncertainty-simulated",
-        "Standard deviation of the lag against its scatter, simulated",
+        "Stated standard deviation of the lag compared with the scatter of the errors, simulated",
         sigma,
         SEEDED,
     ),
     Experiment(
         "lag-drift",
-        "Drift of the lag over two minutes",
+        "Error of the estimated drift of the lag over two minutes",
         drift,
         SEEDED,
     ),
@@ -405,7 +405,7 @@ EXPERIMENTS = (
     ),
     Experiment(
         "lag-orientation-input",
-        "Lead of the orientations of a filter over its gyroscope",
+        "Time by which the orientations of a filter lead its gyroscope",
         quaternion_input,
         BOARD,
         EXCERPTS,
