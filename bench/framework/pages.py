@@ -8,6 +8,8 @@ A template in ``bench/pages`` is Markdown with fields in double braces:
     A value with its unit, with N decimals.
 ``{{range: ID ... | ENDING}}``
     Smallest and largest value among the results of several experiments whose names end with ENDING.
+``{{range: ID ... | ENDING | N}}``
+    The same values, with N decimals.
 ``{{experiment: ID ...}}``
     Title, subjects, reference, command and table of each experiment.
 ``{{speed: ID ...}}``
@@ -82,10 +84,9 @@ def render(template: str) -> str:
 def _field(kind: str, argument: str) -> str:
     match kind:
         case "value":
-            # In a Markdown table, the separator is escaped.
-            return _value(*(part.strip() for part in argument.replace("\\|", "|").split("|")))
+            return _value(*_parts(argument))
         case "range":
-            return _range(*(part.strip() for part in argument.split("|")))
+            return _range(*_parts(argument))
         case "experiment":
             return "\n\n".join(_experiment(name) for name in argument.split())
         case "speed":
@@ -97,6 +98,11 @@ def _field(kind: str, argument: str) -> str:
         case _:
             msg = f"unknown field {kind!r} in a template of {TEMPLATES}"
             raise TemplateError(msg)
+
+
+def _parts(argument: str) -> list[str]:
+    """Return the parts of a field, whose separator is escaped in a Markdown table."""
+    return [part.strip() for part in argument.replace("\\|", "|").split("|")]
 
 
 @cache
@@ -123,7 +129,7 @@ def _value(name: str, result: str, decimals: str = "") -> str:
     return f"{found.value:.{digits}g}{unit}"
 
 
-def _range(names: str, ending: str) -> str:
+def _range(names: str, ending: str, decimals: str = "0") -> str:
     results = [result for name in names.split() for result in storage.results_of(stored(name))]
     found = sorted(
         (result for result in results if result.name.endswith(ending)), key=lambda r: r.value
@@ -131,7 +137,8 @@ def _range(names: str, ending: str) -> str:
     if not found:
         msg = f"no result of {names} ends with {ending!r}"
         raise TemplateError(msg)
-    return f"{found[0].value:.0f} to {found[-1].value:.0f} {found[0].unit}"
+    first, last = (f"{result.value:.{int(decimals)}f}" for result in (found[0], found[-1]))
+    return f"{first} to {last}{UNITS.get(found[0].unit, f' {found[0].unit}')}"
 
 
 def _experiment(name: str) -> str:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.framework import pages
+from bench.framework import pages, storage
 from bench.framework.experiment import Result, find_experiments
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
@@ -33,6 +33,18 @@ def test_unknown_fields_and_results_are_refused() -> None:
     name = find_experiments()[0].id
     with pytest.raises(pages.TemplateError, match="has no result 'nothing'"):
         pages.render(f"{{{{value: {name} | nothing}}}}")
+
+
+def test_a_range_has_the_smallest_and_the_largest_result_also_inside_a_table() -> None:
+    name = "recorded-legs-after-squats"
+    found = [
+        result.value
+        for result in storage.results_of(pages.stored(name))
+        if result.name.endswith("squats1: flexion")
+    ]
+    rendered = pages.render(f"{{{{range: {name} \\| squats1: flexion \\| 2}}}}")
+    assert len(found) == 4  # two legs, two references
+    assert rendered == f"{min(found):.2f} to {max(found):.2f}°"
 
 
 def test_results_named_by_row_and_column_become_a_matrix() -> None:
