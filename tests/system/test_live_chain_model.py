@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.system.station import Listener, Station, running, stopped
+from tests.system.station import Listener, Station, hang_up, running, stopped
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from jointfit_daemon.tools.child_processes import Simulator
+    from jointfit_daemon.tools.child_processes import ChildProcess, Simulator
     from tests.broker_fixture import Broker
 
 pytestmark = [pytest.mark.system, pytest.mark.experiment, pytest.mark.timeout(200)]
@@ -28,6 +28,7 @@ async def test_lost_and_exchanged_markers_are_flagged_and_the_rest_is_tracked(
         await listener.client.subscribe("optical/chain")
         await listener.until(lambda: "optical/chain" in listener.latest)
         faulty, sound = await lose_and_exchange_markers(simulator, listener)
+        await reload_another_model(station, daemon, listener)
         code, _ = await stopped(daemon)
         assert code == 0, station.log
 
@@ -72,6 +73,23 @@ async def lose_and_exchange_markers(
     await listener.until(lambda: not flags())
     await listener.event("T1", "in use")
     return faulty, listener.latest["optical/chain"]
+
+
+async def reload_another_model(station: Station, daemon: ChildProcess, listener: Listener) -> None:
+    """Check that a model with a marker on the wrong segment is refused, and the old one tracked."""
+    model = station.rig.with_name("leg.toml")
+    text = model.read_text()
+    thigh = 'name = "T2"\nsegment = "thigh"'
+    assert thigh in text
+    model.write_text(text.replace(thigh, thigh.replace("thigh", "shank")))
+    hang_up(daemon)
+    await listener.event(
+        "demo", "refused, the running configuration stays in force", "chain.model has T2 on 'shank'"
+    )
+    refused_us = listener.latest["optical/chain"]["t_us"]
+    await listener.until(lambda: listener.latest["optical/chain"]["t_us"] > refused_us)
+    assert listener.latest["optical/chain"]["error_m"].keys() >= {"T1", "T2", "T3"}
+    model.write_text(text)
 
 
 async def test_a_model_with_other_markers_stops_the_start_with_their_names(
