@@ -334,7 +334,8 @@ def _check_method(method: str, movement: Movement) -> None:
     if "angles" in chosen.needs:
         raise UnsuitableTrialError(
             f"--method {method} needs inertial angles of the child, which a marker trial does not"
-            " contain: use jointfit calibrate, or another method"
+            f' contain: set center_method = "{method}" in [calibration] of rig.toml and run'
+            " jointfit calibrate, or use another method"
         )
 
     dimensions = 0 if movement.points is None else movement.points.shape[-1]
